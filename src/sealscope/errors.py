@@ -1,0 +1,27 @@
+"""The errors a caller can act on.
+
+Each message is one line that names the rule, the value and the place, for example
+``charge_pressure must be > 0 Pa, got -3.0 (rigs/lab.toml)``.
+"""
+
+from __future__ import annotations
+
+
+class SealscopeError(Exception):
+    """Base of every error that Sealscope raises on purpose; its text is one line, fit to print."""
+
+
+class InputError(SealscopeError, ValueError):
+    """A value, an option or a file from outside breaks a rule."""
+
+
+class UnreadableFile(InputError):
+    """A file cannot be read as a recording; the other files of the same call still can."""
+
+
+class SimulationFailed(SealscopeError, ArithmeticError):
+    """A run diverged, or proved to be under-resolved; no result is returned."""
+
+
+class MissingExtra(SealscopeError, ImportError):
+    """An optional library is needed; the message names the extra that installs it."""
