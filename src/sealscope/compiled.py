@@ -105,4 +105,4 @@ def kernel(function: _F) -> _F:
 
 def law(function: _F) -> _F:
     """Compile a small law that only other compiled functions call: inlined there, cached with them, never alone."""
-    return numba.njit(nogil=True, error_model="numpy", inline="never")(function)  # type: ignore[no-any-return]
+    return numba.njit(nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]

@@ -1,0 +1,19 @@
+"""What a person reads of a diagnosis: the page and the terminal text (names only, loaded when first used)."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sealscope.reporting.contract import Mark
+    from sealscope.reporting.page import render_page, write_page
+    from sealscope.reporting.text import diagnosis_text
+
+__all__ = ["Mark", "diagnosis_text", "render_page", "write_page"]
+
+_HOMES = {"Mark": "contract", "diagnosis_text": "text", "render_page": "page", "write_page": "page"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(f"sealscope.reporting.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

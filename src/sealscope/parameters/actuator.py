@@ -1,0 +1,34 @@
+"""Parameters of the cylinder and its friction."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from sealscope.parameters.fields import Part, choice, quantity
+
+
+class Cylinder(Part):
+    """Double-rod cylinder between two caps, eqs. (4.13)-(4.15), (4.18), (4.19); x = 0 at mid-stroke, |x| <= L/2."""
+
+    A_A: Annotated[float, quantity("piston area on side A", "m^2", gt=0, le=10)]
+    A_B: Annotated[float, quantity("piston area on side B", "m^2", gt=0, le=10)]
+    L: Annotated[float, quantity("stroke", "m", gt=0, le=100)]
+    M_eq: Annotated[float, quantity("moving mass", "kg", gt=0, le=1e6)]
+    V: Annotated[float, quantity("volume of each side at mid-stroke", "m^3", gt=0, le=100)]
+    volumes: Annotated[Literal["fixed", "position"], choice("chamber volumes: constant V, or V + A_A x and V - A_B x")]
+    k_stop: Annotated[float, quantity("stiffness of the end stop", "N/m", gt=0, le=1e12)]
+    d_stop: Annotated[float, quantity("damping of the end stop", "N s/m", ge=0, le=1e9)]
+    F_l: Annotated[float, quantity("constant external load", "N", ge=-1e8, le=1e8)]
+
+
+class Friction(Part):
+    """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22)."""
+
+    F_pr: Annotated[float, quantity("preload force of the seals", "N", ge=0, le=1e7)]
+    F_cfr: Annotated[float, quantity("Coulomb friction per pressure", "N/Pa", ge=0, le=1)]
+    C_c: Annotated[float, quantity("transition coefficient", "s/m", gt=0, le=1e6)]
+    K_brk: Annotated[float, quantity("breakaway force over Coulomb force", "1", ge=1, le=100)]
+    F_v: Annotated[float, quantity("viscous friction coefficient", "N s/m", ge=0, le=1e8)]
+    v_th: Annotated[float, quantity("velocity below which friction is linear", "m/s", gt=0, le=10)]
+    coulomb_pressure: Annotated[Literal["sum", "difference"], choice("pressure in the Coulomb force, eq. (4.20)")]
+    bracket: Annotated[Literal["continuous", "literal"], choice("bracketing of the linear part, eq. (4.22)")]

@@ -1,0 +1,58 @@
+"""Parameters of the electric and hydraulic drive: servo motor, pump, lines with throttles, fluid."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from sealscope.parameters.fields import Part, choice, quantity
+
+
+class Motor(Part):
+    """PI-controlled servo motor, eqs. (4.2)-(4.6)."""
+
+    R_c: Annotated[float, quantity("winding resistance", "ohm", gt=0, le=1e4)]
+    L_c: Annotated[float, quantity("winding inductance", "H", gt=0, le=10)]
+    C_e: Annotated[float, quantity("back electromotive force constant", "V s/rad", gt=0, le=1e3)]
+    C_m: Annotated[float, quantity("torque constant", "N m/A", gt=0, le=1e3)]
+    J_M: Annotated[float, quantity("moment of inertia of motor and pump", "kg m^2", gt=0, le=1e3)]
+    B_M: Annotated[float, quantity("viscous damping of motor and pump", "N m s/rad", ge=0, le=1e3)]
+    k_p: Annotated[float, quantity("proportional gain of the speed loop", "V s/rad", ge=0, le=1e6)]
+    K_i: Annotated[float, quantity("integral gain of the speed loop", "V/rad", ge=0, le=1e6)]
+    omega_per_volt: Annotated[float, quantity("commanded speed per volt", "rad/(s V)", gt=0, le=1e4)]
+    V_max: Annotated[float, quantity("largest motor voltage", "V", gt=0, le=1e5)]
+    i_max: Annotated[float, quantity("largest motor current", "A", gt=0, le=1e5)]
+    integrator: Annotated[Literal["state", "euler"], choice("integral of the speed error, eq. (4.2)")]
+
+
+class Pump(Part):
+    """Bidirectional pump of fixed displacement, eq. (4.1)."""
+
+    q_b: Annotated[float, quantity("displacement", "m^3/rev", gt=0, le=0.1)]
+    G_pump: Annotated[float, quantity("internal leakage conductance of the pump", "m^3/(s Pa)", ge=0, le=1e-6)]
+    omega_max: Annotated[float, quantity("speed limit (informative)", "rad/s", gt=0, le=1e4)]
+
+
+class Line(Part):
+    """Lines between pump and cylinder, and the one-way throttles in them, eqs. (4.7)-(4.12), (4.16), (4.17).
+
+    `orifices = "absent"`: the pump is piped to the cylinder directly (p_1 = p_A, p_2 = p_B, V_1 and V_2 unused).
+    """
+
+    orifices: Annotated[Literal["absent", "present"], choice("throttles and line volumes in the model")]
+    C_d: Annotated[float, quantity("discharge coefficient of the throttle", "1", gt=0, le=1)]
+    d_line: Annotated[float, quantity("bore of the line", "m", gt=0, le=0.5)]
+    closed_A: Annotated[float, quantity("closed fraction of the throttle at A", "1", ge=0, le=0.99)]
+    closed_B: Annotated[float, quantity("closed fraction of the throttle at B", "1", ge=0, le=0.99)]
+    closed_means: Annotated[Literal["area", "diameter"], choice("what the closed fraction is a fraction of")]
+    metering: Annotated[Literal["meter-out", "literal"], choice("which flow is throttled, eqs. (4.9)-(4.12)")]
+    dp_0: Annotated[float, quantity("pressure difference below which the throttle is laminar", "Pa", gt=0, le=1e6)]
+    V_1: Annotated[float, quantity("volume of the line at pump port 1", "m^3", gt=0, le=1)]
+    V_2: Annotated[float, quantity("volume of the line at pump port 2", "m^3", gt=0, le=1)]
+
+
+class Fluid(Part):
+    """The oil and the pressure the closed circuit is charged to."""
+
+    K_oil: Annotated[float, quantity("effective bulk modulus", "Pa", gt=0, le=1e11)]
+    rho: Annotated[float, quantity("density", "kg/m^3", gt=0, le=1e4)]
+    p_charge: Annotated[float, quantity("charge pressure: all pressures at the start", "Pa", ge=0, le=1e8)]

@@ -1,0 +1,108 @@
+"""How a parameter is declared: symbol = field name; human name, SI unit and range stand in the model.
+
+A model holds SI numbers and choices only. It has no default: every value comes from a rig's file, with its source.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Iterator, Mapping
+from typing import Any, Self, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from sealscope.errors import InputError
+
+_BOUNDS = {
+    "greater_than": (">", "gt"),
+    "greater_than_equal": (">=", "ge"),
+    "less_than": ("<", "lt"),
+    "less_than_equal": ("<=", "le"),
+}
+
+
+def quantity(name: str, unit: str, **bounds: float) -> Any:
+    """Declare a number: human `name`, SI `unit` ("1" where it has none), bounds `gt`, `ge`, `lt`, `le` in that unit."""
+    return Field(title=name, json_schema_extra={"unit": unit}, **bounds)  # type: ignore[call-overload]
+
+
+def choice(name: str) -> Any:
+    """Declare a choice between readings of the source; the annotation is a Literal of the allowed words."""
+    return Field(title=name, json_schema_extra={"unit": ""})
+
+
+def unit_of(field: FieldInfo) -> str:
+    """SI unit of a declared parameter ("" for a choice)."""
+    extra = field.json_schema_extra
+    return str(extra["unit"]) if isinstance(extra, dict) else ""
+
+
+def choices_of(field: FieldInfo) -> tuple[str, ...]:
+    """The allowed words of a choice, () for a number."""
+    annotation = field.annotation
+    return get_args(annotation) if get_origin(annotation) is typing.Literal else ()
+
+
+def with_unit(number: float, unit: str) -> str:
+    """`number` followed by its unit, bare where it has none."""
+    return f"{number:g}" if unit in ("", "1") else f"{number:g} {unit}"
+
+
+def rule_broken(error: ValidationError, model: type[BaseModel]) -> str:
+    """The sentence "SYMBOL must be ..., got ..." for the first error pydantic found in values of `model`."""
+    first = error.errors(include_url=False)[0]
+    symbol = ".".join(str(part) for part in first["loc"])
+    kind, got = first["type"], first.get("input")
+    if kind == "value_error":
+        return str(first["ctx"]["error"])
+    if kind == "missing":
+        return f"{symbol} is missing"
+    if kind == "extra_forbidden":
+        return f"{symbol} is not a parameter"
+    field = model.model_fields.get(symbol)
+    unit = unit_of(field) if field is not None else ""
+    if kind in _BOUNDS:
+        sign, key = _BOUNDS[kind]
+        return f"{symbol} must be {sign} {with_unit(first['ctx'][key], unit)}, got {got}"
+    if kind == "literal_error" and field is not None:
+        return f"{symbol} must be one of {', '.join(choices_of(field))}, got {got!r}"
+    if kind == "finite_number":
+        return f"{symbol} must be finite, got {got}"
+    wanted = {"int_type": "a whole number", "float_type": "a number"}.get(kind)
+    if wanted:
+        return f"{symbol} must be {wanted}, got {got!r}"
+    return f"{symbol}: {first['msg']}, got {got!r}"
+
+
+class PartsDisagreeError(InputError):
+    """A rule across several parameters is broken; no single one of them is to blame."""
+
+
+class Part(BaseModel):
+    """A group of parameters: immutable, finite numbers, no unknown names; breaking a rule raises InputError."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            across = error.errors(include_url=False)[0]["type"] == "value_error"
+            raise (PartsDisagreeError if across else InputError)(rule_broken(error, type(self))) from None
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy; with `update` it raises InputError, because pydantic would not validate the new values."""
+        if update:
+            raise InputError("a rig must be changed by Rig.with_values, got model_copy(update=...)")
+        return super().model_copy(deep=deep)
+
+
+def leaves(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Dotted name and declaration of every parameter below `model`, in the order of declaration."""
+    for symbol, field in model.model_fields.items():
+        annotation = field.annotation
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            yield from leaves(annotation, f"{prefix}{symbol}.")
+        elif field.json_schema_extra is not None:
+            yield prefix + symbol, field

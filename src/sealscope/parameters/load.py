@@ -1,0 +1,95 @@
+"""Rigs as files: one TOML a rig, packaged by name or a user's own, which may extend another."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from sealscope.errors import InputError
+from sealscope.parameters.names import closest
+from sealscope.parameters.rig import Entry, Rig, flatten
+
+_PACKAGED = Path(__file__).parent / "rigs"
+_LARGEST_FILE = 1_000_000
+_DEEPEST = 8
+
+
+def rig_names() -> tuple[str, ...]:
+    """Names of the packaged rigs."""
+    return tuple(sorted(path.stem for path in _PACKAGED.glob("*.toml")))
+
+
+def load_rig(name_or_path: str | os.PathLike[str] = "thesis") -> Rig:
+    """The rig of that name, or of a TOML file with value, unit and source for each parameter.
+
+    A file may say `[rig] extends = "thesis"` (or a path beside it) and then needs only the values that differ. Raises
+    InputError where the file cannot be read, a name is unknown, or a value has no source, a wrong unit or a bad value.
+    """
+    text = os.fspath(name_or_path)
+    if text in rig_names():
+        return _packaged(text)
+    if "\0" in text or not _is_path(text):
+        raise InputError(
+            f"{text!r} is no packaged rig ({', '.join(rig_names())}) and no .toml file{closest(text, rig_names())}"
+        )
+    return _build(Path(text), text)
+
+
+@lru_cache(maxsize=32)
+def _packaged(name: str) -> Rig:
+    return _build(_PACKAGED / f"{name}.toml", f"rigs/{name}.toml")
+
+
+def _is_path(text: str) -> bool:
+    return text.endswith(".toml") or "/" in text or os.sep in text or Path(text).is_file()
+
+
+def _build(path: Path, place: str) -> Rig:
+    head, entries = _collect(path, place, ())
+    return Rig.from_entries(entries, name=head.get("name", path.stem), title=head.get("title", ""), place=place)
+
+
+def _collect(path: Path, place: str, seen: tuple[Path, ...]) -> tuple[dict[str, str], dict[str, Entry]]:
+    """Head and entries of a file, on top of those of the rig it extends."""
+    here = path.resolve()
+    if here in seen or len(seen) >= _DEEPEST:
+        raise InputError(f"extends must end at a rig of its own, got a circle or more than {_DEEPEST} files ({place})")
+    tree = _parse(path, place)
+    head = tree.pop("rig", {})
+    if not isinstance(head, dict):
+        raise InputError(f"rig must be a table, got {head!r} ({place})")
+    for key, value in head.items():
+        if key not in ("name", "title", "extends"):
+            raise InputError(f"rig.{key} is not known; [rig] has name, title and extends ({place})")
+        if not isinstance(value, str) or not value.strip():
+            raise InputError(f"rig.{key} must be a text, got {value!r} ({place})")
+    entries: dict[str, Entry] = {}
+    base = head.get("extends")
+    if base in rig_names():
+        entries = _collect(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*seen, here))[1]
+    elif base is not None and "\0" not in base and _is_path(base):
+        entries = _collect(path.parent / base, os.fspath(Path(place).parent / base), (*seen, here))[1]
+    elif base is not None:
+        raise InputError(
+            f"extends must be a packaged rig ({', '.join(rig_names())}) or a .toml file, got {base!r} ({place})"
+        )
+    return head, entries | flatten(tree.items(), place)
+
+
+def _parse(path: Path, place: str) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            data = file.read(_LARGEST_FILE + 1)
+    except OSError as error:
+        raise InputError(f"rig file cannot be read: {error.strerror or error} ({place})") from None
+    if len(data) > _LARGEST_FILE:
+        raise InputError(f"a rig file must be at most {_LARGEST_FILE} bytes, got more ({place})")
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise InputError(f"a rig file must be UTF-8 text, got byte {data[error.start]:#04x} ({place})") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"a rig file must be TOML: {str(error).splitlines()[0]} ({place})") from None

@@ -1,0 +1,54 @@
+"""Names of parameters: bare where unique, dotted otherwise; and settings as typed on a command line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
+from sealscope.errors import InputError
+
+
+def closest(word: str, known: Sequence[str]) -> str:
+    """`; did you mean ...?` with the known name nearest to `word`, or an empty string."""
+    folded = {name.casefold(): name for name in known}
+    near = difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.5)
+    return f"; did you mean {folded[near[0]]}?" if near else ""
+
+
+def resolve(name: str, dotted: Sequence[str]) -> str:
+    """The dotted name that `name` stands for: itself, or the only one that ends with it (`V_1`, `p_A.noise`).
+
+    Raises InputError where no parameter has the name, or several have.
+    """
+    if name in dotted:
+        return name
+    found = [full for full in dotted if full.endswith("." + name)] if name else []
+    if len(found) == 1:
+        return found[0]
+    if found:
+        shown = ", ".join(found[:6]) + (", ..." if len(found) > 6 else "")
+        raise InputError(f"parameter {name} is not unique, give one of {shown}")
+    bare = [full.rpartition(".")[2] for full in dotted]
+    raise InputError(f"{name!r} is not a parameter{closest(name, dotted if '.' in name else [*dict.fromkeys(bare)])}")
+
+
+def parse_setting(text: str) -> tuple[str, str]:
+    """Name and value of one `NAME=VALUE[unit]`; the value stays text, for `Rig.with_values` to read.
+
+    Raises InputError where there is no name, no equals sign or no value.
+    """
+    name, equals, value = text.partition("=")
+    name, value = name.strip(), value.strip()
+    if not (name and equals and value):
+        raise InputError(f"a setting must be NAME=VALUE or NAME=VALUE[unit], got {text!r}")
+    return name, value
+
+
+def parse_settings(texts: Sequence[str]) -> dict[str, str]:
+    """All settings of one command; a name given twice with different values raises InputError."""
+    settings: dict[str, str] = {}
+    for text in texts:
+        name, value = parse_setting(text)
+        if settings.setdefault(name, value) != value:
+            raise InputError(f"{name} must be set once, got {settings[name]} and {value}")
+    return settings

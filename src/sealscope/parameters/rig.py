@@ -1,0 +1,301 @@
+"""The Rig: all parameters of one machine, immutable, each number in SI with the unit and source it came with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from functools import cache
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from pydantic import PrivateAttr, model_validator
+from pydantic.fields import FieldInfo
+
+from sealscope.errors import InputError
+from sealscope.parameters.actuator import Cylinder, Friction
+from sealscope.parameters.drive import Fluid, Line, Motor, Pump
+from sealscope.parameters.fields import Part, PartsDisagreeError, choices_of, leaves, unit_of, with_unit
+from sealscope.parameters.instruments import Daq, Sensors
+from sealscope.parameters.names import closest, resolve
+from sealscope.units import parse_quantity, to_si
+
+Value = float | int | str
+
+
+class Entry(NamedTuple):
+    """One value as given: number or word, unit ("" for a choice), source, and the file or option it stands in."""
+
+    value: Value
+    unit: str
+    source: str
+    place: str
+
+    def text(self) -> str:
+        """Value and unit as given."""
+        return str(self.value) if self.unit in ("", "1") else f"{self.value} {self.unit}"
+
+
+class Row(NamedTuple):
+    """One line of the table of parameters; `value` in the SI unit `unit`, `given` as the file states it."""
+
+    symbol: str
+    name: str
+    meaning: str
+    value: Value
+    unit: str
+    given: str
+    source: str
+
+
+class Rig(Part):
+    """Parameters of one actuator; made by `load_rig`, changed only into another one by `with_values`.
+
+    Numbers are SI doubles: `rig.motor.R_c` [ohm], `rig.sensors.p_A.noise` [Pa]. Two rigs are equal when all numbers and
+    choices are, whatever the units and sources they came with. Raises InputError where parts do not fit together.
+    """
+
+    motor: Motor
+    pump: Pump
+    line: Line
+    cylinder: Cylinder
+    friction: Friction
+    fluid: Fluid
+    sensors: Sensors
+    daq: Daq
+    _name: str = PrivateAttr(default="")
+    _title: str = PrivateAttr(default="")
+    _entries: tuple[tuple[str, Entry], ...] = PrivateAttr(default=())
+
+    @model_validator(mode="after")
+    def _parts_fit_together(self) -> Self:
+        c = self.cylinder
+        for symbol in ("A_A", "A_B") if c.volumes == "position" else ():
+            swept = getattr(c, symbol) * c.L / 2.0
+            if swept >= c.V:
+                rule = f'must be > {symbol} L/2 = {with_unit(swept, "m^3")} when volumes = "position"'
+                raise ValueError(f"cylinder.V {rule}, got {c.V}")
+        return self
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Rig):
+            return NotImplemented
+        return all(getattr(self, part) == getattr(other, part) for part in Rig.model_fields)
+
+    def __hash__(self) -> int:
+        return hash(tuple(getattr(self, part) for part in Rig.model_fields))
+
+    @property
+    def name(self) -> str:
+        """Name of the rig."""
+        return self._name
+
+    @property
+    def title(self) -> str:
+        """What the rig is, in words."""
+        return self._title
+
+    def __getitem__(self, name: str) -> Value:
+        """The SI value of a parameter by its bare or dotted name."""
+        value: Any = self
+        for symbol in resolve(name, declared_names()).split("."):
+            value = getattr(value, symbol)
+        return value  # type: ignore[no-any-return]
+
+    def entry(self, name: str) -> Entry:
+        """Value, unit, source and place of a parameter, as given."""
+        return self._given()[resolve(name, declared_names())]
+
+    def _given(self) -> dict[str, Entry]:
+        if not self._entries:
+            raise InputError("a rig must have sources; make it with load_rig or Rig.from_entries, not from bare parts")
+        return dict(self._entries)
+
+    def with_values(self, settings: Mapping[str, Value], *, source: str = "set by caller") -> Rig:
+        """Another rig with some values replaced, `source` written beside each.
+
+        A name is bare where it is unique (`V_1`), else dotted (`sensors.p_A.noise`). A number is in SI; a text carries
+        its unit (`"0.8[ohm]"`, `"50 %"`) or is a choice's word. Raises InputError for an unknown or ambiguous name, a
+        wrong unit or a value out of range.
+        """
+        if not source.strip():
+            raise InputError("source must not be blank")
+        entries = self._given()
+        replaced: dict[str, str] = {}
+        for name, value in settings.items():
+            full = resolve(name, declared_names())
+            if full in replaced:
+                raise InputError(f"{full} must be set once, got {replaced[full]} and {name}")
+            replaced[full] = name
+            entries[full] = Entry(*_as_given(full, value, source), source, source)
+        return Rig.from_entries(entries, name=self._name, title=self._title, place=source)
+
+    def table(self) -> list[Row]:
+        """Every parameter in the order of declaration."""
+        entries = self._given()
+        return [
+            Row(
+                name.rpartition(".")[2],
+                name,
+                str(field.title),
+                self[name],
+                unit_of(field),
+                entries[name].text(),
+                entries[name].source,
+            )
+            for name, field in _declared().items()
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The rig as plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
+        tree: dict[str, Any] = {"rig": {"name": self._name, "title": self._title}}
+        for name, entry in self._given().items():
+            *groups, symbol = name.split(".")
+            at = tree
+            for group in groups:
+                at = at.setdefault(group, {})
+            unit = {} if entry.unit == "" else {"unit": entry.unit}
+            at[symbol] = {"value": entry.value, **unit, "source": entry.source}
+        return tree
+
+    @classmethod
+    def from_dict(cls, tree: Mapping[str, Any], *, place: str) -> Rig:
+        """The rig that `as_dict` wrote down, for example in a recording's provenance; `place` is named in errors."""
+        head = tree.get("rig")
+        name, title = (head.get("name", ""), head.get("title", "")) if isinstance(head, Mapping) else ("", "")
+        parts = ((key, item) for key, item in tree.items() if key != "rig")
+        return cls.from_entries(flatten(parts, place), name=str(name), title=str(title), place=place)
+
+    @classmethod
+    def from_entries(cls, entries: Mapping[str, Entry], *, name: str, title: str = "", place: str) -> Rig:
+        """A rig from one entry for each declared parameter, by dotted name; `place` is named where one is missing."""
+        known = declared_names()
+        for full in entries:
+            if full not in _declared():
+                raise InputError(f"{full} is not a parameter{closest(full, known)} ({entries[full].place})")
+        tree: dict[str, Any] = {}
+        for full, field in _declared().items():
+            if full not in entries:
+                raise InputError(f"{full} is missing ({place})")
+            *groups, symbol = full.split(".")
+            at = tree
+            for group in groups:
+                at = at.setdefault(group, {})
+            at[symbol] = _si_value(full, field, entries[full])
+        values: dict[str, Any] = {
+            group: _part(cls, group, tree[group], group, entries, place) for group in cls.model_fields
+        }
+        try:
+            rig = cls(**values)
+        except InputError as error:
+            raise InputError(f"{error} ({place})") from None
+        rig._name, rig._title = name, title
+        rig._entries = tuple((full, entries[full]) for full in known)
+        return rig
+
+
+@cache
+def _declared() -> dict[str, FieldInfo]:
+    return dict(leaves(Rig))
+
+
+@cache
+def declared_names() -> tuple[str, ...]:
+    """Dotted names of all parameters, in the order of declaration."""
+    return tuple(_declared())
+
+
+def _part(
+    owner: type[Part], symbol: str, values: dict[str, Any], path: str, entries: Mapping[str, Entry], place: str
+) -> Part:
+    """Build one group, its groups first; a broken rule is told with the place of its value, or of the whole rig."""
+    model = owner.model_fields[symbol].annotation
+    assert isinstance(model, type)
+    assert issubclass(model, Part)
+    built = {
+        key: _part(model, key, value, f"{path}.{key}", entries, place) if isinstance(value, dict) else value
+        for key, value in values.items()
+    }
+    try:
+        return model(**built)
+    except InputError as error:
+        text = str(error)
+        culprit = f"{path}.{text.split(maxsplit=1)[0]}"
+        where = place if isinstance(error, PartsDisagreeError) else entries[culprit].place
+        raise InputError(f"{_qualified(culprit, text)} ({where})") from None
+
+
+def _qualified(full: str, text: str) -> str:
+    """`text` as it is where its first word, a symbol, is unique among parameters, else with the dotted name."""
+    symbol = full.rpartition(".")[2]
+    unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1
+    return text if unique else full + text[len(symbol) :]
+
+
+def _shown(full: str) -> str:
+    return _qualified(full, full.rpartition(".")[2])
+
+
+def _si_value(full: str, field: FieldInfo, entry: Entry) -> Value:
+    """The SI number or the word of one entry; raises InputError for a blank source, a wrong type or a wrong unit."""
+    shown, place = _shown(full), entry.place
+    if not isinstance(entry.source, str) or not entry.source.strip():
+        raise InputError(f"{shown} must have a source, got none ({place})")
+    if words := choices_of(field):
+        if entry.value not in words:
+            raise InputError(f"{shown} must be one of {', '.join(words)}, got {entry.value!r} ({place})")
+        if entry.unit:
+            raise InputError(f"{shown} is a choice and must have no unit, got {entry.unit!r} ({place})")
+        return entry.value
+    if isinstance(entry.value, bool) or not isinstance(entry.value, int | float):
+        raise InputError(f"{shown} must be a number, got {entry.value!r} ({place})")
+    si_unit = unit_of(field)
+    if not entry.unit:
+        raise InputError(f"{shown} must have a unit, such as {si_unit}, got none ({place})")
+    try:
+        number = to_si(float(entry.value), entry.unit, si_unit, name=shown, place=place)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(f"{shown} must be finite, got {entry.value} ({place})")
+    return int(number) if field.annotation is int and number.is_integer() else number
+
+
+def _as_given(full: str, value: Any, place: str) -> tuple[Value, str]:
+    """Value and unit that a caller's number (SI) or text (with its unit) stands for."""
+    field = _declared()[full]
+    if choices_of(field):
+        return (value.strip() if isinstance(value, str) else value), ""
+    si_unit = unit_of(field)
+    if isinstance(value, str):
+        return parse_quantity(value, si_unit, name=_shown(full), place=place), si_unit
+    return (value.item() if isinstance(value, np.generic) else value), si_unit
+
+
+def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, Entry]:
+    """Entries of nested tables `{group: {symbol: {value, unit, source}}}` by dotted name; else InputError."""
+    entries: dict[str, Entry] = {}
+    for key, item in tree:
+        full = prefix + key
+        if full in _declared() or (isinstance(item, dict) and "value" in item):
+            entries[full] = _entry(full, item, place)
+        elif isinstance(item, dict):
+            entries |= flatten(item.items(), place, full + ".")
+        else:
+            raise InputError(f"{full} is not a parameter{closest(full, declared_names())} ({place})")
+    return entries
+
+
+def _entry(full: str, item: Any, place: str) -> Entry:
+    if full not in _declared():
+        raise InputError(f"{full} is not a parameter{closest(full, declared_names())} ({place})")
+    shown = _shown(full)
+    if not isinstance(item, dict):
+        raise InputError(f"{shown} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")
+    if unknown := sorted(set(item) - {"value", "unit", "source"}):
+        raise InputError(f"{shown} must have value, unit and source only, got {unknown[0]} ({place})")
+    if "value" not in item:
+        raise InputError(f"{shown} must have a value, got none ({place})")
+    for key in ("unit", "source"):
+        if not isinstance(item.get(key, ""), str):
+            raise InputError(f"{key} of {shown} must be a text, got {item[key]!r} ({place})")
+    return Entry(item["value"], item.get("unit", ""), item.get("source", ""), place)

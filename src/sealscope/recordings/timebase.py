@@ -1,0 +1,161 @@
+"""From a time column to seconds and a sampling rate: numbers of any unit, epoch seconds, date stamps."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.recording import Array
+from sealscope.units import to_si
+
+_CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d{1,9})?)?"
+STAMP = re.compile(
+    rf"\s*(?:(?P<date>\d{{4}}-\d{{2}}-\d{{2}})|(?P<day>\d{{1,2}})\.(?P<month>\d{{1,2}})\.(?P<year>\d{{4}}))?"
+    rf"(?:(?:^|[T\s_])\s*(?P<clock>{_CLOCK}))?\s*(?P<zone>Z|UTC|[+-]\d{{2}}:?\d{{2}})?\s*"
+)
+_SINCE = re.compile(r"\s*(?P<unit>[a-z]+)\s+since\s+(?P<start>.+?)\s*", re.IGNORECASE)
+_LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
+#: Numbers from here on, without a unit, are read as the time since 1970 in this unit.
+_EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
+_EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
+
+
+class TimeBase(NamedTuple):
+    """`t`: (n,) [s], `rate` [Hz], `start`: what is known of the moment t = 0, `notes`: lines for the history."""
+
+    t: Array
+    rate: float
+    start: dict[str, Any]
+    notes: tuple[str, ...]
+
+
+def is_stamp(text: str) -> bool:
+    """Whether `text` is a date stamp or the time of a day that `stamps` can read."""
+    match = STAMP.fullmatch(text)
+    return bool(match and (match["date"] or match["year"] or match["clock"]))
+
+
+def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
+    """Date stamps (ISO, or day.month.year) and times of a day as datetime64[ns]; an empty cell is NaT.
+
+    Raises ValueError with the index of the first cell that is no stamp.
+    """
+    plain: list[str] = []
+    for index, cell in enumerate(cells):
+        match = STAMP.fullmatch(cell)
+        if match is None or not (match["date"] or match["year"] or match["clock"]):
+            if cell.strip():
+                raise ValueError(index)
+            plain.append("NaT")
+            continue
+        date = match["date"] or (f"{match['year']}-{match['month']:0>2}-{match['day']:0>2}" if match["year"] else "1970-01-01")
+        clock = (match["clock"] or "00:00").replace(",", ".")
+        plain.append(f"{date}T{clock:0>5}" if clock[1] != ":" else f"{date}T0{clock}")
+    try:
+        return np.array(plain, dtype="datetime64[ns]")
+    except ValueError:  # the 30th of February
+        for index, cell in enumerate(plain):
+            try:
+                np.datetime64(cell, "ns")
+            except ValueError:
+                raise ValueError(index) from None
+        raise
+
+
+def nominal_rate(t: Array) -> float:
+    """The sampling rate [Hz] that stamps `t` tell: the shortest decimal that agrees with them.
+
+    From the mean interval where they are uniform, else from the median interval. Raises InputError where no interval is
+    positive.
+    """
+    steps = np.diff(t)
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    if not steps.size:
+        raise InputError("time must increase between some samples")
+    step = float(np.median(steps))
+    span = float(t[-1] - t[0])
+    slack = 1e-9
+    if np.isfinite(span) and steps.size == t.size - 1:
+        mean = span / (t.size - 1)
+        off_line = float(np.max(np.abs(t - t[0] - mean * np.arange(t.size))))
+        if off_line < 0.6 * mean:
+            step = mean
+            slack = max(slack, min(off_line, 0.01 * mean) / span)
+    rate = 1.0 / step
+    for digits in range(1, 16):
+        rounded = float(f"{rate:.{digits}g}")
+        if abs(rounded / rate - 1.0) <= slack:
+            return rounded
+    return rate
+
+
+def _from_stamps(values: NDArray[np.datetime64], place: str) -> tuple[Array, dict[str, Any]]:
+    nanoseconds = values.astype("datetime64[ns]")
+    known = ~np.isnat(nanoseconds)
+    if not known.any():
+        raise UnreadableFile(f"time must have a stamp in some row, got none ({place})")
+    start = nanoseconds[known][0]
+    t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
+    t[~known] = np.nan
+    return t, {"start": str(start)}
+
+
+def _from_numbers(values: Array, unit: str | None, name: str, place: str) -> tuple[Array, dict[str, Any], list[str]]:
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        raise UnreadableFile(f"time must have a number in some row, got none ({place})")
+    first = float(finite[0])
+    since = _SINCE.fullmatch(unit) if unit else None
+    if since:
+        word = since["unit"].lower()
+        origin = since["start"]
+        seconds = to_si(values - first, _LONG_UNITS.get(word, word), "s", name="time", place=place)
+        try:
+            base = stamps([origin])[0]
+            begin = base + np.timedelta64(round(to_si(first, _LONG_UNITS.get(word, word), "s") * 1e9), "ns")
+        except ValueError:
+            return seconds, {"start": f"{first:g} {unit}"}, []
+        return seconds, {"start": str(begin)}, []
+    if unit is None:
+        size = abs(first)
+        if np.all(np.diff(finite) == 1) and finite.size == values.size and size < _EARLIEST_EPOCH:
+            raise UnreadableFile(
+                f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
+                f"give the rate ({place})"
+            )
+        for least, epoch_unit in _EPOCH:
+            if size >= least:
+                seconds = to_si(values - first, epoch_unit, "s")
+                epoch = to_si(first, epoch_unit, "s")
+                return seconds, {"start_epoch_s": epoch}, [f"column {name} read as {epoch_unit} since 1970"]
+        return values, {}, [f"column {name} has no unit: taken as s"]
+    seconds = to_si(values, unit, "s", name="time", place=place)
+    first = float(seconds[np.isfinite(values)][0])
+    if first >= _EARLIEST_EPOCH:
+        return to_si(values - float(finite[0]), unit, "s"), {"start_epoch_s": first}, []
+    return seconds, {}, []
+
+
+def time_base(values: NDArray[Any], unit: str | None, name: str, rate: float | None, place: str) -> TimeBase:
+    """Seconds and rate from a time column's `values` (n,), numbers in `unit` or datetime64.
+
+    Stamps and epoch times are based at their first sample, whose moment is kept in `start`; other times are left where they
+    are. `rate` is the file's own word on the nominal rate, if any. Raises UnreadableFile, naming `place`.
+    """
+    notes: list[str] = []
+    try:
+        if values.dtype.kind == "M":
+            t, start = _from_stamps(values, place)
+        else:
+            t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name, place)
+        return TimeBase(t, rate if rate is not None else nominal_rate(t), start, tuple(notes))
+    except UnreadableFile:
+        raise
+    except InputError as error:
+        text = str(error)
+        raise UnreadableFile(text if place in text else f"{text} ({place})") from None

@@ -1,0 +1,220 @@
+"""The charts of the page: what each shows, in which unit and how drawn; once as data for the script, once as plain SVG."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import COUNTS, Recording
+from sealscope.reporting.contract import DiagnosisLike, Mark
+from sealscope.reporting.features import NAMES, PRODUCT, STEP, WINDOW, ChamberDetails
+from sealscope.reporting.series import Base, coded, coded_times, time_base
+
+Array = NDArray[np.float64]
+
+SAMPLES, WINDOWS = "samples", "windows"
+#: points of a series drawn by the script, and in the still picture
+POINTS, STILL_POINTS = 16_000, 400
+#: samples drawn one by one round the onset, so that the ringing itself can be looked at
+NEAR_SAMPLES = 6_000
+
+#: unit of pressures -> Pa per unit, unit of their details, Pa per that unit
+PRESSURE_UNITS: dict[str, tuple[float, str, float]] = {
+    "bar": (1e5, "mbar", 1e2),
+    "MPa": (1e6, "kPa", 1e3),
+    "kPa": (1e3, "kPa", 1e3),
+    "psi": (6894.757293168, "psi", 6894.757293168),
+}
+#: SI unit of other channels -> unit shown, SI per unit
+_SHOWN = {"m": ("mm", 1e-3), "rad/s": ("rpm", np.pi / 30), "m^3/s": ("mL/min", 1e-6 / 60), "V": ("V", 1.0), "rad": ("rad", 1.0)}
+
+
+@dataclass(frozen=True)
+class Series:
+    """One line of a chart: its label, the style's name in the style sheet, and its values in the chart's unit."""
+
+    label: str
+    style: str
+    values: Array
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One chart; `base` names the time axis its series share (all samples, or the centres of the RMS windows)."""
+
+    key: str
+    group: str
+    title: str
+    unit: str
+    series: tuple[Series, ...]
+    base: str = SAMPLES
+    height: int = 150
+
+
+def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
+    """The unit in which a channel is shown, and how many of the channel's own units it holds.
+
+    Raises InputError for an unknown pressure unit.
+    """
+    if pressure_unit not in PRESSURE_UNITS:
+        raise InputError(f"pressure unit must be one of {', '.join(PRESSURE_UNITS)}, got {pressure_unit!r}")
+    if unit == "Pa":
+        size, detail_unit, detail_size = PRESSURE_UNITS[pressure_unit]
+        return (detail_unit, detail_size) if detail else (pressure_unit, size)
+    if unit == COUNTS:
+        return "counts", 1.0
+    return _SHOWN.get(unit, (unit, 1.0))
+
+
+def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
+    """The charts of the recorded channels, those of one kind and unit together; channels without samples are left out."""
+    plan = [
+        ("u", "Command", (("u", "a"),)),
+        ("x", "Piston position", (("x", "a"),)),
+        ("omega", "Motor speed", (("omega", "a"),)),
+        ("p_AB", "Chamber pressures", (("p_A", "a"), ("p_B", "b"))),
+        ("p_12", "Pump port pressures", (("p_1", "a"), ("p_2", "b"))),
+        ("q_leak", "Flow meter in the bypass", (("q_leak", "a"),)),
+    ]
+    charts = []
+    for key, title, members in plan:
+        units: dict[str, list[Series]] = {}
+        for name, style in members:
+            if name in recording and np.isfinite(recording[name]).any():
+                unit, size = shown_unit(recording.units[name], pressure_unit)
+                units.setdefault(unit, []).append(Series(name, style, recording[name] / size))
+        for i, (unit, series) in enumerate(units.items()):
+            height = 210 if key == "p_AB" else 140
+            charts.append(Chart(f"{key}-{i}", "channels", title, unit, tuple(series), height=height))
+    return charts
+
+
+def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
+    """Windowed RMS: d1..d4 of each chamber, and d3d4 of each."""
+    charts = []
+    for chamber in chambers:
+        if not chamber.window_t.size:
+            continue
+        unit, size = shown_unit(chamber.unit, pressure_unit, detail=True)
+        name = chamber.channel
+        lines = tuple(Series(d, d, chamber.window_rms[d] / size) for d in NAMES if d != PRODUCT)
+        charts.append(Chart(f"rms-{name}", "rms", f"RMS of the details of {name}", unit, lines, f"{WINDOWS}-{name}", 230))
+    for chamber in chambers:
+        if chamber.window_t.size:
+            unit, size = shown_unit(chamber.unit, pressure_unit, detail=True)
+            name = chamber.channel
+            line = Series("d3·d4", "d3d4", chamber.window_rms[PRODUCT] / size**2)
+            title = f"RMS of d3·d4 of {name}"
+            charts.append(Chart(f"rms-{name}-d3d4", "rms", title, f"{unit}²", (line,), f"{WINDOWS}-{name}", 150))
+    return charts
+
+
+def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
+    """The details themselves, one chart each, the chambers side by side."""
+    charts = []
+    for d in NAMES:
+        for chamber in chambers:
+            unit, size = shown_unit(chamber.unit, pressure_unit, detail=True)
+            size, unit = (size**2, f"{unit}²") if d == PRODUCT else (size, unit)
+            label = "d3·d4" if d == PRODUCT else d
+            style = "b" if chamber.channel == "p_B" else "a"
+            line = Series(label, style, chamber.values[d] / size)
+            title = f"{label} of {chamber.channel}"
+            charts.append(Chart(f"{d}-{chamber.channel}", "details", title, unit, (line,), height=130))
+    return charts
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """All charts over their time axes: `data` for the script (plain JSON values), `still` (key -> SVG), and how decimated."""
+
+    data: dict[str, Any]
+    still: dict[str, dict[str, Any]]
+    base: Base
+
+
+def draw(
+    recording: Recording, chambers: list[ChamberDetails], charts: list[Chart], diagnosis: DiagnosisLike, marks: list[Mark]
+) -> Drawing:
+    """Decimate and code every chart's series, and lay out the still picture of each.
+
+    Peaks are kept: each bucket contributes its least and its greatest sample.
+    """
+    middle = float(recording.t[len(recording) // 2])
+    near = middle if diagnosis.onset_s is None else diagnosis.onset_s
+    base = time_base(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
+    few = time_base(recording.t, recording.rate, STILL_POINTS)
+    span = (float(base.t[0]), float(base.t[-1]))
+    axes: dict[str, Array] = {SAMPLES: base.t} | {f"{WINDOWS}-{c.channel}": c.window_t for c in chambers}
+    low, high = diagnosis.onset_interval_s or (None, None)
+    data: dict[str, Any] = {
+        "span": span,
+        "axes": {name: coded_times(t) for name, t in axes.items() if any(c.base == name for c in charts)},
+        "onset": {"t": diagnosis.onset_s, "low": low, "high": high},
+        "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
+        "charts": [],
+    }
+    still = {}
+    for chart in charts:
+        sampled = chart.base == SAMPLES
+        lines = [base.reduce(s.values) if sampled else s.values for s in chart.series]
+        data["charts"].append(
+            {
+                "key": chart.key,
+                "axis": chart.base,
+                "title": chart.title,
+                "unit": chart.unit,
+                "height": chart.height,
+                "series": [
+                    {"label": s.label, "style": s.style} | coded(line) for s, line in zip(chart.series, lines, strict=True)
+                ],
+            }
+        )
+        few_lines = [few.reduce(s.values) if sampled else s.values for s in chart.series]
+        still[chart.key] = still_chart(chart, few.t if sampled else axes[chart.base], few_lines, span)
+    return Drawing(data, still, base)
+
+
+def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, float]) -> dict[str, Any]:
+    """Paths, ticks and scales of the still picture, in a box 860 wide and `chart.height` high."""
+    width, height = 860.0, float(chart.height)
+    stacked = np.concatenate(lines)
+    finite = stacked[np.isfinite(stacked)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    if high - low <= 0:
+        low, high = low - 0.5, high + 0.5
+    margin = 0.04 * (high - low)
+    low, high = low - margin, high + margin
+    start, stop = span if span[1] > span[0] else (span[0], span[0] + 1)
+
+    def across(seconds: Array) -> Array:
+        return (seconds - start) / (stop - start) * width
+
+    paths = []
+    for series, line in zip(chart.series, lines, strict=True):
+        drawn = np.isfinite(line)
+        pen = drawn & ~np.append(False, drawn[:-1])
+        xs, ys = np.rint(across(t)), height - (line - low) / (high - low) * height
+        steps = [f"{'M' if p else 'L'}{x:.0f} {y:.0f}" for p, x, y in zip(pen[drawn], xs[drawn], ys[drawn], strict=True)]
+        paths.append({"label": series.label, "style": series.style, "d": "".join(steps)})
+    return {
+        "paths": paths,
+        "width": width,
+        "height": height,
+        "x_ticks": [(float(across(np.asarray(v))), f"{v:g}") for v in ticks(start, stop, 8)],
+        "y_ticks": [(height - (v - low) / (high - low) * height, f"{v:g}") for v in ticks(low, high, 4)],
+        "scale": (start, width / (stop - start)),
+    }
+
+
+def ticks(low: float, high: float, about: int) -> list[float]:
+    """Round values (1, 2 or 5 times a power of ten apart) between low and high, about as many as asked."""
+    raw = (high - low) / about
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = float(next(m for m in (1, 2, 5, 10) if m * power >= raw * 0.999) * power)
+    first = int(np.ceil(low / step - 1e-9))
+    return [float(f"{i * step:.12g}") for i in range(first, int(np.floor(high / step + 1e-9)) + 1)]

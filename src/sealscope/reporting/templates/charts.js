@@ -1,0 +1,108 @@
+(function () {
+  "use strict";
+  const data = JSON.parse(document.getElementById("chart-data").textContent);
+  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
+  const axes = {};
+  for (const [name, text] of Object.entries(data.axes)) {
+    const t = new DataView(bytes(text));
+    axes[name] = Array.from({length: t.byteLength / 8}, (_, i) => t.getFloat64(8 * i, true));
+  }
+  // An axis of windows begins and ends inside the recording: empty points stretch it, so that all charts line up.
+  const stretched = (name, list, head, tail) => (name === "samples" ? list : [head].concat(list, [tail]));
+  const values = (s) => {
+    const q = new DataView(bytes(s.q));
+    return Array.from({length: q.byteLength / 2}, (_, i) => {
+      const k = q.getInt16(2 * i, true);
+      return k === -32768 ? null : s.low + (k + 32767) * s.step;
+    });
+  };
+  const shown = (v, unit) => (v == null ? "–" : Number(v.toPrecision(4)) + " " + unit).replace("-", "−");
+  const dashes = {d2: [7, 3], d4: [2, 3]};
+  const widths = {d3: 2, d3d4: 1.6};
+  const [first, last] = data.span;
+  const plots = [];
+  let linking = false;
+
+  function marksOver(u, color) {
+    const ctx = u.ctx, {left, top, width, height} = u.bbox, px = devicePixelRatio || 1;
+    const at = (t) => Math.round(u.valToPos(t, "x", true));
+    ctx.save();
+    ctx.beginPath();
+    ctx.rect(left, top, width, height);
+    ctx.clip();
+    const line = (t, style, dash, wide) => {
+      ctx.strokeStyle = style;
+      ctx.lineWidth = wide * px;
+      ctx.setLineDash(dash.map((d) => d * px));
+      ctx.beginPath();
+      ctx.moveTo(at(t), top);
+      ctx.lineTo(at(t), top + height);
+      ctx.stroke();
+    };
+    const onset = data.onset;
+    if (onset.low != null) {
+      ctx.fillStyle = color("--band");
+      ctx.fillRect(at(onset.low), top, Math.max(px, at(onset.high) - at(onset.low)), height);
+    }
+    if (onset.t != null) line(onset.t, color("--leak"), [], 1.5);
+    for (const m of data.marks) line(m.t, color(m.known ? "--ink" : "--soft"), m.known ? [8, 3, 2, 3] : [2, 3], 1.5);
+    ctx.restore();
+  }
+
+  function link(from, min, max) {
+    if (linking) return;
+    linking = true;
+    for (const p of plots) if (p !== from) p.setScale("x", {min, max});
+    linking = false;
+  }
+
+  function build() {
+    const style = getComputedStyle(document.documentElement);
+    const color = (name) => style.getPropertyValue(name).trim();
+    for (const p of plots.splice(0)) p.destroy();
+    for (const c of data.charts) {
+      const box = document.querySelector('[data-chart="' + c.key + '"]');
+      if (!box) continue;
+      const pen = (s) => ({
+        label: s.label, stroke: color("--" + s.style), width: widths[s.style] || 1.1, dash: dashes[s.style],
+        points: {show: c.axis !== "samples" && axes[c.axis].length < 60}, value: (u, v) => shown(v, c.unit),
+      });
+      const axis = {stroke: color("--soft"), grid: {stroke: color("--grid"), width: 1}, ticks: {stroke: color("--rule"), width: 1}, font: "12px system-ui, sans-serif"};
+      const plot = new uPlot({
+        width: box.clientWidth, height: c.height,
+        scales: {x: {time: false}, y: {range: (u, min, max) => min == null ? [0, 1] : uPlot.rangeNum(min, max, 0.06, true)}},
+        axes: [Object.assign({size: 30, values: (u, list) => list.map((v) => v + " s")}, axis), Object.assign({size: 58, space: 22, values: (u, list) => list.map((v) => (v == null ? "" : String(+v.toPrecision(6)).replace("-", "−")))}, axis)],
+        series: [{label: "t", value: (u, v) => (v == null ? "–" : v.toFixed(2) + " s")}].concat(c.series.map(pen)),
+        legend: {markers: {width: 1, fill: (u, i) => u.series[i]._stroke || color("--" + c.series[i - 1].style)}},
+        cursor: {sync: {key: "t", scales: ["x", null]}, drag: {x: true, y: false}},
+        hooks: {draw: [(u) => marksOver(u, color)], setScale: [(u, key) => {if (key === "x" && u.status) link(u, u.scales.x.min, u.scales.x.max);}]},
+      }, [stretched(c.axis, axes[c.axis], first, last)].concat(c.series.map((s) => stretched(c.axis, values(s), null, null))), box);
+      box.classList.add("live");
+      plot.drawnHeight = c.height;
+      plots.push(plot);
+    }
+  }
+  build();
+
+  const tools = document.getElementById("chart-tools");
+  if (tools) {
+    tools.hidden = false;
+    tools.addEventListener("click", (event) => {
+      const range = event.target.dataset && event.target.dataset.range;
+      if (range && plots.length) {
+        const [min, max] = range.split(" ").map(Number);
+        plots[0].setScale("x", {min, max});
+        link(plots[0], min, max);
+      }
+    });
+  }
+  let waiting = 0;
+  new ResizeObserver(() => {
+    clearTimeout(waiting);
+    waiting = setTimeout(() => plots.forEach((p) => {
+      const width = p.root.parentNode.clientWidth;
+      if (width && width !== p.width) p.setSize({width, height: p.drawnHeight});
+    }), 60);
+  }).observe(document.querySelector("main"));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", build);
+})();

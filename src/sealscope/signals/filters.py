@@ -1,0 +1,82 @@
+"""The wavelet's filters, and how far each level's detail reaches into the signal around it."""
+
+from __future__ import annotations
+
+import difflib
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sealscope.errors import InputError
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: More levels than this would need more than 61 000 samples of db8 for one coefficient.
+MAX_LEVELS = 12
+
+
+@cache
+def discrete_wavelet(name: str) -> Any:
+    """PyWavelets' discrete wavelet of that name; raises InputError for a name it does not know."""
+    import pywt
+
+    if not isinstance(name, str) or name not in pywt.wavelist(kind="discrete"):
+        near = difflib.get_close_matches(str(name), pywt.wavelist(kind="discrete"), n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise InputError(f"wavelet must be a discrete wavelet such as db8, got {name!r}{hint}")
+    return pywt.Wavelet(name)
+
+
+def decomposition_filters(wavelet: str = "db8") -> tuple[Array, Array]:
+    """The low-pass and high-pass taps h, g of the analysis, in the order of a causal convolution.
+
+    ``a_j[n] = sum_k h[k] a_(j-1)[n - 2^(j-1) k]``, the same with g for d_j. Each of shape (taps,); for an orthogonal
+    wavelet both have unit l2 norm. Source: Daubechies, Ten Lectures on Wavelets (1992), Table 6.1, as PyWavelets
+    holds them.
+    """
+    chosen = discrete_wavelet(wavelet)
+    return np.array(chosen.dec_lo, dtype=np.float64), np.array(chosen.dec_hi, dtype=np.float64)
+
+
+def checked_levels(levels: int) -> int:
+    """`levels` as an int between 1 and MAX_LEVELS; raises InputError otherwise."""
+    if isinstance(levels, bool) or not isinstance(levels, (int, np.integer)) or not 1 <= levels <= MAX_LEVELS:
+        raise InputError(f"levels must be a whole number from 1 to {MAX_LEVELS}, got {levels!r}")
+    return int(levels)
+
+
+def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
+    """How many samples before and after its own a detail of the stationary transform reads, (levels, 2).
+
+    ``before_j = (L/2 - 1)(2^j - 1)``, ``after_j = (L/2)(2^j - 1)`` with L taps, PyWavelets' alignment. For db8: 7, 21,
+    49, 105 before and 8, 24, 56, 120 after.
+    """
+    half = int(discrete_wavelet(wavelet).dec_len) // 2
+    spread = 2 ** np.arange(1, checked_levels(levels) + 1, dtype=np.int64) - 1
+    return np.stack([(half - 1) * spread, half * spread], axis=1)
+
+
+def finite_array(values: ArrayLike, name: str = "signal", ndim: int | None = None) -> Array:
+    """`values` as doubles; raises InputError unless they are real, finite and (where asked) of `ndim` dimensions."""
+    try:
+        array = np.asarray(values)
+        if np.iscomplexobj(array) or array.dtype.kind in "SUMm":
+            raise TypeError
+        array = np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be real numbers, got {type(values).__name__}") from None
+    if array.ndim == 0 or (ndim is not None and array.ndim != ndim):
+        wanted = f"{ndim}-dimensional" if ndim else "at least one-dimensional"
+        raise InputError(f"{name} must be {wanted}, got shape {array.shape}")
+    finite = np.isfinite(array)
+    if not finite.all():
+        first = tuple(int(i) for i in np.argwhere(~finite)[0])
+        count = int(array.size - np.count_nonzero(finite))
+        where = first[0] if array.ndim == 1 else first
+        raise InputError(
+            f"{name} must be finite, got {array[first]} at sample {where} ({count} of {array.size} samples)"
+        )
+    return array

@@ -1,0 +1,207 @@
+"""Commands: the voltage that a test sends to the servo drive, as data."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array, Recording
+
+
+class Command(Protocol):
+    """A command: volts as a function of time, and its own description in the words that `parse_command` reads."""
+
+    def volts(self, t: Array) -> Array:
+        """u [V] at times t [s] (any shape); 0 before t = 0."""
+        ...
+
+    def __str__(self) -> str: ...
+
+
+@dataclass(frozen=True)
+class Sine:
+    """u = offset + amplitude sin(omega t + phase); `omega` [rad/s]."""
+
+    amplitude: float
+    omega: float
+    phase: float = 0.0
+    offset: float = 0.0
+
+    def volts(self, t: Array) -> Array:
+        return self.offset + self.amplitude * np.sin(self.omega * t + self.phase)
+
+    def __str__(self) -> str:
+        phase = f" {self.phase:+g}" if self.phase else ""
+        offset = f" {self.offset:+g}" if self.offset else ""
+        return f"{self.amplitude:g} sin({self.omega:g}t{phase}){offset}"
+
+
+@dataclass(frozen=True)
+class Step:
+    """u = 0 before `at` [s], `level` [V] from then on."""
+
+    level: float
+    at: float = 0.0
+
+    def volts(self, t: Array) -> Array:
+        return np.where(t >= self.at, self.level, 0.0)
+
+    def __str__(self) -> str:
+        return f"step {self.level:g} at {self.at:g} s"
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """u rises evenly from 0 at `start` [s] to `level` [V] at `stop` [s] and stays there."""
+
+    level: float
+    start: float
+    stop: float
+
+    def __post_init__(self) -> None:
+        if not self.stop > self.start:
+            raise InputError(f"a ramp must stop after it starts, got {self.start:g} s to {self.stop:g} s")
+
+    def volts(self, t: Array) -> Array:
+        return self.level * np.clip((t - self.start) / (self.stop - self.start), 0.0, 1.0)
+
+    def __str__(self) -> str:
+        return f"ramp {self.level:g} from {self.start:g} s to {self.stop:g} s"
+
+
+@dataclass(frozen=True)
+class Chirp:
+    """u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))): frequency from f_0 to f_1 [Hz] over T [s], f_1 afterwards."""
+
+    amplitude: float
+    f_0: float
+    f_1: float
+    duration: float
+
+    def __post_init__(self) -> None:
+        if not (self.f_0 >= 0 and self.f_1 >= 0 and self.duration > 0):
+            raise InputError(f"a chirp must have frequencies >= 0 Hz and a duration > 0 s, got {self}")
+
+    def volts(self, t: Array) -> Array:
+        within = np.minimum(t, self.duration)
+        cycles = self.f_0 * within + (self.f_1 - self.f_0) * within**2 / (2.0 * self.duration)
+        return self.amplitude * np.sin(2.0 * np.pi * (cycles + self.f_1 * (t - within)))
+
+    def __str__(self) -> str:
+        return f"chirp {self.amplitude:g} from {self.f_0:g} Hz to {self.f_1:g} Hz over {self.duration:g} s"
+
+
+@dataclass(frozen=True)
+class PseudoRandom:
+    """Pseudo-random binary command: +amplitude or -amplitude, drawn anew every `hold` [s] from `seed`."""
+
+    amplitude: float
+    hold: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.hold > 0:
+            raise InputError(f"a pseudo-random command must hold each value for > 0 s, got {self.hold:g} s")
+
+    def volts(self, t: Array) -> Array:
+        slot = np.floor(t / self.hold).astype(np.int64)
+        signs = np.random.default_rng(self.seed).integers(0, 2, size=max(int(slot.max(initial=0)) + 1, 1)) * 2 - 1
+        return np.where(slot >= 0, self.amplitude * signs[np.maximum(slot, 0)], 0.0)
+
+    def __str__(self) -> str:
+        return f"prbs {self.amplitude:g} every {self.hold:g} s seed {self.seed}"
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A command that was recorded: linear between its samples, its last value afterwards."""
+
+    t: Array
+    u: Array
+    origin: str = "recorded"
+
+    def __post_init__(self) -> None:
+        if self.t.shape != self.u.shape or self.t.ndim != 1 or self.t.size < 2:
+            raise InputError(f"a recorded command needs two samples or more in t and u, got {self.t.size} ({self.origin})")
+        if not (np.all(np.isfinite(self.u)) and np.all(np.diff(self.t) > 0)):
+            raise InputError(f"a recorded command must be finite and its time must rise ({self.origin})")
+
+    def volts(self, t: Array) -> Array:
+        return np.interp(t, self.t, self.u)
+
+    def __str__(self) -> str:
+        return f"file {self.origin}"
+
+
+def recorded_command(recording: Recording, origin: str) -> Recorded:
+    """The command channel `u` of a recording as a command of its own; the first sample is at t = 0."""
+    return Recorded(recording.t - recording.t[0], recording["u"], origin)
+
+
+def check_command(command: Command, t: Array, limit: float) -> None:
+    """Raise InputError where the command leaves +-`limit` [V] (the converter's range) or is not a number at the times `t` [s]."""
+    u = command.volts(t)
+    bad = ~(np.abs(u) <= limit * (1 + 1e-12))
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise InputError(f"command must stay within +-{limit:g} V, got {u[k]:.4g} V at t = {t[k]:.4g} s ({command})")
+
+
+_N = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_S = r"\s*s?"
+_FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
+    (
+        rf"({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_N.replace('[-+]?', '[-+] *')})?\s*\)\s*([-+]\s*[\d.eE]+)?\s*v?",
+        lambda g: Sine(_number(g[0], 1.0), _number(g[1], 1.0), _number(g[2], 0.0), _number(g[3], 0.0)),
+    ),
+    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_N}){_S})?", lambda g: Step(_number(g[0], 0.0), _number(g[1], 0.0))),
+    (
+        rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_N}){_S}\s+)?(?:to|over)\s+({_N}){_S}",
+        lambda g: Ramp(_number(g[0], 0.0), _number(g[1], 0.0), _number(g[2], 0.0)),
+    ),
+    (
+        rf"chirp\s+({_N})\s*v?\s+from\s+({_N})\s*(?:hz)?\s+to\s+({_N})\s*(?:hz)?\s+over\s+({_N}){_S}",
+        lambda g: Chirp(_number(g[0], 0.0), _number(g[1], 0.0), _number(g[2], 0.0), _number(g[3], 0.0)),
+    ),
+    (
+        rf"prbs\s+({_N})\s*v?\s+every\s+({_N}){_S}(?:\s+seed\s+(\d+))?",
+        lambda g: PseudoRandom(_number(g[0], 0.0), _number(g[1], 0.0), int(g[2] or 0)),
+    ),
+)
+
+
+def _number(text: str | None, default: float) -> float:
+    if text is None:
+        return default
+    value = float(text.replace(" ", ""))
+    if not math.isfinite(value):
+        raise InputError(f"a number in a command must be finite, got {text}")
+    return value
+
+
+def parse_command(text: str) -> Command:
+    """A command from words: `3 sin(4t)`, `step 5 at 1 s`, `ramp 5 from 1 s to 3 s`, `chirp 3 from 0.1 Hz to 5 Hz over 60 s`,
+    `prbs 2 every 0.5 s seed 1`, `file LOG` (the channel u of a recording).
+
+    Raises InputError that shows the forms when the text is none of them.
+    """
+    stripped = text.strip()
+    if stripped.lower().startswith("file "):
+        from sealscope.recordings import read
+
+        path = stripped[5:].strip()
+        return recorded_command(read(path), path)
+    for pattern, make in _FORMS:
+        found = re.fullmatch(pattern, stripped, re.IGNORECASE)
+        if found:
+            return make(list(found.groups()))
+    raise InputError(
+        "command must be like '3 sin(4t)', 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'chirp 3 from 0.1 Hz to 5 Hz over 60 s', "
+        f"'prbs 2 every 0.5 s seed 1' or 'file LOG', got {text!r}"
+    )

@@ -1,0 +1,122 @@
+"""An experiment: a rig, a command, the leaks, how long, and how it is sampled and integrated."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+from sealscope.simulation.commands import Command, Sine, check_command, parse_command
+from sealscope.simulation.faults import Leak, parse_leak
+from sealscope.simulation.integrate import Method, choose_method
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Most samples a recording may have (about 1.4 GB of channels), so that a slip of the unit cannot fill the memory.
+MOST_SAMPLES = 20_000_000
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Everything a run depends on; equal experiments give equal bytes.
+
+    `duration` [s]; `seed` of the instruments' noise; `x_0` [m] piston position at the start, from mid-stroke; `method` and `step` [s] of the
+    solver; `allow_unresolved` lets an unstable or under-resolved run through, marked in its provenance. The sampling rate is the rig's `daq.sample_rate`.
+    """
+
+    rig: Rig
+    command: Command = field(default_factory=lambda: Sine(3.0, 4.0))
+    duration: float = 180.0
+    leaks: tuple[Leak, ...] = ()
+    seed: int = 0
+    x_0: float = 0.0
+    method: Method = "auto"
+    step: float | None = None
+    allow_unresolved: bool = False
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.duration) and self.duration > 0):
+            raise InputError(f"duration must be > 0 s and finite, got {self.duration}")
+        samples = self.duration * self.rate
+        if samples < 1 or samples > MOST_SAMPLES:
+            raise InputError(
+                f"duration x daq.sample_rate must be 1 to {MOST_SAMPLES} samples, got {samples:.4g} ({self.duration:g} s at {self.rate:g} Hz)"
+            )
+        if self.seed < 0:
+            raise InputError(f"seed must be >= 0, got {self.seed}")
+        half = self.rig.cylinder.L / 2
+        if not abs(self.x_0) <= half:
+            raise InputError(f"x_0 must be within the stroke, -{half:g} m to {half:g} m, got {self.x_0}")
+        choose_method(self.rig, self.method)
+        check_command(self.command, self.sample_times(), self.rig.daq.u_max)
+
+    @property
+    def rate(self) -> float:
+        """Sampling rate of the recording [Hz]."""
+        return self.rig.daq.sample_rate
+
+    def sample_times(self) -> Array:
+        """Times [s] of the recording's samples."""
+        return np.arange(round(self.duration * self.rate)) / self.rate
+
+    def onset(self) -> float | None:
+        """Time [s] at which the first leak opens within the run, None for a run without one."""
+        onsets = [leak.opening.onset() for leak in self.leaks if (leak.mean or leak.coefficient or 0.0) > 0]
+        onsets = [onset for onset in onsets if onset < self.duration]
+        return max(0.0, min(onsets)) if onsets else None
+
+    def describe(self) -> dict[str, Any]:
+        """The experiment in plain words and numbers, without what only the truth may know (the leaks)."""
+        return {
+            "rig": self.rig.name,
+            "parameters_set": {
+                row.name: f"{row.value} {row.unit}".strip() for row in self.rig.table() if row.source.startswith("set by")
+            },
+            "command": str(self.command),
+            "duration_s": self.duration,
+            "sample_rate_hz": self.rate,
+            "seed": self.seed,
+            "x_0_m": self.x_0,
+        }
+
+    def key(self) -> str:
+        """A short name that is the same for equal experiments only."""
+        values = {row.name: str(row.value) for row in self.rig.table()}
+        leaks = [f"{leak!r}" for leak in self.leaks]
+        text = json.dumps([self.describe(), values, leaks, self.method, self.step], sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def make_experiment(
+    *,
+    rig: Rig | str = "thesis",
+    command: Command | str = "3 sin(4t)",
+    leak: Leak | str | Iterable[Leak | str] | None = None,
+    values: Mapping[str, float | str] | None = None,
+    **others: Any,
+) -> Experiment:
+    """An Experiment from words: rig by name or file, command and leaks as text, parameters by name (`values={"V_1": "50[cm^3]"}`).
+
+    Raises InputError for whatever breaks a rule, with rule, value and place.
+    """
+    from sealscope.parameters import Rig, load_rig
+
+    loaded = rig if isinstance(rig, Rig) else load_rig(rig)
+    if values:
+        loaded = loaded.with_values(values)
+    given = [] if leak is None else [leak] if isinstance(leak, (str, Leak)) else list(leak)
+    leaks = [parse_leak(one) if isinstance(one, str) else one for one in given]
+    return Experiment(
+        rig=loaded,
+        command=parse_command(command) if isinstance(command, str) else command,
+        leaks=tuple(one for one in leaks if one is not None),
+        **others,
+    )

@@ -1,0 +1,137 @@
+"""Integrate the rig over an experiment: choose method and step, feed the inputs block by block, refuse a result that cannot be trusted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from sealscope.errors import InputError, SimulationFailed
+from sealscope.recordings.recording import Array
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+Method = Literal["auto", "rk4", "imex"]
+Inputs = Callable[[Array], tuple[Array, Array, Array]]
+Progress = Callable[[float], None]
+
+#: Largest step [s] taken unless the caller asks for another: error in p_A under 10 Pa rms (docs/decisions/0004-solvers.md).
+DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
+#: Lowest gauge pressure [Pa] the model is valid for: there is no cavitation in it, and oil holds no tension.
+VACUUM = -101325.0
+_BLOCK_STEPS = 4096
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What the integration gives: (n,) times [s] and (n, 15) outputs in the order of `sealscope.physics.rig.OUTPUTS`."""
+
+    t: Array
+    rows: Array
+    method: str
+    step: float
+
+    def __getitem__(self, name: str) -> Array:
+        from sealscope.physics.rig import OUTPUTS
+
+        return self.rows[:, OUTPUTS.index(name)]
+
+
+def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
+    """The stated method, or the one that suits the rig: implicit-explicit with throttles, explicit without."""
+    if method not in ("auto", "rk4", "imex"):
+        raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
+    throttled = rig.line.orifices == "present"
+    if method == "imex" and not throttled:
+        raise InputError("method imex needs throttles (line.orifices = present), got line.orifices = absent; use rk4")
+    euler = rig.motor.integrator == "euler"
+    if euler and (method == "imex" or throttled and method == "auto"):
+        raise InputError("motor.integrator = euler (eq. 4.2 taken literally) needs method rk4, got imex")
+    if method == "auto":
+        return "imex" if throttled else "rk4"
+    return method
+
+
+def _steps_per_output(rate: float, step: float) -> int:
+    return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))
+
+
+def integrate(
+    rig: Rig,
+    inputs: Inputs,
+    duration: float,
+    rate: float,
+    *,
+    x_0: float = 0.0,
+    method: Method = "auto",
+    step: float | None = None,
+    allow_unresolved: bool = False,
+    progress: Progress | None = None,
+) -> Trajectory:
+    """Integrate from rest over `duration` [s] and report the outputs at `rate` [Hz].
+
+    `inputs(t)` gives command [V] and the leakage coefficients G and C at times `t` of any shape. The step is the largest that divides the output interval
+    and is not above `step` (default `DEFAULT_STEP`). Inputs may jump at a step's boundary: the step's first and last node are looked up
+    just inside it. `progress` is called with the time reached [s].
+
+    Raises InputError for a step that is not positive; SimulationFailed when the method is unstable at this step (unless `allow_unresolved`),
+    when a state is not finite, or when a pressure falls below vacuum (unless `allow_unresolved`).
+    """
+    from sealscope.physics.imex import IMEX_NODES, advance_imex
+    from sealscope.physics.rig import OUTPUTS, initial_state, rig_numbers, stiffest_rate
+    from sealscope.physics.rk4 import RK4_NODES, RK4_STABILITY, advance_rk4
+
+    chosen = choose_method(rig, method)
+    if step is not None and not (math.isfinite(step) and step > 0):
+        raise InputError(f"step must be > 0 s, got {step}")
+    every = _steps_per_output(rate, step or DEFAULT_STEP[chosen])
+    h = 1.0 / (rate * every)
+    p = rig_numbers(rig)
+    if chosen == "rk4" and p.throttled and not allow_unresolved:
+        limit = RK4_STABILITY / stiffest_rate(p)
+        if h > limit:
+            raise SimulationFailed(
+                f"step must be <= {limit:.2g} s for rk4 with throttles (line volumes answer within {1 / stiffest_rate(p):.2g} s), "
+                f"got {h:.3g} s; use method imex"
+            )
+    nodes = np.array(IMEX_NODES if chosen == "imex" else RK4_NODES)
+    nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
+    n_out = round(duration * rate)
+    rows = np.empty((n_out, len(OUTPUTS)))
+    y = initial_state(rig, x_0)
+    block = max(1, _BLOCK_STEPS // every)
+    for first in range(0, n_out, block):
+        last = min(first + block, n_out)
+        start = np.arange(first * every, last * every, dtype=np.float64)
+        u, G, C = inputs((start[:, None] + nodes) * h)
+        if chosen == "imex":
+            advance_imex(y, h, u, G, C, p, every, rows[first:last])
+        else:
+            advance_rk4(y, h, u, G, C, p, rig.motor.integrator == "euler", every, rows[first:last])
+        _check(rows[first:last], first, rate, allow_unresolved)
+        if progress is not None:
+            progress(last / rate)
+    return Trajectory(np.arange(n_out) / rate, rows, chosen, h)
+
+
+def _check(rows: Array, first: int, rate: float, allow_unresolved: bool) -> None:
+    from sealscope.physics.rig import OUTPUTS, P_2, P_A
+
+    bad = ~np.isfinite(rows)
+    if bad.any():
+        k, column = np.unravel_index(int(np.argmax(bad)), bad.shape)
+        raise SimulationFailed(
+            f"the run diverged: {OUTPUTS[column]} is not finite at t = {(first + k) / rate:.4g} s; take a smaller step or smaller gains"
+        )
+    pressures = rows[:, P_A : P_2 + 1]
+    if not allow_unresolved and pressures.min() < VACUUM:
+        k, column = np.unravel_index(int(np.argmax(pressures < VACUUM)), pressures.shape)
+        raise SimulationFailed(
+            f"{OUTPUTS[P_A + column]} must stay above vacuum ({VACUUM:g} Pa gauge: the model has no cavitation), got "
+            f"{pressures[k, column]:.4g} Pa at t = {(first + k) / rate:.4g} s (x = {rows[k, 4]:.3f} m); "
+            "raise fluid.p_charge, take a smaller command or start further from the cap"
+        )

@@ -1,0 +1,144 @@
+"""Simulate an experiment: size its leaks, integrate the rig, record it as the instruments would, keep the truth apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sealscope.recordings.recording import Array, Recording
+from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.faults import LITRE_PER_MINUTE, Leak
+from sealscope.simulation.instruments import FILTER_REACH, record
+from sealscope.simulation.integrate import DEFAULT_STEP, Trajectory, choose_method, integrate
+from sealscope.simulation.sizing import leak_flow, mean_while_open, sized
+
+#: Told what is being done and how far it is, 0..1.
+Progress = Callable[[str, float], None]
+#: What the truth of a run holds at each sample.
+TRUE_OUTPUTS = ("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak")
+_OVERSAMPLING = 4
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a real rig would not tell: the leaks that were put in, and every state without noise at the recording's samples."""
+
+    leaks: tuple[Leak, ...]
+    onset_s: float | None
+    mean_leak_lpm: float
+    t: Array
+    outputs: dict[str, Array]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A simulated experiment: the recording, and, apart from it, the truth."""
+
+    recording: Recording
+    truth: Truth
+
+
+def oversampling(experiment: Experiment) -> int:
+    """Outputs per sample: enough for the anti-alias filter, no more than the solver has steps."""
+    longest = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
+    return max(1, min(_OVERSAMPLING, math.ceil(1.0 / (experiment.rate * longest) * (1.0 - 1e-9))))
+
+
+def _inputs(experiment: Experiment, leaks: tuple[Leak, ...]) -> Callable[[Array], tuple[Array, Array, Array]]:
+    def inputs(t: Array) -> tuple[Array, Array, Array]:
+        G, C = np.zeros_like(t), np.zeros_like(t)
+        for leak in leaks:
+            (G if leak.law == "laminar" else C)[...] += (leak.coefficient or 0.0) * leak.opening.share(t)
+        return experiment.command.volts(t), G, C
+
+    return inputs
+
+
+def trajectory(
+    experiment: Experiment,
+    leaks: tuple[Leak, ...],
+    *,
+    step: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Trajectory:
+    """The states and flows over the experiment, sampled for the instruments; `leaks` have their coefficients."""
+    factor = oversampling(experiment)
+    return integrate(
+        experiment.rig,
+        _inputs(experiment, leaks),
+        (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate,
+        experiment.rate * factor,
+        x_0=experiment.x_0,
+        method=experiment.method,
+        step=step or experiment.step,
+        allow_unresolved=experiment.allow_unresolved,
+        progress=progress,
+    )
+
+
+def sized_leaks(experiment: Experiment, progress: Progress | None = None) -> tuple[Leak, ...]:
+    """The experiment's leaks with the coefficients that give their means at the rig's own operating point."""
+    if not any(leak.mean for leak in experiment.leaks):
+        return tuple(leak if leak.mean is None else Leak(leak.law, 0.0, None, leak.opening) for leak in experiment.leaks)
+    runs = 0
+
+    def one_run(leaks: tuple[Leak, ...]) -> Trajectory:
+        nonlocal runs
+        if progress is not None:
+            progress("sizing the leak", 1.0 - 0.5**runs)
+        runs += 1
+        return trajectory(experiment, leaks)
+
+    found = sized(experiment.leaks, one_run, experiment.rig.line.dp_0)
+    if progress is not None:
+        progress("sizing the leak", 1.0)
+    return found
+
+
+def run(experiment: Experiment, progress: Progress | None = None) -> Run:
+    """Simulate the experiment.
+
+    Raises InputError for an experiment that cannot be (a leak larger than the pump's flow), SimulationFailed for a run that
+    diverged or cannot be resolved.
+    """
+    leaks = sized_leaks(experiment, progress)
+    n = round(experiment.duration * experiment.rate)
+    factor = oversampling(experiment)
+
+    def told(reached: float) -> None:
+        if progress is not None:
+            progress("simulating", min(1.0, reached / experiment.duration))
+
+    path = trajectory(experiment, leaks, progress=told)
+    times = experiment.sample_times()
+    made = record(experiment.rig, path, experiment.command.volts(times), factor, experiment.seed)
+    provenance: dict[str, Any] = {
+        "origin": "simulation",
+        "experiment": experiment.describe(),
+        "experiment_key": experiment.key(),
+        "solver": {"method": path.method, "step_s": path.step, "allow_unresolved": experiment.allow_unresolved},
+    }
+    history = (f"simulated with {path.method}, h = {path.step:.4g} s; sampled at {experiment.rate:g} Hz",)
+    recording = replace(made, provenance=provenance, history=history)
+    instants = slice(0, n * factor, factor)
+    outputs = {name: path[name][instants] for name in TRUE_OUTPUTS}
+    return Run(recording, Truth(leaks, experiment.onset(), _mean_leak(leaks, path, experiment), times, outputs))
+
+
+def _mean_leak(leaks: tuple[Leak, ...], path: Trajectory, experiment: Experiment) -> float:
+    """Mean of the leaks' flows while open [L/min], as the run really had it."""
+    dp = path["p_A"] - path["p_B"]
+    flows = [mean_while_open(leak, path.t, leak_flow(leak, path.t, dp, experiment.rig.line.dp_0)) for leak in leaks]
+    return sum(flows) / LITRE_PER_MINUTE
+
+
+def simulate(**experiment: Any) -> Recording:
+    """Simulate from words and return the Recording: `simulate(command="3 sin(4t)", leak="0.0042 L/min from 90 s", duration=180, seed=1)`.
+
+    Keywords are those of `make_experiment`; `run` gives the truth beside the recording.
+    """
+    return run(make_experiment(**experiment)).recording

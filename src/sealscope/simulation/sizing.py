@@ -1,0 +1,79 @@
+"""Find the leakage coefficient that gives a stated mean flow at the rig's own operating point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from sealscope.errors import InputError, SimulationFailed
+from sealscope.recordings.recording import Array
+from sealscope.simulation.faults import LITRE_PER_MINUTE, Leak
+from sealscope.simulation.integrate import Trajectory
+
+#: Relative distance from the mean asked for at which the search ends.
+TOLERANCE = 1e-3
+_MOST_RUNS = 12
+
+Integrate = Callable[[tuple[Leak, ...]], Trajectory]
+
+
+def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
+    """|Q_L| [m^3/s] of one leak with a known coefficient under the chambers' pressure difference `dp` [Pa]."""
+    from sealscope.physics.leakage import leakage_series
+
+    size = (leak.coefficient or 0.0) * leak.opening.share(t)
+    none = np.zeros_like(size)
+    G, C = (size, none) if leak.law == "laminar" else (none, size)
+    return np.asarray(np.abs(leakage_series(np.ascontiguousarray(dp), G, C, dp_0)))
+
+
+def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
+    """Mean flow [m^3/s] while the leak is open, per unit of opening: sum |Q_L| over the sum of the opening."""
+    opening = leak.opening.share(t)
+    total = float(opening.sum())
+    return float(flow.sum()) / total if total > 0 else 0.0
+
+
+def _refuse_impossible(leaks: tuple[Leak, ...], pump_flow: float) -> None:
+    for leak in leaks:
+        if leak.mean is not None and leak.mean >= pump_flow:
+            raise InputError(
+                f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for this command, "
+                f"got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
+            )
+
+
+def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[Leak, ...]:
+    """The leaks with a coefficient each, found so that each one's mean is what was asked for.
+
+    The flow is nearly proportional to the coefficient (friction sets the pressure difference), so the coefficient is scaled by asked/got until
+    it is within `TOLERANCE`, starting from the rig without these leaks.
+
+    Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed where the search does not settle.
+    """
+    current = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
+    for attempt in range(_MOST_RUNS):
+        run = integrate(current)
+        if attempt == 0:
+            _refuse_impossible(leaks, float(np.mean(np.abs(run["Q_1"]))))
+        dp = run["p_A"] - run["p_B"]
+        worst = 0.0
+        following = []
+        for asked, now in zip(leaks, current, strict=True):
+            if asked.mean is None or asked.mean == 0.0:
+                following.append(now)
+                continue
+            unit = mean_while_open(now, run.t, leak_flow(replace(now, coefficient=1.0), run.t, dp, dp_0))
+            if not unit > 0:
+                raise InputError(f"a leak with a mean flow must be open within the run, got {asked}")
+            worst = max(worst, abs(unit * (now.coefficient or 0.0) / asked.mean - 1.0))
+            following.append(replace(now, coefficient=asked.mean / unit))
+        if worst <= TOLERANCE:
+            return current
+        current = tuple(following)
+    raise SimulationFailed(
+        f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: {', '.join(str(leak) for leak in leaks)} is more than this "
+        "rig's pressures can drive; ask for a smaller leak"
+    )

@@ -1,0 +1,222 @@
+"""Overriding values by name: from Python numbers, from texts with units, and the errors."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sealscope.errors import InputError
+from sealscope.parameters import Motor, Rig, load_rig, parse_setting, parse_settings
+from sealscope.parameters.fields import choices_of, unit_of
+from sealscope.parameters.rig import _declared
+
+RIG = load_rig("thesis")
+NUMBERS = [name for name, field in _declared().items() if field.annotation is float]
+CHOICES = [name for name, field in _declared().items() if choices_of(field)]
+
+
+def message(settings: dict[str, Any], **more: Any) -> str:
+    with pytest.raises(InputError) as caught:
+        RIG.with_values(settings, **more)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_numbers_are_si_and_texts_carry_units() -> None:
+    rig = RIG.with_values(
+        {
+            "motor.R_c": "0.8[ohm]",
+            "V_1": 5e-5,
+            "V_2": "50[cm^3]",
+            "p_A.noise": "1 psi",
+            "closed_A": "50 %",
+            "omega_per_volt": "26.7[rad/s/V]",
+            "orifices": "present",
+            "bits": "12",
+            "counts": np.int64(4096),
+            "L": np.float32(0.5),
+        }
+    )
+    assert rig.motor.R_c == 0.8
+    assert rig.line.V_1 == rig.line.V_2 == 5e-5
+    assert rig.sensors.p_A.noise == pytest.approx(6894.757293168361)
+    assert rig.sensors.p_B == RIG.sensors.p_B
+    assert rig.line.closed_A == 0.5
+    assert rig.motor.omega_per_volt == 26.7
+    assert rig.line.orifices == "present"
+    assert (rig.daq.bits, rig.sensors.theta.counts) == (12, 4096)
+    assert isinstance(rig.daq.bits, int)
+    assert rig.cylinder.L == 0.5
+
+
+def test_source_tells_who_set_it_and_the_first_rig_is_untouched() -> None:
+    rig = RIG.with_values({"V_1": 5e-5})
+    assert rig.entry("V_1").source == "set by caller"
+    assert RIG.line.V_1 == 44e-6
+    assert RIG.with_values({"V_1": 5e-5}, source="rig survey of May").entry("line.V_1").source == "rig survey of May"
+    assert rig.entry("V_2") == RIG.entry("V_2")
+    assert message({"V_1": 5e-5}, source=" ") == "source must not be blank"
+
+
+def test_equality_is_of_values() -> None:
+    again = RIG.with_values({"L": "600 mm"})
+    assert again == RIG
+    assert hash(again) == hash(RIG)
+    assert again.entry("L") != RIG.entry("L")
+    assert RIG.with_values({"L": 0.61}) != RIG
+    assert RIG != "thesis"
+    assert RIG.with_values({}) == RIG
+
+
+def test_immutable() -> None:
+    with pytest.raises(Exception, match="frozen"):
+        RIG.motor.R_c = 1.0  # type: ignore[misc]
+    with pytest.raises(Exception, match="frozen"):
+        RIG.motor = RIG.motor  # type: ignore[misc]
+    with pytest.raises(InputError, match="with_values"):
+        RIG.motor.model_copy(update={"R_c": -1.0})
+    assert RIG.motor.model_copy() == RIG.motor
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"V_1": -3.0}, "V_1 must be > 0 m^3, got -3.0 (set by caller)"),
+        ({"F_v": -1}, "F_v must be >= 0 N s/m, got -1.0 (set by caller)"),
+        ({"d_line": "7 m"}, "d_line must be <= 0.5 m, got 7.0 (set by caller)"),
+        ({"closed_A": 1.0}, "closed_A must be <= 0.99, got 1.0 (set by caller)"),
+        ({"closed_B": "-1%"}, "closed_B must be >= 0, got -0.01 (set by caller)"),
+        ({"K_brk": 0.5}, "K_brk must be >= 1, got 0.5 (set by caller)"),
+        ({"p_A.noise": -1}, "sensors.p_A.noise must be >= 0 Pa, got -1.0 (set by caller)"),
+        ({"bits": 3.5}, "bits must be a whole number, got 3.5 (set by caller)"),
+        ({"bits": 40}, "bits must be <= 32 bit, got 40 (set by caller)"),
+        ({"V_1": True}, "V_1 must be a number, got True (set by caller)"),
+        ({"V_1": None}, "V_1 must be a number, got None (set by caller)"),
+        ({"V_1": math.nan}, "V_1 must be finite, got nan (set by caller)"),
+        ({"F_l": math.inf}, "F_l must be finite, got inf (set by caller)"),
+        ({"V_1": "5[Pa]"}, "V_1 must have a unit of volume, such as m^3, got Pa (set by caller)"),
+        ({"q_b": "4.9 cm^3"}, "q_b must have a unit of volume per turn, such as m^3/rev, got cm^3 (set by caller)"),
+        ({"V_1": "big"}, "V_1 must be a number with or without a unit, such as 2[m^3], got 'big' (set by caller)"),
+        ({"volumes": "fix"}, "volumes must be one of fixed, position, got 'fix' (set by caller)"),
+        ({"volumes": ["fixed"]}, "volumes must be one of fixed, position, got ['fixed'] (set by caller)"),
+        ({"V1": 1}, "'V1' is not a parameter; did you mean V_1?"),
+        ({"moter.R_c": 1}, "'moter.R_c' is not a parameter; did you mean motor.R_c?"),
+        ({"": 1}, "'' is not a parameter"),
+        ({"xyzzy_unknown": 1}, "'xyzzy_unknown' is not a parameter"),
+        ({"V_1": 1e-5, "line.V_1": 2e-5}, "line.V_1 must be set once, got V_1 and line.V_1"),
+        ({"range_hi": 1}, "parameter range_hi is not unique, give one of sensors.p_1.range_hi, sensors.p_2.range_hi, "
+         "sensors.p_A.range_hi, sensors.p_B.range_hi, sensors.q_leak.range_hi"),
+        ({"p_A.range_lo": "4000 psi"}, "sensors.p_A.range_lo must be < range_hi = 2.06843e+07 Pa, got "),
+        ({"sensor_volts_hi": 20}, "sensor_volts_hi must be <= range = 10 V, got 20.0 (set by caller)"),
+        ({"sensor_volts_lo": -20}, "sensor_volts_lo must be >= -range = -10 V, got -20.0 (set by caller)"),
+        ({"sensor_volts_lo": 10}, "sensor_volts_lo must be < sensor_volts_hi = 10 V, got 10.0 (set by caller)"),
+    ],
+)  # fmt: skip
+def test_each_rule_is_told_in_one_line(settings: dict[str, Any], text: str) -> None:
+    assert message(settings).startswith(text)
+
+
+def test_dead_volume_must_be_positive_when_volumes_move() -> None:
+    assert RIG.with_values({"V": 1.5e-4}).cylinder.V == 1.5e-4
+    assert message({"V": 1.5e-4, "volumes": "position"}, source="--set") == (
+        'cylinder.V must be > A_A L/2 = 0.0001899 m^3 when volumes = "position", got 0.00015 (--set)'
+    )
+    assert "A_B L/2 = 0.0003 m^3" in message({"A_B": 1e-3, "volumes": "position"})
+    assert RIG.with_values({"volumes": "position"}).cylinder.volumes == "position"
+
+
+def test_parts_made_by_hand_obey_the_same_rules() -> None:
+    values = RIG.motor.model_dump()
+    assert Motor(**values) == RIG.motor
+    with pytest.raises(InputError, match=r"^R_c must be > 0 ohm, got -1.0$"):
+        Motor(**{**values, "R_c": -1.0})
+    with pytest.raises(InputError, match=r"^R_d is not a parameter$"):
+        Motor(**values, R_d=1.0)
+    with pytest.raises(InputError, match=r"^R_c is missing$"):
+        Motor(**{name: value for name, value in values.items() if name != "R_c"})
+    bare = Rig(**{part: getattr(RIG, part) for part in Rig.model_fields})
+    assert bare == RIG
+    with pytest.raises(InputError, match="must have sources"):
+        bare.table()
+
+
+def _range(name: str) -> tuple[float, float]:
+    low, high = -math.inf, math.inf
+    for rule in _declared()[name].metadata:
+        low = max(low, getattr(rule, "gt", low), getattr(rule, "ge", low))
+        high = min(high, getattr(rule, "lt", high), getattr(rule, "le", high))
+    return low, high
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_every_number_has_a_range(name: str) -> None:
+    low, high = _range(name)
+    assert math.isfinite(low)
+    assert math.isfinite(high)
+    assert low < high
+
+
+@settings(deadline=None, max_examples=200)
+@given(name=st.sampled_from(NUMBERS), value=st.floats(width=64))
+def test_a_number_is_taken_exactly_or_refused_by_name(name: str, value: float) -> None:
+    low, high = _range(name)
+    try:
+        rig = RIG.with_values({name: value})
+    except InputError as error:
+        assert name.rpartition(".")[2] in str(error)
+        assert "\n" not in str(error)
+        if low < value < high:  # only a rule across values is left
+            assert "range" in str(error) or "sensor_volts" in str(error)
+    else:
+        assert rig[name] == value
+        assert low <= value <= high
+
+
+@settings(deadline=None, max_examples=100)
+@given(name=st.sampled_from(NUMBERS), fraction=st.floats(0.5, 2.0))
+def test_text_and_number_agree(name: str, fraction: float) -> None:
+    current = RIG[name]
+    assert isinstance(current, float)
+    value = current * fraction
+    try:
+        rig = RIG.with_values({name: value})
+    except InputError:
+        return
+    assert RIG.with_values({name: repr(value)}) == rig
+    assert RIG.with_values({name: f"{value!r}[{unit_of(_declared()[name])}]"}) == rig
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_every_word_of_a_choice_is_accepted(name: str) -> None:
+    words = choices_of(_declared()[name])
+    assert len(words) > 1
+    for word in words:
+        assert RIG.with_values({name: f" {word} "})[name] == word
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.text(max_size=20), st.one_of(st.text(max_size=20), st.integers(), st.none(), st.lists(st.floats())))
+def test_anything_else_is_an_input_error(name: str, value: Any) -> None:
+    for key in (name, "V_1"):
+        try:
+            RIG.with_values({key: value})
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
+def test_parse_setting() -> None:
+    assert parse_setting("V_1=50[cm^3]") == ("V_1", "50[cm^3]")
+    assert parse_setting(" motor.R_c = 0.8 ") == ("motor.R_c", "0.8")
+    for bad in ("V_1", "=3", "V_1=", "", " = "):
+        with pytest.raises(InputError, match=r"NAME=VALUE\[unit\], got"):
+            parse_setting(bad)
+    assert parse_settings(["V_1=1", "V_2=2", "V_1=1"]) == {"V_1": "1", "V_2": "2"}
+    with pytest.raises(InputError, match="V_1 must be set once, got 1 and 2"):
+        parse_settings(["V_1=1", "V_1=2"])
+    assert RIG.with_values(dict([parse_setting("V_1=50[cm^3]")])).line.V_1 == 5e-5

@@ -1,0 +1,84 @@
+"""The wavelet's filters against the published table, and how far the levels reach."""
+
+import numpy as np
+import pytest
+
+from sealscope.errors import InputError
+from sealscope.signals.filters import MAX_LEVELS, checked_levels, decomposition_filters, finite_array, reach
+
+# Daubechies, Ten Lectures on Wavelets, SIAM (1992), Table 6.1, N = 8; the same numbers are PyWavelets' rec_lo of db8.
+PUBLISHED_DB8 = [
+    0.0544158422431072,
+    0.3128715909143166,
+    0.6756307362973195,
+    0.5853546836542159,
+    -0.0158291052563823,
+    -0.2840155429615824,
+    0.0004724845739124,
+    0.1287474266204893,
+    -0.0173693010018090,
+    -0.0440882539307971,
+    0.0139810279174001,
+    0.0087460940474065,
+    -0.0048703529934520,
+    -0.0003917403733770,
+    0.0006754494064506,
+    -0.0001174767841248,
+]
+
+
+def test_db8_taps_are_the_published_ones():
+    low, high = decomposition_filters("db8")
+    np.testing.assert_allclose(low, PUBLISHED_DB8[::-1], atol=1e-12, rtol=0)
+    # the quadrature mirror of the low-pass, up to sign
+    mirror = np.array(PUBLISHED_DB8) * (-1.0) ** np.arange(16)
+    assert min(np.abs(high - mirror).max(), np.abs(high + mirror).max()) < 1e-12
+
+
+def test_db8_is_orthonormal_and_blind_to_polynomials_of_degree_7():
+    low, high = decomposition_filters("db8")
+    for shift in range(0, 16, 2):
+        expected = float(shift == 0)
+        assert low[shift:] @ low[: 16 - shift] == pytest.approx(expected, abs=1e-12)
+        assert high[shift:] @ high[: 16 - shift] == pytest.approx(expected, abs=1e-12)
+    k = np.linspace(-1.0, 1.0, 16)
+    for degree in range(8):
+        assert abs(high @ k**degree) < 1e-11
+    assert abs(high @ k**8) > 1e-6
+
+
+def test_reach_of_db8_and_of_haar():
+    assert reach("db8", 4).tolist() == [[7, 8], [21, 24], [49, 56], [105, 120]]
+    assert reach("haar", 3).tolist() == [[0, 1], [0, 3], [0, 7]]
+
+
+@pytest.mark.parametrize("levels", [0, -1, MAX_LEVELS + 1, 2.0, True, "4", None])
+def test_levels_that_are_refused(levels):
+    with pytest.raises(InputError, match="levels must be a whole number from 1 to 12, got "):
+        checked_levels(levels)
+
+
+def test_an_unknown_wavelet_names_a_near_one():
+    with pytest.raises(
+        InputError, match=r"wavelet must be a discrete wavelet such as db8, got 'dab8'; did you mean db8\?"
+    ):
+        decomposition_filters("dab8")
+    with pytest.raises(InputError, match="discrete wavelet"):
+        decomposition_filters("morl")  # continuous
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([1.0, 2.0, np.nan, np.nan], r"x must be finite, got nan at sample 2 \(2 of 4 samples\)"),
+        ([1.0, -np.inf], r"x must be finite, got -inf at sample 1 \(1 of 2 samples\)"),
+        (["a", "b"], "x must be real numbers"),
+        ([1 + 2j, 0], "x must be real numbers"),
+        ([[1.0], [2.0, 3.0]], "x must be real numbers"),
+        (np.zeros((3, 2)), r"x must be 1-dimensional, got shape \(3, 2\)"),
+        (3.0, r"x must be 1-dimensional, got shape \(\)"),
+    ],
+)
+def test_arrays_that_are_refused(values, message):
+    with pytest.raises(InputError, match=message):
+        finite_array(values, "x", ndim=1)
