@@ -1,9 +1,9 @@
 """Units at the edges: what a file, an option or a figure says, turned into the SI doubles used inside, and back.
 
 A unit is parsed into powers of base units, its factor held as an exact fraction times a power of pi, so that
-``234 cm^3`` is exactly the double ``2.34e-4``. An angle and a count of a converter are dimensions of their own: ``Hz`` is
-not ``rad/s``, ``m^3/rev`` is not ``m^3``, and raw counts are not a pressure. The units of hydraulics are known without
-help; for all others pint is asked, and loaded only then.
+``234 cm^3`` is exactly the double ``2.34e-4``. An angle and a count of a converter are dimensions of their own:
+``Hz`` is not ``rad/s``, ``m^3/rev`` is not ``m^3``, and raw counts are not a pressure. The units of hydraulics are
+known without help; for all others pint is asked, and loaded only then.
 """
 
 from __future__ import annotations
@@ -65,8 +65,9 @@ _ATOMS: dict[str, Unit] = {
 } | {
     "1": _unit(1),
     "%": _unit("1/100"),
-    "percent": _unit("1/100"),
     "psi": _unit(_PSI, kg=1, m=-1, s=-2),
+    "psia": _unit(_PSI, offset=-101325 / _PSI, kg=1, m=-1, s=-2),
+    "bara": _unit(10**5, offset="-1.01325", kg=1, m=-1, s=-2),
     "lpm": _unit("1/60000", m=3, s=-1),
     "min": _unit(60, s=1),
     "h": _unit(3600, s=1),
@@ -78,12 +79,14 @@ _ATOMS: dict[str, Unit] = {
     "degC": _unit(1, K=1, offset="273.15"),
     "degF": _unit("5/9", K=1, offset="459.67"),
 }
-#: Other spellings that loggers write; a gauge pressure keeps its zero.
+#: Other spellings. Pressures inside are gauge pressures; absolute ones lose one standard atmosphere.
 _SPELLINGS = {
     spelling: name
     for name, spellings in {
-        "psi": "PSI Psi psig PSIG",
-        "bar": "BAR Bar barg",
+        "psi": "PSI Psi psig PSIG psi(g)",
+        "psia": "PSIA psi(a)",
+        "bar": "BAR Bar barg bar(g)",
+        "bara": "bar(a)",
         "Pa": "pa PA",
         "rpm": "RPM Rpm U/min r/min",
         "lpm": "LPM",
@@ -105,6 +108,7 @@ _SPELLINGS = {
         "K": "kelvin",
         "A": "ampere",
         "1": "-",
+        "%": "percent",
     }.items()
     for spelling in spellings.split()
 } | {"": "1"}
@@ -113,27 +117,11 @@ _SIGNS = str.maketrans(
     | {"\u00b2": "^2", "\u00b3": "^3", "\u00b5": "u", "\u03bc": "u", "\u03a9": "ohm", "\u2126": "ohm", "\u2212": "-"}
 )
 _KINDS = {
-    "Pa": "pressure",
-    "m": "length",
-    "m^2": "area",
-    "m^3": "volume",
-    "m^3/s": "volume flow",
-    "rad/s": "angular speed",
-    "rad": "angle",
-    "s": "time",
-    "V": "voltage",
-    "A": "current",
-    "N": "force",
-    "kg": "mass",
-    "Hz": "frequency",
-    "ohm": "resistance",
-    "H": "inductance",
-    "kg m^2": "inertia",
-    "kg/m^3": "density",
-    "K": "temperature",
-    "m/s": "speed",
-    "m^3/rev": "volume per turn",
-}
+    "Pa": "pressure", "m": "length", "m^2": "area", "m^3": "volume", "m^3/s": "volume flow", "rad/s": "angular speed",
+    "rad": "angle", "s": "time", "V": "voltage", "A": "current", "N": "force", "kg": "mass", "Hz": "frequency",
+    "ohm": "resistance", "H": "inductance", "kg m^2": "inertia", "kg/m^3": "density", "K": "temperature",
+    "m/s": "speed", "m^3/rev": "volume per turn",
+}  # fmt: skip
 _TOKEN = re.compile(
     r"\s*(?:(?P<op>[/()])|\^(?P<power>[+-]?\d(?:\.5)?)(?![\d.])|(?P<name>[^\W\d]\w*?|%|°[CF]?|1)(?P<digit>[23]?)(?=$|[\s/()^]))"
 )
@@ -340,8 +328,7 @@ def parse_quantity(
 ) -> float:
     """The number that ``2[L/min]``, ``3 psi`` or ``5`` (already SI) stands for, in `si_unit`.
 
-    Raises InputError where there is no number, where the unit has another dimension, and, unless `finite` is False,
-    where the number is not finite.
+    Raises InputError where there is no number, where the dimension is another, and, if `finite`, where it is not finite.
     """
     where = f" ({place})" if place else ""
     match = _NUMBER.fullmatch(text) if len(text) <= _LONGEST_TEXT else None

@@ -9,8 +9,6 @@ from sealscope.physics.rig import CURRENT, INTEGRAL, OMEGA, RigNumbers, observe,
 
 #: Nodes of the step at which the inputs are needed.
 RK4_NODES = (0.0, 0.5, 1.0)
-#: Stability limit of h |lambda| on the negative real axis (Hairer & Wanner, Solving Ordinary Differential Equations II, 1996, IV.2).
-RK4_STABILITY = 2.785
 
 
 @kernel

@@ -1,0 +1,45 @@
+"""Recording, its files, and what is wrong with the data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Recording
+
+if TYPE_CHECKING:
+    from sealscope.recordings.columns import split_map_option
+    from sealscope.recordings.files import read, write
+    from sealscope.recordings.quality import Finding, inspect, uniform_segments
+    from sealscope.recordings.whole import whole_file
+
+_HOMES = {
+    "split_map_option": "columns",
+    "read": "files",
+    "write": "files",
+    "Finding": "quality",
+    "inspect": "quality",
+    "uniform_segments": "quality",
+    "whole_file": "whole",
+}
+
+__all__ = [
+    "CHANNEL_UNITS",
+    "COUNTS",
+    "Finding",
+    "Recording",
+    "inspect",
+    "read",
+    "split_map_option",
+    "uniform_segments",
+    "whole_file",
+    "write",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Load what is heavy when it is first used."""
+    from importlib import import_module
+
+    if name in _HOMES:
+        return getattr(import_module(f"sealscope.recordings.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

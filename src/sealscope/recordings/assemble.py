@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.columns import Label, plan
-from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Recording
+from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Array, Recording
 from sealscope.recordings.timebase import time_base
 from sealscope.units import to_si
 
@@ -25,14 +26,14 @@ FORMAT_VERSION = 1
 class Table:
     """Named columns of a file that is open.
 
-    `fetch(columns, time)` gives the channels' columns as doubles, in order, and then the time column, if asked for, as
+    `fetch(columns, time)` gives the channels' columns as doubles, in order, and the time column, if asked for, as
     doubles or datetime64. `own`: what Sealscope itself wrote beside the numbers, or None.
     """
 
     place: str
     kind: str
     labels: Sequence[Label]
-    fetch: Callable[[Sequence[int], int | None], list[NDArray[Any]]]
+    fetch: Callable[[Sequence[int], int | None], tuple[list[Array], NDArray[Any] | None]]
     own: Mapping[str, Any] | None = None
     notes: tuple[str, ...] = ()
 
@@ -70,7 +71,7 @@ def read_own_words(text: str | bytes, place: str) -> dict[str, Any]:
     """The inverse of `own_words` from JSON text; raises UnreadableFile where it is damaged."""
     try:
         words = json.loads(text)
-        own = {
+        own: dict[str, Any] = {
             "rate": float(words["rate"]),
             "provenance": dict(words["provenance"]),
             "history": [str(line) for line in words["history"]],
@@ -98,11 +99,9 @@ def check_writable(recording: Recording) -> None:
 
 def recording_of(table: Table, channel_map: Mapping[str, str], rate: float | None) -> Recording:
     """The recording that `table` holds; raises UnreadableFile."""
-    own = table.own if not channel_map else None
     chosen = plan(table.labels, channel_map, rate, table.place)
     columns = chosen.columns
-    *values, last = [*table.fetch(columns, chosen.time), np.empty(0)]
-    time_values = values.pop() if chosen.time is not None else last
+    values, time_values = table.fetch(columns, chosen.time)
     count = len(values[0])
     if count == 0:
         raise UnreadableFile(f"a recording must have samples, got a header and no rows ({table.place})")
@@ -113,16 +112,17 @@ def recording_of(table: Table, channel_map: Mapping[str, str], rate: float | Non
         channels[name] = to_si(values[at[column]], unit, si_unit, name=name, place=table.place)
         units[name] = si_unit
     notes = [*table.notes, *chosen.notes]
-    if chosen.time is None:
+    start: dict[str, Any] = {}
+    if chosen.time is None or time_values is None:
         assert rate is not None
-        t, start = np.arange(count) / rate, {}
+        t = np.arange(count) / rate
+    elif table.own is not None and not channel_map:
+        t, rate = time_values, table.own["rate"]
     else:
-        label = table.labels[chosen.time]
-        file_rate = table.own["rate"] if table.own else None
-        t, rate, start, more = time_base(time_values, chosen.time_unit, label.whole, file_rate, table.place)
+        name = table.labels[chosen.time].whole
+        t, rate, start, more = time_base(time_values, chosen.time_unit, name, table.place)
         notes += more
-    if own is not None:
-        provenance, history = own["provenance"], (*own["history"], *notes)
-    else:
-        provenance, history = {"file": table.place, "format": table.kind, **start}, tuple(notes)
-    return Recording(t, channels, units, rate, provenance, history)
+    if table.own is not None:
+        return Recording(t, channels, units, rate, table.own["provenance"], (*table.own["history"], *notes))
+    provenance = {"file": Path(table.place).name, "format": table.kind, **start}
+    return Recording(t, channels, units, rate, provenance, tuple(notes))

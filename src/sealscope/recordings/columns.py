@@ -12,7 +12,9 @@ from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS
 from sealscope.units import parse_unit, same_dimension
 
 _BRACKETS = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]\s*")
-_SOFT_UNIT = re.compile(r"(?P<name>.*?)(?:\s*\((?P<unit>[^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s(?P<over>[^/]+(?:/[^/]+)?))\s*")
+_SOFT_UNIT = re.compile(
+    r"(?P<name>.*?)(?:\s*\((?P<unit>[^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s(?P<over>[^/]+(?:/[^/]+)?))\s*"
+)
 #: Names of a time column, most telling first, and the unit that the name itself tells.
 _TIME_NAMES = {
     "t": None,
@@ -173,8 +175,9 @@ def _find_time(labels: Sequence[Label], place: str) -> int | None:
 def plan(labels: Sequence[Label], channel_map: Mapping[str, str], rate: float | None, place: str) -> Plan:
     """Decide which columns are read, and as what.
 
-    A mapped channel comes before a column that bears the channel's own name. Raises UnreadableFile where a mapped column
-    is missing or its unit is of another dimension, where no column is a channel, and where there is neither time nor rate.
+    A mapped channel comes before a column that bears the channel's own name. Raises UnreadableFile where a mapped
+    column is missing or its unit is of another dimension, where no column is a channel, and where there is neither time
+    nor rate.
     """
     notes: list[str] = []
     channels: dict[str, tuple[int, str]] = {}
@@ -205,6 +208,7 @@ def plan(labels: Sequence[Label], channel_map: Mapping[str, str], rate: float | 
             f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
             f"got columns {listed(label.whole for label in labels)} ({place})"
         )
+    seen_time = time
     if rate is not None and time is not None:
         notes.append(f"time column {labels[time].whole} not used: the rate was given as {rate:g} Hz")
         time = None
@@ -214,7 +218,7 @@ def plan(labels: Sequence[Label], channel_map: Mapping[str, str], rate: float | 
             f"got columns {listed(label.whole for label in labels)} ({place})"
         )
     order = {channel: channels[channel] for channel in sorted(channels, key=lambda c: channels[c][0])}
-    used = {column for column, _ in order.values()} | {time}
+    used = {column for column, _ in order.values()} | {seen_time}
     ignored = [label.whole for i, label in enumerate(labels) if i not in used and label.whole]
     if ignored:
         notes.append(f"columns not used: {listed(ignored, 40)}")

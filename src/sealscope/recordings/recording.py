@@ -1,7 +1,7 @@
 """The Recording: labelled time series with units, a rate and a history; the one meeting point of the whole project.
 
-A Recording is what a rig's data logger would have written. Where it came from (a simulator, a file, a stream) is told by
-its provenance and by nothing else; the truth of a simulation is never part of it.
+A Recording is what a rig's data logger would have written. Where it came from (a simulator, a file, a stream) is told
+by its provenance and by nothing else; the truth of a simulation is never part of it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sealscope.errors import InputError
 
 Array = NDArray[np.float64]
 
-#: Channel names (the thesis's symbols) and the unit each has inside Sealscope; `docs/nomenclature.md` says what they are.
+#: Channel names (the thesis's symbols) and the unit each has inside Sealscope; `docs/nomenclature.md` explains them.
 CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
     {
         "u": "V",
@@ -47,9 +47,9 @@ def _frozen(values: Any) -> Array:
 class Recording:
     """Channels sampled on one time base.
 
-    `t`: (n,) time [s]; `channels`: name -> (n,) values, NaN where a sample is missing; `units`: name -> unit, the SI unit of
-    `CHANNEL_UNITS` or `COUNTS`; `rate`: nominal sampling rate [Hz]; `provenance`: plain JSON values that say where the
-    data come from; `history`: one line for each processing step. Arrays are copied and read-only.
+    `t`: (n,) time [s]; `channels`: name -> (n,) values, NaN where a sample is missing; `units`: name -> unit, the SI
+    unit of `CHANNEL_UNITS` or `COUNTS`; `rate`: nominal sampling rate [Hz]; `provenance`: plain JSON values that say
+    where the data come from; `history`: one line for each processing step. Arrays are copied and read-only.
 
     Raises InputError when lengths differ, a unit is missing or the rate is not positive.
     """
@@ -106,6 +106,15 @@ class Recording:
             t=self.t[inside],
             channels={name: values[inside] for name, values in self.channels.items()},
             history=(*self.history, f"cut to {start:g} s <= t < {stop:g} s"),
+        )
+
+    def samples(self, chosen: slice) -> Recording:
+        """The samples of a slice, times as they are."""
+        return replace(
+            self,
+            t=self.t[chosen],
+            channels={name: values[chosen] for name, values in self.channels.items()},
+            history=(*self.history, f"cut to samples {chosen.start} to {chosen.stop}"),
         )
 
     def only(self, names: Iterable[str]) -> Recording:

@@ -53,7 +53,9 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
                 raise ValueError(index)
             plain.append("NaT")
             continue
-        date = match["date"] or (f"{match['year']}-{match['month']:0>2}-{match['day']:0>2}" if match["year"] else "1970-01-01")
+        date = match["date"] or (
+            f"{match['year']}-{match['month']:0>2}-{match['day']:0>2}" if match["year"] else "1970-01-01"
+        )
         clock = (match["clock"] or "00:00").replace(",", ".")
         plain.append(f"{date}T{clock:0>5}" if clock[1] != ":" else f"{date}T0{clock}")
     try:
@@ -85,7 +87,7 @@ def nominal_rate(t: Array) -> float:
         off_line = float(np.max(np.abs(t - t[0] - mean * np.arange(t.size))))
         if off_line < 0.6 * mean:
             step = mean
-            slack = max(slack, min(off_line, 0.01 * mean) / span)
+            slack = max(slack, min(2 * off_line / span, 1e-3))
     rate = 1.0 / step
     for digits in range(1, 16):
         rounded = float(f"{rate:.{digits}g}")
@@ -141,11 +143,11 @@ def _from_numbers(values: Array, unit: str | None, name: str, place: str) -> tup
     return seconds, {}, []
 
 
-def time_base(values: NDArray[Any], unit: str | None, name: str, rate: float | None, place: str) -> TimeBase:
+def time_base(values: NDArray[Any], unit: str | None, name: str, place: str) -> TimeBase:
     """Seconds and rate from a time column's `values` (n,), numbers in `unit` or datetime64.
 
-    Stamps and epoch times are based at their first sample, whose moment is kept in `start`; other times are left where they
-    are. `rate` is the file's own word on the nominal rate, if any. Raises UnreadableFile, naming `place`.
+    Stamps and epoch times are based at their first sample, whose moment is kept in `start`; other times are left where
+    they are. Raises UnreadableFile, naming `place`.
     """
     notes: list[str] = []
     try:
@@ -153,7 +155,7 @@ def time_base(values: NDArray[Any], unit: str | None, name: str, rate: float | N
             t, start = _from_stamps(values, place)
         else:
             t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name, place)
-        return TimeBase(t, rate if rate is not None else nominal_rate(t), start, tuple(notes))
+        return TimeBase(t, nominal_rate(t), start, tuple(notes))
     except UnreadableFile:
         raise
     except InputError as error:

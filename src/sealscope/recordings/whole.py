@@ -13,7 +13,7 @@ from sealscope.errors import InputError
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary name in the folder of `path`, renamed to `path` when the block ends well and removed when it does not.
+    """A temporary name in the folder of `path`: renamed to `path` when the block ends well, removed when it does not.
 
     Raises InputError where the folder does not exist or cannot be written.
     """

@@ -1,4 +1,4 @@
-"""The charts of the page: what each shows, in which unit and how drawn; once as data for the script, once as plain SVG."""
+"""The charts of the page: what each shows, in which unit and how drawn: data for the script, and still pictures."""
 
 from __future__ import annotations
 
@@ -11,26 +11,30 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Recording
 from sealscope.reporting.contract import DiagnosisLike, Mark
-from sealscope.reporting.features import NAMES, PRODUCT, STEP, WINDOW, ChamberDetails
+from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
 from sealscope.reporting.series import Base, coded, coded_times, time_base
 
 Array = NDArray[np.float64]
 
-SAMPLES, WINDOWS = "samples", "windows"
+SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
-POINTS, STILL_POINTS = 16_000, 400
+POINTS, STILL_POINTS = 16_000, 800
 #: samples drawn one by one round the onset, so that the ringing itself can be looked at
 NEAR_SAMPLES = 6_000
 
 #: unit of pressures -> Pa per unit, unit of their details, Pa per that unit
 PRESSURE_UNITS: dict[str, tuple[float, str, float]] = {
-    "bar": (1e5, "mbar", 1e2),
+    "bar": (1e5, "kPa", 1e3),
     "MPa": (1e6, "kPa", 1e3),
     "kPa": (1e3, "kPa", 1e3),
     "psi": (6894.757293168, "psi", 6894.757293168),
 }
 #: SI unit of other channels -> unit shown, SI per unit
-_SHOWN = {"m": ("mm", 1e-3), "rad/s": ("rpm", np.pi / 30), "m^3/s": ("mL/min", 1e-6 / 60), "V": ("V", 1.0), "rad": ("rad", 1.0)}
+_SHOWN = {
+    "m": ("mm", 1e-3),
+    "rad/s": ("rpm", np.pi / 30),
+    "m^3/s": ("L/min", 1e-3 / 60),
+}
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[
 
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """The charts of the recorded channels, those of one kind and unit together; channels without samples are left out."""
+    """The charts of the recorded channels, those of one kind and unit together; one without samples is left out."""
     plan = [
         ("u", "Command", (("u", "a"),)),
         ("x", "Piston position", (("x", "a"),)),
@@ -93,6 +97,10 @@ def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
     return charts
 
 
+def _axis(channel: str) -> str:
+    return f"windows-{channel}"
+
+
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """Windowed RMS: d1..d4 of each chamber, and d3d4 of each."""
     charts = []
@@ -102,14 +110,14 @@ def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart
         unit, size = shown_unit(chamber.unit, pressure_unit, detail=True)
         name = chamber.channel
         lines = tuple(Series(d, d, chamber.window_rms[d] / size) for d in NAMES if d != PRODUCT)
-        charts.append(Chart(f"rms-{name}", "rms", f"RMS of the details of {name}", unit, lines, f"{WINDOWS}-{name}", 230))
+        charts.append(Chart(f"rms-{name}", "rms", f"RMS of the details of {name}", unit, lines, _axis(name), 230))
     for chamber in chambers:
         if chamber.window_t.size:
             unit, size = shown_unit(chamber.unit, pressure_unit, detail=True)
             name = chamber.channel
             line = Series("d3·d4", "d3d4", chamber.window_rms[PRODUCT] / size**2)
             title = f"RMS of d3·d4 of {name}"
-            charts.append(Chart(f"rms-{name}-d3d4", "rms", title, f"{unit}²", (line,), f"{WINDOWS}-{name}", 150))
+            charts.append(Chart(f"rms-{name}-d3d4", "rms", title, f"{unit}²", (line,), _axis(name), 150))
     return charts
 
 
@@ -130,7 +138,7 @@ def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Ch
 
 @dataclass(frozen=True)
 class Drawing:
-    """All charts over their time axes: `data` for the script (plain JSON values), `still` (key -> SVG), and how decimated."""
+    """All charts: `data` for the script (plain JSON values), `still` by chart key for the template, and their base."""
 
     data: dict[str, Any]
     still: dict[str, dict[str, Any]]
@@ -138,23 +146,28 @@ class Drawing:
 
 
 def draw(
-    recording: Recording, chambers: list[ChamberDetails], charts: list[Chart], diagnosis: DiagnosisLike, marks: list[Mark]
+    recording: Recording,
+    chambers: list[ChamberDetails],
+    charts: list[Chart],
+    diagnosis: DiagnosisLike,
+    marks: list[Mark],
 ) -> Drawing:
     """Decimate and code every chart's series, and lay out the still picture of each.
 
     Peaks are kept: each bucket contributes its least and its greatest sample.
     """
     middle = float(recording.t[len(recording) // 2])
-    near = middle if diagnosis.onset_s is None else diagnosis.onset_s
+    near = diagnosis.onset_s if diagnosis.onset_s is not None and np.isfinite(diagnosis.onset_s) else middle
     base = time_base(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
     few = time_base(recording.t, recording.rate, STILL_POINTS)
     span = (float(base.t[0]), float(base.t[-1]))
-    axes: dict[str, Array] = {SAMPLES: base.t} | {f"{WINDOWS}-{c.channel}": c.window_t for c in chambers}
-    low, high = diagnosis.onset_interval_s or (None, None)
+    axes: dict[str, Array] = {SAMPLES: base.t} | {_axis(c.channel): c.window_t for c in chambers}
+    onset, interval = onset_within(diagnosis, span)
+    low, high = interval or (None, None)
     data: dict[str, Any] = {
         "span": span,
         "axes": {name: coded_times(t) for name, t in axes.items() if any(c.base == name for c in charts)},
-        "onset": {"t": diagnosis.onset_s, "low": low, "high": high},
+        "onset": {"t": onset, "low": low, "high": high},
         "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
         "charts": [],
     }
@@ -170,13 +183,27 @@ def draw(
                 "unit": chart.unit,
                 "height": chart.height,
                 "series": [
-                    {"label": s.label, "style": s.style} | coded(line) for s, line in zip(chart.series, lines, strict=True)
+                    {"label": s.label, "style": s.style} | coded(line)
+                    for s, line in zip(chart.series, lines, strict=True)
                 ],
             }
         )
         few_lines = [few.reduce(s.values) if sampled else s.values for s in chart.series]
         still[chart.key] = still_chart(chart, few.t if sampled else axes[chart.base], few_lines, span)
     return Drawing(data, still, base)
+
+
+def onset_within(
+    diagnosis: DiagnosisLike, span: tuple[float, float]
+) -> tuple[float | None, tuple[float, float] | None]:
+    """The onset and its interval [s] as drawn: an end that lies outside the recording, or is unbounded, is cut."""
+    onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
+    if onset is None or not np.isfinite(onset):
+        return None, None
+    if interval is None or np.isnan(interval[0]) or np.isnan(interval[1]):
+        return float(onset), None
+    low, high = (float(np.clip(end, *span)) for end in interval)
+    return float(onset), (low, high)
 
 
 def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, float]) -> dict[str, Any]:
@@ -198,8 +225,8 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
     for series, line in zip(chart.series, lines, strict=True):
         drawn = np.isfinite(line)
         pen = drawn & ~np.append(False, drawn[:-1])
-        xs, ys = np.rint(across(t)), height - (line - low) / (high - low) * height
-        steps = [f"{'M' if p else 'L'}{x:.0f} {y:.0f}" for p, x, y in zip(pen[drawn], xs[drawn], ys[drawn], strict=True)]
+        points = zip(pen[drawn], across(t)[drawn], height * (high - line[drawn]) / (high - low), strict=True)
+        steps = [f"{'M' if begins else 'L'}{x:.0f} {y:.0f}" for begins, x, y in points]
         paths.append({"label": series.label, "style": series.style, "d": "".join(steps)})
     return {
         "paths": paths,

@@ -1,4 +1,4 @@
-"""What this room needs to know of a diagnosis: the attributes of the public output contract, and marks on a time axis."""
+"""What this room needs to know of a diagnosis (attributes of the public output contract), and marks on a time axis."""
 
 from __future__ import annotations
 

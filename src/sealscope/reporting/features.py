@@ -1,4 +1,4 @@
-"""The details and their RMS as the page shows them: of the longest stretch of a recording that can be transformed."""
+"""The details and their RMS as the page shows them: of every stretch of a recording that can be transformed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.contract import DiagnosisLike
+from sealscope.reporting.series import ordered_time
 
 Array = NDArray[np.float64]
 
@@ -18,6 +19,7 @@ LEVELS = 4
 PRODUCT = "d3d4"
 NAMES = (*(f"d{level}" for level in range(1, LEVELS + 1)), PRODUCT)
 WINDOW, STEP = 1000, 500
+HALF_WINDOWS = 10
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,8 @@ class ChamberDetails:
     """d1..d4 and d3d4 of one chamber's pressure.
 
     `values`: name -> (n,) over the whole recording, NaN where the transform would touch an end or a fault of the data;
-    `window_t`: (w,) centres of the RMS windows [s]; `window_rms`: name -> (w,). Unit: the channel's, d3d4 its square.
+    `window_t`: (w,) centres of the RMS windows [s]; `window_rms`: name -> (w,), NaN between two stretches. Unit: the
+    channel's, d3d4 its square.
     """
 
     channel: str
@@ -52,81 +55,102 @@ class Change:
         return 100 * (self.after - self.before) / self.before
 
 
-def usable(recording: Recording, channel: str) -> slice:
-    """The longest stretch in which the channel has every sample and time runs on evenly; empty where there is none."""
-    good = np.isfinite(recording[channel])
-    apart = np.zeros(len(recording), dtype=bool)
-    if len(recording) > 1:
-        steps = np.diff(recording.t) * recording.rate
-        apart[1:] = ~((steps > 0.5) & (steps < 1.5))
-    starts = np.flatnonzero(good & (apart | ~np.append(False, good[:-1])))
-    if not starts.size:
-        return slice(0, 0)
-    ends = np.flatnonzero(~np.append(good, False) | np.append(apart, True))
-    stops = ends[np.searchsorted(ends, starts, side="right")]
-    longest = int(np.argmax(stops - starts))
-    return slice(int(starts[longest]), int(stops[longest]))
-
-
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
-    """The details of one chamber over its longest usable stretch, and a sentence that says what was left out or why not.
+    """The details of one chamber over its usable stretches, and a sentence that says what was left out, or why all was.
 
     Raises nothing for bad data: the reason is returned in words, with None.
     """
-    from sealscope.signals.details import details
+    from sealscope.recordings.quality import uniform_segments
+    from sealscope.signals.details import details, shortest
     from sealscope.signals.windows import windowed_rms
 
     if channel not in recording:
         return None, f"{channel} is not in this recording."
-    part = usable(recording, channel)
-    try:
-        transformed = details(recording[channel][part], levels=LEVELS)
-    except InputError as error:
-        return None, f"No details of {channel}: {error}."
-    n, values = len(recording), {}
-    for level, name in enumerate(NAMES[:LEVELS], start=1):
-        values[name] = _placed(transformed[level], transformed.inside(level), part, n)
-    inside = transformed.inside()
-    values[PRODUCT] = _placed(transformed.product(3, 4), transformed.inside(3, 4), part, n)
-    levels = windowed_rms(transformed, WINDOW, STEP, first=part.start)
-    product = windowed_rms(transformed.product(3, 4)[inside], WINDOW, STEP)
-    rms = dict(zip(NAMES, [*levels.rms, product.rms], strict=True))
-    # in the stretch time runs evenly, so a window's centre follows from its samples' numbers
-    centres = recording.t[part.start] + (levels.ends - WINDOW / 2 - part.start) / recording.rate
-    left_out = n - (part.stop - part.start)
-    note = ""
-    if left_out:
-        first, last = recording.t[part.start], recording.t[part.stop - 1]
-        note = (
-            f"{channel}: the details are of the longest stretch with every sample, {first:.1f} s to {last:.1f} s; "
-            f"{left_out} of {n} samples are left out."
+    n, series = len(recording), recording[channel]
+    t = ordered_time(recording.t, recording.rate)[0]
+    needed = shortest(levels=LEVELS)
+    parts = uniform_segments(recording, [channel])
+    usable = [part for part in parts if part.stop - part.start >= needed]
+    if not usable:
+        longest = max((part.stop - part.start for part in parts), default=0)
+        return (
+            None,
+            f"No details of {channel}: they need {needed} samples without a fault, the most there are is {longest}.",
         )
-    if not centres.size:
-        note = f"{note} {channel} is too short for a window of {WINDOW} samples.".strip()
-    return ChamberDetails(channel, recording.units[channel], values, centres, rms), note
+    values = {name: np.full(n, np.nan) for name in NAMES}
+    window_t: list[Array] = []
+    window_rms: dict[str, list[Array]] = {name: [] for name in NAMES}
+    for part in usable:
+        try:
+            transformed = details(series[part], levels=LEVELS)
+        except InputError as error:
+            return None, f"No details of {channel}: {error}."
+        product, inside = transformed.product(3, 4), transformed.inside()
+        for level, name in enumerate(NAMES[:LEVELS], start=1):
+            _place(values[name], transformed[level], transformed.inside(level), part)
+        _place(values[PRODUCT], product, transformed.inside(3, 4), part)
+        ends, levels = windowed_rms(transformed, WINDOW, STEP)
+        if not ends.size:
+            continue
+        lines = [*levels, windowed_rms(product[inside], WINDOW, STEP).rms]
+        centres = t[part.start] + (ends - WINDOW / 2) / recording.rate
+        if window_t:  # a point without a value parts two stretches
+            window_t.append(centres[:1])
+            for name in NAMES:
+                window_rms[name].append(np.array([np.nan]))
+        window_t.append(centres)
+        for name, line in zip(NAMES, lines, strict=True):
+            window_rms[name].append(line)
+    notes = []
+    left_out = n - sum(part.stop - part.start for part in usable)
+    if left_out:
+        pieces = f"{len(usable)} stretch{'es' if len(usable) > 1 else ''}"
+        notes.append(f"{channel}: the details are of {pieces} without a fault; {left_out} of {n} samples are left out.")
+    if not window_t:
+        notes.append(f"{channel} has no stretch long enough for an RMS window of {WINDOW} samples.")
+    joined = {name: np.concatenate(lines) if lines else np.empty(0) for name, lines in window_rms.items()}
+    centres = np.concatenate(window_t) if window_t else np.empty(0)
+    return ChamberDetails(channel, recording.units[channel], values, centres, joined), " ".join(notes)
 
 
-def _placed(series: Array, inside: slice, part: slice, n: int) -> Array:
-    whole = np.full(n, np.nan)
+def _place(whole: Array, series: Array, inside: slice, part: slice) -> None:
     whole[part.start + inside.start : part.start + inside.stop] = series[inside]
-    return whole
 
 
-def before_and_after(diagnosis: DiagnosisLike, recording: Recording) -> tuple[float, float, str]:
-    """The end of the part before and the start of the part after [s], and a sentence that says which they are."""
-    first, last = float(recording.t[0]), float(recording.t[-1])
-    if diagnosis.onset_s is None:
-        middle = (first + last) / 2
-        return middle, middle, f"No onset was found: the first half is set against the second (parted at {middle:.1f} s)."
-    low, high = diagnosis.onset_interval_s or (diagnosis.onset_s, diagnosis.onset_s)
-    if low == high:
-        return low, high, f"Before and after the onset at {low:.1f} s."
-    return low, high, f"Before {low:.1f} s and after {high:.1f} s; what lies in the onset's interval is left out."
+@dataclass(frozen=True)
+class Parts:
+    """The two parts of a recording whose RMS are compared, t < `end` and t >= `start` [s]; their names; why these."""
+
+    end: float
+    start: float
+    heads: tuple[str, str]
+    text: str
 
 
-def changes(recording: Recording, chambers: list[ChamberDetails], before_end: float, after_start: float) -> list[Change]:
-    """RMS before and after for each detail of each chamber; None where a part has no samples."""
-    early, late = recording.t < before_end, recording.t >= after_start
+def parts_to_compare(diagnosis: DiagnosisLike, recording: Recording) -> Parts:
+    """Before and after the onset's interval; without an onset the halves, or the whole of a short recording alone.
+
+    A half of fewer than `HALF_WINDOWS` windows is not compared: it would show the stroke and not the seal.
+    """
+    t = ordered_time(recording.t, recording.rate)[0]
+    if diagnosis.onset_s is not None:
+        low, high = diagnosis.onset_interval_s or (diagnosis.onset_s, diagnosis.onset_s)
+        text = f"Before and after the onset at {low:.1f} s."
+        if low < high:
+            text = f"Before {low:.1f} s and after {high:.1f} s; what lies in the onset's interval is left out."
+        return Parts(low, high, ("Before", "After"), text)
+    if len(recording) < 2 * (WINDOW + (HALF_WINDOWS - 1) * STEP):
+        text = "No onset was found, and the recording is too short to be parted."
+        return Parts(np.inf, np.inf, ("Whole", "Later"), text)
+    middle = float(t[0] + t[-1]) / 2
+    text = f"No onset was found: the first half is set against the second, parted at {middle:.1f} s."
+    return Parts(middle, middle, ("First half", "Second half"), text)
+
+
+def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[Change]:
+    """RMS in the first and the second part for each detail of each chamber; None where a part has no samples."""
+    t = ordered_time(recording.t, recording.rate)[0]
+    early, late = t < parts.end, t >= parts.start
     return [
         Change(chamber.channel, name, _rms(values[early]), _rms(values[late]))
         for chamber in chambers

@@ -37,8 +37,8 @@ def render_page(
     """The page as a string of HTML with nothing outside it.
 
     `rig`: parameters whose key values label the schematic (attributes as a Rig has them); `marks`: further moments on
-    every chart; `truth_onset_s` [s], `truth_leak_lpm` [L/min]: what the caller knows to be true, shown beside what was found;
-    `pressure_unit`: "bar", "MPa", "kPa" or "psi".
+    every chart; `truth_onset_s` [s], `truth_leak_lpm` [L/min]: what the caller knows to be true, shown beside the
+    finding; `pressure_unit`: "bar", "MPa", "kPa" or "psi".
 
     Raises InputError for an empty recording, an unknown pressure unit or a mark that is not a finite time.
     """
@@ -75,17 +75,17 @@ def render_page(
         title=title or (Path(name).name if diagnosis.file else "Diagnosis of a recording"),
         subtitle=_subtitle(recording, diagnosis),
         notes=[note for _, note in found if note],
-        schematic=Markup(schematic),  # noqa: S704 - rendered above with escaping
+        schematic=Markup(schematic),
         schematic_note=_schematic_note(rig),
         recording=recording,
         version=_version(),
         uplot_license=_packaged("vendor/uPlot.LICENSE"),
-        uplot_css=Markup(_packaged("vendor/uPlot.min.css")),  # noqa: S704 - our own file
-        page_css=Markup(_packaged("templates/page.css")),  # noqa: S704
-        uplot_js=Markup(uplot_js),  # noqa: S704
-        charts_js=Markup(charts_js),  # noqa: S704
-        script_hashes=Markup(" ".join(_hash(code) for code in (uplot_js, charts_js))),  # noqa: S704
-        chart_data=Markup(_script_json(drawing.data)),  # noqa: S704 - no "<" is left in it
+        uplot_css=Markup(_packaged("vendor/uPlot.min.css")),
+        page_css=Markup(_packaged("templates/page.css")),
+        uplot_js=Markup(uplot_js),
+        charts_js=Markup(charts_js),
+        script_hashes=Markup(" ".join(_hash(code) for code in (uplot_js, charts_js))),
+        chart_data=Markup(_script_json(drawing.data)),
     )
 
 
@@ -99,7 +99,13 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
     temporary: Path | None = None
     try:
         with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", newline="\n", dir=target.parent, prefix=f".{target.name}.", suffix=".part", delete=False
+            "w",
+            encoding="utf-8",
+            newline="\n",
+            dir=target.parent,
+            prefix=".page-",
+            suffix=".part",
+            delete=False,
         ) as file:
             temporary = Path(file.name)
             file.write(text)
@@ -108,7 +114,7 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
     except OSError as error:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
-        raise InputError(f"page must be written to a folder that can be written, got {error.strerror} ({target})") from None
+        raise InputError(f"page must go to a folder that can be written, got: {error.strerror} ({target})") from None
     except BaseException:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
@@ -193,7 +199,8 @@ def _evidence(
     shown: list[charts.Chart],
     marks: list[Mark],
 ) -> dict[str, Any]:
-    base, onset, interval = drawing.base, diagnosis.onset_s, diagnosis.onset_interval_s
+    base, span = drawing.base, drawing.data["span"]
+    onset, interval = charts.onset_within(diagnosis, span)
     fine = base.fine
 
     def base_t(sample: int) -> float:
@@ -202,10 +209,11 @@ def _evidence(
     if base.width == 1:
         decimation = "Every sample is drawn."
     else:
+        first, last = base_t(fine.start), base_t(fine.stop - 1)
         decimation = (
-            f"Of each {base.width} samples in turn ({1000 * base.width / recording.rate:.3g} ms) the least and the greatest are "
-            f"drawn, so every peak is kept; from {base_t(fine.start):.1f} s to {base_t(fine.stop - 1):.1f} s every sample is "
-            f"drawn. Values are rounded to 1/65 534 of their range. The verdict and all numbers rest on every sample."
+            f"Of each {base.width} samples in turn ({1000 * base.width / recording.rate:.3g} ms) the least and the "
+            f"greatest are drawn, so every peak is kept; from {first:.1f} s to {last:.1f} s every sample is drawn. "
+            "Values are rounded to 1/65 534 of their range. The verdict and all numbers rest on every sample."
         )
     if base.by_sample:
         decimation += " The time stamps are out of order: time is drawn as the sample's number over the rate."
@@ -215,7 +223,6 @@ def _evidence(
     if onset is not None:
         events.append({"t": onset, "width": None, "kind": ""})
     events += [{"t": mark.t, "width": None, "kind": "known" if mark.known else "other"} for mark in marks]
-    span = drawing.data["span"]
 
     def around(seconds: float) -> tuple[float, float] | None:
         return None if onset is None else (max(span[0], onset - seconds), min(span[1], onset + seconds))
@@ -231,7 +238,6 @@ def _evidence(
         "groups": groups,
         "still": drawing.still,
         "events": events,
-        "chart_span": span,
         "span": span,
         "around": around(20.0),
         "close": close,
@@ -245,9 +251,9 @@ def _evidence(
 def _numbers(
     recording: Recording, diagnosis: DiagnosisLike, chambers: list[features.ChamberDetails], pressure_unit: str
 ) -> dict[str, Any]:
-    before_end, after_start, parts_note = features.before_and_after(diagnosis, recording)
-    rows = []
-    for change in features.changes(recording, chambers, before_end, after_start):
+    parts = features.parts_to_compare(diagnosis, recording)
+    rows: list[dict[str, Any]] = []
+    for change in features.changes(recording, chambers, parts):
         unit, size = charts.shown_unit(recording.units[change.channel], pressure_unit, detail=True)
         product = change.name == features.PRODUCT
         size = size**2 if product else size
@@ -260,7 +266,7 @@ def _numbers(
                 "before": None if change.before is None else change.before / size,
                 "after": None if change.after is None else change.after / size,
                 "percent": percent,
-                "percent_text": words.ABSENT if percent is None else f"{percent + 0.0:+.1f} %".replace("-", "−"),
+                "percent_text": _signed_percent(percent),
             }
         )
     limit = max([10.0, *(abs(row["percent"]) for row in rows if row["percent"] is not None)])
@@ -270,11 +276,15 @@ def _numbers(
     return {
         "changes": rows,
         "bar_limit": f"{limit:g}",
-        "parts_note": parts_note,
-        "recording_note": f"{_subtitle(recording, diagnosis)}; nominal rate {recording.rate:g} Hz",
+        "parts": parts,
+        "recording_note": f"{_subtitle(recording, diagnosis)}. Units as shown on this page.",
         "channels": [_summary(recording, name, pressure_unit) for name in recording.channels],
         "provenance": list(_flat(recording.provenance)),
     }
+
+
+def _signed_percent(percent: float | None) -> str:
+    return words.ABSENT if percent is None else f"{round(percent, 1) + 0.0:+.1f} %".replace("-", "−")
 
 
 def _bar(percent: float | None, limit: float) -> dict[str, Any] | None:

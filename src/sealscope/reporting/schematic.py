@@ -1,10 +1,10 @@
-"""The actuator as a labelled schematic: what is drawn where stands in the template, what it says is put together here."""
+"""The actuator as a labelled schematic: the template says what is drawn where, this file what is written there."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.reporting import words
 from sealscope.reporting.contract import DiagnosisLike
 
@@ -23,23 +23,23 @@ _VALUES = {
 def schematic_context(recording: Recording, diagnosis: DiagnosisLike, rig: Any | None) -> dict[str, Any]:
     """What the schematic's template needs: which sensors recorded, whether oil bypasses the piston, values of the rig.
 
-    `rig`: anything with the attributes of a Rig (`rig.cylinder.A_A` [m^2], `rig.pump.q_b` [m^3/rad] or per revolution as
-    the rig states it); a value that it does not have is not shown.
+    `rig`: anything with the attributes of a Rig (`rig.cylinder.A_A` [m^2], `rig.pump.q_b` [m^3/rev]); a value
+    that it does not have is not shown.
     """
     leaking = diagnosis.verdict == "leak"
     amount = f"{words.number(diagnosis.leak_lpm)} L/min" if leaking and diagnosis.leak_lpm is not None else ""
     return {
         "leaking": leaking,
         "leak_label": f"leak {amount}".strip() if leaking else "",
-        "recorded": {name: name in recording for name in ("u", "x", "theta", "omega", "p_1", "p_2", "p_A", "p_B", "q_leak")},
+        "recorded": {name: name in recording for name in CHANNEL_UNITS},
         "values": rig_values(rig),
         "verdict": diagnosis.verdict,
     }
 
 
 def rig_values(rig: Any | None) -> dict[str, str]:
-    """The rig's key values with unit, by symbol; empty without a rig."""
-    shown = {}
+    """The rig's key values with unit, by symbol; an empty text for what the rig does not state."""
+    shown = dict.fromkeys((label for label, _, _ in _VALUES.values()), "")
     for dotted, (label, unit, size) in _VALUES.items():
         part: Any = rig
         for name in dotted.split("."):

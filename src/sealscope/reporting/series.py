@@ -20,9 +20,9 @@ class Base:
     """The points of time at which all series of one recording are drawn.
 
     `t`: (m,) [s], never decreasing; `starts`, `stops`: (k,) first sample of each bucket and the one after its last;
-    `width`: samples in a full bucket (1: every sample is drawn); `fine`: the samples that are drawn one by one whatever
-    the width; `breaks`: points that end a stretch before a gap in time; `by_sample`: the recording's time stamps are out
-    of order, so t is the sample's number over the rate.
+    `width`: samples in a full bucket (1: every sample is drawn); `fine`: the samples drawn one by one whatever the
+    width; `breaks`: points that end a stretch before a gap in time; `by_sample`: the time stamps are out of order, so t
+    is the sample's number over the rate.
     """
 
     t: Array
@@ -36,8 +36,8 @@ class Base:
     def reduce(self, values: Array) -> Array:
         """The least and the greatest value of each bucket, (n,) -> (m,), in the order in which they are met.
 
-        A bucket of one sample gives one point. NaN where a bucket holds no finite sample and at each gap, so that no line
-        is drawn there.
+        A bucket of one sample gives one point. NaN where a bucket holds no finite sample and at each gap: no line is
+        drawn there.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -54,6 +54,12 @@ def _paired(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
     return np.asarray(both[kept])
 
 
+def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
+    """The time stamps (n,) [s], or, and True, the samples' numbers over the rate where the stamps do not increase."""
+    by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
+    return (np.arange(t.size) / rate, True) if by_sample else (t, False)
+
+
 def time_base(t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0) -> Base:
     """The drawing base of n samples with about `points` points, and every sample drawn round the time `near` [s].
 
@@ -61,8 +67,7 @@ def time_base(t: Array, rate: float, points: int, *, near: float | None = None, 
     an equal count of samples; a drawn extreme stands at most one bucket away from its true time.
     """
     n = t.size
-    by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
-    t = np.arange(n) / rate if by_sample else t
+    t, by_sample = ordered_time(t, rate)
     width = 1 if n <= points else -(-n // (points // 2))
     centre = 0 if near is None else int(np.searchsorted(t, near))
     fine = slice(max(0, centre - near_samples // 2), min(n, centre + near_samples // 2)) if width > 1 else slice(0, n)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from math import floor, isfinite, log10
+from math import floor, isfinite, isnan, log10
 
-from sealscope.reporting.contract import DiagnosisLike
+from sealscope.reporting.contract import DiagnosisLike, FindingLike
 
 ABSENT = "–"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """`value` with `digits` significant digits and without an exponent where that stays short; a dash for None or NaN."""
-    if value is None or value != value:
+    """`value` with `digits` significant digits, without an exponent where that stays short; a dash for None or NaN."""
+    if value is None or isnan(value):
         return ABSENT
     if not isfinite(value):
         return "∞" if value > 0 else "−∞"
@@ -25,10 +25,10 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def clock(seconds: float | None) -> str:
-    """A time on the recording's axis: seconds with one decimal up to an hour, otherwise h:mm:ss as well."""
+    """A time on the recording's axis: seconds (one decimal, more below 10 s), from an hour on as h:mm:ss as well."""
     if seconds is None or not isfinite(seconds):
         return ABSENT
-    text = f"{seconds:.1f} s".replace("-", "−")
+    text = (f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s").replace("-", "−")
     if abs(seconds) < 3600:
         return text
     whole = int(abs(seconds))
@@ -82,7 +82,7 @@ def how_sure(diagnosis: DiagnosisLike) -> str:
         return "no score was formed"
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     text = f"score {number(diagnosis.score)}, {relation} the threshold of {number(diagnosis.threshold)}"
-    return f"{text}; the threshold is {false_alarms(diagnosis)}" if diagnosis.false_alarm_probability is not None else text
+    return f"{text}; {false_alarms(diagnosis)}"
 
 
 def false_alarms(diagnosis: DiagnosisLike) -> str:
@@ -92,20 +92,26 @@ def false_alarms(diagnosis: DiagnosisLike) -> str:
         return "no false-alarm rate is stated for the threshold"
     if 0 < p < 1:
         every = 1 / p
-        shown = f"{round(every)}" if every >= 10 else f"{every:.3g}"
-        return f"set so that {number(100 * p)} % of leak-free recordings raise a false alarm (1 in {shown})"
-    return f"set for a false-alarm probability of {number(p)}"
+        shown = f"{round(every)}" if every >= 10 else number(every)
+        share = f"{number(100 * p)} % (1 in {shown})"
+        return f"the threshold is set so that {share} of leak-free recordings raise a false alarm"
+    return f"the threshold is set for a false-alarm probability of {number(p)}"
+
+
+def _fault(finding: FindingLike) -> str:
+    name = finding.code.replace("_", " ")
+    return f"{name} ({finding.channel})" if finding.channel else name
 
 
 def next_steps(diagnosis: DiagnosisLike) -> tuple[str, ...]:
     """What to check next, most useful first."""
     trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
-    faults = ", ".join(dict.fromkeys(f"{f.code} ({f.channel})" if f.channel else f.code for f in trouble))
+    faults = ", ".join(dict.fromkeys(_fault(finding) for finding in trouble))
     if diagnosis.verdict == "leak":
         steps = [
-            "Repeat the recording with the same command and oil temperature: a worn seal shows again, a disturbance does not.",
+            "Repeat the recording with the same command and oil temperature: a worn seal shows again.",
             "Make sure that the bypass needle valve is shut. The pressures cannot tell it from the piston seal.",
-            "Hold the piston against a load with the motor at rest and watch x: creep confirms oil crossing the piston.",
+            "Hold the piston against a load with the motor at rest and watch x: creep confirms the leak.",
             "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until then.",
         ]
         if trouble:
@@ -113,7 +119,7 @@ def next_steps(diagnosis: DiagnosisLike) -> tuple[str, ...]:
     elif diagnosis.verdict == "no leak":
         steps = [
             "Keep this recording as the baseline for later ones of this actuator with the same command.",
-            "A leak too small to lift the score over its threshold stays unseen. A longer recording sees smaller leaks.",
+            "A leak too small to lift the score over its threshold stays unseen; a longer recording sees smaller ones.",
         ]
         if trouble:
             steps.insert(0, f"Judge with care, the data have faults: {faults}.")
@@ -121,5 +127,5 @@ def next_steps(diagnosis: DiagnosisLike) -> tuple[str, ...]:
         steps = ["Remove the cause named above and record again; a verdict was not forced out of these data."]
         if trouble:
             steps.append(f"Findings on the data: {faults}.")
-        steps.append("Record p_A and p_B at 500 Hz or more for some minutes, with one command throughout, or give a baseline.")
+        steps.append("Record p_A and p_B at 500 Hz or more for some minutes under one command, or give a baseline.")
     return tuple(steps)

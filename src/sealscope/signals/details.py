@@ -76,16 +76,18 @@ class Details:
 def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
     """How many samples at the beginning and the end of each level touch the padding, (levels, 2).
 
-    Stationary: the filters' reach. Decimated: a held coefficient is up to ``2^j - 1`` samples old. Reconstructed:
-    analysis and synthesis together reach ``(L - 1)(2^j - 1)`` to both sides.
+    Stationary: the filters' reach. Decimated: from sample ``2^j ceil(2 before_j / 2^j) - before_j`` the first held
+    coefficient that saw no padding. Reconstructed: analysis and synthesis together reach ``(L - 1)(2^j - 1)`` to both
+    sides.
     """
     _one_of(transform, Transform, "transform")
     stationary = reach(wavelet, levels)
     if transform == "stationary":
         return stationary
     if transform == "decimated":
-        held = 2 ** np.arange(1, levels + 1, dtype=np.int64) - 1
-        return stationary + np.stack([held, np.zeros_like(held)], axis=1)
+        step = 2 ** np.arange(1, levels + 1, dtype=np.int64)
+        before = -(-2 * stationary[:, 0] // step) * step - stationary[:, 0]
+        return np.stack([before, stationary[:, 1]], axis=1)
     both = stationary.sum(axis=1)
     return np.stack([both, both], axis=1)
 

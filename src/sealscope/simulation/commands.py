@@ -14,6 +14,11 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Array, Recording
 
 
+def number_text(value: float) -> str:
+    """The shortest text that reads back as exactly this number."""
+    return repr(float(value)).removesuffix(".0")
+
+
 class Command(Protocol):
     """A command: volts as a function of time, and its own description in the words that `parse_command` reads."""
 
@@ -37,9 +42,10 @@ class Sine:
         return self.offset + self.amplitude * np.sin(self.omega * t + self.phase)
 
     def __str__(self) -> str:
-        phase = f" {self.phase:+g}" if self.phase else ""
-        offset = f" {self.offset:+g}" if self.offset else ""
-        return f"{self.amplitude:g} sin({self.omega:g}t{phase}){offset}"
+        phase, offset = (
+            f" {'-' if value < 0 else '+'} {number_text(abs(value))}" if value else "" for value in (self.phase, self.offset)
+        )
+        return f"{number_text(self.amplitude)} sin({number_text(self.omega)}t{phase}){offset}"
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,7 @@ class Step:
         return np.where(t >= self.at, self.level, 0.0)
 
     def __str__(self) -> str:
-        return f"step {self.level:g} at {self.at:g} s"
+        return f"step {number_text(self.level)} at {number_text(self.at)} s"
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ class Ramp:
         return self.level * np.clip((t - self.start) / (self.stop - self.start), 0.0, 1.0)
 
     def __str__(self) -> str:
-        return f"ramp {self.level:g} from {self.start:g} s to {self.stop:g} s"
+        return f"ramp {number_text(self.level)} from {number_text(self.start)} s to {number_text(self.stop)} s"
 
 
 @dataclass(frozen=True)
@@ -94,12 +100,17 @@ class Chirp:
         return self.amplitude * np.sin(2.0 * np.pi * (cycles + self.f_1 * (t - within)))
 
     def __str__(self) -> str:
-        return f"chirp {self.amplitude:g} from {self.f_0:g} Hz to {self.f_1:g} Hz over {self.duration:g} s"
+        amplitude, f_0, f_1, duration = map(number_text, (self.amplitude, self.f_0, self.f_1, self.duration))
+        return f"chirp {amplitude} from {f_0} Hz to {f_1} Hz over {duration} s"
 
 
 @dataclass(frozen=True)
 class PseudoRandom:
-    """Pseudo-random binary command: +amplitude or -amplitude, drawn anew every `hold` [s] from `seed`."""
+    """Pseudo-random binary command: +amplitude or -amplitude, drawn anew every `hold` [s] from `seed`.
+
+    The sign of slot k is a bit of SplitMix64 at its k-th state (Steele, Lea, Flood, OOPSLA 2014): any slot is known at
+    once, however many stand before it.
+    """
 
     amplitude: float
     hold: float
@@ -110,12 +121,16 @@ class PseudoRandom:
             raise InputError(f"a pseudo-random command must hold each value for > 0 s, got {self.hold:g} s")
 
     def volts(self, t: Array) -> Array:
-        slot = np.floor(t / self.hold).astype(np.int64)
-        signs = np.random.default_rng(self.seed).integers(0, 2, size=max(int(slot.max(initial=0)) + 1, 1)) * 2 - 1
-        return np.where(slot >= 0, self.amplitude * signs[np.maximum(slot, 0)], 0.0)
+        slot = np.maximum(np.floor(t / self.hold), 0.0).astype(np.uint64)
+        start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
+        z = start + (slot + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        signs = np.where((z ^ (z >> np.uint64(31))) >> np.uint64(63), 1.0, -1.0)
+        return np.where(t >= 0, self.amplitude * signs, 0.0)
 
     def __str__(self) -> str:
-        return f"prbs {self.amplitude:g} every {self.hold:g} s seed {self.seed}"
+        return f"prbs {number_text(self.amplitude)} every {number_text(self.hold)} s seed {self.seed}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,10 +169,11 @@ def check_command(command: Command, t: Array, limit: float) -> None:
 
 
 _N = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_SIGNED = _N.replace("[-+]?", r"[-+]\s*", 1)
 _S = r"\s*s?"
 _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
     (
-        rf"({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_N.replace('[-+]?', '[-+] *')})?\s*\)\s*([-+]\s*[\d.eE]+)?\s*v?",
+        rf"({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_SIGNED})?\s*\)\s*({_SIGNED})?\s*v?",
         lambda g: Sine(_number(g[0], 1.0), _number(g[1], 1.0), _number(g[2], 0.0), _number(g[3], 0.0)),
     ),
     (rf"step\s+({_N})\s*v?(?:\s+at\s+({_N}){_S})?", lambda g: Step(_number(g[0], 0.0), _number(g[1], 0.0))),

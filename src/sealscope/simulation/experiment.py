@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -89,10 +89,20 @@ class Experiment:
 
     def key(self) -> str:
         """A short name that is the same for equal experiments only."""
-        values = {row.name: str(row.value) for row in self.rig.table()}
-        leaks = [f"{leak!r}" for leak in self.leaks]
-        text = json.dumps([self.describe(), values, leaks, self.method, self.step], sort_keys=True, default=str)
+        values = {row.name: repr(row.value) for row in self.rig.table()}
+        inputs = [_exact(self.command), *(_exact(leak) for leak in self.leaks)]
+        solver = [self.method, self.step, self.allow_unresolved]
+        text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _exact(value: Any) -> Any:
+    """A command or a leak as plain values that differ wherever its numbers do, in the last digit or deep in a table."""
+    if isinstance(value, np.ndarray):
+        return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
+    if is_dataclass(value):
+        return [type(value).__name__, *(_exact(getattr(value, one.name)) for one in fields(value))]
+    return repr(value)
 
 
 def make_experiment(

@@ -14,6 +14,7 @@ from sealscope.recordings.recording import Array
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+    from sealscope.physics.rig import RigNumbers
 
 Method = Literal["auto", "rk4", "imex"]
 Inputs = Callable[[Array], tuple[Array, Array, Array]]
@@ -24,6 +25,8 @@ DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
 #: Lowest gauge pressure [Pa] the model is valid for: there is no cavitation in it, and oil holds no tension.
 VACUUM = -101325.0
 _BLOCK_STEPS = 4096
+#: How many times finer than its default the step is made for a quick rig without being asked.
+_FINER = 10
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
     if method == "imex" and not throttled:
         raise InputError("method imex needs throttles (line.orifices = present), got line.orifices = absent; use rk4")
     euler = rig.motor.integrator == "euler"
-    if euler and (method == "imex" or throttled and method == "auto"):
+    if euler and (method == "imex" or (throttled and method == "auto")):
         raise InputError("motor.integrator = euler (eq. 4.2 taken literally) needs method rk4, got imex")
     if method == "auto":
         return "imex" if throttled else "rk4"
@@ -74,33 +77,34 @@ def integrate(
 ) -> Trajectory:
     """Integrate from rest over `duration` [s] and report the outputs at `rate` [Hz].
 
-    `inputs(t)` gives command [V] and the leakage coefficients G and C at times `t` of any shape. The step is the largest that divides the output interval
-    and is not above `step` (default `DEFAULT_STEP`). Inputs may jump at a step's boundary: the step's first and last node are looked up
-    just inside it. `progress` is called with the time reached [s].
+    `inputs(t)` gives command [V] and the leakage coefficients G and C at times `t` of any shape. The step is the largest
+    that divides the output interval and is not above `step` (default `DEFAULT_STEP`, down to a tenth of it for a quick
+    rig or a large leak). Inputs may jump at a step's boundary: the step's first and last node are looked up just inside it. `progress`
+    is called with the time reached [s].
 
-    Raises InputError for a step that is not positive; SimulationFailed when the method is unstable at this step (unless `allow_unresolved`),
-    when a state is not finite, or when a pressure falls below vacuum (unless `allow_unresolved`).
+    Raises InputError for a step that is not positive; SimulationFailed when the step cannot resolve the rig, the leak or
+    a stop that was hit, when a state is not finite, or when a pressure falls below vacuum; `allow_unresolved` lets all
+    but a state that is not finite pass.
     """
     from sealscope.physics.imex import IMEX_NODES, advance_imex
-    from sealscope.physics.rig import OUTPUTS, initial_state, rig_numbers, stiffest_rate
-    from sealscope.physics.rk4 import RK4_NODES, RK4_STABILITY, advance_rk4
+    from sealscope.physics.rig import OUTPUTS, POSITION, initial_state, longest_step, longest_step_on_stop, rig_numbers
+    from sealscope.physics.rk4 import RK4_NODES, advance_rk4
 
     chosen = choose_method(rig, method)
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
-    every = _steps_per_output(rate, step or DEFAULT_STEP[chosen])
-    h = 1.0 / (rate * every)
     p = rig_numbers(rig)
-    if chosen == "rk4" and p.throttled and not allow_unresolved:
-        limit = RK4_STABILITY / stiffest_rate(p)
-        if h > limit:
-            raise SimulationFailed(
-                f"step must be <= {limit:.2g} s for rk4 with throttles (line volumes answer within {1 / stiffest_rate(p):.2g} s), "
-                f"got {h:.3g} s; use method imex"
-            )
+    n_out = round(duration * rate)
+    if step is None:
+        default = DEFAULT_STEP[chosen]
+        _, G, C = inputs(np.arange(n_out) / rate)
+        step = max(min(default, longest_step(p, float(G.max(initial=0.0)), float(C.max(initial=0.0)))), default / _FINER)
+    every = _steps_per_output(rate, step)
+    h = 1.0 / (rate * every)
+    if not allow_unresolved:
+        _refuse_unresolved(p, h, chosen)
     nodes = np.array(IMEX_NODES if chosen == "imex" else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
-    n_out = round(duration * rate)
     rows = np.empty((n_out, len(OUTPUTS)))
     y = initial_state(rig, x_0)
     block = max(1, _BLOCK_STEPS // every)
@@ -108,14 +112,35 @@ def integrate(
         last = min(first + block, n_out)
         start = np.arange(first * every, last * every, dtype=np.float64)
         u, G, C = inputs((start[:, None] + nodes) * h)
+        if not allow_unresolved:
+            _refuse_long(h, longest_step(p, float(G.max()), float(C.max())), "the leak")
         if chosen == "imex":
             advance_imex(y, h, u, G, C, p, every, rows[first:last])
         else:
             advance_rk4(y, h, u, G, C, p, rig.motor.integrator == "euler", every, rows[first:last])
+        if not allow_unresolved and np.any(np.abs(rows[first:last, POSITION]) > 0.5 * p.L):
+            _refuse_long(h, longest_step_on_stop(p), "the hard stop (cylinder.k_stop, d_stop)")
         _check(rows[first:last], first, rate, allow_unresolved)
         if progress is not None:
             progress(last / rate)
     return Trajectory(np.arange(n_out) / rate, rows, chosen, h)
+
+
+def _refuse_long(h: float, limit: float, what: str) -> None:
+    if h > limit * (1.0 + 1e-9):
+        raise SimulationFailed(f"step must be <= {limit:.2g} s to resolve {what}, got {h:.3g} s; take a smaller step")
+
+
+def _refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
+    from sealscope.physics.rig import DECAY_LIMIT, longest_step, stiffest_rate
+
+    _refuse_long(h, longest_step(p), "speed loop, oil columns and friction of this rig")
+    limit = DECAY_LIMIT / stiffest_rate(p)
+    if method == "rk4" and p.throttled and h > limit:
+        raise SimulationFailed(
+            f"step must be <= {limit:.2g} s for rk4 with throttles (line volumes answer within "
+            f"{1 / stiffest_rate(p):.2g} s), got {h:.3g} s; use method imex"
+        )
 
 
 def _check(rows: Array, first: int, rate: float, allow_unresolved: bool) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.recordings.recording import Array, Recording
+from sealscope.simulation.commands import check_command
 from sealscope.simulation.experiment import Experiment, make_experiment
 from sealscope.simulation.faults import LITRE_PER_MINUTE, Leak
 from sealscope.simulation.instruments import FILTER_REACH, record
@@ -49,11 +50,17 @@ def oversampling(experiment: Experiment) -> int:
 
 
 def _inputs(experiment: Experiment, leaks: tuple[Leak, ...]) -> Callable[[Array], tuple[Array, Array, Array]]:
+    limit = experiment.rig.daq.u_max
+
     def inputs(t: Array) -> tuple[Array, Array, Array]:
         G, C = np.zeros_like(t), np.zeros_like(t)
         for leak in leaks:
             (G if leak.law == "laminar" else C)[...] += (leak.coefficient or 0.0) * leak.opening.share(t)
-        return experiment.command.volts(t), G, C
+        u = experiment.command.volts(t)
+        if not np.abs(u).max(initial=0.0) <= limit:  # between samples, or beyond the end, where the filter still looks
+            check_command(experiment.command, t[t <= experiment.duration], limit)
+            u = np.clip(u, -limit, limit)
+        return u, G, C
 
     return inputs
 

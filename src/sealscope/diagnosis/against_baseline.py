@@ -1,0 +1,147 @@
+"""Compare a recording with leak-free ones: with several, by the scatter between recordings; with one or two, by the scatter of blocks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import QUANTITIES, Blocks, cut, whole_log_rms
+from sealscope.diagnosis.change import permutations_for, two_samples, upper_quantile
+from sealscope.diagnosis.operating_point import LEVEL_RATIO, OperatingPoint, difference, operating_point
+from sealscope.diagnosis.rms_results import JUDGED, largest_changes, method_result
+from sealscope.diagnosis.verdict import Evidence, Verdict
+from sealscope.recordings.recording import Array, Recording
+
+#: Fewest comparable baseline recordings from which the scatter between recordings is estimated ...
+FEWEST_RECORDINGS = 3
+#: ... and from which the dependence of the details on the pressure level is estimated too.
+FEWEST_FOR_LEVEL = 6
+#: Fewest blocks of each side where blocks are compared.
+FEWEST_BLOCKS = 12
+#: How far outside the baseline's range of levels a recording may lie, as a share of the range and at least, in log units.
+LEVEL_MARGIN = 0.25
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What leak-free recordings lead one to expect of another at the same operating point: mean and standard deviation (f,) of its log RMS, and degrees of freedom."""
+
+    mean: Array
+    deviation: Array
+    freedom: int
+
+
+def predict(log_rms: Array, levels: Array, level: float) -> Prediction:
+    """Normal prediction for one more recording from n leak-free ones.
+
+    `log_rms`: (n, f); `levels`: (n,) log pressure levels. From six recordings on, the log RMS is a line over the level (least squares), else a
+    constant; the deviation includes the estimate's own error (Montgomery, Peck & Vining, Introduction to Linear Regression Analysis, sec. 2.5).
+    """
+    n = len(levels)
+    with_level = n >= FEWEST_FOR_LEVEL and np.ptp(levels) > 0
+    design = np.stack([np.ones(n), levels - levels.mean()], axis=1) if with_level else np.ones((n, 1))
+    at = np.array([1.0, level - float(levels.mean())]) if with_level else np.ones(1)
+    coefficients, *_ = np.linalg.lstsq(design, log_rms, rcond=None)
+    freedom = n - design.shape[1]
+    residual = log_rms - design @ coefficients
+    variance = np.sum(residual**2, axis=0) / freedom
+    leverage = float(at @ np.linalg.solve(design.T @ design, at))
+    return Prediction(at @ coefficients, np.sqrt(variance * (1.0 + leverage)), freedom)
+
+
+def student_threshold(probability: float, freedom: int) -> float:
+    """|t| that Student's t with `freedom` degrees of freedom exceeds with `probability`, both tails together."""
+    from scipy.special import stdtrit
+
+    return float(-stdtrit(freedom, probability / 2.0))
+
+
+def _outside(level: float, levels: Array) -> bool:
+    if len(levels) < FEWEST_FOR_LEVEL:
+        return bool(np.all(np.abs(levels - level) > np.log(LEVEL_RATIO)))
+    margin = max(LEVEL_MARGIN * float(np.ptp(levels)), float(np.log(LEVEL_RATIO)))
+    return not levels.min() - margin <= level <= levels.max() + margin
+
+
+def against(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
+    """Evidence from the comparison with the leak-free recordings of the same operating point."""
+    point = operating_point(recording)
+    points = [operating_point(one) for one in baseline]
+    reasons = [difference(point, other) for other in points]
+    alike = [k for k, reason in enumerate(reasons) if reason is None]
+    if not alike:
+        most = Counter(reason for reason in reasons if reason).most_common(1)[0][0]
+        return Evidence("cannot tell", f"none of the {len(baseline)} baseline recordings is comparable: {most}")
+    levels = np.array([points[k].level for k in alike])
+    if _outside(point.level, levels):
+        return Evidence(
+            "cannot tell",
+            f"the pressure level, {_level(point)}, lies outside that of the {len(alike)} comparable baseline recordings, "
+            f"{np.exp(levels.min()):.4g} to {np.exp(levels.max()):.4g}",
+        )
+    chosen = [baseline[k] for k in alike]
+    if len(chosen) >= FEWEST_RECORDINGS:
+        return _by_recordings(recording, chosen, point.level, levels, probability)
+    return _by_blocks(recording, chosen, probability)
+
+
+def _level(point: OperatingPoint) -> str:
+    return f"{np.exp(point.level):.4g} {point.units[0]} rms"
+
+
+def _by_recordings(
+    recording: Recording, baseline: Sequence[Recording], level: float, levels: Array, probability: float
+) -> Evidence:
+    expected = predict(np.stack([whole_log_rms(one) for one in baseline]), levels, level)
+    changes = whole_log_rms(recording) - expected.mean
+    t = changes / expected.deviation
+    chambers = operating_point(recording).chambers
+    names = [f"{quantity} of {chamber}" for chamber in chambers for quantity in QUANTITIES]
+    judged = [k for k, name in enumerate(names) if name.split()[0] in JUDGED]
+    own = student_threshold(probability, expected.freedom)
+    threshold = student_threshold(probability / len(judged), expected.freedom)
+    methods = tuple(
+        method_result(name, abs(float(t[k])), own, f"{100 * np.expm1(changes[k]):+.1f} % against the baseline")
+        for k, name in enumerate(names)
+    )
+    score = float(np.max(np.abs(t[judged])))
+    told = largest_changes([names[k] for k in judged], t[judged], changes[judged], np.full(len(judged), threshold))
+    verdict: Verdict = "leak" if score > threshold else "no leak"
+    against_what = f"against {len(baseline)} comparable leak-free recordings (largest |t| {score:.1f}, threshold {threshold:.1f})"
+    reason = f"{told} {against_what}" if verdict == "leak" else f"no change of the details' RMS {against_what}"
+    return Evidence(verdict, reason, score, threshold, methods=methods)
+
+
+def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
+    before: list[Blocks] = [cut(one) for one in baseline]
+    after = cut(recording)
+    x = np.concatenate([*(one.log_rms for one in before), after.log_rms])
+    split = len(x) - len(after.log_rms)
+    if min(split, len(after.log_rms)) < FEWEST_BLOCKS:
+        return Evidence(
+            "cannot tell",
+            f"too little to compare: {split} blocks of baseline and {len(after.log_rms)} of the recording, {FEWEST_BLOCKS} of each are needed "
+            f"(or {FEWEST_RECORDINGS} comparable baseline recordings, got {len(baseline)})",
+        )
+    joint = after.columns(*JUDGED)
+    score, single, t2_null, single_null = two_samples(x, split, joint, permutations_for(probability))
+    threshold = float(upper_quantile(t2_null, probability))
+    thresholds = upper_quantile(single_null, probability)
+    changes = x[split:].mean(axis=0) - x[:split].mean(axis=0)
+    methods = tuple(
+        method_result(
+            name, abs(float(single[k])), float(thresholds[k]), f"{100 * np.expm1(changes[k]):+.1f} % against the baseline"
+        )
+        for k, name in enumerate(after.names)
+    )
+    verdict: Verdict = "leak" if score > threshold else "no leak"
+    told = largest_changes(after.names, single, changes, thresholds) if verdict == "leak" else "no change of the details' RMS"
+    count = f"{len(baseline)} comparable leak-free recording{'s' if len(baseline) > 1 else ''}"
+    reason = (
+        f"{told} against {count} (T2 {score:.1f}, threshold {threshold:.1f}, from the scatter within recordings alone: "
+        f"give {FEWEST_RECORDINGS} or more to have the drift between recordings in it)"
+    )
+    return Evidence(verdict, reason, score, threshold, methods=methods)

@@ -1,0 +1,134 @@
+"""Cut a recording into blocks of equal standing and give each the RMS of its details.
+
+A block is a whole share of the command's cycle, so that blocks of the same phase are alike but for noise and for what has changed in the machine; where
+there is no cycle it is a window of fixed length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.details import Details, details
+
+CHAMBERS = ("p_A", "p_B")
+LEVELS = 4
+#: The quantities of one chamber, in the order of the columns of `Blocks.log_rms`.
+QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
+#: Length a block should have [s]: long enough for the RMS of d4 to be steady, short enough to place an onset.
+BLOCK_SECONDS = 1.5
+_LONGEST_CYCLE = 20.0
+_CYCLE_CORRELATION = 0.6
+_ANALYSIS_RATE = 50.0
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """log RMS of every quantity in every block.
+
+    `edges`: (n + 1,) boundaries [s]; `log_rms`: (n, 5 per chamber), the phase's own level taken out; `chambers`: their names; `phases`: blocks a cycle (1: none);
+    `cycle`: its length [s], None where no cycle was found.
+    """
+
+    edges: Array
+    log_rms: Array
+    chambers: tuple[str, ...]
+    phases: int
+    cycle: float | None
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns, such as "d3 of p_A"."""
+        return [f"{quantity} of {chamber}" for chamber in self.chambers for quantity in QUANTITIES]
+
+    def columns(self, *quantities: str) -> list[int]:
+        """Indices of the named quantities in every chamber."""
+        return [
+            chamber * len(QUANTITIES) + QUANTITIES.index(quantity)
+            for chamber in range(len(self.chambers))
+            for quantity in quantities
+        ]
+
+
+def find_cycle(recording: Recording) -> float | None:
+    """Length of the duty's cycle [s] from the command, or else from the pressure difference; None when nothing repeats.
+
+    The first maximum of the autocorrelation after its first zero, at least 0.6 high, between 0.2 s and 20 s and repeated five times or more; refined by a parabola.
+    """
+    if "u" in recording and np.ptp(recording["u"]) > 0:
+        signal = recording["u"]
+    elif all(name in recording for name in CHAMBERS):
+        signal = recording["p_A"] - recording["p_B"]
+    else:
+        signal = recording[next(name for name in CHAMBERS if name in recording)]
+    stride = max(1, int(recording.rate / _ANALYSIS_RATE))
+    usable = signal[: signal.size // stride * stride]
+    slow = usable.reshape(-1, stride).mean(axis=1)
+    slow = slow - slow.mean()
+    n = slow.size
+    if n < 32 or not np.any(slow):
+        return None
+    spectrum = np.abs(np.fft.rfft(slow, 2 * n)) ** 2
+    correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)
+    correlation = correlation / correlation[0]
+    longest = min(n // 5, int(_LONGEST_CYCLE * recording.rate / stride))
+    below = np.flatnonzero(correlation[:longest] < 0)
+    if below.size == 0:
+        return None
+    first = int(below[0])
+    inner = correlation[first + 1 : longest - 1]
+    peaks = np.flatnonzero((inner >= correlation[first : longest - 2]) & (inner > correlation[first + 2 : longest]))
+    peaks = peaks[inner[peaks] >= _CYCLE_CORRELATION]
+    if peaks.size == 0:
+        return None
+    best = peaks[inner[peaks] >= inner[peaks].max() - 0.05][0]
+    k = int(first + 1 + best)
+    a, b, c = correlation[k - 1 : k + 2]
+    lag = (k + 0.5 * (a - c) / (a - 2 * b + c)) * stride / recording.rate
+    return float(lag) if lag >= 0.2 else None
+
+
+def mean_squares(found: Details, bounds: np.ndarray) -> Array:
+    """Mean square of d1..d4 and d3d4 between consecutive sample bounds: (len(bounds) - 1, 5)."""
+    squares = np.vstack([found.values**2, found.product()[None, :] ** 2])
+    sums = np.add.reduceat(squares, bounds[:-1], axis=1)
+    sums[:, -1] = squares[:, bounds[-2] : bounds[-1]].sum(axis=1)
+    return np.asarray((sums / np.diff(bounds)).T)
+
+
+def chambers_of(recording: Recording) -> tuple[str, ...]:
+    """The chamber pressures that the recording has."""
+    return tuple(name for name in CHAMBERS if name in recording)
+
+
+def whole_log_rms(recording: Recording) -> Array:
+    """log RMS of every quantity over the whole recording but its edges: (5 per chamber,)."""
+    rows = []
+    for chamber in chambers_of(recording):
+        found = details(recording[chamber])
+        inside = found.inside()
+        rows.append(mean_squares(found, np.array([inside.start, inside.stop]))[0])
+    return np.asarray(0.5 * np.log(np.concatenate(rows)))
+
+
+def cut(recording: Recording) -> Blocks:
+    """Blocks of a uniformly sampled recording without missing samples, edges of the transform dropped."""
+    chambers = chambers_of(recording)
+    transformed = [details(recording[chamber]) for chamber in chambers]
+    inside = transformed[0].inside()
+    cycle = find_cycle(recording)
+    phases = 1 if cycle is None else max(1, round(cycle / BLOCK_SECONDS))
+    length = BLOCK_SECONDS if cycle is None else cycle / phases * max(1, round(BLOCK_SECONDS / (cycle / phases)))
+    count = int((inside.stop - inside.start) / (length * recording.rate))
+    bounds = inside.start + np.round(np.arange(count + 1) * length * recording.rate).astype(np.int64)
+    if count == 0:
+        return Blocks(recording.t[bounds], np.empty((0, len(QUANTITIES) * len(chambers))), chambers, phases, cycle)
+    log_rms = 0.5 * np.log(np.concatenate([mean_squares(found, bounds) for found in transformed], axis=1))
+    if phases > 1:
+        for phase in range(min(phases, count)):
+            same = log_rms[phase::phases]
+            log_rms[phase::phases] = same - same.mean(axis=0) + log_rms.mean(axis=0)
+    ends = recording.t[0] + bounds / recording.rate
+    return Blocks(ends, log_rms, chambers, phases, cycle)

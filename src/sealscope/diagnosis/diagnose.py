@@ -1,0 +1,110 @@
+"""Diagnose a recording: look at the data first, run every detector its channels allow, state one verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import chambers_of
+from sealscope.diagnosis.contract import DETECTORS, Detector
+from sealscope.diagnosis.verdict import Diagnosis, Evidence, MethodResult
+from sealscope.errors import InputError
+from sealscope.recordings.quality import Finding, inspect, uniform_segments
+from sealscope.recordings.recording import Recording
+
+#: Probability of `leak` on a leak-free recording, unless the caller asks for another.
+FALSE_ALARM_PROBABILITY = 0.01
+_PROBABILITIES = (1e-4, 0.2)
+#: Findings on a chamber pressure that leave no trust in its details ...
+_SPOILING = ("constant", "stuck")
+#: ... and clipping, when it takes more than this share of the samples; a chamber that empties into the tank rests at the rail for a while in any stroke.
+_MOST_CLIPPED = 0.5
+
+
+def analysable(recording: Recording) -> tuple[Recording, Finding | None]:
+    """The longest stretch that is uniformly sampled with no chamber pressure missing, and a finding that says so where it is not all."""
+    chambers = chambers_of(recording)
+    stretches = uniform_segments(recording, (*chambers, "u") if "u" in recording else chambers)
+    if not stretches:
+        return recording.between(math.inf, math.inf), None
+    longest = max(stretches, key=lambda one: one.stop - one.start)
+    if longest.start == 0 and longest.stop == len(recording):
+        return recording, None
+    part = recording.samples(longest)
+    text = f"only the longest whole stretch was analysed: {part.t[0]:.4g} s to {part.t[-1]:.4g} s, {len(part)} of {len(recording)} samples"
+    return part, Finding("part_analysed", "warning", None, len(recording) - len(part), float(part.t[0]), text)
+
+
+def check_probability(probability: float) -> None:
+    """Raise InputError for a false-alarm probability that no threshold can be set for."""
+    low, high = _PROBABILITIES
+    if not low <= probability <= high:
+        raise InputError(f"false-alarm probability must be {low:g} to {high:g}, got {probability}")
+
+
+def diagnose(
+    recording: Recording,
+    baseline: Sequence[Recording] = (),
+    *,
+    false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
+    file: str | None = None,
+) -> Diagnosis:
+    """Say whether oil bypasses the piston in this recording.
+
+    `baseline`: leak-free recordings of the same machine; without any, the recording's own beginning is the baseline and the onset is looked for. Baseline
+    recordings that cannot be compared (other direction, command, pressure level) are left out. The verdict is `cannot tell` where the data do not allow one.
+
+    Raises InputError for a false-alarm probability outside 1e-4 to 0.2.
+    """
+    check_probability(false_alarm_probability)
+    quality = list(inspect(recording))
+    part, cut_down = analysable(recording)
+    if cut_down is not None:
+        quality.append(cut_down)
+    spoilt = [finding for finding in quality if finding.channel in chambers_of(recording) and _spoils(finding, len(part))]
+    whole = [analysable(one)[0] for one in baseline]
+    evidence = [
+        (detector.name, _examine(detector, part, whole, false_alarm_probability, spoilt))
+        for detector in (make() for make in DETECTORS.values())
+    ]
+    name, chosen = evidence[0]
+    methods = [MethodResult(name, chosen.score, chosen.threshold, chosen.verdict, chosen.reason), *chosen.methods]
+    return Diagnosis(
+        file=file or str(recording.provenance.get("file", "recording")),
+        verdict=chosen.verdict,
+        reason=chosen.reason,
+        onset_s=chosen.onset_s,
+        onset_interval_s=chosen.onset_interval_s,
+        leak_lpm=chosen.leak_lpm,
+        leak_interval_lpm=chosen.leak_interval_lpm,
+        false_alarm_probability=false_alarm_probability,
+        score=chosen.score,
+        threshold=chosen.threshold,
+        methods=tuple(methods),
+        quality=tuple(quality),
+    )
+
+
+def _spoils(finding: Finding, samples: int) -> bool:
+    return finding.code in _SPOILING or (finding.code == "clipped" and finding.count > _MOST_CLIPPED * samples)
+
+
+def _examine(
+    detector: Detector,
+    recording: Recording,
+    baseline: Sequence[Recording],
+    probability: float,
+    spoilt: Sequence[Finding],
+) -> Evidence:
+    unusable = detector.usable(recording)
+    if unusable is not None:
+        return Evidence("cannot tell", unusable)
+    if spoilt:
+        return Evidence("cannot tell", f"the pressures cannot be trusted: {spoilt[0].text}")
+    usable = [one for one in baseline if detector.usable(one) is None]
+    if baseline and not usable:
+        return Evidence("cannot tell", f"no baseline recording can be used: {detector.usable(baseline[0])}")
+    with np.errstate(all="ignore"):
+        return detector.examine(recording, usable, probability)

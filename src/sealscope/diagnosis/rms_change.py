@@ -1,0 +1,122 @@
+"""The thesis's method as a detector with a false-alarm probability: has the RMS of the db8 details of the chamber pressures changed?
+
+The thesis compares the RMS of d1..d4 and of d3*d4 before and after (its ch. 5 and Appendix C) and calls a leak where it went down (p_A) or up (p_B). Here each of
+these changes is a method of its own with a threshold from the leak-free scatter, and all chambers and levels d2..d4 together make the verdict. d1 is noise alone:
+where it changes too, the sensors' noise is taken out of the other levels first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sealscope.diagnosis.against_baseline import against
+from sealscope.diagnosis.blocks import QUANTITIES, Blocks, chambers_of, cut
+from sealscope.diagnosis.change import null_maxima, onset_interval, permutations_for, scan, upper_quantile
+from sealscope.diagnosis.rms_results import JUDGED, describe_change, largest_changes, method_result
+from sealscope.diagnosis.verdict import Evidence, MethodResult, Verdict
+from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.details import shortest
+
+#: Fewest blocks in which a change can be looked for: the covariance of six columns needs them.
+FEWEST_BLOCKS = 24
+
+
+def excess(blocks: Blocks) -> Array:
+    """Energy of d2..d4 beyond that of d1, relative to its mean: (n, 3 per chamber). White noise, which every level holds alike, drops out."""
+    energy = np.exp(2.0 * blocks.log_rms)
+    columns = []
+    for chamber in range(len(blocks.chambers)):
+        noise = energy[:, chamber * len(QUANTITIES)]
+        for quantity in JUDGED:
+            level = energy[:, chamber * len(QUANTITIES) + QUANTITIES.index(quantity)]
+            columns.append((level - noise) / level.mean())
+    return np.stack(columns, axis=1)
+
+
+class RmsChange:
+    """Change of the details' RMS, within a recording or against leak-free ones."""
+
+    name = "rms change"
+
+    def usable(self, recording: Recording) -> str | None:
+        chambers = chambers_of(recording)
+        if not chambers:
+            return "needs the pressure of a chamber (p_A or p_B)"
+        for chamber in chambers:
+            if np.ptp(recording[chamber]) == 0:
+                return f"{chamber} is constant"
+        if len(recording) < shortest():
+            return f"needs {shortest()} samples or more without a gap, got {len(recording)}"
+        return None
+
+    def examine(
+        self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float
+    ) -> Evidence:
+        if baseline:
+            return against(recording, baseline, false_alarm_probability)
+        return self._within(recording, false_alarm_probability)
+
+    def _within(self, recording: Recording, probability: float) -> Evidence:
+        blocks = cut(recording)
+        n = len(blocks.log_rms)
+        if n < FEWEST_BLOCKS:
+            return Evidence(
+                "cannot tell",
+                f"too short to be its own baseline: {n} blocks, {FEWEST_BLOCKS} are needed; give leak-free recordings as --baseline",
+            )
+        x = blocks.log_rms
+        joint = blocks.columns(*JUDGED)
+        found = scan(x, joint)
+        t2_null, single_null = null_maxima(x, joint, permutations_for(probability))
+        threshold = float(upper_quantile(t2_null, probability))
+        thresholds = upper_quantile(single_null, probability)
+        methods = self._methods(blocks, found.single, thresholds)
+
+        step = int(np.argmax(found.joint))
+        score = float(found.joint[step])
+        verdict: Verdict = "leak" if score > threshold else "no leak"
+        changes = x[step + 1 :].mean(axis=0) - x[: step + 1].mean(axis=0)
+        told = largest_changes(blocks.names, found.single[step], changes, thresholds)
+        first, last = onset_interval(found.joint)
+        onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
+        if verdict == "no leak":
+            reason = (
+                f"no change of the details' RMS within the recording beyond its scatter (T2 {score:.1f}, threshold {threshold:.1f}); "
+                "a leak that was there from the start would need a --baseline to be seen"
+            )
+            return Evidence(verdict, reason, score, threshold, methods=methods)
+        noise = np.abs(found.single).max(axis=0)
+        if any(noise[k] > thresholds[k] for k in blocks.columns("d1")):
+            score, threshold, step = self._without_noise(blocks, probability)
+            if score <= threshold:
+                reason = "the noise (d1) changed, and the other details by no more than it: a sensor or its wiring changed, or the leak is hidden"
+                return Evidence("cannot tell", reason, score, threshold, methods=methods)
+            onset = float(blocks.edges[step + 1])
+            told += ", beyond a change of the noise"
+        if not found.step_wins():
+            reason = f"{told}, evenly over the recording (trend T2 {found.trend:.1f}, step {found.joint.max():.1f}): a drift and a growing leak look alike"
+            return Evidence("cannot tell", reason, score, threshold, methods=methods)
+        reason = f"{told} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"
+        return Evidence(verdict, reason, score, threshold, onset, interval, methods=methods)
+
+    @staticmethod
+    def _without_noise(blocks: Blocks, probability: float) -> tuple[float, float, int]:
+        x = excess(blocks)
+        joint = list(range(x.shape[1]))
+        found = scan(x, joint)
+        null, _ = null_maxima(x, joint, permutations_for(probability), seed=1)
+        step = int(np.argmax(found.joint))
+        return float(found.joint[step]), float(upper_quantile(null, probability)), step
+
+    @staticmethod
+    def _methods(blocks: Blocks, single: Array, thresholds: Array) -> tuple[MethodResult, ...]:
+        results = []
+        for k, name in enumerate(blocks.names):
+            step = int(np.argmax(np.abs(single[:, k])))
+            score = abs(float(single[step, k]))
+            change = float(blocks.log_rms[step + 1 :, k].mean() - blocks.log_rms[: step + 1, k].mean())
+            reason = f"{describe_change(name, change)} at {blocks.edges[step + 1]:.1f} s"
+            results.append(method_result(name, score, float(thresholds[k]), reason))
+        return tuple(results)

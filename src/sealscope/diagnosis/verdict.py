@@ -1,0 +1,107 @@
+"""What a diagnosis says: one verdict for a recording, the evidence of every method, and the false-alarm probability it was made for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sealscope.recordings.quality import Finding
+
+Verdict = Literal["leak", "no leak", "cannot tell"]
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """One method's evidence: its score against the threshold that its false-alarm probability sets (None where it could not be computed)."""
+
+    name: str
+    score: float | None
+    threshold: float | None
+    verdict: Verdict
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a detector found in one recording; `methods` are its parts, each with a threshold of its own."""
+
+    verdict: Verdict
+    reason: str
+    score: float | None = None
+    threshold: float | None = None
+    onset_s: float | None = None
+    onset_interval_s: tuple[float, float] | None = None
+    leak_lpm: float | None = None
+    leak_interval_lpm: tuple[float, float] | None = None
+    methods: tuple[MethodResult, ...] = ()
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The verdict on one recording.
+
+    `onset_s`, `onset_interval_s` [s] on the recording's time axis; `leak_lpm`, `leak_interval_lpm` [L/min], None where the channels do not allow it;
+    `false_alarm_probability`: the probability of `leak` on a leak-free recording for which `threshold` was set; `quality`: findings on the data.
+    """
+
+    file: str
+    verdict: Verdict
+    reason: str
+    onset_s: float | None
+    onset_interval_s: tuple[float, float] | None
+    leak_lpm: float | None
+    leak_interval_lpm: tuple[float, float] | None
+    false_alarm_probability: float
+    score: float | None
+    threshold: float | None
+    methods: tuple[MethodResult, ...]
+    quality: tuple[Finding, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The diagnosis as plain JSON values, keys in the order of the output contract; a number that is not finite becomes null."""
+        return {
+            "file": self.file,
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "onset_s": _plain(self.onset_s),
+            "onset_interval_s": _pair(self.onset_interval_s),
+            "leak_lpm": _plain(self.leak_lpm),
+            "leak_interval_lpm": _pair(self.leak_interval_lpm),
+            "false_alarm_probability": self.false_alarm_probability,
+            "score": _plain(self.score),
+            "threshold": _plain(self.threshold),
+            "methods": [
+                {
+                    "name": method.name,
+                    "score": _plain(method.score),
+                    "threshold": _plain(method.threshold),
+                    "verdict": method.verdict,
+                    "reason": method.reason,
+                }
+                for method in self.methods
+            ],
+            "quality": [
+                {
+                    "code": finding.code,
+                    "channel": finding.channel,
+                    "count": finding.count,
+                    "first_t": _plain(finding.first_t),
+                    "severity": finding.severity,
+                    "text": finding.text,
+                }
+                for finding in self.quality
+            ],
+        }
+
+    def __str__(self) -> str:
+        since = "" if self.onset_s is None else f" since {self.onset_s:.1f} s"
+        return f"{self.file}: {self.verdict}{since} ({self.reason})"
+
+
+def _plain(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _pair(pair: tuple[float, float] | None) -> list[float | None] | None:
+    return None if pair is None else [_plain(pair[0]), _plain(pair[1])]

@@ -1,0 +1,50 @@
+"""The rig of the checks, and a short way to run it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sealscope.parameters import Rig, load_rig
+from sealscope.simulation.integrate import Trajectory, integrate
+
+#: The rig of the independent results: 26.7 rad/s per volt, 0.25 MPa everywhere at the start, line volumes of 50 cm^3.
+CHECK_RIG = {"omega_per_volt": 26.7, "p_charge": 0.25e6, "V_1": 50e-6, "V_2": 50e-6}
+HALF_CLOSED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
+
+
+@pytest.fixture(scope="session")
+def check_rig() -> Callable[..., Rig]:
+    """The check rig with values replaced; `throttled` puts both throttles in, half closed by area."""
+
+    def make(throttled: bool = False, **values: Any) -> Rig:
+        throttles = HALF_CLOSED if throttled else {}
+        return load_rig("thesis").with_values({**CHECK_RIG, **throttles, **values})
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def drive() -> Callable[..., Trajectory]:
+    """Integrate a rig under u = amplitude sin(4 t) (or a function of time) with constant leakage coefficients."""
+
+    def run(
+        rig: Rig,
+        duration: float,
+        *,
+        u: Callable[[np.ndarray], np.ndarray] | float = 3.0,
+        G: float = 0.0,
+        C: float = 0.0,
+        rate: float = 500.0,
+        **options: Any,
+    ) -> Trajectory:
+        def inputs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            volts = u(t) if callable(u) else u * np.sin(4.0 * t)
+            return volts, np.full_like(t, G), np.full_like(t, C)
+
+        return integrate(rig, inputs, duration, rate, **options)
+
+    return run

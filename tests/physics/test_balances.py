@@ -1,0 +1,132 @@
+"""Oil and energy: nothing appears, nothing is lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import simpson
+
+PUMP_LEAK = 4e-13
+
+
+def oil(rig, run) -> np.ndarray:
+    """Compressed oil in the closed circuit, sum of V_i p_i / K [m^3], (n,)."""
+    held = rig.cylinder.V * (run["p_A"] + run["p_B"])
+    if rig.line.orifices == "present":
+        held = held + rig.line.V_1 * run["p_1"] + rig.line.V_2 * run["p_2"]
+    return held / rig.fluid.K_oil
+
+
+def turned_over(run) -> float:
+    """Oil that the pump moved [m^3]."""
+    return float(simpson(np.abs(run["Q_1"]), x=run.t))
+
+
+@pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
+@settings(max_examples=12, deadline=None)
+@given(
+    amplitude=st.floats(0.5, 6.0),
+    G=st.floats(0.0, 1e-11),
+    C=st.floats(0.0, 2e-9),
+    G_pump=st.floats(0.0, 1e-12),
+    closed=st.sampled_from([0.0, 0.25, 0.75]),
+    metering=st.sampled_from(["meter-out", "literal"]),
+)
+def test_the_closed_circuit_keeps_its_oil(check_rig, drive, throttled, amplitude, G, C, G_pump, closed, metering):
+    rig = check_rig(throttled, G_pump=G_pump, closed_A=closed, closed_B=closed, metering=metering)
+    run = drive(rig, 5.0, u=amplitude, G=G, C=C)
+    held = oil(rig, run)
+    assert np.abs(held - held[0]).max() <= 1e-9 * held[0]
+    # and the charge is not merely large beside what moves
+    assert np.abs(held - held[0]).max() <= 1e-9 * turned_over(run)
+
+
+def test_the_balance_would_see_a_slip(check_rig, drive):
+    """A cylinder with two areas, fixed volumes and nothing to make good the difference does not keep its oil."""
+    rig = check_rig(A_B="600[mm^2]")
+    run = drive(rig, 5.0, u=0.2)
+    held = oil(rig, run)
+    moved = (rig.cylinder.A_A - rig.cylinder.A_B) * (run["x"] - run["x"][0])
+    assert np.abs(held - held[0]).max() > 1e-4 * held[0]
+    np.testing.assert_allclose(held - held[0], -moved, atol=1e-6 * np.abs(moved).max())
+
+
+def test_position_dependent_volumes_keep_the_mass_to_first_order_in_pressure_over_bulk_modulus(check_rig, drive):
+    """With V_A = V + A x and dp/dt = K/V (Q - A v) the oil held grows by the piston's work over K, and by nothing else."""
+    rig = check_rig(volumes="position", p_charge="2[MPa]")
+    run = drive(rig, 10.0, u=8.0, rate=2000.0)
+    c, K = rig.cylinder, rig.fluid.K_oil
+    V_A, V_B = c.V + c.A_A * run["x"], c.V - c.A_B * run["x"]
+    assert np.ptp(V_A) > 0.2 * c.V  # it moves far enough to matter
+    held = (V_A * run["p_A"] + V_B * run["p_B"]) / K
+    work = (run["p_A"] - run["p_B"]) * run["v"] * c.A_A
+    gained = np.concatenate([[0.0], np.cumsum(0.5 * (work[1:] + work[:-1])) / 2000.0]) / K
+    np.testing.assert_allclose(held - held[0], gained, atol=2e-4 * np.abs(gained).max())
+    # the error in mass, relative: the work done over K V, below p/K
+    assert np.abs(held - held[0]).max() < 2e-3 * turned_over(run)
+
+
+def energy_terms(rig, run, G: float, C: float) -> dict[str, float]:
+    """Energies [J] of a run: what came in through the wires, what each place lost, what is stored more than before."""
+    m, c, f, K = rig.motor, rig.cylinder, rig.friction, rig.fluid.K_oil
+    i, w, v = run["i"], run["omega"], run["v"]
+    p_A, p_B, p_1, p_2 = (run[name] for name in ("p_A", "p_B", "p_1", "p_2"))
+
+    def total(power: np.ndarray) -> float:
+        return float(simpson(power, x=run.t))
+
+    def gained(energy: np.ndarray) -> float:
+        return float(energy[-1] - energy[0])
+
+    speed = np.abs(v)
+    F_C = f.F_pr + f.F_cfr * (p_A + p_B)
+    running = F_C * (1 + (f.K_brk - 1) * np.exp(-f.C_c * speed)) + f.F_v * speed
+    standing = speed / f.v_th * (F_C * (1 + (f.K_brk - 1) * np.exp(-f.C_c * f.v_th)) + f.F_v * f.v_th)
+    dp = p_A - p_B
+    stored = 0.5 * c.V * (p_A**2 + p_B**2) / K
+    terms = {
+        "wires": total(run["V"] * i),
+        "copper": total(m.R_c * i**2),
+        "motor and pump, viscous": total(m.B_M * w**2),
+        "pump leakage": total(rig.pump.G_pump * (p_1 - p_2) ** 2),
+        "piston leakage": total(dp * (G * dp + C * dp / (dp**2 + rig.line.dp_0**2) ** 0.25)),
+        "friction": total(np.where(speed > f.v_th, running, standing) * speed),
+        "load": total(c.F_l * v),
+        "winding": gained(0.5 * m.L_c * i**2),
+        "rotor": gained(0.5 * m.J_M * w**2),
+        "piston": gained(0.5 * c.M_eq * v**2),
+    }
+    if rig.line.orifices == "present":
+        stored = stored + 0.5 * (rig.line.V_1 * p_1**2 + rig.line.V_2 * p_2**2) / K
+        terms["throttles"] = total(run["Q_A"] * (p_1 - p_A) + run["Q_B"] * (p_B - p_2))
+    return {**terms, "oil": gained(stored)}
+
+
+@pytest.mark.parametrize(
+    ("throttled", "values", "G", "C"),
+    [
+        (False, {}, 0.0, 0.0),
+        (False, {"G_pump": PUMP_LEAK, "F_l": 20.0}, 6e-13, 2e-10),
+        (True, {}, 0.0, 0.0),
+        (True, {"G_pump": PUMP_LEAK, "closed_A": 0.75, "metering": "literal"}, 6e-13, 2e-10),
+    ],
+    ids=["free", "free, leaks and load", "throttled", "throttled, literal, leaks"],
+)
+def test_what_the_wires_bring_is_found_again(check_rig, drive, throttled, values, G, C):
+    rig = check_rig(throttled, **values)
+    assert rig.motor.C_e == rig.motor.C_m  # else the motor itself makes or eats energy
+    step = 1e-5
+    run = drive(rig, 2.0 + step, G=G, C=C, rate=1 / step, step=step)
+    terms = energy_terms(rig, run, G, C)
+    came = terms.pop("wires")
+    assert came > 0.5
+    assert sum(terms.values()) == pytest.approx(came, rel=1e-6), terms
+    for name in ("copper", "friction", "motor and pump, viscous"):
+        assert terms[name] > 1e-3 * came
+    if G:
+        assert terms["pump leakage"] > 1e-4 * came
+        assert terms["piston leakage"] > 1e-4 * came
+    if throttled:
+        assert terms["throttles"] > 1e-5 * came  # seen by the tolerance

@@ -1,0 +1,255 @@
+"""Findings: each fault that is put in is named, with its place; healthy data of every kind raise nothing."""
+
+import time
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sealscope.errors import InputError
+from sealscope.recordings import CHANNEL_UNITS, Finding, Recording, inspect, uniform_segments
+
+RATE = 500.0
+STEP_PSI = 10 / 2**13 * 300  # 14 bits over +-10 V, 0..10 V for 0..3000 psi
+PSI = 6894.757293168361
+
+
+def recording(channels: dict[str, np.ndarray], t: np.ndarray | None = None) -> Recording:
+    count = len(next(iter(channels.values())))
+    return Recording(np.arange(count) / RATE if t is None else t, channels, CHANNEL_UNITS, RATE)
+
+
+def quantised(values: np.ndarray, step: float) -> np.ndarray:
+    return np.round(values / step) * step
+
+
+def healthy(count: int = 20_000, seed: int = 0, noise: float = 1.23) -> dict[str, np.ndarray]:
+    """Channels as a rig gives them: noisy quantised pressures, a slow encoder, a stepwise command, a resting meter."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(count) / RATE
+    swing = 0.06e6 * np.tanh(8 * np.cos(4 * t)) + 2e3 * np.exp(-((4 * t) % np.pi)) * np.sin(438 * t)
+    pressures = {
+        name: quantised(3e5 + sign * swing + noise * PSI * rng.normal(size=count), STEP_PSI * PSI)
+        for name, sign in (("p_A", 1), ("p_B", -1), ("p_1", 1), ("p_2", -1))
+    }
+    return {
+        "u": np.where((t > 5) & (t < 20), 3.0, 0.0),
+        "theta": quantised(20 * np.sin(0.4 * t), 2 * np.pi / 20_000),
+        "x": quantised(0.02 * np.sin(4 * t), 20e-6),
+        "omega": 30 * np.cos(4 * t),
+        "q_leak": quantised(np.where(t > 15, 7e-8, 0) + 2e-10 * rng.normal(size=count), 1e-9),
+    } | pressures
+
+
+SQUARE = np.sign(np.sin(np.arange(20_000) / 125 + 0.1))
+RAMP = np.clip(np.arange(20_000) / 5000.0, 1, 2)
+
+
+def codes(found: tuple[Finding, ...], channel: str | None = None) -> list[str]:
+    return [finding.code for finding in found if finding.channel == channel]
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.3, 1.23, 5.0])
+def test_healthy_data_raise_nothing(seed: int, noise: float) -> None:
+    assert inspect(recording(healthy(20_000, seed, noise))) == ()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.sin(np.arange(20_000) / 125),
+        quantised(np.sin(np.arange(20_000) / 2000), 1e-3),
+        quantised(np.sin(np.arange(20_000) / 2000), 1e-1),
+        SQUARE,
+        SQUARE + quantised(np.random.default_rng(1).normal(size=20_000), 0.5) / 10,
+        np.repeat(np.random.default_rng(2).normal(size=200), 100),
+        quantised(RAMP + np.random.default_rng(3).normal(size=20_000) * 2e-3, 1e-3),
+        np.cumsum(np.random.default_rng(4).normal(size=20_000)),
+        quantised(1 - np.exp(-np.arange(20_000) / 1000), 1e-3),
+        np.random.default_rng(5).integers(0, 2, 20_000).astype(float),
+        np.random.default_rng(6).normal(size=20_000).astype(np.float32).astype(float),
+    ],
+    ids=["sine", "slow", "coarse", "square", "noisy square", "staircase", "ramp", "walk", "settling", "bits", "noise"],
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["p_A", "x"])
+def test_no_fault_is_seen_in_signals_without(values: np.ndarray, name: str) -> None:
+    assert inspect(recording({name: values})) == ()
+
+
+def test_speed() -> None:
+    long = recording(healthy(90_000))
+    start = time.perf_counter()
+    inspect(long)
+    assert time.perf_counter() - start < 1.0
+
+
+def test_missing_runs() -> None:
+    p = healthy()["p_A"]
+    p[100:150] = np.nan
+    p[5000:5200] = np.nan
+    (finding,) = inspect(recording({"p_A": p}))
+    assert (finding.code, finding.severity, finding.channel, finding.count) == ("missing", "warning", "p_A", 250)
+    assert finding.first_t == 0.2
+    assert finding.text == "p_A: 250 samples missing in 2 stretches, the longest 0.4 s"
+
+
+def test_all_missing_and_infinite() -> None:
+    p, q = healthy()["p_A"], healthy()["p_B"]
+    p[:] = np.nan
+    q[77] = np.inf
+    found = inspect(recording({"p_A": p, "p_B": q}))
+    assert codes(found, "p_A") == ["missing"]
+    assert codes(found, "p_B") == ["infinite"]
+
+
+@pytest.mark.parametrize("every", [2, 5, 50])
+def test_mixed_rates(every: int) -> None:
+    p = healthy()["p_A"]
+    p[np.arange(p.size) % every != 0] = np.nan
+    found = inspect(recording({"p_A": p, "p_B": healthy()["p_B"]}))
+    assert codes(found, "p_A") == ["mixed_rate"]
+    assert f"({RATE / every:g} Hz among 500 Hz)" in found[0].text
+    assert codes(found, "p_B") == []
+
+
+def test_gap() -> None:
+    t = np.arange(5000) / RATE
+    t[2000:] += 1.0
+    t[4000:] += 0.1
+    (finding,) = inspect(recording({"p_A": healthy()["p_A"][:5000]}, t))
+    assert (finding.code, finding.severity, finding.count) == ("gap", "fatal", 2)
+    assert finding.first_t == t[1999]
+    assert "about 550 samples lost" in finding.text
+
+
+def test_duplicated_and_reversed_time() -> None:
+    t = np.arange(5000) / RATE
+    t[1000] = t[999]
+    found = inspect(recording({"p_A": healthy()["p_A"][:5000]}, t))
+    assert ("duplicated_time", "fatal", 1) in [(f.code, f.severity, f.count) for f in found]
+    t = np.arange(5000) / RATE
+    t[3000:] -= 2.0
+    found = inspect(recording({"p_A": healthy()["p_A"][:5000]}, t))
+    assert [(f.code, f.severity, f.count) for f in found] == [("reversed_time", "fatal", 1)]
+    assert found[0].first_t == t[3000]
+    t = (np.arange(5000) / RATE)[::-1]
+    assert codes(inspect(recording({"p_A": healthy()["p_A"][:5000]}, t))) == ["reversed_time"]
+
+
+def test_missing_time() -> None:
+    t = np.arange(5000) / RATE
+    t[10] = np.nan
+    found = inspect(recording({"p_A": healthy()["p_A"][:5000]}, t))
+    assert found[0].code == "missing_time"
+
+
+@pytest.mark.parametrize(("jitter", "expected"), [(0.001, []), (0.02, []), (0.1, ["warning"]), (0.5, ["fatal"])])
+def test_irregular_sampling(jitter: float, expected: list[str]) -> None:
+    rng = np.random.default_rng(0)
+    t = (np.arange(5000) + jitter * rng.uniform(-0.9, 0.9, 5000)) / RATE
+    found = [f for f in inspect(recording({"p_A": healthy()["p_A"][:5000]}, t)) if f.code == "irregular_sampling"]
+    assert [f.severity for f in found] == expected
+
+
+def test_a_rate_that_contradicts_the_stamps() -> None:
+    wrong = replace(recording({"p_A": healthy()["p_A"]}), rate=1000.0)
+    (finding,) = inspect(wrong)
+    assert (finding.code, finding.severity) == ("rate_mismatch", "fatal")
+    assert finding.text == "time stamps tell 500 Hz, the recording's rate is 1000 Hz"
+
+
+def test_constant() -> None:
+    found = inspect(recording({"p_A": np.full(1000, 3e5), "u": np.zeros(1000), "q_leak": np.zeros(1000)}))
+    assert [(f.code, f.severity, f.channel) for f in found] == [
+        ("constant", "warning", "p_A"),
+        ("constant", "note", "u"),
+        ("constant", "note", "q_leak"),
+    ]
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("noise", "step"), [(0.0, 0.0), (0.01, 0.0), (0.01, 0.002), (0.05, 0.01), (0.0, 0.002)])
+@pytest.mark.parametrize("side", ["high", "low"])
+def test_clipped(seed: int, noise: float, step: float, side: str) -> None:
+    rng = np.random.default_rng(seed)
+    p = np.sin(2 * np.pi * np.arange(20_000) / 777) + noise * rng.normal(size=20_000)
+    p = quantised(p, step) if step else p
+    cut = np.minimum(p, 0.8) if side == "high" else np.maximum(p, -0.8)
+    found = inspect(recording({"p_A": cut}))
+    assert codes(found, "p_A") == ["clipped"]
+    assert f"at the {side} end" in found[0].text
+    assert found[0].count == np.sum(p >= 0.8) if side == "high" else np.sum(p <= -0.8)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("name", ["p_A", "x"])
+def test_stuck(seed: int, name: str) -> None:
+    values = healthy(20_000, seed)[name]
+    start = 7000 + 371 * seed
+    values[start : start + 400] = values[start]
+    found = [f for f in inspect(recording({name: values})) if f.code == "stuck"]
+    assert len(found) == 1
+    assert abs(found[0].first_t * RATE - start) <= 6
+    assert 395 <= found[0].count <= 420
+
+
+@pytest.mark.parametrize("mains", [50.0, 60.0])
+def test_mains_hum(mains: float) -> None:
+    channels = healthy()
+    t = np.arange(20_000) / RATE
+    channels["p_A"] = channels["p_A"] + 2 * PSI * np.sin(2 * np.pi * (mains + 0.02) * t + 1)
+    (finding,) = inspect(recording(channels))
+    assert (finding.code, finding.channel) == ("mains_hum", "p_A")
+    assert f"{mains:g} Hz" in finding.text
+    amplitude = float(finding.text.split("amplitude ")[1].split()[0])
+    assert amplitude == pytest.approx(2 * PSI, rel=0.15)
+
+
+def test_an_unconnected_sensor() -> None:
+    t = np.arange(5000) / RATE
+    p = 1500 * np.sin(2 * np.pi * 60 * t) + 30 * np.random.default_rng(0).normal(size=t.size)
+    (finding,) = inspect(recording({"p_A": p}))
+    assert finding.severity == "warning"
+    assert "is the sensor connected?" in finding.text
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.data())
+def test_uniform_segments_are_maximal_sound_and_disjoint(data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, 60))
+    steps = data.draw(
+        st.lists(st.sampled_from([1.0, 1.0, 1.0, 1.1, 0.0, -3.0, 4.0, np.nan]), min_size=count, max_size=count)
+    )
+    holes = data.draw(st.lists(st.integers(0, count - 1), max_size=4))
+    t = np.cumsum(np.nan_to_num(steps)) / RATE
+    t[np.isnan(steps)] = np.nan
+    p = np.ones(count)
+    p[holes] = np.nan
+    segments = uniform_segments(recording({"p_A": p, "x": np.ones(count)}, t), ["p_A"])
+    inside = np.zeros(count, dtype=bool)
+    for segment in segments:
+        assert not inside[segment].any()
+        inside[segment] = True
+        assert np.isfinite(p[segment]).all()
+        assert (np.abs(np.diff(t[segment]) * RATE - 1) < 0.5).all()
+    assert np.array_equal(inside, np.isfinite(p) & np.isfinite(t))
+    for one, other in pairwise(segments):
+        if one.stop == other.start:
+            assert not abs((t[other.start] - t[one.stop - 1]) * RATE - 1) < 0.5
+
+
+def test_uniform_segments_of_a_sound_recording_and_of_parts() -> None:
+    whole = recording(healthy())
+    assert uniform_segments(whole) == [slice(0, 20_000)]
+    p = healthy()["p_A"]
+    p[10:20] = np.nan
+    holed = recording({"p_A": p, "x": healthy()["x"]})
+    assert uniform_segments(holed) == [slice(0, 10), slice(20, 20_000)]
+    assert uniform_segments(holed, ["x"]) == [slice(0, 20_000)]
+    assert uniform_segments(holed, shortest=226) == [slice(20, 20_000)]
+    with pytest.raises(InputError, match="p_B is not in this recording"):
+        uniform_segments(holed, ["p_B"])

@@ -1,0 +1,51 @@
+"""Real strokes of a rotary actuator (public data set vtnsi/actuator_dataset), and what is found in them."""
+
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.recordings import COUNTS, inspect, read
+
+FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "real" / "vtnsi_actuator"
+FILES = sorted(FOLDER.glob("*/*.txt"))
+pytestmark = pytest.mark.skipif(not FILES, reason="../shared/data/real/vtnsi_actuator is absent")
+MAP = {"p_A": "PG_1", "p_B": "PG_2"}
+
+
+def test_every_stroke_reads_as_numpy_reads_it() -> None:
+    start = time.perf_counter()
+    for path in FILES:
+        recording = read(path, channel_map=MAP, rate=1000)
+        assert recording.units["p_A"] == recording.units["p_B"] == COUNTS
+        assert recording.rate == 1000
+        assert len(recording) == 3000
+        expected = np.genfromtxt(path, delimiter="\t", skip_header=1, usecols=(8, 9))
+        assert np.array_equal(recording["p_A"], expected[:, 0])
+        assert np.array_equal(recording["p_B"], expected[:, 1])
+    assert time.perf_counter() - start < 60
+
+
+def test_ports_are_clean_but_for_the_strokes_that_fall_below_zero() -> None:
+    found = Counter()
+    for path in FILES:
+        recording = read(path, channel_map=MAP, rate=1000)
+        for finding in inspect(recording):
+            assert finding.code == "clipped"
+            at_zero = np.flatnonzero(recording[finding.channel] == 0)
+            assert finding.count == at_zero.size > 300
+            found[finding.code] += 1
+    assert 0 < found["clipped"] < len(FILES)
+
+
+def test_what_is_not_connected_is_seen_as_hum() -> None:
+    hums = sum(
+        any(
+            f.code == "mains_hum" and "60 Hz" in f.text
+            for f in inspect(read(path, channel_map={"p_A": "PG_3"}, rate=1000))
+        )
+        for path in FILES
+    )
+    assert hums > len(FILES) // 2

@@ -1,0 +1,189 @@
+"""What is written reads back as the same recording, to the bit, in every format; nothing half-written stays."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sealscope.errors import InputError
+from sealscope.recordings import CHANNEL_UNITS, COUNTS, Recording, read, write
+
+FORMATS = ["nc", "h5", "hdf5", "csv", "tsv", "txt", "parquet"]
+json_values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**53), 2**53)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> Recording:
+    count = draw(st.integers(1, 40))
+    numbers = hnp.arrays(np.float64, count, elements=st.floats(allow_nan=True, allow_infinity=False, width=64))
+    names = draw(st.lists(st.sampled_from(list(CHANNEL_UNITS)), min_size=1, unique=True))
+    return Recording(
+        t=draw(hnp.arrays(np.float64, count, elements=st.floats(allow_nan=False, allow_infinity=False))),
+        channels={name: draw(numbers) for name in names},
+        units={name: draw(st.sampled_from([CHANNEL_UNITS[name], COUNTS])) for name in names},
+        rate=draw(st.floats(1e-3, 1e9)),
+        provenance=draw(st.dictionaries(st.text(), json_values, max_size=4)),
+        history=tuple(draw(st.lists(st.text(), max_size=3))),
+    )
+
+
+def same_bits(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.shape == b.shape and bool(np.all((a.view(np.int64) == b.view(np.int64)) | (np.isnan(a) & np.isnan(b))))
+
+
+def assert_same(a: Recording, b: Recording) -> None:
+    assert set(a.channels) == set(b.channels)
+    assert same_bits(a.t, b.t)
+    for name in a.channels:
+        assert same_bits(a[name], b[name]), name
+    assert dict(a.units) == dict(b.units)
+    assert a.rate == b.rate
+    assert dict(a.provenance) == dict(b.provenance)
+    assert a.history == b.history
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(recording=recordings())
+def test_exact(tmp_path: Path, suffix: str, recording: Recording) -> None:
+    path = tmp_path / f"log.{suffix}"
+    write(recording, path)
+    assert_same(read(path), recording)
+
+
+def plain(count: int = 600) -> Recording:
+    t = np.arange(count) / 500
+    p = 3e5 + 1e4 * np.sin(4 * t)
+    return Recording(t, {"p_A": p, "x": 0.01 * np.cos(4 * t)}, CHANNEL_UNITS, 500.0, {"by": "test"}, ("made",))
+
+
+@pytest.mark.parametrize("suffix", ["nc", "csv", "parquet"])
+def test_through_every_format_in_turn(tmp_path: Path, suffix: str) -> None:
+    first, second = tmp_path / "a.csv", tmp_path / f"b.{suffix}"
+    write(plain(), first)
+    write(read(first), second)
+    assert_same(read(second), plain())
+
+
+def test_long_provenance(tmp_path: Path) -> None:
+    long = Recording(
+        np.arange(3) / 5, {"p_A": np.ones(3)}, {"p_A": "Pa"}, 5.0, {"table": list(range(60_000))}, ("x" * 9,)
+    )
+    for suffix in ("csv", "nc", "parquet"):
+        write(long, tmp_path / f"log.{suffix}")
+        assert_same(read(tmp_path / f"log.{suffix}"), long)
+
+
+def test_numpy_values_in_provenance_become_plain_ones(tmp_path: Path) -> None:
+    recording = Recording([0, 1], {"x": [1, 2]}, {"x": "m"}, 1.0, {"seed": np.int64(3), "gain": np.array([1.5])})
+    write(recording, tmp_path / "a.nc")
+    assert dict(read(tmp_path / "a.nc").provenance) == {"seed": 3, "gain": [1.5]}
+
+
+def test_xarray_opens_our_netcdf(tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    write(plain(), tmp_path / "log.nc")
+    with xarray.open_dataset(tmp_path / "log.nc", engine="h5netcdf") as data:
+        assert data["p_A"].dims == ("t",)
+        assert data["p_A"].attrs["units"] == "Pa"
+        assert data["t"].dtype == np.float64
+        assert np.array_equal(data["t"].values, plain().t)
+        assert np.array_equal(data["x"].values, plain()["x"])
+        assert json.loads(data.attrs["provenance"]) == {"by": "test"}
+        assert float(data.attrs["rate"]) == 500.0
+
+
+def test_any_hdf5_tool_opens_our_netcdf(tmp_path: Path) -> None:
+    import h5py
+
+    write(plain(), tmp_path / "log.h5")
+    with h5py.File(tmp_path / "log.h5") as file:
+        assert np.array_equal(file["p_A"][...], plain()["p_A"])
+
+
+def test_header_of_a_text_file(tmp_path: Path) -> None:
+    write(plain(3), tmp_path / "log.csv")
+    lines = (tmp_path / "log.csv").read_text().splitlines()
+    assert lines[0].startswith("# sealscope: {")
+    assert lines[1] == "t [s],p_A [Pa],x [m]"
+    assert len(lines) == 5
+
+
+@pytest.mark.parametrize("suffix", ["nc", "csv", "parquet"])
+def test_a_failure_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"log.{suffix}"
+    write(plain(), path)
+    before = path.read_bytes()
+
+    class DiskFullError(OSError):
+        pass
+
+    def fail(*args: object, **kwargs: object) -> None:
+        Path(str(args[1])).write_bytes(b"half a rec")
+        raise DiskFullError(28, "No space left on device")
+
+    module = {"nc": "netcdf", "csv": "text", "parquet": "parquet"}[suffix]
+    writer = {"nc": "write_netcdf", "csv": "write_text", "parquet": "write_parquet"}[suffix]
+    monkeypatch.setattr(f"sealscope.recordings.{module}.{writer}", fail)
+    with pytest.raises(InputError, match="No space left on device"):
+        write(plain(), path)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_interrupted_by_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sealscope.recordings.text.write_text", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write(plain(), tmp_path / "log.csv")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("recording", "name", "message"),
+    [
+        (plain(), "log.xlsx", "must end in"),
+        (plain(), "log", "must end in"),
+        (plain(), "absent/log.csv", "cannot write"),
+        (plain(0), "log.nc", "at least one sample"),
+        (Recording([0, 1], {"load": [1, 2]}, {"load": "N"}, 1.0), "log.csv", "channel to write must be one of"),
+        (Recording([0, 1], {"p_A": [1, 2]}, {"p_A": "psi"}, 1.0), "log.csv", "must be in Pa or count"),
+        (Recording([0, 1], {"p_A": [1, np.inf]}, {"p_A": "Pa"}, 1.0), "log.csv", "must be finite or missing"),
+        (Recording([0, 1], {"p_A": [1, 2]}, {"p_A": "Pa"}, 1.0, {"o": object()}), "log.nc", "JSON values only"),
+    ],
+)
+def test_refused_before_anything_is_written(tmp_path: Path, recording: Recording, name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        write(recording, tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_parquet_without_pyarrow_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    from sealscope.errors import MissingExtra
+
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[io\]'"):
+        write(plain(), tmp_path / "log.parquet")
+    (tmp_path / "foreign.parquet").write_bytes(b"PAR1 and more")
+    with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[io\]'"):
+        read(tmp_path / "foreign.parquet")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["foreign.parquet"]

@@ -1,0 +1,221 @@
+"""Logs of other people's loggers: delimiters, decimals, headers, units, encodings, time columns, maps."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings import COUNTS, read, split_map_option
+
+T = [0.0, 0.002, 0.004, 0.006]
+P = [2.5, 2.25, -2.125, 2e-3]
+BAR = np.array(P) * 1e5
+
+
+def saved(folder: Path, text: str | bytes, name: str = "log.csv", encoding: str = "utf-8") -> Path:
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode(encoding))
+    return path
+
+
+def body(delimiter: str, decimal: str = ".", newline: str = "\n") -> str:
+    rows = [f"{t:.3f}{delimiter}{p!r}" for t, p in zip(T, P, strict=True)]
+    return newline.join(rows).replace(".", decimal) + newline
+
+
+LAYOUTS = {
+    "comma": "t [s],p_A [bar]\n" + body(","),
+    "semicolon": "t [s];p_A [bar]\n" + body(";"),
+    "semicolon, decimal comma": "t [s];p_A [bar]\n" + body(";", ","),
+    "tab": "t [s]\tp_A [bar]\n" + body("\t"),
+    "tab, decimal comma": "t [s]\tp_A [bar]\n" + body("\t", ","),
+    "blanks": "t [s]   p_A [bar]\n" + body("   "),
+    "blanks, decimal comma": "t[s] p_A[bar]\n" + body("  ", ","),
+    "bar": "t [s]|p_A [bar]\n" + body("|"),
+    "comma and blank": "t [s], p_A [bar]\n" + body(", "),
+    "round brackets": "time (s),p_A (bar)\n" + body(","),
+    "units over a stroke": "Zeit / s;p_A / bar\n" + body(";", ","),
+    "units row": "Time;p_A\ns;bar\n" + body(";"),
+    "units row in brackets": "Time\tp_A\n[s]\t[bar]\n" + body("\t"),
+    "no blank before unit": "t[s],p_A[bar]\n" + body(","),
+    "other case": "Time [s],P_a [BAR]\n" + body(","),
+    "quoted": '"t [s]","p_A [bar]"\n' + "".join(f'"{t}","{p!r}"\n' for t, p in zip(T, P, strict=True)),
+    "windows line ends": ("t [s],p_A [bar]\n" + body(",")).replace("\n", "\r\n"),
+    "old mac line ends": ("t [s],p_A [bar]\n" + body(",")).replace("\n", "\r"),
+    "no last line end": ("t [s],p_A [bar]\n" + body(",")).rstrip(),
+    "comments": "# made by a logger, on Monday\n% rig 3\n\nt [s],p_A [bar]\n" + body(","),
+    "commented header": "# t [s], p_A [bar]\n" + body(","),
+    "comment within": "t [s],p_A [bar]\n" + body(",").replace("\n", "\n# pause\n", 1),
+    "blank lines within": "t [s],p_A [bar]\n" + body(",").replace("\n", "\n\n", 2),
+    "preamble": "Logger 7000\nOperator: N. N.\nChannels,2\nSampling,500,Hz,fixed\n\nt [s],p_A [bar]\n" + body(","),
+    "preamble, units row": "DAQ export\nDate;2024-05-31\n\nTime;p_A;note\ns;bar;\n"
+    + body(";", ",").replace("\n", ";\n"),
+    "milliseconds": "time [ms],p_A [MPa]\n" + "".join(f"{1e3 * t},{p / 10!r}\n" for t, p in zip(T, P, strict=True)),
+    "time without unit": "time,p_A [bar]\n" + body(","),
+    "text beside": "who,t [s],p_A [bar],remark\n" + "".join(f"N,{t},{p!r},a b\n" for t, p in zip(T, P, strict=True)),
+    "empty columns at the end": "t [s],p_A [bar],,\n" + body(",").replace("\n", ",,\n"),
+    "padded numbers": "t [s],p_A [bar]\n" + "".join(f"  {t} ,  {p!r} \n" for t, p in zip(T, P, strict=True)),
+    "Fortran exponents": "t [s],p_A [bar]\n"
+    + "".join(f"{t},{p!r}D+00\n" for t, p in zip(T[:3], P, strict=False))
+    + "0.006,2D-3\n",
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layouts(tmp_path: Path, name: str) -> None:
+    recording = read(saved(tmp_path, LAYOUTS[name]))
+    assert np.allclose(recording.t, T, rtol=1e-15)
+    assert recording["p_A"] == pytest.approx(BAR, rel=1e-14)
+    assert recording.units["p_A"] == "Pa"
+    assert recording.rate == 500.0
+    assert recording.provenance["file"] == "log.csv"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "cp1252"])
+def test_encodings(tmp_path: Path, encoding: str) -> None:
+    text = "t [s];p_A [bar];Öl [°C]\r\n" + body(";", ",", "\r\n").replace("\r\n", ";40\r\n")
+    data = text.encode(encoding)
+    if encoding == "utf-16-le":
+        data = b"\xff\xfe" + data
+    recording = read(saved(tmp_path, data))
+    assert recording["p_A"] == pytest.approx(BAR, rel=1e-14)
+    assert any("Öl [°C]" in line for line in recording.history)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("psi", 6894.757293168361), ("kPa", 1e3), ("MPa", 1e6), ("mbar", 100.0), ("N/mm^2", 1e6)]
+)
+def test_units_of_pressure(tmp_path: Path, unit: str, factor: float) -> None:
+    recording = read(saved(tmp_path, f"t [s],p_A [{unit}]\n" + body(",")))
+    assert recording["p_A"] == pytest.approx(np.array(P) * factor, rel=1e-14)
+
+
+def test_other_channels_and_units(tmp_path: Path) -> None:
+    text = "t [s],x [mm],omega [rpm],q_leak [L/min],u [mV],theta [deg]\n0,1,60,6,2000,180\n0.1,2,120,12,4000,360\n"
+    recording = read(saved(tmp_path, text))
+    assert recording["x"] == pytest.approx([1e-3, 2e-3])
+    assert recording["omega"] == pytest.approx([2 * np.pi, 4 * np.pi])
+    assert recording["q_leak"] == pytest.approx([1e-4, 2e-4])
+    assert recording["u"] == pytest.approx([2, 4])
+    assert recording["theta"] == pytest.approx([np.pi, 2 * np.pi])
+    assert recording.rate == 10.0
+
+
+def test_map_and_rate(tmp_path: Path) -> None:
+    path = saved(tmp_path, "Time\tPG_1\tPG_2\tname\n1\t10\t20\ta\n2\t11\t21\tb\n3\t12\t22\t\n", "log.txt")
+    recording = read(path, channel_map={"p_A": "PG_1", "p_B": "PG_2[psi]"}, rate=1000)
+    assert np.array_equal(recording["p_A"], [10, 11, 12])
+    assert recording.units["p_A"] == COUNTS
+    assert recording["p_B"] == pytest.approx(np.array([20, 21, 22]) * 6894.757293168361, rel=1e-15)
+    assert np.array_equal(recording.t, [0, 0.001, 0.002])
+    assert any("Time not used: the rate was given as 1000 Hz" in line for line in recording.history)
+    assert any("raw counts" in line for line in recording.history)
+    with pytest.raises(UnreadableFile, match="count of rows 1, 2"):
+        read(path, channel_map={"p_A": "PG_1"})
+
+
+def test_map_by_number_without_a_header(tmp_path: Path) -> None:
+    recording = read(saved(tmp_path, body(",")), channel_map={"t": "1[s]", "p_A": "2[bar]"})
+    assert recording["p_A"] == pytest.approx(BAR)
+    assert recording.rate == 500
+
+
+def test_mapped_column_comes_before_the_namesake(tmp_path: Path) -> None:
+    path = saved(tmp_path, "t [s],p_A [bar],true p_A [bar]\n0,1,5\n1,2,6\n")
+    assert read(path, channel_map={"p_A": "true p_A"})["p_A"] == pytest.approx([5e5, 6e5])
+
+
+def test_epoch_and_stamps(tmp_path: Path) -> None:
+    lines = [1717151400.000 + 0.5 * i for i in range(4)]
+    for factor, name in ((1, "time"), (1, "time [s]"), (1000, "time"), (1000, "time [ms]")):
+        text = f"{name},p_A [bar]\n" + "".join(f"{factor * s:.3f},1\n" for s in lines)
+        recording = read(saved(tmp_path, text))
+        assert recording.t == pytest.approx([0, 0.5, 1, 1.5], abs=1e-6)
+        assert recording.rate == 2.0
+        assert recording.provenance["start_epoch_s"] == pytest.approx(lines[0])
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "2024-05-31T12:00:0{}.{}00",
+        "2024-05-31 12:00:0{}.{}",
+        "2024-05-31 12:00:0{},{}00",
+        "31.05.2024 12:00:0{}.{}",
+        "2024-05-31T12:00:0{}.{}Z",
+        "12:00:0{}.{}",
+    ],
+)
+def test_stamps(tmp_path: Path, form: str) -> None:
+    text = "Timestamp;p_A [bar]\n" + "".join(form.format(i // 2, 5 * (i % 2)) + ";1\n" for i in range(6))
+    recording = read(saved(tmp_path, text))
+    assert recording.t == pytest.approx(np.arange(6) / 2, abs=1e-12)
+    assert recording.rate == 2.0
+    if ":0" in form and "2024" in form:
+        assert recording.provenance["start"].startswith("2024-05-31T12:00:00")
+
+
+def test_missing_cells_become_nan(tmp_path: Path) -> None:
+    text = "t [s],p_A [bar],p_B [bar]\n0,1,1\n1,,NaN\n2,-,n/a\n3,4,4\n"
+    recording = read(saved(tmp_path, text))
+    assert np.array_equal(recording["p_A"], [1e5, np.nan, np.nan, 4e5], equal_nan=True)
+    assert np.array_equal(recording["p_B"], [1e5, np.nan, np.nan, 4e5], equal_nan=True)
+
+
+def test_a_cut_last_line_is_missing(tmp_path: Path) -> None:
+    recording = read(saved(tmp_path, "t [s],p_A [bar],p_B [bar]\n0,1,1\n1,2,2\n2,3,3\n3,4"))
+    assert np.array_equal(recording["p_A"], [1e5, 2e5, 3e5, np.nan], equal_nan=True)
+
+
+def test_a_time_axis_that_starts_late_stays(tmp_path: Path) -> None:
+    assert np.array_equal(read(saved(tmp_path, "t [s],x [m]\n90,1\n91,2\n92,3\n")).t, [90, 91, 92])
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    delimiter=st.sampled_from([",", ";", "\t", "  ", "|"]),
+    comma=st.booleans(),
+    values=st.lists(st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=3), min_size=2, max_size=30),
+    units_row=st.booleans(),
+    preamble=st.lists(st.sampled_from(["Rig", "Operator: N. N.", "Rate = 500 Hz", "# remark"]), max_size=3),
+)
+def test_any_layout_gives_the_same_numbers(
+    tmp_path: Path, delimiter: str, comma: bool, values: list[list[float]], units_row: bool, preamble: list[str]
+) -> None:
+    comma = comma and delimiter != ","
+    units_row = units_row and delimiter != "  "
+    if units_row:
+        head = [delimiter.join(["t", "p_A", "p_B"]), delimiter.join(["s", "Pa", "Pa"])]
+    else:
+        head = [delimiter.join(["t [s]", "p_A [Pa]", "p_B [Pa]"])]
+    rows = [delimiter.join(map(repr, [float(i), *row[1:]])) for i, row in enumerate(values)]
+    if comma:
+        rows = [row.replace(".", ",") for row in rows]
+    recording = read(saved(tmp_path, "\n".join([*preamble, *head, *rows]) + "\n"))
+    assert np.array_equal(recording["p_A"], [row[1] for row in values])
+    assert np.array_equal(recording["p_B"], [row[2] for row in values])
+
+
+@pytest.mark.parametrize("stamp_digits", [3, 4, 6])
+@pytest.mark.parametrize("rate", [100.0, 200.0, 500.0, 1000.0, 1024.0, 4096.0])
+def test_rate_from_rounded_stamps(tmp_path: Path, rate: float, stamp_digits: int) -> None:
+    if rate > 1000 and stamp_digits == 3:
+        pytest.skip("stamps coarser than the step tell the rate only on average")
+    rows = "".join(f"{i / rate:.{stamp_digits}f},{i}\n" for i in range(5000))
+    assert read(saved(tmp_path, "t [s],x [m]\n" + rows)).rate == rate
+
+
+def test_split_map_option() -> None:
+    assert split_map_option("p_A=PG_1") == ("p_A", "PG_1")
+    assert split_map_option(" p_A = Druck A [bar] ") == ("p_A", "Druck A [bar]")
+    for text, message in [
+        ("p_A", "must read CHANNEL=COLUMN"),
+        ("=PG_1", "must read CHANNEL=COLUMN"),
+        ("p_A=", "must read CHANNEL=COLUMN"),
+        ("pA=PG_1", "did you mean p_A?"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            split_map_option(text)

@@ -1,0 +1,268 @@
+"""The page: well-formed, self-contained, safe, true to the diagnosis, and small."""
+
+from __future__ import annotations
+
+import json
+import re
+from base64 import b64decode, b64encode
+from dataclasses import replace
+from hashlib import sha256
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sealscope.errors import InputError
+from sealscope.reporting import Mark, render_page, write_page
+
+VOID = {"meta", "link", "br", "img", "hr", "input"}
+EVIL = '"><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7*7 }}</script>'
+
+
+class Reader(HTMLParser):
+    """Reads a page, insists on balanced tags, and collects what the tests ask for."""
+
+    def __init__(self, page):
+        super().__init__(convert_charrefs=True)
+        self.open, self.targets, self.values, self.scripts, self.handlers, self.ids = [], [], {}, [], [], []
+        self.text, self.tables = "", []
+        self.feed(page)
+        self.close()
+        assert self.open == [], f"left open: {self.open}"
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in VOID:
+            self.open.append(tag)
+        named = dict(attrs)
+        assert len(named) == len(attrs), f"an attribute of <{tag}> stands twice"
+        self.targets += [named[name] for name in ("src", "href", "action", "data", "xlink:href") if named.get(name)]
+        self.handlers += [name for name in named if name.startswith("on")]
+        if "id" in named:
+            self.ids.append(named["id"])
+        if tag == "data":
+            self.values.setdefault(named["value"], "")
+            self.current = named["value"]
+        if tag == "script":
+            self.scripts.append("")
+        if tag == "table":
+            self.tables.append(False)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.handle_endtag(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
+        self.open.pop()
+
+    def handle_data(self, data):
+        if self.open[-1:] == ["script"]:
+            self.scripts[-1] += data
+        elif self.open[-1:] != ["style"]:
+            self.text += data
+        if "data" in self.open:
+            self.values[self.current] += data
+        if self.open[-1:] == ["caption"] and data.strip():
+            self.tables[-1] = True
+
+
+def chart_data(reader):
+    return json.loads(reader.scripts[0])
+
+
+def drawn(series):
+    q = np.frombuffer(b64decode(series["q"]), dtype="<i2").astype(float)
+    return np.where(q == -32768, np.nan, series["low"] + (q + 32767) * series["step"])
+
+
+@pytest.fixture(scope="module")
+def page(recording, make_diagnosis):
+    return render_page(recording, make_diagnosis(), truth_onset_s=20.0, truth_leak_lpm=0.0043, marks=[Mark(5, "cold")])
+
+
+@pytest.fixture(scope="module")
+def reader(page):
+    return Reader(page)
+
+
+def test_the_page_asks_nothing_of_a_network(page, reader):
+    assert all(target.startswith("#") and target[1:] in reader.ids for target in reader.targets)
+    assert not re.search(r"@import|url\((?!#)", page)
+    assert "default-src 'none'" in page and "connect-src" not in page
+
+
+def test_only_the_two_scripts_of_this_project_may_run(page, reader):
+    policy = re.search(r"script-src ([^;]*);", page).group(1)
+    hashes = {f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'" for code in reader.scripts[1:]}
+    assert len(reader.scripts) == 3 and set(policy.split()) == hashes
+    assert reader.handlers == []
+
+
+def test_ids_are_unique_and_every_table_has_a_caption(reader):
+    assert len(reader.ids) == len(set(reader.ids))
+    assert reader.tables and all(reader.tables)
+
+
+def test_the_numbers_are_the_diagnosis_own(reader):
+    assert reader.values["20.375"] == "20.4 s, between 18.5 s and 21.8 s"
+    assert reader.values["0.00421"] == "0.00421 L/min, between 0.0031 and 0.0057 L/min"
+    assert "5.44" in reader.values["5.4375"] and "3.22" in reader.values["3.21875"]
+    for said in ("d3 fell in both chambers", "12 samples stand at the rail", "the RMS of d3 of p_A fell by 31 %",
+                 "0.1 % (1 in 1000)", "bench 4", "converted with 14 bits", "the onset found is 0.4 s late",
+                 "the leak is 0.0043 L/min on average", "cold (5.0 s)"):  # fmt: skip
+        assert said in reader.text
+
+
+def test_the_marks_and_the_onset_are_on_the_charts(reader):
+    data = chart_data(reader)
+    assert data["onset"] == {"t": 20.375, "low": 18.5, "high": 21.75}
+    assert data["marks"] == [
+        {"t": 5, "label": "cold", "known": False},
+        {"t": 20.0, "label": "true onset", "known": True},
+    ]
+
+
+def test_what_is_drawn_is_what_was_recorded(reader, recording):
+    charts = {chart["key"]: chart for chart in chart_data(reader)["charts"]}
+    p_A, p_B = charts["p_AB-0"]["series"]
+    assert charts["p_AB-0"]["unit"] == "bar"
+    for series, name in ((p_A, "p_A"), (p_B, "p_B")):
+        line, values = drawn(series), recording[name] / 1e5
+        assert np.nanmax(line) == pytest.approx(values.max(), rel=1e-6)
+        assert np.nanmin(line) == pytest.approx(values.min(), rel=1e-6)
+    assert {"u-0", "x-0", "omega-0", "p_12-0", "q_leak-0", "rms-p_A", "rms-p_B-d3d4", "d1-p_A", "d3d4-p_B"} <= set(
+        charts
+    )
+    assert charts["x-0"]["unit"] == "mm" and charts["d3d4-p_A"]["unit"] == "kPa²"
+
+
+def test_each_chart_has_its_place_and_a_still_picture(page, reader):
+    for chart in chart_data(reader)["charts"]:
+        assert page.count(f'data-chart="{chart["key"]}"') == 1
+    assert page.count('<svg class="still"') == len(chart_data(reader)["charts"])
+
+
+def test_another_pressure_unit_and_a_wrong_one(recording, make_diagnosis):
+    data = chart_data(Reader(render_page(recording, make_diagnosis(), pressure_unit="psi")))
+    chart = next(c for c in data["charts"] if c["key"] == "p_AB-0")
+    assert chart["unit"] == "psi"
+    assert np.nanmax(drawn(chart["series"][0])) == pytest.approx(recording["p_A"].max() / 6894.757, rel=1e-6)
+    with pytest.raises(InputError, match="pressure unit must be one of bar, MPa, kPa, psi, got 'torr'"):
+        render_page(recording, make_diagnosis(), pressure_unit="torr")
+
+
+def test_counts_stay_counts(recording, make_diagnosis):
+    counts = replace(recording.only(["p_A"]), units={"p_A": "count"})
+    chart = next(c for c in chart_data(Reader(render_page(counts, make_diagnosis())))["charts"] if c["key"] == "p_AB-0")
+    assert chart["unit"] == "counts"
+    assert np.nanmax(drawn(chart["series"][0])) == pytest.approx(counts["p_A"].max(), rel=1e-6)
+
+
+def test_names_that_try_to_be_markup_are_text(recording, make_diagnosis):
+    bad = SimpleNamespace(code=EVIL, channel=EVIL, count=1, first_t=0.0, text=EVIL, severity="warning")
+    method = SimpleNamespace(name=EVIL, score=1.0, threshold=2.0, verdict=EVIL, reason=EVIL)
+    hostile = replace(recording, provenance={EVIL: EVIL, "deep": {"er": [EVIL]}}, history=(EVIL,))
+    diagnosis = make_diagnosis(file=EVIL, reason=EVIL, quality=(bad,), methods=(method,))
+    read = Reader(render_page(hostile, diagnosis, marks=[Mark(1.0, EVIL)], rig=SimpleNamespace(title=EVIL)))
+    assert len(read.scripts) == 3 and read.handlers == []
+    assert read.text.count(EVIL) > 5  # in full and as it is: not run, not filled in
+    assert chart_data(read)["marks"][0]["label"] == EVIL and "<" not in read.scripts[0]
+
+
+def test_missing_channels_and_none_everywhere(recording, no_verdict, make_diagnosis):
+    for names in ([], ["u"], ["p_B"], ["p_A", "q_leak"]):
+        for part in (recording.only(names), recording.only(names).between(0, 0.06)):
+            for diagnosis in (no_verdict, make_diagnosis()):
+                text = Reader(render_page(part, diagnosis)).text
+                assert "None" not in text and "nan" not in text.split()
+    assert "p_A is not in this recording." in Reader(render_page(recording.only(["u"]), no_verdict)).text
+
+
+def test_faulty_data_are_drawn_and_named_not_refused(recording, make_diagnosis):
+    values = recording["p_A"].copy()
+    values[3000:3400] = np.nan
+    values[50] = np.inf
+    t = recording.t.copy()
+    t[9000] = t[8000]
+    faulty = replace(
+        recording, t=t, channels={**recording.channels, "p_A": values, "x": np.full(len(recording), np.nan)}
+    )
+    read = Reader(render_page(faulty, make_diagnosis()))
+    assert "time stamps are out of order" in read.text and "samples are left out" in read.text
+    line = drawn(next(c for c in chart_data(read)["charts"] if c["key"] == "p_AB-0")["series"][0])
+    assert np.isnan(line).any() and not any(c["key"] == "x-0" for c in chart_data(read)["charts"])
+    one = replace(recording, t=[0.0], channels={"p_A": [3e5]}, units={"p_A": "Pa"})
+    Reader(render_page(one, make_diagnosis()))
+    with pytest.raises(InputError, match="at least 1 sample"):
+        render_page(recording.between(-2, -1), make_diagnosis())
+
+
+def test_an_unbounded_interval_is_drawn_to_the_recordings_end(recording, make_diagnosis):
+    diagnosis = make_diagnosis(onset_interval_s=(18.5, np.inf), leak_interval_lpm=(0.003, np.inf))
+    read = Reader(render_page(recording, diagnosis))
+    assert chart_data(read)["onset"]["high"] == pytest.approx(recording.t[-1])
+    assert "between 0.003 and ∞ L/min" in read.text
+
+
+@pytest.mark.parametrize("verdict", ["leak", "no leak", "cannot tell"])
+def test_the_schematic_highlights_the_leak_path_only_for_a_leak(recording, make_diagnosis, verdict):
+    page = render_page(recording, make_diagnosis(verdict=verdict))
+    assert ('class="leak"' in page) == (verdict == "leak")
+    assert ("leak 0.00421 L/min" in page) == (verdict == "leak")
+
+
+def test_the_schematic_tells_recorded_sensors_from_others_and_shows_the_rigs_values(recording, make_diagnosis):
+    page = render_page(recording.only(["p_A"]), make_diagnosis())
+    assert "in chamber A, p_A, in this recording" in page and "in chamber B, p_B, not in this recording" in page
+    rig = SimpleNamespace(
+        title="bench 4", cylinder=SimpleNamespace(A_A=633e-6, A_B=500e-6, L=0.6), pump=SimpleNamespace(q_b=4.9e-6)
+    )
+    text = Reader(render_page(recording, make_diagnosis(), rig=rig)).text
+    for value in ("633 mm²", "500 mm²", "600 mm", "4.9 cm³/rev", "Values: bench 4."):
+        assert value in text
+
+
+def test_the_packaged_rig_labels_the_schematic(recording, make_diagnosis):
+    rig = pytest.importorskip("sealscope.parameters").load_rig("thesis")
+    text = Reader(render_page(recording, make_diagnosis(), rig=rig)).text
+    assert "633 mm²" in text and "4.9 cm³/rev" in text
+
+
+def test_three_minutes_at_500_hz_stay_under_two_megabytes(make_recording, make_diagnosis):
+    long = make_recording(seconds=180.0)
+    page = render_page(long, make_diagnosis(onset_s=90.0, onset_interval_s=(88.0, 93.0)))
+    assert len(page.encode()) < 2_000_000
+    assert "Of each 12 samples in turn (24 ms)" in page and "from 84.0 s to 96.0 s every sample is drawn" in page
+
+
+def test_the_page_is_the_same_twice(recording, make_diagnosis):
+    assert render_page(recording, make_diagnosis()) == render_page(recording, make_diagnosis())
+
+
+def test_a_page_is_written_whole_or_not_at_all(tmp_path, recording, make_diagnosis, monkeypatch):
+    target = tmp_path / "page.html"
+    assert write_page(target, recording, make_diagnosis()) == target
+    assert target.read_text(encoding="utf-8") == render_page(recording, make_diagnosis())
+    assert [entry.name for entry in tmp_path.iterdir()] == ["page.html"]
+    before = target.read_bytes()
+
+    def full(self, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        write_page(target, recording, make_diagnosis(verdict="no leak"))
+    assert target.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path, recording, make_diagnosis):
+    with pytest.raises(InputError, match=r"page must go to a folder .*absent"):
+        write_page(tmp_path / "absent" / "page.html", recording, make_diagnosis())
+
+
+def test_a_mark_must_stand_at_a_time():
+    with pytest.raises(InputError, match="'oil change' must be finite, got nan"):
+        Mark(float("nan"), "oil change")

@@ -1,0 +1,77 @@
+"""The sentences of page and terminal."""
+
+from __future__ import annotations
+
+import pytest
+
+from sealscope.reporting import diagnosis_text, words
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (None, "–"),
+        (float("nan"), "–"),
+        (float("inf"), "∞"),
+        (0, "0"),
+        (0.0042, "0.0042"),
+        (0.0099999, "0.01"),
+        (-3.14159, "−3.14"),
+        (8123.4, "8123"),
+        (123456.0, "123456"),
+        (1e-9, "1e−09"),
+    ],
+)
+def test_numbers_are_short_and_without_needless_exponents(value, shown):
+    assert words.number(value) == shown
+
+
+def test_times_beyond_an_hour_are_shown_as_a_clock_too():
+    assert words.clock(91.26) == "91.3 s"
+    assert words.clock(7325.0) == "7325.0 s (2:02:05)"
+    assert words.clock(0.06) == "0.06 s"
+    assert words.clock(None) == "–"
+
+
+def test_a_leak_in_words(make_diagnosis):
+    text = diagnosis_text(make_diagnosis())
+    first, *rest = text.splitlines()
+    flat = " ".join(" ".join(rest).split())
+    assert first == "bench/log_17.csv: leak"
+    assert "20.4 s, between 18.5 s and 21.8 s" in flat
+    assert "0.00421 L/min, between 0.0031 and 0.0057 L/min" in flat
+    assert "score 5.44, over the threshold of 3.22" in flat
+    assert "0.1 % (1 in 1000) of leak-free recordings" in flat
+    assert "details: leak (score 5.44, threshold 3.22)" in flat
+    assert "Rule out a fault of the data first: clipped (p_1)" in flat
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_no_leak_claims_no_onset_and_no_flow(make_diagnosis):
+    text = diagnosis_text(make_diagnosis(verdict="no leak", score=1.5, onset_s=None, leak_lpm=None, quality=()))
+    assert "since" not in text and "L/min" not in text
+    assert "not over the threshold" in text and "baseline" in text
+
+
+def test_a_leak_since_before_the_recording_and_of_unknown_size(make_diagnosis):
+    text = diagnosis_text(make_diagnosis(onset_s=None, onset_interval_s=None, leak_lpm=None, leak_interval_lpm=None))
+    assert "not within this recording" in text and "the channels do not allow it" in text
+
+
+def test_all_that_may_be_none_may_be_none(no_verdict):
+    text = diagnosis_text(no_verdict)
+    assert text.startswith("this recording: cannot tell")
+    assert "no score was formed" in text and "None" not in text and "nan" not in text
+
+
+def test_control_characters_of_a_file_name_do_not_reach_the_terminal(make_diagnosis):
+    text = diagnosis_text(make_diagnosis(file="a\x1b[31m\nb.csv", reason="bad\x07"))
+    assert "\x1b" not in text and "\x07" not in text
+    assert text.splitlines()[0].endswith("b.csv: leak")
+
+
+@pytest.mark.parametrize(
+    ("p", "shown"), [(0.05, "5 % (1 in 20)"), (1e-5, "0.001 % (1 in 100000)"), (0.4, "(1 in 2.5)")]
+)
+def test_false_alarm_rates_in_words(make_diagnosis, p, shown):
+    assert shown in words.false_alarms(make_diagnosis(false_alarm_probability=p))
