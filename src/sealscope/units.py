@@ -79,7 +79,7 @@ _ATOMS: dict[str, Unit] = {
     "degC": _unit(1, K=1, offset="273.15"),
     "degF": _unit("5/9", K=1, offset="459.67"),
 }
-#: Other spellings. Pressures inside are gauge pressures; absolute ones lose one standard atmosphere.
+# pressures inside are gauge pressures; absolute ones lose one standard atmosphere
 _SPELLINGS = {
     spelling: name
     for name, spellings in {
@@ -328,7 +328,7 @@ def parse_quantity(
 ) -> float:
     """The number that ``2[L/min]``, ``3 psi`` or ``5`` (already SI) stands for, in `si_unit`.
 
-    Raises InputError where there is no number, where the dimension is another, and, if `finite`, where it is not finite.
+    Raises InputError where there is no number, for another dimension, and, if `finite`, for an infinite one or NaN.
     """
     where = f" ({place})" if place else ""
     match = _NUMBER.fullmatch(text) if len(text) <= _LONGEST_TEXT else None

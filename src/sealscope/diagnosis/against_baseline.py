@@ -11,7 +11,7 @@ import numpy as np
 from sealscope.diagnosis.blocks import QUANTITIES, Blocks, cut, whole_log_rms
 from sealscope.diagnosis.change import permutations_for, two_samples, upper_quantile
 from sealscope.diagnosis.operating_point import LEVEL_RATIO, OperatingPoint, difference, operating_point
-from sealscope.diagnosis.rms_results import JUDGED, largest_changes, method_result
+from sealscope.diagnosis.rms_results import JUDGED, excess, largest_changes, method_result
 from sealscope.diagnosis.verdict import Evidence, Verdict
 from sealscope.recordings.recording import Array, Recording
 
@@ -27,11 +27,13 @@ LEVEL_MARGIN = 0.25
 
 @dataclass(frozen=True)
 class Prediction:
-    """What leak-free recordings lead one to expect of another at the same operating point: mean and standard deviation (f,) of its log RMS, and degrees of freedom."""
+    """What leak-free recordings lead one to expect of another at the same operating point: `mean` and standard `deviation` (f,) of its log RMS, degrees of
+    freedom, and the `fitted` values (n, f) of the leak-free ones themselves."""
 
     mean: Array
     deviation: Array
     freedom: int
+    fitted: Array
 
 
 def predict(log_rms: Array, levels: Array, level: float) -> Prediction:
@@ -49,7 +51,7 @@ def predict(log_rms: Array, levels: Array, level: float) -> Prediction:
     residual = log_rms - design @ coefficients
     variance = np.sum(residual**2, axis=0) / freedom
     leverage = float(at @ np.linalg.solve(design.T @ design, at))
-    return Prediction(at @ coefficients, np.sqrt(variance * (1.0 + leverage)), freedom)
+    return Prediction(at @ coefficients, np.sqrt(variance * (1.0 + leverage)), freedom, design @ coefficients)
 
 
 def student_threshold(probability: float, freedom: int) -> float:
@@ -95,8 +97,9 @@ def _level(point: OperatingPoint) -> str:
 def _by_recordings(
     recording: Recording, baseline: Sequence[Recording], level: float, levels: Array, probability: float
 ) -> Evidence:
-    expected = predict(np.stack([whole_log_rms(one) for one in baseline]), levels, level)
-    changes = whole_log_rms(recording) - expected.mean
+    known, measured = np.stack([whole_log_rms(one) for one in baseline]), whole_log_rms(recording)
+    expected = predict(known, levels, level)
+    changes = measured - expected.mean
     t = changes / expected.deviation
     chambers = operating_point(recording).chambers
     names = [f"{quantity} of {chamber}" for chamber in chambers for quantity in QUANTITIES]
@@ -107,12 +110,34 @@ def _by_recordings(
         method_result(name, abs(float(t[k])), own, f"{100 * np.expm1(changes[k]):+.1f} % against the baseline")
         for k, name in enumerate(names)
     )
+    noise = [k for k, name in enumerate(names) if name.startswith("d1 ")]
+    noisy = bool(np.any(np.abs(t[noise]) > own))
+    if noisy:
+        t = t.copy()
+        t[judged] = _without_noise(known, measured, expected, judged)
     score = float(np.max(np.abs(t[judged])))
     told = largest_changes([names[k] for k in judged], t[judged], changes[judged], np.full(len(judged), threshold))
     verdict: Verdict = "leak" if score > threshold else "no leak"
-    against_what = f"against {len(baseline)} comparable leak-free recordings (largest |t| {score:.1f}, threshold {threshold:.1f})"
+    against_what = (
+        f"against {len(baseline)} comparable leak-free recordings (largest |t| {score:.1f}, threshold {threshold:.1f})"
+    )
     reason = f"{told} {against_what}" if verdict == "leak" else f"no change of the details' RMS {against_what}"
+    if noisy:
+        reason += "; the noise (d1) changed too, and was taken out of the other details"
     return Evidence(verdict, reason, score, threshold, methods=methods)
+
+
+def _without_noise(known: Array, measured: Array, expected: Prediction, judged: list[int]) -> Array:
+    """t of the judged quantities' energy beyond that of their chamber's d1, relative to what was expected of the quantity: white noise drops out."""
+    noise = [k - k % len(QUANTITIES) for k in judged]
+    before = np.exp(2 * (known[:, judged] - expected.fitted[:, judged])) - np.exp(
+        2 * (known[:, noise] - expected.fitted[:, judged])
+    )
+    after = np.exp(2 * (measured[judged] - expected.mean[judged])) - np.exp(
+        2 * (measured[noise] - expected.mean[judged])
+    )
+    scatter = np.sqrt(np.sum((before - before.mean(axis=0)) ** 2, axis=0) / expected.freedom * (1.0 + 1.0 / len(known)))
+    return np.asarray((after - before.mean(axis=0)) / scatter)
 
 
 def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
@@ -131,17 +156,33 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
     threshold = float(upper_quantile(t2_null, probability))
     thresholds = upper_quantile(single_null, probability)
     changes = x[split:].mean(axis=0) - x[:split].mean(axis=0)
+    noisy = any(abs(single[k]) > thresholds[k] for k in after.columns("d1"))
+    if noisy:
+        beyond = np.concatenate([excess(one) for one in [*before, after]])
+        score, _, t2_null, _ = two_samples(
+            beyond, split, list(range(beyond.shape[1])), permutations_for(probability), seed=1
+        )
+        threshold = float(upper_quantile(t2_null, probability))
     methods = tuple(
         method_result(
-            name, abs(float(single[k])), float(thresholds[k]), f"{100 * np.expm1(changes[k]):+.1f} % against the baseline"
+            name,
+            abs(float(single[k])),
+            float(thresholds[k]),
+            f"{100 * np.expm1(changes[k]):+.1f} % against the baseline",
         )
         for k, name in enumerate(after.names)
     )
     verdict: Verdict = "leak" if score > threshold else "no leak"
-    told = largest_changes(after.names, single, changes, thresholds) if verdict == "leak" else "no change of the details' RMS"
+    told = (
+        largest_changes(after.names, single, changes, thresholds)
+        if verdict == "leak"
+        else "no change of the details' RMS"
+    )
     count = f"{len(baseline)} comparable leak-free recording{'s' if len(baseline) > 1 else ''}"
     reason = (
         f"{told} against {count} (T2 {score:.1f}, threshold {threshold:.1f}, from the scatter within recordings alone: "
         f"give {FEWEST_RECORDINGS} or more to have the drift between recordings in it)"
     )
+    if noisy:
+        reason += "; the noise (d1) changed too, and was taken out of the other details"
     return Evidence(verdict, reason, score, threshold, methods=methods)

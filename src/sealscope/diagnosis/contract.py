@@ -18,9 +18,7 @@ class Detector(Protocol):
         """None when the recording has what the detector needs, else the reason why not, in one line."""
         ...
 
-    def examine(
-        self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float
-    ) -> Evidence:
+    def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Evidence on a recording that is `usable`; with an empty baseline the recording's own beginning is the baseline."""
         ...
 

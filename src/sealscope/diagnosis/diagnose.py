@@ -63,7 +63,9 @@ def diagnose(
     part, cut_down = analysable(recording)
     if cut_down is not None:
         quality.append(cut_down)
-    spoilt = [finding for finding in quality if finding.channel in chambers_of(recording) and _spoils(finding, len(part))]
+    spoilt = [
+        finding for finding in quality if finding.channel in chambers_of(recording) and _spoils(finding, len(part))
+    ]
     whole = [analysable(one)[0] for one in baseline]
     evidence = [
         (detector.name, _examine(detector, part, whole, false_alarm_probability, spoilt))

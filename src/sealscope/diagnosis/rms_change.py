@@ -12,27 +12,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from sealscope.diagnosis.against_baseline import against
-from sealscope.diagnosis.blocks import QUANTITIES, Blocks, chambers_of, cut
+from sealscope.diagnosis.blocks import Blocks, chambers_of, cut
 from sealscope.diagnosis.change import null_maxima, onset_interval, permutations_for, scan, upper_quantile
-from sealscope.diagnosis.rms_results import JUDGED, describe_change, largest_changes, method_result
+from sealscope.diagnosis.rms_results import JUDGED, describe_change, excess, largest_changes, method_result
 from sealscope.diagnosis.verdict import Evidence, MethodResult, Verdict
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import shortest
 
 #: Fewest blocks in which a change can be looked for: the covariance of six columns needs them.
 FEWEST_BLOCKS = 24
-
-
-def excess(blocks: Blocks) -> Array:
-    """Energy of d2..d4 beyond that of d1, relative to its mean: (n, 3 per chamber). White noise, which every level holds alike, drops out."""
-    energy = np.exp(2.0 * blocks.log_rms)
-    columns = []
-    for chamber in range(len(blocks.chambers)):
-        noise = energy[:, chamber * len(QUANTITIES)]
-        for quantity in JUDGED:
-            level = energy[:, chamber * len(QUANTITIES) + QUANTITIES.index(quantity)]
-            columns.append((level - noise) / level.mean())
-    return np.stack(columns, axis=1)
 
 
 class RmsChange:
@@ -51,9 +39,7 @@ class RmsChange:
             return f"needs {shortest()} samples or more without a gap, got {len(recording)}"
         return None
 
-    def examine(
-        self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float
-    ) -> Evidence:
+    def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         if baseline:
             return against(recording, baseline, false_alarm_probability)
         return self._within(recording, false_alarm_probability)

@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealscope.diagnosis.blocks import QUANTITIES, Blocks
 from sealscope.diagnosis.verdict import MethodResult, Verdict
 from sealscope.recordings.recording import Array
 
 #: Quantities that make the verdict; d1 holds noise alone, d3d4 follows from d3 and d4.
 JUDGED = ("d2", "d3", "d4")
+
+
+def excess(blocks: Blocks) -> Array:
+    """Energy of d2..d4 beyond that of d1, relative to its mean: (n, 3 per chamber). White noise, which every level holds alike, drops out."""
+    energy = np.exp(2.0 * blocks.log_rms)
+    columns = []
+    for chamber in range(len(blocks.chambers)):
+        noise = energy[:, chamber * len(QUANTITIES)]
+        for quantity in JUDGED:
+            level = energy[:, chamber * len(QUANTITIES) + QUANTITIES.index(quantity)]
+            columns.append((level - noise) / level.mean())
+    return np.stack(columns, axis=1)
 
 
 def describe_change(name: str, change: float) -> str:

@@ -265,9 +265,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
         V_A, V_B = p.V - 0.5 * p.A_A * p.L, p.V + 0.5 * p.A_B * p.L
     chambers = p.K_oil * (1.0 / V_A + 1.0 / V_B)
     ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if p.throttled else chambers
-    loop = _longest_for_pair(
-        p.R_c / p.L_c + p.B_M / p.J_M, (p.R_c * p.B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M)
-    )
+    loop = _longest_for_pair(p.R_c / p.L_c + p.B_M / p.J_M, (p.R_c * p.B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M))
     column = p.K_oil * (p.A_A**2 / V_A + p.A_B**2 / V_B) / p.M_eq
     standing = p.F_pr * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
     standing += 0.0 if p.literal_bracket else p.F_v

@@ -43,7 +43,8 @@ class Sine:
 
     def __str__(self) -> str:
         phase, offset = (
-            f" {'-' if value < 0 else '+'} {number_text(abs(value))}" if value else "" for value in (self.phase, self.offset)
+            f" {'-' if value < 0 else '+'} {number_text(abs(value))}" if value else ""
+            for value in (self.phase, self.offset)
         )
         return f"{number_text(self.amplitude)} sin({number_text(self.omega)}t{phase}){offset}"
 
@@ -143,7 +144,9 @@ class Recorded:
 
     def __post_init__(self) -> None:
         if self.t.shape != self.u.shape or self.t.ndim != 1 or self.t.size < 2:
-            raise InputError(f"a recorded command needs two samples or more in t and u, got {self.t.size} ({self.origin})")
+            raise InputError(
+                f"a recorded command needs two samples or more in t and u, got {self.t.size} ({self.origin})"
+            )
         if not (np.all(np.isfinite(self.u)) and np.all(np.diff(self.t) > 0)):
             raise InputError(f"a recorded command must be finite and its time must rise ({self.origin})")
 

@@ -78,7 +78,9 @@ class Experiment:
         return {
             "rig": self.rig.name,
             "parameters_set": {
-                row.name: f"{row.value} {row.unit}".strip() for row in self.rig.table() if row.source.startswith("set by")
+                row.name: f"{row.value} {row.unit}".strip()
+                for row in self.rig.table()
+                if row.source.startswith("set by")
             },
             "command": str(self.command),
             "duration_s": self.duration,

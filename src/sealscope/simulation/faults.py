@@ -55,7 +55,9 @@ class Growing:
 
     def __post_init__(self) -> None:
         if not self.stop > self.start:
-            raise InputError(f"a growing leak must stop growing after it starts, got {self.start:g} s to {self.stop:g} s")
+            raise InputError(
+                f"a growing leak must stop growing after it starts, got {self.start:g} s to {self.stop:g} s"
+            )
 
     def share(self, t: Array) -> Array:
         return np.clip((t - self.start) / (self.stop - self.start), 0.0, 1.0)
@@ -78,7 +80,9 @@ class Tabulated:
         if self.t.size != self.opening.size or self.t.size < 1 or np.any(np.diff(self.t) < 0):
             raise InputError("a leak table must have one opening for each time, and its times must rise")
         if not (np.all(self.opening >= 0) and np.all(self.opening <= 1)):
-            raise InputError(f"openings of a leak table must be in 0..1, got {self.opening.min():g}..{self.opening.max():g}")
+            raise InputError(
+                f"openings of a leak table must be in 0..1, got {self.opening.min():g}..{self.opening.max():g}"
+            )
 
     def share(self, t: Array) -> Array:
         return np.interp(t, self.t, self.opening)

@@ -36,7 +36,9 @@ def decimate(values: Array, factor: int, n: int) -> Array:
 def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
     """Pressure [Pa] as read back from the converter: the transducer saturates at its range, the converter counts in steps of `daq.step` [V]."""
     volts_per_pascal = (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
-    volts = daq.sensor_volts_lo + (np.clip(pressure, sensor.range_lo, sensor.range_hi) - sensor.range_lo) * volts_per_pascal
+    volts = (
+        daq.sensor_volts_lo + (np.clip(pressure, sensor.range_lo, sensor.range_hi) - sensor.range_lo) * volts_per_pascal
+    )
     top = 2 ** (daq.bits - 1)
     codes = np.clip(np.rint(volts / daq.step), -top, top - 1)
     return sensor.range_lo + (codes * daq.step - daq.sensor_volts_lo) / volts_per_pascal

@@ -98,7 +98,9 @@ def integrate(
     if step is None:
         default = DEFAULT_STEP[chosen]
         _, G, C = inputs(np.arange(n_out) / rate)
-        step = max(min(default, longest_step(p, float(G.max(initial=0.0)), float(C.max(initial=0.0)))), default / _FINER)
+        step = max(
+            min(default, longest_step(p, float(G.max(initial=0.0)), float(C.max(initial=0.0)))), default / _FINER
+        )
     every = _steps_per_output(rate, step)
     h = 1.0 / (rate * every)
     if not allow_unresolved:

@@ -68,7 +68,8 @@ def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tup
     factor = oversampling(experiment)
     units = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
     found = [
-        Difference(name, _rms(coarse[name][: n * factor] - fine[name][: n * factor]), units[name], None) for name in _STATES
+        Difference(name, _rms(coarse[name][: n * factor] - fine[name][: n * factor]), units[name], None)
+        for name in _STATES
     ]
     found += [
         Difference(name, _rms(coarse[name][: n * factor] - fine[name][: n * factor]), "Pa", PRESSURE_TOLERANCE)

@@ -90,7 +90,9 @@ def trajectory(
 def sized_leaks(experiment: Experiment, progress: Progress | None = None) -> tuple[Leak, ...]:
     """The experiment's leaks with the coefficients that give their means at the rig's own operating point."""
     if not any(leak.mean for leak in experiment.leaks):
-        return tuple(leak if leak.mean is None else Leak(leak.law, 0.0, None, leak.opening) for leak in experiment.leaks)
+        return tuple(
+            leak if leak.mean is None else Leak(leak.law, 0.0, None, leak.opening) for leak in experiment.leaks
+        )
     runs = 0
 
     def one_run(leaks: tuple[Leak, ...]) -> Trajectory:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -14,7 +15,8 @@ from sealscope.simulation.integrate import Trajectory
 
 #: Relative distance from the mean asked for at which the search ends.
 TOLERANCE = 1e-3
-_MOST_RUNS = 12
+_MOST_RUNS = 20
+_LEAST_SLOPE = 0.1
 
 Integrate = Callable[[tuple[Leak, ...]], Trajectory]
 
@@ -45,15 +47,25 @@ def _refuse_impossible(leaks: tuple[Leak, ...], pump_flow: float) -> None:
             )
 
 
+def _slope(before: tuple[float, float], now: tuple[float, float]) -> float:
+    """d log flow / d log coefficient between two runs, within what a leak can do; 1 where they do not tell."""
+    (c_0, q_0), (c_1, q_1) = before, now
+    if min(c_0, q_0, c_1, q_1) <= 0.0 or abs(c_1 / c_0 - 1.0) < 1e-6:
+        return 1.0
+    return min(max(math.log(q_1 / q_0) / math.log(c_1 / c_0), _LEAST_SLOPE), 1.0)
+
+
 def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[Leak, ...]:
     """The leaks with a coefficient each, found so that each one's mean is what was asked for.
 
-    The flow is nearly proportional to the coefficient (friction sets the pressure difference), so the coefficient is scaled by asked/got until
-    it is within `TOLERANCE`, starting from the rig without these leaks.
+    A small leak's flow is proportional to its coefficient (friction sets the pressure difference), a large one's grows
+    less. So each coefficient is scaled by (asked/got)^(1/s), s the slope d log flow / d log coefficient of that leak
+    between the last two runs, until every mean is within `TOLERANCE`, starting from the rig without these leaks.
 
     Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed where the search does not settle.
     """
     current = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
+    before: list[tuple[float, float]] = [(0.0, 0.0)] * len(leaks)  # coefficient and mean flow of the run before
     for attempt in range(_MOST_RUNS):
         run = integrate(current)
         if attempt == 0:
@@ -61,15 +73,23 @@ def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[L
         dp = run["p_A"] - run["p_B"]
         worst = 0.0
         following = []
-        for asked, now in zip(leaks, current, strict=True):
+        for k, (asked, now) in enumerate(zip(leaks, current, strict=True)):
             if asked.mean is None or asked.mean == 0.0:
                 following.append(now)
                 continue
+            size = now.coefficient or 0.0
             unit = mean_while_open(now, run.t, leak_flow(replace(now, coefficient=1.0), run.t, dp, dp_0))
             if not unit > 0:
                 raise InputError(f"a leak with a mean flow must be open within the run, got {asked}")
-            worst = max(worst, abs(unit * (now.coefficient or 0.0) / asked.mean - 1.0))
-            following.append(replace(now, coefficient=asked.mean / unit))
+            got = unit * size
+            worst = max(worst, abs(got / asked.mean - 1.0))
+            scaled = (
+                asked.mean / unit
+                if size == 0.0
+                else size * (asked.mean / got) ** (1.0 / _slope(before[k], (size, got)))
+            )
+            before[k] = (size, got)
+            following.append(replace(now, coefficient=scaled))
         if worst <= TOLERANCE:
             return current
         current = tuple(following)
