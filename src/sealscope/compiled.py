@@ -2,8 +2,8 @@
 
 Plain ``cache=True`` keys a kernel by its own file only, so an edit to a law in another file leaves the kernel's
 old machine code valid and silently wrong. Here the cache directory is named by a hash over the sources of every
-room that holds compiled code, the versions of numba and Python and the processor, and lies in the user's cache folder (never in site-packages, which
-may be read-only). `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off.
+room that holds compiled code, the versions of numba and Python and the processor, and lies in the user's cache folder
+(never in site-packages, which may be read-only). `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off.
 """
 
 from __future__ import annotations

@@ -15,13 +15,13 @@ class InputError(SealscopeError, ValueError):
     """A value, an option or a file from outside breaks a rule."""
 
 
-class UnreadableFile(InputError):
+class UnreadableFile(InputError):  # noqa: N818 (says what happened)
     """A file cannot be read as a recording; the other files of the same call still can."""
 
 
-class SimulationFailed(SealscopeError, ArithmeticError):
+class SimulationFailed(SealscopeError, ArithmeticError):  # noqa: N818 (says what happened)
     """A run diverged, or proved to be under-resolved; no result is returned."""
 
 
-class MissingExtra(SealscopeError, ImportError):
+class MissingExtra(SealscopeError, ImportError):  # noqa: N818 (says what happened)
     """An optional library is needed; the message names the extra that installs it."""

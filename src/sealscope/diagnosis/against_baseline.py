@@ -1,4 +1,5 @@
-"""Compare a recording with leak-free ones: with several, by the scatter between recordings; with one or two, by the scatter of blocks."""
+"""Compare a recording with leak-free ones: with several, by the scatter between recordings; with one or two, by the
+scatter of blocks."""
 
 from __future__ import annotations
 
@@ -21,14 +22,16 @@ FEWEST_RECORDINGS = 3
 FEWEST_FOR_LEVEL = 6
 #: Fewest blocks of each side where blocks are compared.
 FEWEST_BLOCKS = 12
-#: How far outside the baseline's range of levels a recording may lie, as a share of the range and at least, in log units.
+#: How far outside the baseline's range of levels a recording may lie, as a share of the range and at least, in log
+#: units.
 LEVEL_MARGIN = 0.25
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What leak-free recordings lead one to expect of another at the same operating point: `mean` and standard `deviation` (f,) of its log RMS, degrees of
-    freedom, and the `fitted` values (n, f) of the leak-free ones themselves."""
+    """What leak-free recordings lead one to expect of another at the same operating point: `mean` and standard
+    `deviation` (f,) of its log RMS, degrees of freedom, and the `fitted` values (n, f) of the leak-free ones
+    themselves."""
 
     mean: Array
     deviation: Array
@@ -39,8 +42,9 @@ class Prediction:
 def predict(log_rms: Array, levels: Array, level: float) -> Prediction:
     """Normal prediction for one more recording from n leak-free ones.
 
-    `log_rms`: (n, f); `levels`: (n,) log pressure levels. From six recordings on, the log RMS is a line over the level (least squares), else a
-    constant; the deviation includes the estimate's own error (Montgomery, Peck & Vining, Introduction to Linear Regression Analysis, sec. 2.5).
+    `log_rms`: (n, f); `levels`: (n,) log pressure levels. From six recordings on, the log RMS is a line over the
+    level (least squares), else a constant; the deviation includes the estimate's own error (Montgomery, Peck &
+    Vining, Introduction to Linear Regression Analysis, sec. 2.5).
     """
     n = len(levels)
     with_level = n >= FEWEST_FOR_LEVEL and np.ptp(levels) > 0
@@ -81,7 +85,8 @@ def against(recording: Recording, baseline: Sequence[Recording], probability: fl
     if _outside(point.level, levels):
         return Evidence(
             "cannot tell",
-            f"the pressure level, {_level(point)}, lies outside that of the {len(alike)} comparable baseline recordings, "
+            f"the pressure level, {_level(point)}, lies outside that of the {len(alike)} comparable baseline "
+            f"recordings, "
             f"{np.exp(levels.min()):.4g} to {np.exp(levels.max()):.4g}",
         )
     chosen = [baseline[k] for k in alike]
@@ -128,7 +133,8 @@ def _by_recordings(
 
 
 def _without_noise(known: Array, measured: Array, expected: Prediction, judged: list[int]) -> Array:
-    """t of the judged quantities' energy beyond that of their chamber's d1, relative to what was expected of the quantity: white noise drops out."""
+    """t of the judged quantities' energy beyond that of their chamber's d1, relative to what was expected of the
+    quantity: white noise drops out."""
     noise = [k - k % len(QUANTITIES) for k in judged]
     before = np.exp(2 * (known[:, judged] - expected.fitted[:, judged])) - np.exp(
         2 * (known[:, noise] - expected.fitted[:, judged])
@@ -148,7 +154,8 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
     if min(split, len(after.log_rms)) < FEWEST_BLOCKS:
         return Evidence(
             "cannot tell",
-            f"too little to compare: {split} blocks of baseline and {len(after.log_rms)} of the recording, {FEWEST_BLOCKS} of each are needed "
+            f"too little to compare: {split} blocks of baseline and {len(after.log_rms)} of the recording, "
+            f"{FEWEST_BLOCKS} of each are needed "
             f"(or {FEWEST_RECORDINGS} comparable baseline recordings, got {len(baseline)})",
         )
     joint = after.columns(*JUDGED)

@@ -1,7 +1,7 @@
 """Cut a recording into blocks of equal standing and give each the RMS of its details.
 
-A block is a whole share of the command's cycle, so that blocks of the same phase are alike but for noise and for what has changed in the machine; where
-there is no cycle it is a window of fixed length.
+A block is a whole share of the command's cycle, so that blocks of the same phase are alike but for noise and for what
+has changed in the machine; where there is no cycle it is a window of fixed length.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _ANALYSIS_RATE = 50.0
 class Blocks:
     """log RMS of every quantity in every block.
 
-    `edges`: (n + 1,) boundaries [s]; `log_rms`: (n, 5 per chamber), the phase's own level taken out; `chambers`: their names; `phases`: blocks a cycle (1: none);
-    `cycle`: its length [s], None where no cycle was found.
+    `edges`: (n + 1,) boundaries [s]; `log_rms`: (n, 5 per chamber), the phase's own level taken out; `chambers`:
+    their names; `phases`: blocks a cycle (1: none); `cycle`: its length [s], None where no cycle was found.
     """
 
     edges: Array
@@ -55,7 +55,8 @@ class Blocks:
 def find_cycle(recording: Recording) -> float | None:
     """Length of the duty's cycle [s] from the command, or else from the pressure difference; None when nothing repeats.
 
-    The first maximum of the autocorrelation after its first zero, at least 0.6 high, between 0.2 s and 20 s and repeated five times or more; refined by a parabola.
+    The first maximum of the autocorrelation after its first zero, at least 0.6 high, between 0.2 s and 20 s and
+    repeated five times or more; refined by a parabola.
     """
     if "u" in recording and np.ptp(recording["u"]) > 0:
         signal = recording["u"]

@@ -1,13 +1,16 @@
-"""Has the mean of a series of vectors changed, and when? A scan over every instant, and what the scan gives when nothing has changed.
+"""Has the mean of a series of vectors changed, and when? A scan over every instant, and what the scan gives when
+nothing has changed.
 
-The series x_1..x_n (blocks) has a covariance S, estimated from the differences of neighbours, which a single step does not inflate. For a step after block k,
+The series x_1..x_n (blocks) has a covariance S, estimated from the differences of neighbours, which a single step
+does not inflate. For a step after block k,
 
     T2(k) = n / (k (n - k)) c_k' S^-1 c_k,   c_k = sum_{i <= k} (x_i - mean)
 
-is twice the log likelihood ratio of "the mean changed after k" against "it did not" (Srivastava & Worsley, Likelihood ratio tests for a change in the multivariate normal
-mean, JASA 81 (1986) 199-204). The threshold is the quantile of max T2 over random orders of the same blocks: without a change every order is as likely as
-the one observed. Pairs of neighbours are moved together, so that the short memory of the blocks (the filters reach from one into the next) stays in
-the null distribution; longer runs would carry the very step that is looked for.
+is twice the log likelihood ratio of "the mean changed after k" against "it did not" (Srivastava & Worsley, Likelihood
+ratio tests for a change in the multivariate normal mean, JASA 81 (1986) 199-204). The threshold is the quantile of
+max T2 over random orders of the same blocks: without a change every order is as likely as the one observed. Pairs of
+neighbours are moved together, so that the short memory of the blocks (the filters reach from one into the next) stays
+in the null distribution; longer runs would carry the very step that is looked for.
 """
 
 from __future__ import annotations
@@ -18,8 +21,9 @@ import numpy as np
 
 from sealscope.recordings.recording import Array
 
-#: 95 % of the time the likelihood ratio at the true instant is within this of its maximum: P(2 log LR <= x) = (1 - exp(-x/2))^2
-#: (Eo & Morley, Likelihood-ratio-based confidence sets for the timing of structural breaks, Quantitative Economics 6 (2015) 463-497).
+#: 95 % of the time the likelihood ratio at the true instant is within this of its maximum: P(2 log LR <= x) = (1 -
+#: exp(-x/2))^2 (Eo & Morley, Likelihood-ratio-based confidence sets for the timing of structural breaks, Quantitative
+#: Economics 6 (2015) 463-497).
 ONSET_CUT = -2.0 * np.log(1.0 - np.sqrt(0.95))
 _BATCH = 250
 _RUN = 2
@@ -27,8 +31,8 @@ _RUN = 2
 
 @dataclass(frozen=True)
 class Scan:
-    """`joint`: (n - 1,) T2 for a step after block k = 1..n-1; `single`: (n - 1, f) its square root, signed, for each column alone: > 0 where the mean rises; `trend`:
-    T2 of an even drift from the first to the last block."""
+    """`joint`: (n - 1,) T2 for a step after block k = 1..n-1; `single`: (n - 1, f) its square root, signed, for each
+    column alone: > 0 where the mean rises; `trend`: T2 of an even drift from the first to the last block."""
 
     joint: Array
     single: Array
@@ -40,7 +44,8 @@ class Scan:
 
 
 def _statistics(x: np.ndarray, joint: list[int], least: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T2 (m, n-1), single (m, n-1, f) and trend T2 (m,) of a stack of series x (m, n, f); steps nearer than `least` blocks to an end are left out."""
+    """T2 (m, n-1), single (m, n-1, f) and trend T2 (m,) of a stack of series x (m, n, f); steps nearer than `least`
+    blocks to an end are left out."""
     _, n, _ = x.shape
     centred = x - x.mean(axis=1, keepdims=True)
     differences = np.diff(x, axis=1)
@@ -102,14 +107,16 @@ def null_maxima(x: Array, joint: list[int], count: int, seed: int = 0) -> tuple[
 
 
 def upper_quantile(null: Array, probability: float) -> Array:
-    """Threshold that a null sample (m, ...) exceeds with `probability`: its order statistic of rank ceil((1 - p)(m + 1)), so that the rate is at most p."""
+    """Threshold that a null sample (m, ...) exceeds with `probability`: its order statistic of rank ceil((1 - p)(m +
+    1)), so that the rate is at most p."""
     m = null.shape[0]
     rank = min(m, int(np.ceil((1.0 - probability) * (m + 1) - 1e-9)))
     return np.asarray(np.sort(null, axis=0)[rank - 1])
 
 
 def two_samples(x: Array, split: int, joint: list[int], count: int, seed: int = 0) -> tuple[float, Array, Array, Array]:
-    """T2 and single statistics for a step after block `split` alone, and their null samples over random orders: (t2, single (f,), t2 null, |single| null)."""
+    """T2 and single statistics for a step after block `split` alone, and their null samples over random orders: (t2,
+    single (f,), t2 null, |single| null)."""
     random = np.random.default_rng(seed)
     t2, single, _ = _statistics(x[None], joint, 1)
     t2_null, single_null = np.empty(count), np.empty((count, x.shape[1]))

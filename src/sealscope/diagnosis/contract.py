@@ -1,4 +1,5 @@
-"""What every detector is: a small class that looks at a recording, with or without leak-free ones beside it, and states its evidence."""
+"""What every detector is: a small class that looks at a recording, with or without leak-free ones beside it, and
+states its evidence."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from sealscope.recordings.recording import Recording
 
 
 class Detector(Protocol):
-    """A detector: states evidence at a false-alarm probability, never sees the truth, and says `cannot tell` rather than guess."""
+    """A detector: states evidence at a false-alarm probability, never sees the truth, and says `cannot tell` rather
+    than guess."""
 
     name: str
 
@@ -19,7 +21,8 @@ class Detector(Protocol):
         ...
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
-        """Evidence on a recording that is `usable`; with an empty baseline the recording's own beginning is the baseline."""
+        """Evidence on a recording that is `usable`; with an empty baseline the recording's own beginning is the
+        baseline."""
         ...
 
 

@@ -19,12 +19,14 @@ FALSE_ALARM_PROBABILITY = 0.01
 _PROBABILITIES = (1e-4, 0.2)
 #: Findings on a chamber pressure that leave no trust in its details ...
 _SPOILING = ("constant", "stuck")
-#: ... and clipping, when it takes more than this share of the samples; a chamber that empties into the tank rests at the rail for a while in any stroke.
+#: ... and clipping, when it takes more than this share of the samples; a chamber that empties into the tank rests at
+#: the rail for a while in any stroke.
 _MOST_CLIPPED = 0.5
 
 
 def analysable(recording: Recording) -> tuple[Recording, Finding | None]:
-    """The longest stretch that is uniformly sampled with no chamber pressure missing, and a finding that says so where it is not all."""
+    """The longest stretch that is uniformly sampled with no chamber pressure missing, and a finding that says so
+    where it is not all."""
     chambers = chambers_of(recording)
     stretches = uniform_segments(recording, (*chambers, "u") if "u" in recording else chambers)
     if not stretches:
@@ -33,7 +35,10 @@ def analysable(recording: Recording) -> tuple[Recording, Finding | None]:
     if longest.start == 0 and longest.stop == len(recording):
         return recording, None
     part = recording.samples(longest)
-    text = f"only the longest whole stretch was analysed: {part.t[0]:.4g} s to {part.t[-1]:.4g} s, {len(part)} of {len(recording)} samples"
+    text = (
+        f"only the longest whole stretch was analysed: {part.t[0]:.4g} s to {part.t[-1]:.4g} s, {len(part)} of "
+        f"{len(recording)} samples"
+    )
     return part, Finding("part_analysed", "warning", None, len(recording) - len(part), float(part.t[0]), text)
 
 
@@ -53,8 +58,9 @@ def diagnose(
 ) -> Diagnosis:
     """Say whether oil bypasses the piston in this recording.
 
-    `baseline`: leak-free recordings of the same machine; without any, the recording's own beginning is the baseline and the onset is looked for. Baseline
-    recordings that cannot be compared (other direction, command, pressure level) are left out. The verdict is `cannot tell` where the data do not allow one.
+    `baseline`: leak-free recordings of the same machine; without any, the recording's own beginning is the baseline
+    and the onset is looked for. Baseline recordings that cannot be compared (other direction, command, pressure
+    level) are left out. The verdict is `cannot tell` where the data do not allow one.
 
     Raises InputError for a false-alarm probability outside 1e-4 to 0.2.
     """

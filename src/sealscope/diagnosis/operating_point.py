@@ -11,17 +11,20 @@ import numpy as np
 from sealscope.diagnosis.blocks import CHAMBERS, chambers_of, find_cycle
 from sealscope.recordings.recording import Recording
 
-#: A stroke goes one way when its net way is more than this share of the whole way (or of the pressure difference's rms).
+#: A stroke goes one way when its net way is more than this share of the whole way (or of the pressure difference's
+#: rms).
 ONE_WAY = 0.5
-#: Pressure levels (rms of the pressure difference) are alike within this ratio when too few recordings tell how the details follow the level.
+#: Pressure levels (rms of the pressure difference) are alike within this ratio when too few recordings tell how the
+#: details follow the level.
 LEVEL_RATIO = 1.15
 _SLOW_RATE = 20.0
 
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """`direction`: +1, -1 for a stroke one way, 0 for a back-and-forth duty; `level`: log of the rms of the pressure difference; `rate` [Hz]; `units` of
-    the chambers; `chambers`; `command_rms` [V] and `cycle` [s] where there is a command."""
+    """`direction`: +1, -1 for a stroke one way, 0 for a back-and-forth duty; `level`: log of the rms of the pressure
+    difference; `rate` [Hz]; `units` of the chambers; `chambers`; `command_rms` [V] and `cycle` [s] where there is a
+    command."""
 
     direction: Literal[-1, 0, 1]
     level: float
@@ -54,7 +57,7 @@ def operating_point(recording: Recording) -> OperatingPoint:
     pressure = recording["p_A"] - recording["p_B"] if len(chambers) == 2 else recording[chambers[0]]
     if len(chambers) < 2:
         pressure = pressure - pressure.mean()
-    command = recording["u"] if "u" in recording else None
+    command = recording.channels.get("u")
     return OperatingPoint(
         direction=_direction(recording),
         level=0.5 * math.log(max(float(np.mean(pressure**2)), 1e-300)),

@@ -1,8 +1,10 @@
-"""The thesis's method as a detector with a false-alarm probability: has the RMS of the db8 details of the chamber pressures changed?
+"""The thesis's method as a detector with a false-alarm probability: has the RMS of the db8 details of the chamber
+pressures changed?
 
-The thesis compares the RMS of d1..d4 and of d3*d4 before and after (its ch. 5 and Appendix C) and calls a leak where it went down (p_A) or up (p_B). Here each of
-these changes is a method of its own with a threshold from the leak-free scatter, and all chambers and levels d2..d4 together make the verdict. d1 is noise alone:
-where it changes too, the sensors' noise is taken out of the other levels first.
+The thesis compares the RMS of d1..d4 and of d3*d4 before and after (its ch. 5 and Appendix C) and calls a leak where
+it went down (p_A) or up (p_B). Here each of these changes is a method of its own with a threshold from the leak-free
+scatter, and all chambers and levels d2..d4 together make the verdict. d1 is noise alone: where it changes too, the
+sensors' noise is taken out of the other levels first.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class RmsChange:
         if n < FEWEST_BLOCKS:
             return Evidence(
                 "cannot tell",
-                f"too short to be its own baseline: {n} blocks, {FEWEST_BLOCKS} are needed; give leak-free recordings as --baseline",
+                f"too short to be its own baseline: {n} blocks, {FEWEST_BLOCKS} are needed; give leak-free "
+                f"recordings as --baseline",
             )
         x = blocks.log_rms
         joint = blocks.columns(*JUDGED)
@@ -69,7 +72,8 @@ class RmsChange:
         onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
         if verdict == "no leak":
             reason = (
-                f"no change of the details' RMS within the recording beyond its scatter (T2 {score:.1f}, threshold {threshold:.1f}); "
+                f"no change of the details' RMS within the recording beyond its scatter (T2 {score:.1f}, "
+                f"threshold {threshold:.1f}); "
                 "a leak that was there from the start would need a --baseline to be seen"
             )
             return Evidence(verdict, reason, score, threshold, methods=methods)
@@ -77,12 +81,18 @@ class RmsChange:
         if any(noise[k] > thresholds[k] for k in blocks.columns("d1")):
             score, threshold, step = self._without_noise(blocks, probability)
             if score <= threshold:
-                reason = "the noise (d1) changed, and the other details by no more than it: a sensor or its wiring changed, or the leak is hidden"
+                reason = (
+                    "the noise (d1) changed, and the other details by no more than it: a sensor or its "
+                    "wiring changed, or the leak is hidden"
+                )
                 return Evidence("cannot tell", reason, score, threshold, methods=methods)
             onset = float(blocks.edges[step + 1])
             told += ", beyond a change of the noise"
         if not found.step_wins():
-            reason = f"{told}, evenly over the recording (trend T2 {found.trend:.1f}, step {found.joint.max():.1f}): a drift and a growing leak look alike"
+            reason = (
+                f"{told}, evenly over the recording (trend T2 {found.trend:.1f}, step "
+                f"{found.joint.max():.1f}): a drift and a growing leak look alike"
+            )
             return Evidence("cannot tell", reason, score, threshold, methods=methods)
         reason = f"{told} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"
         return Evidence(verdict, reason, score, threshold, onset, interval, methods=methods)

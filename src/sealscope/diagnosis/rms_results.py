@@ -13,7 +13,8 @@ JUDGED = ("d2", "d3", "d4")
 
 
 def excess(blocks: Blocks) -> Array:
-    """Energy of d2..d4 beyond that of d1, relative to its mean: (n, 3 per chamber). White noise, which every level holds alike, drops out."""
+    """Energy of d2..d4 beyond that of d1, relative to its mean: (n, 3 per chamber). White noise, which every level
+    holds alike, drops out."""
     energy = np.exp(2.0 * blocks.log_rms)
     columns = []
     for chamber in range(len(blocks.chambers)):

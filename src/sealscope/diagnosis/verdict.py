@@ -1,4 +1,5 @@
-"""What a diagnosis says: one verdict for a recording, the evidence of every method, and the false-alarm probability it was made for."""
+"""What a diagnosis says: one verdict for a recording, the evidence of every method, and the false-alarm probability
+it was made for."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ Verdict = Literal["leak", "no leak", "cannot tell"]
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method's evidence: its score against the threshold that its false-alarm probability sets (None where it could not be computed)."""
+    """One method's evidence: its score against the threshold that its false-alarm probability sets (None where it
+    could not be computed)."""
 
     name: str
     score: float | None
@@ -41,8 +43,9 @@ class Evidence:
 class Diagnosis:
     """The verdict on one recording.
 
-    `onset_s`, `onset_interval_s` [s] on the recording's time axis; `leak_lpm`, `leak_interval_lpm` [L/min], None where the channels do not allow it;
-    `false_alarm_probability`: the probability of `leak` on a leak-free recording for which `threshold` was set; `quality`: findings on the data.
+    `onset_s`, `onset_interval_s` [s] on the recording's time axis; `leak_lpm`, `leak_interval_lpm` [L/min], None
+    where the channels do not allow it; `false_alarm_probability`: the probability of `leak` on a leak-free recording
+    for which `threshold` was set; `quality`: findings on the data.
     """
 
     file: str
@@ -59,7 +62,8 @@ class Diagnosis:
     quality: tuple[Finding, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """The diagnosis as plain JSON values, keys in the order of the output contract; a number that is not finite becomes null."""
+        """The diagnosis as plain JSON values, keys in the order of the output contract; a number that is not finite
+        becomes null."""
         return {
             "file": self.file,
             "verdict": self.verdict,

@@ -7,7 +7,8 @@ from sealscope.compiled import law
 
 @law
 def chamber_volumes(x: float, V: float, A_A: float, A_B: float, position_dependent: bool) -> tuple[float, float]:
-    """Oil volumes (V_A, V_B) [m^3] at piston position x [m] from mid-stroke: V on both sides (Table 4.1), or V + A_A x and V - A_B x."""
+    """Oil volumes (V_A, V_B) [m^3] at piston position x [m] from mid-stroke: V on both sides (Table 4.1), or V + A_A
+    x and V - A_B x."""
     if position_dependent:
         return V + A_A * x, V - A_B * x
     return V, V
@@ -15,7 +16,8 @@ def chamber_volumes(x: float, V: float, A_A: float, A_B: float, position_depende
 
 @law
 def pressure_rate(inflow: float, volume: float, K_oil: float) -> float:
-    """dp/dt [Pa/s] = K_oil/V (net inflow - volume growth), eqs. (4.16)-(4.19); `inflow` [m^3/s] is already net of both."""
+    """dp/dt [Pa/s] = K_oil/V (net inflow - volume growth), eqs. (4.16)-(4.19); `inflow` [m^3/s] is already net of
+    both."""
     return K_oil / volume * inflow
 
 

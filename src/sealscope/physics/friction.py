@@ -9,7 +9,8 @@ from sealscope.compiled import law
 
 @law
 def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, of_difference: bool) -> float:
-    """Coulomb force F_C [N] = F_pr + F_cfr (p_A + p_B), eq. (4.20); `of_difference` takes p_A - p_B, the literal reading."""
+    """Coulomb force F_C [N] = F_pr + F_cfr (p_A + p_B), eq. (4.20); `of_difference` takes p_A - p_B, the literal
+    reading."""
     return F_pr + F_cfr * ((p_A - p_B) if of_difference else (p_A + p_B))
 
 
@@ -21,8 +22,9 @@ def stribeck_friction(
 
     |v| > v_th: F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v;
     |v| <= v_th: F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th)) + F_v v_th] / v_th, continuous at v_th.
-    `literal_bracket` reads the unbalanced bracket of eq. (4.22) the other way, F_C times the whole sum and |v| in the exponential, so that
-    F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and no pressure): F = v F_C [1 + (K_brk - 1) exp(-C_c |v|) + F_v v_th] / v_th.
+    `literal_bracket` reads the unbalanced bracket of eq. (4.22) the other way, F_C times the whole sum and |v| in the
+    exponential, so that F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and no pressure): F = v F_C [1 + (K_brk
+    - 1) exp(-C_c |v|) + F_v v_th] / v_th.
     """
     speed = abs(v)
     if speed > v_th:

@@ -1,7 +1,7 @@
 """Internal leakage: oil that passes the piston seal, or the bypass needle valve that imitates it, from chamber A to B.
 
-The equations of the thesis have no leakage term; it enters the chamber balances (eqs. 4.18-4.19) as a flow from A to B. A worn
-seal is a narrow gap, laminar; the rig's needle valve is an orifice. Both may act at once.
+The equations of the thesis have no leakage term; it enters the chamber balances (eqs. 4.18-4.19) as a flow from A to
+B. A worn seal is a narrow gap, laminar; the rig's needle valve is an orifice. Both may act at once.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from sealscope.physics.restrictors import orifice_flow
 
 @law
 def laminar_leakage(dp: float, G: float) -> float:
-    """Q_L = G (p_A - p_B) [m^3/s]: laminar gap of leakage conductance G [m^3/(s Pa)] (Merritt, Hydraulic Control Systems, 1967, leakage of an actuator)."""
+    """Q_L = G (p_A - p_B) [m^3/s]: laminar gap of leakage conductance G [m^3/(s Pa)] (Merritt, Hydraulic Control
+    Systems, 1967, leakage of an actuator)."""
     return G * dp
 
 

@@ -1,4 +1,5 @@
-"""The servo motor with its speed loop: a PI controller, a limited voltage, a winding with a limited current, a shaft."""
+"""The servo motor with its speed loop: a PI controller, a limited voltage, a winding with a limited current, a
+shaft."""
 
 from __future__ import annotations
 

@@ -16,8 +16,9 @@ def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
 def orifice_flow(dp: float, c: float, dp_0: float) -> float:
     """Flow [m^3/s] through an orifice under the pressure difference `dp` [Pa].
 
-    Q = c dp / (dp^2 + dp_0^2)^(1/4), eqs. 4.9-4.12 with the square root made smooth: Q -> c sign(dp) sqrt|dp| for |dp| >> dp_0, and laminar,
-    Q = c dp / sqrt(dp_0), for |dp| << dp_0, where the slope of the bare square root would be infinite.
+    Q = c dp / (dp^2 + dp_0^2)^(1/4), eqs. 4.9-4.12 with the square root made smooth: Q -> c sign(dp) sqrt|dp| for
+    |dp| >> dp_0, and laminar, Q = c dp / sqrt(dp_0), for |dp| << dp_0, where the slope of the bare square root would
+    be infinite.
     """
     return c * dp / math.sqrt(math.sqrt(dp * dp + dp_0 * dp_0))
 
@@ -32,9 +33,10 @@ def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
 def implicit_orifice_drop(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
     """Pressure difference d [Pa] that solves d + g Q(d) = total for a one-way throttle, g >= 0 [Pa s/m^3].
 
-    This scalar equation is all that an implicit stage has to solve for one line volume against one chamber. The left side grows with d, so
-    the root is unique, has the sign of `total`, and Newton's method started below it climbs to it without overshoot (for d > 0 the left side is concave
-    but for a neighbourhood of zero, where the second bound below is sharp). Both bounds used as the start solve a simpler law that lets more flow pass: the bare
+    This scalar equation is all that an implicit stage has to solve for one line volume against one chamber. The left
+    side grows with d, so the root is unique, has the sign of `total`, and Newton's method started below it climbs to
+    it without overshoot (for d > 0 the left side is concave but for a neighbourhood of zero, where the second bound
+    below is sharp). Both bounds used as the start solve a simpler law that lets more flow pass: the bare
     square root (a quadratic), and the laminar tangent at zero.
     """
     c = one_way_coefficient(total, c_forward, c_reverse)

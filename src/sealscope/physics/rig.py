@@ -1,9 +1,10 @@
 """Where the laws meet: the right-hand side of the whole rig, eqs. (4.1)-(4.22).
 
-State y, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega [rad/s] and angle theta [rad],
-piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa]. Without throttles the pump is connected to the
-chambers directly: there are no line volumes, p_1 = p_A and p_2 = p_B. With throttles the stiffness of the equations is in their two flows alone
-(microseconds, against milliseconds for all else), so the right-hand side comes in two parts: everything but the throttles, and the throttles.
+State y, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega [rad/s] and
+angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa]. Without throttles
+the pump is connected to the chambers directly: there are no line volumes, p_1 = p_A and p_2 = p_B. With throttles the
+stiffness of the equations is in their two flows alone (microseconds, against milliseconds for all else), so the
+right-hand side comes in two parts: everything but the throttles, and the throttles.
 """
 
 from __future__ import annotations
@@ -79,10 +80,12 @@ class RigNumbers(NamedTuple):
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
-    """Flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)] of the one-way throttles, eqs. (4.7)-(4.12).
+    """Flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)] of the one-way throttles, eqs.
+    (4.7)-(4.12).
 
-    "Closed" is a share of the area (eq. 4.8) or of the diameter (the text). Metering "meter-out": free flow towards the cylinder and throttled
-    return on both sides (the text and Appendix A); "literal": as eqs. (4.9)-(4.12) are printed, side B the other way round.
+    "Closed" is a share of the area (eq. 4.8) or of the diameter (the text). Metering "meter-out": free flow towards
+    the cylinder and throttled return on both sides (the text and Appendix A); "literal": as eqs. (4.9)-(4.12) are
+    printed, side B the other way round.
     """
     line = rig.line
     area = math.pi / 4.0 * line.d_line**2  # eq. (4.7)
@@ -153,7 +156,7 @@ def initial_state(rig: Rig, x_0: float) -> np.ndarray:
 @law
 def speed_error(y: np.ndarray, u: float, p: RigNumbers) -> float:
     """Commanded less actual motor speed [rad/s]."""
-    return p.omega_per_volt * u - y[OMEGA]
+    return p.omega_per_volt * u - float(y[OMEGA])
 
 
 @law
@@ -179,7 +182,8 @@ def throttle_flow_B(y: np.ndarray, p: RigNumbers) -> float:
 
 @law
 def rates_without_throttles(y: np.ndarray, u: float, G: float, C: float, p: RigNumbers, dy: np.ndarray) -> None:
-    """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients; written into `dy`."""
+    """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients; written into
+    `dy`."""
     p_A, p_B = y[P_A], y[P_B]
     dp_pump = (y[P_1] - y[P_2]) if p.throttled else (p_A - p_B)
     error = speed_error(y, u, p)
@@ -235,9 +239,11 @@ def observe(y: np.ndarray, u: float, G: float, C: float, p: RigNumbers, row: np.
 
 
 def stiffest_rate(p: RigNumbers) -> float:
-    """Fastest decay rate [1/s] of the throttled rig: a line volume against its chamber through the laminar slope at dp = 0.
+    """Fastest decay rate [1/s] of the throttled rig: a line volume against its chamber through the laminar slope at
+    dp = 0.
 
-    lambda = K_oil (1/V_1 + 1/V) c / sqrt(dp_0); an explicit method is stable only for h lambda below its own limit (2.785 for RK4).
+    lambda = K_oil (1/V_1 + 1/V) c / sqrt(dp_0); an explicit method is stable only for h lambda below its own limit
+    (2.785 for RK4).
     """
     c = max(p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out)
     return p.K_oil * (1.0 / min(p.V_1, p.V_2) + 1.0 / p.V) * c / math.sqrt(p.dp_0)

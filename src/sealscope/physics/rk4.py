@@ -1,4 +1,5 @@
-"""The classical Runge-Kutta method, the thesis's own (h = 1e-4 s there): exact enough without throttles, unstable with them."""
+"""The classical Runge-Kutta method, the thesis's own (h = 1e-4 s there): exact enough without throttles, unstable
+with them."""
 
 from __future__ import annotations
 
@@ -25,8 +26,9 @@ def advance_rk4(
 ) -> None:
     """Advance `y` (10,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
-    `u`, `G`, `C`: (n, 3) command [V] and leakage coefficients at t, t + h/2 and t + h of each step; `rows`: (n // every, 15).
-    `euler_integral` takes eq. (4.2) literally: I is held within the step and grows by h (omega_d - omega) once after it.
+    `u`, `G`, `C`: (n, 3) command [V] and leakage coefficients at t, t + h/2 and t + h of each step; `rows`: (n //
+    every, 15). `euler_integral` takes eq. (4.2) literally: I is held within the step and grows by h (omega_d - omega)
+    once after it.
     """
     n = u.shape[0]
     size = y.size

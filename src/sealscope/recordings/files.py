@@ -123,15 +123,28 @@ def read(
         ) from error
 
 
+def check_target(path: str | os.PathLike[str]) -> str:
+    """The format that a file to write has by its suffix; raises InputError for another suffix or a folder that is not
+    there.
+
+    Long work asks this first, so that it does not find out at its end.
+    """
+    file = Path(path)
+    kind = SUFFIXES.get(file.suffix.lower())
+    if kind is None:
+        raise InputError(f"a recording's file must end in {', '.join(SUFFIXES)}, got {file.name}")
+    if not file.parent.is_dir():
+        raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
+    return kind
+
+
 def write(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write `recording` in the format that the suffix tells: .nc .nc4 .h5 .hdf5 .csv .tsv .txt .parquet .pq.
 
     The file appears whole or not at all, and reads back as the same recording, to the bit. Raises InputError.
     """
     file = Path(path)
-    kind = SUFFIXES.get(file.suffix.lower())
-    if kind is None:
-        raise InputError(f"a recording's file must end in {', '.join(SUFFIXES)}, got {file.name}")
+    kind = check_target(file)
     check_writable(recording)
     with whole_file(file) as temporary:
         if kind == "netcdf":

@@ -84,7 +84,8 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Chirp:
-    """u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))): frequency from f_0 to f_1 [Hz] over T [s], f_1 afterwards."""
+    """u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))): frequency from f_0 to f_1 [Hz] over T [s], f_1
+    afterwards."""
 
     amplitude: float
     f_0: float
@@ -163,7 +164,8 @@ def recorded_command(recording: Recording, origin: str) -> Recorded:
 
 
 def check_command(command: Command, t: Array, limit: float) -> None:
-    """Raise InputError where the command leaves +-`limit` [V] (the converter's range) or is not a number at the times `t` [s]."""
+    """Raise InputError where the command leaves +-`limit` [V] (the converter's range) or is not a number at the times
+    `t` [s]."""
     u = command.volts(t)
     bad = ~(np.abs(u) <= limit * (1 + 1e-12))
     if bad.any():
@@ -205,8 +207,8 @@ def _number(text: str | None, default: float) -> float:
 
 
 def parse_command(text: str) -> Command:
-    """A command from words: `3 sin(4t)`, `step 5 at 1 s`, `ramp 5 from 1 s to 3 s`, `chirp 3 from 0.1 Hz to 5 Hz over 60 s`,
-    `prbs 2 every 0.5 s seed 1`, `file LOG` (the channel u of a recording).
+    """A command from words: `3 sin(4t)`, `step 5 at 1 s`, `ramp 5 from 1 s to 3 s`, `chirp 3 from 0.1 Hz to 5 Hz over
+    60 s`, `prbs 2 every 0.5 s seed 1`, `file LOG` (the channel u of a recording).
 
     Raises InputError that shows the forms when the text is none of them.
     """
@@ -221,6 +223,7 @@ def parse_command(text: str) -> Command:
         if found:
             return make(list(found.groups()))
     raise InputError(
-        "command must be like '3 sin(4t)', 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'chirp 3 from 0.1 Hz to 5 Hz over 60 s', "
+        "command must be like '3 sin(4t)', 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'chirp 3 from 0.1 Hz to 5 "
+        "Hz over 60 s', "
         f"'prbs 2 every 0.5 s seed 1' or 'file LOG', got {text!r}"
     )

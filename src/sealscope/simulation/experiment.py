@@ -28,8 +28,9 @@ MOST_SAMPLES = 20_000_000
 class Experiment:
     """Everything a run depends on; equal experiments give equal bytes.
 
-    `duration` [s]; `seed` of the instruments' noise; `x_0` [m] piston position at the start, from mid-stroke; `method` and `step` [s] of the
-    solver; `allow_unresolved` lets an unstable or under-resolved run through, marked in its provenance. The sampling rate is the rig's `daq.sample_rate`.
+    `duration` [s]; `seed` of the instruments' noise; `x_0` [m] piston position at the start, from mid-stroke;
+    `method` and `step` [s] of the solver; `allow_unresolved` lets an unstable or under-resolved run through, marked
+    in its provenance. The sampling rate is the rig's `daq.sample_rate`.
     """
 
     rig: Rig
@@ -48,7 +49,8 @@ class Experiment:
         samples = self.duration * self.rate
         if samples < 1 or samples > MOST_SAMPLES:
             raise InputError(
-                f"duration x daq.sample_rate must be 1 to {MOST_SAMPLES} samples, got {samples:.4g} ({self.duration:g} s at {self.rate:g} Hz)"
+                f"duration x daq.sample_rate must be 1 to {MOST_SAMPLES} samples, got {samples:.4g} "
+                f"({self.duration:g} s at {self.rate:g} Hz)"
             )
         if self.seed < 0:
             raise InputError(f"seed must be >= 0, got {self.seed}")
@@ -115,7 +117,8 @@ def make_experiment(
     values: Mapping[str, float | str] | None = None,
     **others: Any,
 ) -> Experiment:
-    """An Experiment from words: rig by name or file, command and leaks as text, parameters by name (`values={"V_1": "50[cm^3]"}`).
+    """An Experiment from words: rig by name or file, command and leaks as text, parameters by name (`values={"V_1":
+    "50[cm^3]"}`).
 
     Raises InputError for whatever breaks a rule, with rule, value and place.
     """

@@ -101,9 +101,9 @@ class Tabulated:
 class Leak:
     """Leakage across the piston.
 
-    `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt|dp| with C [m^3/(s Pa^0.5)] (needle valve). The size at
-    full opening is either `coefficient` (G or C), or `mean` [m^3/s]: the mean of |Q_L| that the rig shall show at full opening; the coefficient is
-    then found on the rig at its own operating point.
+    `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt|dp| with C [m^3/(s
+    Pa^0.5)] (needle valve). The size at full opening is either `coefficient` (G or C), or `mean` [m^3/s]: the mean of
+    |Q_L| that the rig shall show at full opening; the coefficient is then found on the rig at its own operating point.
     """
 
     law: Literal["laminar", "orifice"] = "laminar"
@@ -132,8 +132,9 @@ _WHEN = rf"(?:from\s+(?P<at>{_N})\s*s?|growing\s+from\s+(?P<start>{_N})\s*s?\s+t
 
 
 def parse_leak(text: str) -> Leak | None:
-    """A leak from words: `0.0042 L/min from 90 s`, `0.01 L/min orifice growing from 60 s to 120 s`, `G = 6.1e-13 from 90 s`,
-    `C = 2e-10`, `table LEAK.csv` (columns `t [s]` and `q_leak [L/min]`: the mean flow asked for at each time), or `none`.
+    """A leak from words: `0.0042 L/min from 90 s`, `0.01 L/min orifice growing from 60 s to 120 s`, `G = 6.1e-13 from
+    90 s`, `C = 2e-10`, `table LEAK.csv` (columns `t [s]` and `q_leak [L/min]`: the mean flow asked for at each time),
+    or `none`.
 
     Raises InputError that shows the forms when the text is none of them.
     """

@@ -20,9 +20,11 @@ _PASS = 0.9  # cut-off (-6 dB) as a share of the Nyquist frequency
 
 
 def decimate(values: Array, factor: int, n: int) -> Array:
-    """`n` samples out of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc (-6 dB at 0.9 of the new Nyquist frequency).
+    """`n` samples out of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc (-6 dB at 0.9 of the new
+    Nyquist frequency).
 
-    `values` runs FILTER_REACH new samples beyond the last one; before the first the signal is at rest at its first value.
+    `values` runs FILTER_REACH new samples beyond the last one; before the first the signal is at rest at its first
+    value.
     """
     if factor == 1:
         return np.array(values[:n])
@@ -34,7 +36,8 @@ def decimate(values: Array, factor: int, n: int) -> Array:
 
 
 def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
-    """Pressure [Pa] as read back from the converter: the transducer saturates at its range, the converter counts in steps of `daq.step` [V]."""
+    """Pressure [Pa] as read back from the converter: the transducer saturates at its range, the converter counts in
+    steps of `daq.step` [V]."""
     volts_per_pascal = (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
     volts = (
         daq.sensor_volts_lo + (np.clip(pressure, sensor.range_lo, sensor.range_hi) - sensor.range_lo) * volts_per_pascal
@@ -47,7 +50,8 @@ def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
 def read_pressure(
     true: Array, common: Array, sensor: PressureTransducer, daq: Daq, rate: float, random: np.random.Generator
 ) -> Array:
-    """What one pressure channel reads [Pa]: gain and offset, own and common noise, drift, hum, saturation, conversion, stuck and lost samples."""
+    """What one pressure channel reads [Pa]: gain and offset, own and common noise, drift, hum, saturation,
+    conversion, stuck and lost samples."""
     t = np.arange(true.size) / rate
     walk = np.cumsum(random.standard_normal(true.size)) * sensor.drift / np.sqrt(rate)
     hum = sensor.hum * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
@@ -67,9 +71,10 @@ def _counted(values: Array, resolution: float) -> Array:
 def record(rig: Rig, trajectory: Trajectory, u: Array, factor: int, seed: int) -> Recording:
     """The Recording that the rig's instruments make of a trajectory.
 
-    `trajectory` is sampled `factor` times faster than the recording and runs FILTER_REACH samples longer; `u`: (n,) command [V] at the
-    recording's samples. Analog channels (pressures, flow meter) pass the anti-alias filter, encoders are read at the instant. The noise of
-    each channel comes from a stream of its own under `seed`, so that no channel's noise depends on another's settings.
+    `trajectory` is sampled `factor` times faster than the recording and runs FILTER_REACH samples longer; `u`: (n,)
+    command [V] at the recording's samples. Analog channels (pressures, flow meter) pass the anti-alias filter,
+    encoders are read at the instant. The noise of each channel comes from a stream of its own under `seed`, so that
+    no channel's noise depends on another's settings.
     """
     n = u.size
     rate = rig.daq.sample_rate

@@ -1,4 +1,5 @@
-"""Integrate the rig over an experiment: choose method and step, feed the inputs block by block, refuse a result that cannot be trusted."""
+"""Integrate the rig over an experiment: choose method and step, feed the inputs block by block, refuse a result that
+cannot be trusted."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ Method = Literal["auto", "rk4", "imex"]
 Inputs = Callable[[Array], tuple[Array, Array, Array]]
 Progress = Callable[[float], None]
 
-#: Largest step [s] taken unless the caller asks for another: error in p_A under 10 Pa rms (docs/decisions/0004-solvers.md).
+#: Largest step [s] taken unless the caller asks for another: error in p_A under 10 Pa rms
+#: (docs/decisions/0004-solvers.md).
 DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
 #: Lowest gauge pressure [Pa] the model is valid for: there is no cavitation in it, and oil holds no tension.
 VACUUM = -101325.0
@@ -31,7 +33,8 @@ _FINER = 10
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What the integration gives: (n,) times [s] and (n, 15) outputs in the order of `sealscope.physics.rig.OUTPUTS`."""
+    """What the integration gives: (n,) times [s] and (n, 15) outputs in the order of
+    `sealscope.physics.rig.OUTPUTS`."""
 
     t: Array
     rows: Array
@@ -77,14 +80,14 @@ def integrate(
 ) -> Trajectory:
     """Integrate from rest over `duration` [s] and report the outputs at `rate` [Hz].
 
-    `inputs(t)` gives command [V] and the leakage coefficients G and C at times `t` of any shape. The step is the largest
-    that divides the output interval and is not above `step` (default `DEFAULT_STEP`, down to a tenth of it for a quick
-    rig or a large leak). Inputs may jump at a step's boundary: the step's first and last node are looked up just inside it. `progress`
-    is called with the time reached [s].
+    `inputs(t)` gives command [V] and the leakage coefficients G and C at times `t` of any shape. The step is the
+    largest that divides the output interval and is not above `step` (default `DEFAULT_STEP`, down to a tenth of it
+    for a quick rig or a large leak). Inputs may jump at a step's boundary: the step's first and last node are looked
+    up just inside it. `progress` is called with the time reached [s].
 
-    Raises InputError for a step that is not positive; SimulationFailed when the step cannot resolve the rig, the leak or
-    a stop that was hit, when a state is not finite, or when a pressure falls below vacuum; `allow_unresolved` lets all
-    but a state that is not finite pass.
+    Raises InputError for a step that is not positive; SimulationFailed when the step cannot resolve the rig, the leak
+    or a stop that was hit, when a state is not finite, or when a pressure falls below vacuum; `allow_unresolved` lets
+    all but a state that is not finite pass.
     """
     from sealscope.physics.imex import IMEX_NODES, advance_imex
     from sealscope.physics.rig import OUTPUTS, POSITION, initial_state, longest_step, longest_step_on_stop, rig_numbers
@@ -152,7 +155,8 @@ def _check(rows: Array, first: int, rate: float, allow_unresolved: bool) -> None
     if bad.any():
         k, column = np.unravel_index(int(np.argmax(bad)), bad.shape)
         raise SimulationFailed(
-            f"the run diverged: {OUTPUTS[column]} is not finite at t = {(first + k) / rate:.4g} s; take a smaller step or smaller gains"
+            f"the run diverged: {OUTPUTS[column]} is not finite at t = {(first + k) / rate:.4g} s; take a smaller "
+            f"step or smaller gains"
         )
     pressures = rows[:, P_A : P_2 + 1]
     if not allow_unresolved and pressures.min() < VACUUM:

@@ -14,7 +14,8 @@ from sealscope.simulation.instruments import PRESSURES, decimate
 from sealscope.simulation.integrate import Trajectory
 from sealscope.simulation.simulate import Progress, oversampling, sized_leaks, trajectory
 
-#: A run is resolved when halving the step moves no pressure by more than this rms [Pa] (a transducer's noise is 8600 Pa) ...
+#: A run is resolved when halving the step moves no pressure by more than this rms [Pa] (a transducer's noise is 8600
+#: Pa) ...
 PRESSURE_TOLERANCE = 100.0
 #: ... and no detail's RMS by more than this share of what it would be in a recording (truth and noise together).
 DETAIL_TOLERANCE = 1e-3
@@ -50,6 +51,16 @@ class Proof:
         """Whether every difference is within its tolerance."""
         return all(one.resolved for one in self.differences)
 
+    def text(self) -> str:
+        """The proof as lines of text: what moved, by how much, and how much it may."""
+        lines = [f"halving the step ({self.method}, {self.step:.3g} s to {self.halved:.3g} s) moves"]
+        for one in self.differences:
+            limit = "" if one.tolerance is None else f" (at most {one.tolerance:.3g})"
+            lines.append(
+                f"  {one.name:<18} {one.difference:10.3g} {one.unit}{limit}{'' if one.resolved else '  NOT RESOLVED'}"
+            )
+        return "\n".join(lines)
+
     def worst(self) -> Difference:
         """The difference furthest beyond, or nearest to, its tolerance."""
         judged = [one for one in self.differences if one.tolerance]
@@ -61,7 +72,8 @@ def _rms(values: np.ndarray) -> float:
 
 
 def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
-    """Differences between two trajectories of one experiment: rms of each channel, and change of each detail's RMS in both chambers."""
+    """Differences between two trajectories of one experiment: rms of each channel, and change of each detail's RMS in
+    both chambers."""
     from sealscope.signals.details import details
 
     n = round(experiment.duration * experiment.rate)
@@ -90,7 +102,8 @@ def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tup
 def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
     """Integrate the experiment twice, at its step and at half of it, and compare.
 
-    Raises SimulationFailed, naming the worst difference, when the run is under-resolved (unless the experiment allows it).
+    Raises SimulationFailed, naming the worst difference, when the run is under-resolved (unless the experiment allows
+    it).
     """
     leaks = sized_leaks(experiment, progress)
 
@@ -107,7 +120,9 @@ def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
     if not (proof.resolved or experiment.allow_unresolved):
         worst = proof.worst()
         raise SimulationFailed(
-            f"the run is under-resolved: halving the step of {coarse.step:.3g} s ({coarse.method}) moves {worst.name} by "
-            f"{worst.difference:.4g} {worst.unit}, which must be <= {worst.tolerance:.4g} {worst.unit}; take a smaller step"
+            f"the run is under-resolved: halving the step of {coarse.step:.3g} s ({coarse.method}) moves "
+            f"{worst.name} by "
+            f"{worst.difference:.4g} {worst.unit}, which must be <= {worst.tolerance:.4g} {worst.unit}; take a "
+            f"smaller step"
         )
     return proof

@@ -1,8 +1,11 @@
-"""Simulate an experiment: size its leaks, integrate the rig, record it as the instruments would, keep the truth apart."""
+"""Simulate an experiment: size its leaks, integrate the rig, record it as the instruments would, keep the truth
+apart."""
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.whole import whole_file
 from sealscope.simulation.commands import check_command
 from sealscope.simulation.experiment import Experiment, make_experiment
 from sealscope.simulation.faults import LITRE_PER_MINUTE, Leak
@@ -26,7 +30,8 @@ _OVERSAMPLING = 4
 
 @dataclass(frozen=True)
 class Truth:
-    """What a real rig would not tell: the leaks that were put in, and every state without noise at the recording's samples."""
+    """What a real rig would not tell: the leaks that were put in, and every state without noise at the recording's
+    samples."""
 
     leaks: tuple[Leak, ...]
     onset_s: float | None
@@ -111,8 +116,8 @@ def sized_leaks(experiment: Experiment, progress: Progress | None = None) -> tup
 def run(experiment: Experiment, progress: Progress | None = None) -> Run:
     """Simulate the experiment.
 
-    Raises InputError for an experiment that cannot be (a leak larger than the pump's flow), SimulationFailed for a run that
-    diverged or cannot be resolved.
+    Raises InputError for an experiment that cannot be (a leak larger than the pump's flow), SimulationFailed for a
+    run that diverged or cannot be resolved.
     """
     leaks = sized_leaks(experiment, progress)
     n = round(experiment.duration * experiment.rate)
@@ -145,8 +150,22 @@ def _mean_leak(leaks: tuple[Leak, ...], path: Trajectory, experiment: Experiment
     return sum(flows) / LITRE_PER_MINUTE
 
 
+def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
+    """Write what was put in as JSON: leaks with their coefficients, onset [s], mean leak while open [L/min]."""
+    told = {
+        "onset_s": truth.onset_s,
+        "mean_leak_lpm": truth.mean_leak_lpm,
+        "leaks": [
+            {"law": leak.law, "coefficient": leak.coefficient, "opening": str(leak.opening)} for leak in truth.leaks
+        ],
+    }
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+
+
 def simulate(**experiment: Any) -> Recording:
-    """Simulate from words and return the Recording: `simulate(command="3 sin(4t)", leak="0.0042 L/min from 90 s", duration=180, seed=1)`.
+    """Simulate from words and return the Recording: `simulate(command="3 sin(4t)", leak="0.0042 L/min from 90 s",
+    duration=180, seed=1)`.
 
     Keywords are those of `make_experiment`; `run` gives the truth beside the recording.
     """

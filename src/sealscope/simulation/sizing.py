@@ -42,7 +42,8 @@ def _refuse_impossible(leaks: tuple[Leak, ...], pump_flow: float) -> None:
     for leak in leaks:
         if leak.mean is not None and leak.mean >= pump_flow:
             raise InputError(
-                f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for this command, "
+                f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for "
+                f"this command, "
                 f"got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
             )
 
@@ -62,7 +63,8 @@ def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[L
     less. So each coefficient is scaled by (asked/got)^(1/s), s the slope d log flow / d log coefficient of that leak
     between the last two runs, until every mean is within `TOLERANCE`, starting from the rig without these leaks.
 
-    Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed where the search does not settle.
+    Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed
+    where the search does not settle.
     """
     current = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
     before: list[tuple[float, float]] = [(0.0, 0.0)] * len(leaks)  # coefficient and mean flow of the run before
@@ -94,6 +96,7 @@ def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[L
             return current
         current = tuple(following)
     raise SimulationFailed(
-        f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: {', '.join(str(leak) for leak in leaks)} is more than this "
+        f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: "
+        f"{', '.join(str(leak) for leak in leaks)} is more than this "
         "rig's pressures can drive; ask for a smaller leak"
     )

@@ -1,0 +1,70 @@
+"""Sealscope: find internal leakage in electro-hydrostatic actuators.
+
+    import sealscope as ss
+    recording = ss.simulate(command="3 sin(4t)", leak="0.0042 L/min from 90 s", seed=1)
+    print(ss.diagnose(recording))
+
+Names load when they are first used, so that importing the package is cheap.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sealscope.diagnosis.diagnose import diagnose
+    from sealscope.diagnosis.verdict import Diagnosis
+    from sealscope.parameters import Rig, load_rig
+    from sealscope.recordings import Recording, inspect, read, write
+    from sealscope.reporting import write_page
+    from sealscope.simulation.experiment import Experiment, make_experiment
+    from sealscope.simulation.proof import prove
+    from sealscope.simulation.simulate import run, simulate
+
+_HOMES = {
+    "Diagnosis": "diagnosis.verdict",
+    "Experiment": "simulation.experiment",
+    "Recording": "recordings.recording",
+    "Rig": "parameters",
+    "diagnose": "diagnosis.diagnose",
+    "inspect": "recordings",
+    "load_rig": "parameters",
+    "make_experiment": "simulation.experiment",
+    "prove": "simulation.proof",
+    "read": "recordings",
+    "run": "simulation.simulate",
+    "simulate": "simulation.simulate",
+    "write": "recordings",
+    "write_page": "reporting",
+}
+
+__all__ = [
+    "Diagnosis",
+    "Experiment",
+    "Recording",
+    "Rig",
+    "__version__",
+    "diagnose",
+    "inspect",
+    "load_rig",
+    "make_experiment",
+    "prove",
+    "read",
+    "run",
+    "simulate",
+    "write",
+    "write_page",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("sealscope")
+    if name in _HOMES:
+        return getattr(import_module(f"sealscope.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,148 @@
+"""What the actuator runs into: caps, current and voltage, vacuum; and what a solver cannot resolve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sealscope.errors import InputError, SimulationFailed
+from sealscope.simulation.integrate import choose_method
+
+FULL_CHARGE = {"p_charge": "40[MPa]"}  # so that the emptied chamber stays above vacuum
+
+
+def hold(volts: float):
+    return lambda t: np.full_like(t, volts)
+
+
+@pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
+@pytest.mark.parametrize("volumes", ["fixed", "position"])
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["cap A-side out", "cap B-side out"])
+def test_both_caps_hold_the_piston(check_rig, drive, throttled, volumes, side):
+    rig = check_rig(throttled, volumes=volumes, **FULL_CHARGE)
+    run = drive(rig, 3.0, u=hold(10.0 * side), x_0=0.27 * side)
+    half, c = rig.cylinder.L / 2, rig.cylinder
+    assert np.abs(run["x"]).max() > half  # it got there
+    # the pump pushes with C_m i_max 2 pi / q_b: 20.5 MPa on 633 mm^2, 13 kN, 1.3 mm; as much again for the impact
+    push = rig.motor.C_m * rig.motor.i_max * 2 * np.pi / rig.pump.q_b * c.A_A
+    assert np.abs(run["x"]).max() - half < 2.0 * push / c.k_stop
+    assert side * run["x"][-1] - half == pytest.approx(push / c.k_stop, rel=0.1)
+    assert np.abs(run["v"][-500:]).max() < 0.02  # and it came to rest
+
+
+def test_current_and_voltage_stay_within_the_drive_s_limits(check_rig, drive):
+    rig = check_rig(**FULL_CHARGE, V_max=60.0, i_max=8.0)
+    run = drive(rig, 2.0, u=lambda t: 10.0 * np.sign(np.sin(8.0 * t)), rate=2000.0)
+    assert np.abs(run["i"]).max() == pytest.approx(8.0, rel=1e-12)  # reached, never passed
+    assert np.abs(run["V"]).max() == pytest.approx(60.0, rel=1e-12)
+    assert np.count_nonzero(np.abs(run["i"]) == 8.0) > 20
+
+
+def test_the_drive_s_own_gains_cannot_be_resolved(check_rig, drive):
+    for throttled in (False, True):
+        with pytest.raises(SimulationFailed, match=r"step must be <= 9\.4e-06 s to resolve speed loop"):
+            drive(check_rig(throttled, k_p=50_000.0, K_i=100.0), 1.0)
+    # with the step that the message asks for the loop is as stiff as it is meant to be
+    run = drive(check_rig(k_p=50_000.0, K_i=100.0), 1.0, step=9e-6)
+    np.testing.assert_allclose(run["omega"][100:], 26.7 * 3 * np.sin(4 * run.t[100:]), atol=2e-3)
+
+
+def test_rk4_with_throttles_at_the_thesis_s_step_is_refused(check_rig, drive):
+    rig = check_rig(throttled=True)
+    rule = r"step must be <= .* for rk4 with throttles .* got 0\.0001 s; use method imex"
+    with pytest.raises(SimulationFailed, match=rule):
+        drive(rig, 5.0, method="rk4", step=1e-4)
+    chatter = drive(rig, 5.0, method="rk4", step=1e-4, allow_unresolved=True)
+    truth = drive(rig, 5.0)
+    error = np.sqrt(np.mean((chatter["p_A"] - truth["p_A"]) ** 2))
+    assert 6e4 < error < 1e5  # 79 500 Pa over a long run: as large as the signal
+    fine = drive(rig, 0.5, method="rk4", step=4e-6)  # within the limit it runs
+    np.testing.assert_allclose(fine["p_A"], truth["p_A"][:250], atol=60.0)
+
+
+def test_a_step_too_long_for_the_rig_is_refused_and_a_default_step_adapts(check_rig, drive):
+    with pytest.raises(SimulationFailed, match=r"step must be <= 0\.0015 s to resolve .*, got 0\.005 s"):
+        drive(check_rig(), 1.0, step=5e-3, rate=100.0)
+    stiff = check_rig(K_oil="20000[MPa]", M_eq="1[kg]")  # the oil column rings at 8 300 rad/s
+    assert drive(stiff, 0.1).step <= 1 / 8000
+    assert drive(check_rig(), 0.1).step == 5e-4
+    assert drive(check_rig(throttled=True), 0.1).step == 1e-3
+
+
+def test_a_leak_that_the_step_cannot_resolve_is_refused(check_rig, drive):
+    C = 2e-7
+    truth = drive(check_rig(), 1.0, C=C, step=2e-5)
+    with pytest.raises(SimulationFailed, match=r"to resolve the leak, got 0\.0005 s"):
+        drive(check_rig(), 1.0, C=C, step=5e-4)
+    wrong = drive(check_rig(), 1.0, C=C, step=5e-4, allow_unresolved=True)
+    assert np.mean(np.abs(wrong["q_leak"])) > 1.2 * np.mean(np.abs(truth["q_leak"]))  # why it is refused
+    default = drive(check_rig(), 1.0, C=C)
+    np.testing.assert_allclose(default["p_A"], truth["p_A"], atol=20.0)
+
+
+def test_a_cap_too_stiff_for_the_step_is_refused_only_once_it_is_hit(check_rig, drive):
+    rig = check_rig(k_stop=1e10, d_stop=3.5e5, **FULL_CHARGE)
+    drive(rig, 1.0, u=hold(5.0))
+    with pytest.raises(SimulationFailed, match="to resolve the hard stop"):
+        drive(rig, 1.0, u=hold(5.0), x_0=0.28)
+
+
+def test_vacuum_is_refused_with_place_and_time(check_rig, drive):
+    def push(t: np.ndarray) -> np.ndarray:
+        return 5.0 * np.minimum(t / 0.5, 1.0)
+
+    rule = r"p_B must stay above vacuum .*-101325 Pa.* at t = .* s \(x = 0\.30"
+    with pytest.raises(SimulationFailed, match=rule):
+        drive(check_rig(), 3.0, u=push, x_0=0.28)
+    run = drive(check_rig(), 3.0, u=push, x_0=0.28, allow_unresolved=True)
+    assert run["p_B"].min() < -101325
+
+
+def test_a_run_that_diverges_is_refused_even_when_all_is_allowed(check_rig, drive):
+    with pytest.raises(SimulationFailed, match=r"the run diverged: .* is not finite at t = "):
+        drive(check_rig(), 5.0, step=1e-2, rate=100.0, allow_unresolved=True)
+
+
+def test_the_literal_integral_tends_to_the_state_as_the_step_goes_to_zero(check_rig, drive):
+    rig = check_rig(integrator="euler")
+    truth = drive(check_rig(), 1.0, rate=100.0, step=1e-5)
+    errors = []
+    for h in (4e-4, 2e-4, 1e-4):
+        run = drive(rig, 1.0, rate=100.0, step=h)
+        assert run.method == "rk4"
+        errors.append(np.abs(run["I"] - truth["I"]).max())
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    np.testing.assert_allclose(orders, 1.0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "method", "rule"),
+    [
+        ({}, "imex", "imex needs throttles"),
+        ({}, "euler", "method must be auto, rk4 or imex, got 'euler'"),
+        ({"orifices": "present", "integrator": "euler"}, "auto", "needs method rk4"),
+        ({"orifices": "present", "integrator": "euler"}, "imex", "needs method rk4"),
+    ],
+)
+def test_a_method_that_does_not_suit_the_rig_is_refused(check_rig, values, method, rule):
+    with pytest.raises(InputError, match=rule):
+        choose_method(check_rig(**values), method)
+
+
+@pytest.mark.parametrize("step", [0.0, -1e-4, float("nan"), float("inf")])
+def test_a_step_must_be_a_time(check_rig, drive, step):
+    with pytest.raises(InputError, match="step must be > 0 s"):
+        drive(check_rig(), 1.0, step=step)
+
+
+def test_inputs_that_jump_at_a_step_keep_the_order(check_rig, drive):
+    """A command that steps at a step's boundary is seen from inside each step, so RK4 keeps its order."""
+
+    def late(t: np.ndarray) -> np.ndarray:
+        return np.where(t >= 0.1, 2.0, 0.0)
+
+    rig = check_rig(F_pr=0.0, F_cfr=0.0)
+    truth = drive(rig, 0.4, u=late, rate=100.0, step=1e-5)
+    errors = [np.abs(drive(rig, 0.4, u=late, rate=100.0, step=h)["p_A"] - truth["p_A"]).max() for h in (5e-4, 2.5e-4)]
+    assert errors[0] < 100.0
+    assert np.log2(errors[0] / errors[1]) > 3.7
