@@ -54,8 +54,7 @@ def test_the_balance_would_see_a_slip(check_rig, drive):
 
 
 def test_position_dependent_volumes_keep_the_mass_to_first_order_in_pressure_over_bulk_modulus(check_rig, drive):
-    ""("With V_A = V + A x and dp/dt = K/V (Q - A v) the oil held grows by the piston's work over K, and by "
-        "nothing else.")""
+    """V_A = V + A x with dp/dt = K/V (Q - A v): the oil held grows by the piston's work over K, by nothing else."""
     rig = check_rig(volumes="position", p_charge="2[MPa]")
     run = drive(rig, 10.0, u=8.0, rate=2000.0)
     c, K = rig.cylinder, rig.fluid.K_oil
