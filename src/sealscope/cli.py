@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import sys
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
     from sealscope.simulation.simulate import Progress
+
+_WRONG_CALL, _INTERRUPTED = 2, 130
 
 app = typer.Typer(
     name="sealscope",
@@ -100,6 +103,12 @@ def _progress() -> Iterator[Progress]:
         yield told
 
 
+def _complain(words: object) -> None:
+    """One line on standard error, whatever characters a file's name or header brought."""
+    printable = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(words))
+    typer.echo(f"sealscope: {printable}", err=True)
+
+
 def _rig(name: str, settings: Sequence[str] | None) -> Rig:
     from sealscope.parameters import load_rig, parse_settings
 
@@ -129,7 +138,7 @@ def _read_all(
         try:
             yield file, read(file, channel_map=channel_map or None, rate=rate)
         except (UnreadableFile, MissingExtra) as error:
-            typer.echo(f"sealscope: {error}", err=True)
+            _complain(error)
             yield file, None
 
 
@@ -145,6 +154,9 @@ def _diagnoses(
 
     check_probability(false_alarm)
     channel_map = _channel_map(maps)
+    for file in files if baseline else ():
+        if all(path.resolve() == file.resolve() for path in baseline):
+            raise InputError(f"a baseline must be another recording than the file itself, got {file}")
     known = [(file, recording) for file, recording in _read_all(baseline, channel_map, rate) if recording is not None]
     if len(known) < len(baseline):
         yield None
@@ -156,8 +168,25 @@ def _diagnoses(
             continue
         others = [one for path, one in known if path.resolve() != file.resolve()]
         if baseline and not others:
-            raise InputError(f"a baseline must be another recording than the file itself, got {file}")
+            _complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
+            yield None
+            continue
         yield recording, diagnose(recording, others, false_alarm_probability=false_alarm, file=str(file))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"a folder to write into must be one or become one, got: {error.strerror} ({folder})"
+        ) from None
+
+
+def _check_folder(file: Path) -> None:
+    """Refuse a file whose folder is not there before the long work, not after it."""
+    if not file.parent.is_dir():
+        raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
 
 
 @app.command()
@@ -199,19 +228,26 @@ def report(
     from sealscope.reporting import write_page
 
     several = len(files) > 1 or output.is_dir()
+    read_too = {path.resolve() for path in (*files, *(baseline or ()))}
+    pages: dict[Path, Path] = {}
+    for file in files:
+        page = output / f"{file.stem}.html" if several else output
+        if page.resolve() in read_too:
+            raise InputError(f"a page must not replace a recording, got {page}")
+        if page in pages:
+            raise InputError(f"pages must have names of their own, got {page} for {pages[page]} and {file}")
+        pages[page] = file
     if several:
-        output.mkdir(parents=True, exist_ok=True)
+        _make_folder(output)
+    else:
+        _check_folder(output)
     complete = True
-    pages: dict[Path, str] = {}
     for found in _diagnoses(files, baseline or [], maps, rate, false_alarm):
         if found is None:
             complete = False
             continue
         recording, diagnosis = found
         page = output / f"{Path(diagnosis.file).stem}.html" if several else output
-        if page in pages:
-            raise InputError(f"pages must have names of their own, got {page} for {pages[page]} and {diagnosis.file}")
-        pages[page] = diagnosis.file
         write_page(page, recording, diagnosis)
         typer.echo(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
     if not complete:
@@ -255,6 +291,10 @@ def simulate(
     from sealscope.units import parse_quantity
 
     check_target(output)
+    if truth is not None:
+        _check_folder(truth)
+        if truth.resolve() == output.resolve():
+            raise InputError(f"recording and truth must be two files, got {output} for both")
     experiment = make_experiment(
         rig=_rig(rig, settings),
         command=command,
@@ -347,6 +387,7 @@ def demo(
     from sealscope.demo import run_demo
     from sealscope.reporting import diagnosis_text
 
+    _make_folder(folder)
     with _progress() as told:
         made = run_demo(folder, seed, told)
     typer.echo(diagnosis_text(made.diagnosis))
@@ -398,8 +439,9 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
                 index += 1
             elif not word.startswith("-"):
                 files += 1
+    if not all(groups):
+        raise InputError("--baseline must be followed by one file or more, got none")
     options = [word for group in groups for name in (group if files else group[:1]) for word in ("--baseline", name)]
-    options += ["--baseline" for group in groups if not group]
     left = [] if files else [name for group in groups for name in group[1:]]
     return [arguments[0], *options, *left, *plain]
 
@@ -407,25 +449,39 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
 def main() -> None:
     """Run the command line; every error a caller can act on is one line on standard error and a status, never a
     traceback."""
-    import click
-
+    # typer brings click along or holds a copy of its own, by version: the class is wherever BadParameter's base is
+    wrong_call: type[Any] = sys.modules[typer.BadParameter.__module__].ClickException
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without the character shows its code instead
+            stream.reconfigure(errors="backslashreplace")
     try:
         status = app(spread_baselines(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
-    except click.exceptions.Exit as error:
+        sys.stdout.flush()
+    except typer.Exit as error:
         status = error.exit_code
-    except click.ClickException as error:
+    except wrong_call as error:
         error.show()
-        status = 2
-    except (click.Abort, KeyboardInterrupt):
-        typer.echo("sealscope: interrupted", err=True)
-        status = 130
+        status = _WRONG_CALL
+    except (typer.Abort, KeyboardInterrupt):
+        status = _INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 1
     except SealscopeError as error:
-        typer.echo(f"sealscope: {error}", err=True)
-        status = 2 if isinstance(error, InputError) and not isinstance(error, UnreadableFile) else 1
+        _complain(error)
+        status = _WRONG_CALL if isinstance(error, InputError) and not isinstance(error, UnreadableFile) else 1
     except (OSError, MemoryError) as error:
-        typer.echo(f"sealscope: {error or 'out of memory'}", err=True)
+        _complain(str(error) or "out of memory")
         status = 1
+    if status == _INTERRUPTED:  # typer may have turned the interrupt into this status
+        _complain("interrupted")
+    _let_go_of_output()
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _let_go_of_output() -> None:
+    """Flush standard output; where nobody takes it any more, send the rest nowhere, so that Python's own flush at its
+    end is silent."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

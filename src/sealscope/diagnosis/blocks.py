@@ -19,6 +19,10 @@ LEVELS = 4
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Length a block should have [s]: long enough for the RMS of d4 to be steady, short enough to place an onset.
 BLOCK_SECONDS = 1.5
+#: ... and fewest samples it should have, at a low sampling rate: two periods of the slowest oscillation in d4, whose memory then ends in the next block.
+BLOCK_SAMPLES = 64
+#: Details below this share of the pressure's largest value are the rounding of the transform: the reading does not move.
+_STILL = 1e-9
 _LONGEST_CYCLE = 20.0
 _CYCLE_CORRELATION = 0.6
 _ANALYSIS_RATE = 50.0

@@ -1,0 +1,122 @@
+"""What a reproduction gives: figures and tables as plain data, which `reporting` draws and prints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sealscope.recordings.recording import Array
+
+#: How a curve is drawn: what it stands for. `reporting.plots` gives each a line, a grey and a colour, readable without the colour.
+Role = Literal[
+    "command", "A", "B", "line 1", "line 2", "literal", "converged", "no leak", "leak", "measured", "simulated",
+    "25 %", "50 %", "75 %", "open", "d1", "d2", "d3", "d4", "d3d4", "reference", "other",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One series of points (x, y), in the panel's units."""
+
+    x: Array
+    y: Array
+    label: str
+    role: Role = "other"
+    kind: Literal["line", "points", "steps", "stems"] = "line"
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """Values (rows over y, columns over x) drawn as greys, such as a spectrogram."""
+
+    x: Array
+    y: Array
+    values: Array
+    label: str
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One set of axes; labels carry the unit in brackets, such as "p_A [MPa]"."""
+
+    x_label: str
+    y_label: str
+    curves: tuple[Curve, ...] = ()
+    title: str = ""
+    marks: tuple[tuple[float, str], ...] = ()
+    image: Image | None = None
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+    log_x: bool = False
+    log_y: bool = False
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number behind a figure."""
+
+    name: str
+    value: float | str
+    unit: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """A figure under the thesis's own number.
+
+    `claims`: ids of the claims it bears on; `resolved`: whether every run in it passed the halving test (None: nothing simulated); a figure that
+    did not is marked on its face.
+    """
+
+    id: str
+    title: str
+    panels: tuple[Panel, ...]
+    numbers: tuple[Number, ...] = ()
+    claims: tuple[str, ...] = ()
+    resolved: bool | None = None
+    notes: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table: `columns` with units in brackets, `rows` of text and numbers (None: no value)."""
+
+    id: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[float | int | str | None, ...], ...]
+    claims: tuple[str, ...] = ()
+    resolved: bool | None = None
+    notes: str = ""
+
+
+Product = Figure | Table
+
+Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One testable sentence of the thesis, in our words: where it stands, what the sheet says, what the simulation says, the verdict, and why."""
+
+    id: str
+    where: str
+    claim: str
+    sheet: str
+    simulation: str
+    verdict: Verdict
+    why: str
+
+
+def thinned(x: Array, y: Array, most: int = 4000) -> tuple[Array, Array]:
+    """The curve with at most about `most` points, least and greatest of each stretch kept, so that peaks survive."""
+    if x.size <= most:
+        return x, y
+    size = int(np.ceil(2 * x.size / most))
+    whole = x.size // size * size
+    blocks = y[:whole].reshape(-1, size)
+    start = np.arange(blocks.shape[0]) * size
+    picks = np.sort(np.concatenate([start + blocks.argmin(axis=1), start + blocks.argmax(axis=1)]))
+    return x[picks], y[picks]
