@@ -1,0 +1,112 @@
+"""The command line: translation from words to calls, nothing else."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from sealscope.cli import recordings, simulation
+from sealscope.errors import InputError, SealscopeError, UnreadableFile
+
+app = typer.Typer(
+    name="sealscope",
+    help="Find internal leakage in electro-hydrostatic actuators: simulate the rig, read recordings, diagnose them.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+for command in (
+    simulation.demo,
+    simulation.simulate,
+    recordings.diagnose,
+    recordings.report,
+    simulation.parameters,
+    recordings.convert,
+):
+    app.command()(command)
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        from sealscope import __version__
+
+        typer.echo(f"sealscope {__version__}")
+        raise typer.Exit
+
+
+def spread_baselines(arguments: Sequence[str]) -> list[str]:
+    """Give every file after `--baseline` an option of its own, so that `FILE... --baseline FILE...` works with a
+    shell's wildcards.
+
+    All words after `--baseline` up to the next option belong to it; but where no other word could be a FILE, only the
+    first one does.
+    """
+    if not arguments or arguments[0] not in ("diagnose", "report"):
+        return list(arguments)
+    takes_value = {"--format", "--map", "--rate", "--false-alarm", "--output", "-o"}
+    groups: list[list[str]] = []
+    plain: list[str] = []
+    index, files = 1, 0
+    while index < len(arguments):
+        word = arguments[index]
+        index += 1
+        if word == "--":
+            rest = list(arguments[index:])
+            files += len(rest)
+            plain += ["--", *rest]
+            break
+        if word == "--baseline":
+            group = []
+            while index < len(arguments) and not arguments[index].startswith("-"):
+                group.append(arguments[index])
+                index += 1
+            groups.append(group)
+        else:
+            plain.append(word)
+            if word in takes_value and index < len(arguments):
+                plain.append(arguments[index])
+                index += 1
+            elif not word.startswith("-"):
+                files += 1
+    if not all(groups):
+        raise InputError("--baseline must be followed by one file or more, got none")
+    options = [word for group in groups for name in (group if files else group[:1]) for word in ("--baseline", name)]
+    left = [] if files else [name for group in groups for name in group[1:]]
+    return [arguments[0], *options, *left, *plain]
+
+
+def main() -> None:
+    """Run the command line; every error a caller can act on is one line on standard error and a status, never a
+    traceback."""
+    # typer brings click along or holds a copy of its own, by version: the class is wherever BadParameter's base is
+    wrong_call: type[Any] = sys.modules[typer.BadParameter.__module__].ClickException
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without the character shows its code instead
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        status = app(spread_baselines(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
+        sys.stdout.flush()
+    except typer.Exit as error:
+        status = error.exit_code
+    except wrong_call as error:
+        error.show()
+        status = _WRONG_CALL
+    except (typer.Abort, KeyboardInterrupt):
+        status = _INTERRUPTED
+    except BrokenPipeError:
+        status = 1
+    except SealscopeError as error:
+        _complain(error)
+        status = _WRONG_CALL if isinstance(error, InputError) and not isinstance(error, UnreadableFile) else 1
+    except (OSError, MemoryError) as error:
+        _complain(str(error) or "out of memory")
+        status = 1
+    if status == _INTERRUPTED:  # typer may have turned the interrupt into this status
+        _complain("interrupted")
+    _let_go_of_output()
+    sys.exit(status if isinstance(status, int) else 0)

@@ -1,0 +1,91 @@
+"""Options that several commands share, and the progress line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sealscope.errors import InputError
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+    from sealscope.simulation.simulate import Progress
+
+
+def complete_rigs(incomplete: str) -> list[str]:
+    from sealscope.parameters import rig_names
+
+    return [name for name in rig_names() if name.startswith(incomplete)]
+
+
+def complete_settings(incomplete: str) -> list[str]:
+    from sealscope.parameters import declared_names
+
+    return [f"{name}=" for name in declared_names() if name.startswith(incomplete)]
+
+
+RigOption = Annotated[
+    str, typer.Option("--rig", help="Rig by name, or the path of a rig's TOML file.", autocompletion=complete_rigs)
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE[unit]", help="Override a parameter; repeat.", autocompletion=complete_settings
+    ),
+]
+MapOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map", metavar="CHANNEL=COLUMN", help="Take a channel from a foreign column, e.g. p_A=PG_1[psi]; repeat."
+    ),
+]
+RateOption = Annotated[float | None, typer.Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
+BaselineOption = Annotated[
+    list[Path] | None, typer.Option("--baseline", metavar="FILE...", help="Leak-free recordings of the same machine.")
+]
+FalseAlarmOption = Annotated[
+    float, typer.Option("--false-alarm", help="Probability of `leak` on a leak-free recording.")
+]
+SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the instruments' noise.")]
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """A progress line on standard error, gone when done; silent where nobody looks."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        tasks: dict[str, Any] = {}
+
+        def told(words: str, share: float) -> None:
+            if words not in tasks:
+                tasks[words] = bar.add_task(words, total=1.0)
+            bar.update(tasks[words], completed=share)
+
+        yield told
+
+
+def rig_with(name: str, settings: Sequence[str] | None) -> Rig:
+    from sealscope.parameters import load_rig, parse_settings
+
+    rig = load_rig(name)
+    return rig.with_values(parse_settings(list(settings)), source="set by --set") if settings else rig
+
+
+def channel_map_of(options: Sequence[str] | None) -> dict[str, str]:
+    from sealscope.recordings import split_map_option
+
+    found: dict[str, str] = {}
+    for option in options or ():
+        channel, column = split_map_option(option)
+        if channel in found:
+            raise InputError(f"--map {channel} must be given once, got {found[channel]} and {column}")
+        found[channel] = column
+    return found

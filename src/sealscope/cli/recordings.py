@@ -1,0 +1,152 @@
+"""The commands that look at recordings: diagnose, report, convert."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sealscope.cli.options import BaselineOption, FalseAlarmOption, MapOption, RateOption, channel_map_of
+from sealscope.errors import InputError, MissingExtra, UnreadableFile
+
+if TYPE_CHECKING:
+    from sealscope.diagnosis.verdict import Diagnosis
+    from sealscope.recordings import Recording
+
+
+class TextFormat(StrEnum):
+    """How verdicts are printed."""
+
+    text = "text"
+    jsonl = "jsonl"
+
+
+def _read_all(
+    files: Sequence[Path], channel_map: dict[str, str], rate: float | None
+) -> Iterator[tuple[Path, Recording | None]]:
+    """Each file and its recording; None, with one line on standard error, where it cannot be read."""
+    from sealscope.recordings import read
+
+    for file in files:
+        try:
+            yield file, read(file, channel_map=channel_map or None, rate=rate)
+        except (UnreadableFile, MissingExtra) as error:
+            _complain(error)
+            yield file, None
+
+
+def _diagnoses(
+    files: Sequence[Path],
+    baseline: Sequence[Path],
+    maps: Sequence[str] | None,
+    rate: float | None,
+    false_alarm: float,
+) -> Iterator[tuple[Recording, Diagnosis] | None]:
+    """Recording and diagnosis of each file, None for one that cannot be read; a file is never its own baseline."""
+    from sealscope.diagnosis.diagnose import check_probability, diagnose
+
+    check_probability(false_alarm)
+    channel_map = channel_map_of(maps)
+    for file in files if baseline else ():
+        if all(path.resolve() == file.resolve() for path in baseline):
+            raise InputError(f"a baseline must be another recording than the file itself, got {file}")
+    known = [(file, recording) for file, recording in _read_all(baseline, channel_map, rate) if recording is not None]
+    if len(known) < len(baseline):
+        yield None
+        if not known:
+            raise UnreadableFile("no baseline could be read, so nothing is diagnosed")
+    for file, recording in _read_all(files, channel_map, rate):
+        if recording is None:
+            yield None
+            continue
+        others = [one for path, one in known if path.resolve() != file.resolve()]
+        if baseline and not others:
+            _complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
+            yield None
+            continue
+        yield recording, diagnose(recording, others, false_alarm_probability=false_alarm, file=str(file))
+
+
+def diagnose(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Recordings: CSV or text, NetCDF, HDF5, Parquet.")
+    ],
+    baseline: BaselineOption = None,
+    output: Annotated[TextFormat, typer.Option("--format", help="Text, or one JSON object a line.")] = TextFormat.text,
+    maps: MapOption = None,
+    rate: RateOption = None,
+    false_alarm: FalseAlarmOption = 0.01,
+) -> None:
+    """Say for each file whether oil bypasses the piston. Exit status 1 where a file could not be read."""
+    from sealscope.reporting import diagnosis_text
+
+    complete = True
+    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm):
+        if found is None:
+            complete = False
+        elif output is TextFormat.jsonl:
+            typer.echo(json.dumps(found[1].as_dict(), allow_nan=False))
+        else:
+            typer.echo(diagnosis_text(found[1]))
+    if not complete:
+        raise typer.Exit(1)
+
+
+def report(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings to report on.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The page, or a folder when there are several files.")],
+    baseline: BaselineOption = None,
+    maps: MapOption = None,
+    rate: RateOption = None,
+    false_alarm: FalseAlarmOption = 0.01,
+) -> None:
+    """Diagnose each file and write a self-contained HTML page of it."""
+    from sealscope.reporting import write_page
+
+    several = len(files) > 1 or output.is_dir()
+    read_too = {path.resolve() for path in (*files, *(baseline or ()))}
+    pages: dict[Path, Path] = {}
+    for file in files:
+        page = output / f"{file.stem}.html" if several else output
+        if page.resolve() in read_too:
+            raise InputError(f"a page must not replace a recording, got {page}")
+        if page in pages:
+            raise InputError(f"pages must have names of their own, got {page} for {pages[page]} and {file}")
+        pages[page] = file
+    if several:
+        _make_folder(output)
+    else:
+        _check_folder(output)
+    complete = True
+    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm):
+        if found is None:
+            complete = False
+            continue
+        recording, diagnosis = found
+        page = output / f"{Path(diagnosis.file).stem}.html" if several else output
+        write_page(page, recording, diagnosis)
+        typer.echo(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
+    if not complete:
+        raise typer.Exit(1)
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(help="Recording to read.")],
+    target: Annotated[Path, typer.Argument(help="Recording to write; its suffix tells the format.")],
+    maps: MapOption = None,
+    rate: RateOption = None,
+) -> None:
+    """Rewrite a recording in another format, with Sealscope's channel names and units."""
+    from sealscope.recordings import inspect, read, write
+    from sealscope.recordings.files import check_target
+
+    check_target(target)
+    recording = read(source, channel_map=channel_map_of(maps) or None, rate=rate)
+    write(recording, target)
+    typer.echo(f"{target}: {len(recording)} samples at {recording.rate:g} Hz, channels {', '.join(recording.channels)}")
+    for finding in inspect(recording):
+        typer.echo(f"{finding.severity}: {finding.text}")

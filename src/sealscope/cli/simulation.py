@@ -1,0 +1,142 @@
+"""The commands that simulate: simulate, parameters, demo."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sealscope.cli.options import RigOption, SeedOption, SetOption, complete_rigs, progress, rig_with
+
+
+class TableFormat(StrEnum):
+    """How tables are printed."""
+
+    table = "table"
+    csv = "csv"
+    json = "json"
+
+
+def simulate(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Recording to write (.nc, .h5, .csv, .parquet).")],
+    rig: RigOption = "thesis",
+    command: Annotated[
+        str, typer.Option("--command", help="Command, e.g. '3 sin(4t)', 'chirp 3 from 0.1 Hz to 5 Hz over 60 s'.")
+    ] = "3 sin(4t)",
+    leak: Annotated[
+        list[str] | None, typer.Option("--leak", help="Leak, e.g. '0.0042 L/min from 90 s'; repeat to combine.")
+    ] = None,
+    duration: Annotated[str, typer.Option("--duration", help="Length [s].")] = "180",
+    start: Annotated[
+        str, typer.Option("--start-position", help="Piston position at the start, from mid-stroke [m].")
+    ] = "0",
+    seed: SeedOption = 0,
+    settings: SetOption = None,
+    method: Annotated[str, typer.Option("--method", help="auto, rk4 or imex.")] = "auto",
+    step: Annotated[str | None, typer.Option("--step", help="Largest step of the solver [s].")] = None,
+    prove: Annotated[
+        bool, typer.Option("--prove", help="Halve the step and report how far everything moves; fail if too far.")
+    ] = False,
+    allow_unresolved: Annotated[
+        bool, typer.Option("--allow-unresolved", help="Let an unstable or unresolved run through, marked.")
+    ] = False,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", help="Write what was put in (leaks, onset) to this JSON file.")
+    ] = None,
+) -> None:
+    """Simulate the rig and record it as its instruments would."""
+    from sealscope.recordings import write
+    from sealscope.recordings.files import check_target
+    from sealscope.simulation.experiment import make_experiment
+    from sealscope.simulation.proof import prove as prove_run
+    from sealscope.simulation.simulate import run, write_truth
+    from sealscope.units import parse_quantity
+
+    check_target(output)
+    if truth is not None:
+        _check_folder(truth)
+        if truth.resolve() == output.resolve():
+            raise InputError(f"recording and truth must be two files, got {output} for both")
+    experiment = make_experiment(
+        rig=rig_with(rig, settings),
+        command=command,
+        leak=leak,
+        duration=parse_quantity(duration, "s"),
+        x_0=parse_quantity(start, "m"),
+        seed=seed,
+        method=method,
+        step=None if step is None else parse_quantity(step, "s"),
+        allow_unresolved=allow_unresolved,
+    )
+    with progress() as told:
+        proof = prove_run(experiment, told) if prove else None
+        made = run(experiment, told)
+    write(made.recording, output)
+    if truth is not None:
+        write_truth(made.truth, truth)
+    if proof is not None:
+        typer.echo(proof.text())
+    solver = made.recording.provenance["solver"]
+    typer.echo(
+        f"{output}: {len(made.recording)} samples at {experiment.rate:g} Hz, {experiment.command} "
+        f"({solver['method']}, h = {solver['step_s']:.3g} s)"
+    )
+    for one in made.truth.leaks:
+        typer.echo(f"leak: {one}")
+    if made.truth.leaks:
+        typer.echo(f"mean leak while open: {made.truth.mean_leak_lpm:.5g} L/min")
+
+
+def parameters(
+    rig: Annotated[
+        str, typer.Argument(help="Rig by name, or the path of a rig's TOML file.", autocompletion=complete_rigs)
+    ] = "thesis",
+    settings: SetOption = None,
+    output: Annotated[TableFormat, typer.Option("--format", help="Table, CSV or JSON.")] = TableFormat.table,
+) -> None:
+    """List a rig's parameters: symbol, name, value, unit and source."""
+    loaded = rig_with(rig, settings)
+    columns = ("symbol", "name", "meaning", "value", "unit", "source")
+    rows = [{column: getattr(row, column) for column in columns} for row in loaded.table()]
+    if output is TableFormat.json:
+        typer.echo(json.dumps(rows, indent=1))
+    elif output is TableFormat.csv:
+        writer = csv.DictWriter(sys.stdout, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    else:
+        from rich.console import Console
+        from rich.table import Table
+
+        console = Console(width=None if sys.stdout.isatty() else 240)
+        table = Table(*columns, title=f"{loaded.name}: {loaded.title}", row_styles=("", "dim"))
+        for row in rows:
+            value = row["value"]
+            table.add_row(
+                *(f"{row[c]:.6g}" if c == "value" and isinstance(value, float) else str(row[c]) for c in columns)
+            )
+        console.print(table)
+
+
+def demo(
+    folder: Annotated[Path, typer.Option("--output", "-o", help="Folder for the recording and the page.")] = Path(
+        "sealscope-demo"
+    ),
+    seed: SeedOption = 1,
+) -> None:
+    """Simulate 180 s with a leak of 0.0042 L/min from second 90, record it, diagnose the recording, write the page."""
+    from sealscope.demo import run_demo
+    from sealscope.reporting import diagnosis_text
+
+    _make_folder(folder)
+    with progress() as told:
+        made = run_demo(folder, seed, told)
+    typer.echo(diagnosis_text(made.diagnosis))
+    typer.echo(f"truth:     {made.truth.mean_leak_lpm:.4f} L/min from {made.truth.onset_s:.1f} s")
+    typer.echo(f"recording: {made.recording}")
+    typer.echo(f"page:      {made.page}")

@@ -1,0 +1,31 @@
+"""One entry of the reproduction: a case, figure, table or list of claims under the thesis's own number, and how it is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal["case", "figure", "table", "claims"]
+
+
+@dataclass(frozen=True)
+class Item:
+    """What can be reproduced, as data.
+
+    `id`: the thesis's own number, such as "fig-4.22"; `make`: "module:function" inside `sealscope.thesis`, a maker
+    `(context, item) -> tuple of Figure, Table and Claim`; `inputs`: what the maker reads, by name; `needs_sheet`: it
+    cannot be made without the thesis's data sheet; `needs`: ids of the items whose products it asks for.
+    """
+
+    id: str
+    chapter: int
+    kind: Kind
+    title: str
+    make: str
+    inputs: tuple[tuple[str, str | float | tuple[str | float, ...]], ...] = ()
+    needs_sheet: bool = False
+    needs: tuple[str, ...] = ()
+
+    def input(self, name: str) -> str | float | tuple[str | float, ...]:
+        """The input called `name`; KeyError where the item has none."""
+        return dict(self.inputs)[name]

@@ -1,0 +1,160 @@
+"""The command line called as a user calls it, and small files to call it with."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sealscope
+from sealscope import cli
+
+SOURCES = Path(sealscope.__file__).resolve().parents[1]
+Listing = dict[str, tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Call:
+    """What one call of the command left behind: exit status, standard output, standard error."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def objects(self) -> list[dict[str, Any]]:
+        """Standard output read as one JSON object a line; fails on anything else."""
+        found = [json.loads(line) for line in self.out.splitlines()]
+        assert all(isinstance(one, dict) for one in found)
+        return found
+
+    def refused(self, status: int = 2) -> str:
+        """The one line of complaint of a call that must end with `status`, without its prefix."""
+        assert self.status == status, self
+        lines = self.err.splitlines()
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("sealscope: "), self.err
+        assert "Traceback" not in self.err
+        return lines[0].removeprefix("sealscope: ")
+
+    def misused(self) -> str:
+        """The complaint of a call whose options are wrong: usage lines and one line `Error: ...`, status 2."""
+        assert self.status == 2, self
+        lines = self.err.splitlines()
+        assert lines[0].startswith("Usage: sealscope"), self.err
+        assert sum(line.startswith("Error: ") for line in lines) == 1, self.err
+        assert lines[-1].startswith("Error: "), self.err
+        assert "Traceback" not in self.err
+        assert self.out == ""
+        return lines[-1].removeprefix("Error: ")
+
+
+Run = Callable[..., Call]
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
+    """Call the command within this process. An exception that is not an exit goes through, and fails the test."""
+
+    def called(*words: object) -> Call:
+        monkeypatch.setattr(sys, "argv", ["sealscope", *map(str, words)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        out, err = capfd.readouterr()
+        assert isinstance(ended.value.code, int)
+        return Call(ended.value.code, out, err)
+
+    return called
+
+
+def environment(**more: str) -> dict[str, str]:
+    """This process's environment, with the package that is under test on the path of a child."""
+    known = os.pathsep.join(part for part in (str(SOURCES), os.environ.get("PYTHONPATH", "")) if part)
+    return {**os.environ, "PYTHONPATH": known, **more}
+
+
+def command(*words: object) -> list[str]:
+    """The words that start the command in a process of its own."""
+    return [sys.executable, "-m", "sealscope", *map(str, words)]
+
+
+@pytest.fixture
+def process() -> Run:
+    """Call the command in a process of its own, as a shell does."""
+
+    def called(*words: object, **more: str) -> Call:
+        done = subprocess.run(
+            command(*words), capture_output=True, text=True, check=False, env=environment(**more), timeout=120
+        )
+        return Call(done.returncode, done.stdout, done.stderr)
+
+    return called
+
+
+def listing(folder: Path) -> Listing:
+    """Every file below a folder, hidden ones too, with its size and the time of its last change."""
+    return {
+        str(path.relative_to(folder)): (path.stat().st_size, path.stat().st_mtime_ns) if path.is_file() else (0, 0)
+        for path in folder.rglob("*")
+    }
+
+
+@pytest.fixture
+def untouched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """Work in `tmp_path`; the function given says when it is complete, and at the end it must still be as it was."""
+    monkeypatch.chdir(tmp_path)
+    known: list[Listing] = []
+
+    def complete() -> None:
+        known.append(listing(tmp_path))
+
+    complete()
+    yield complete
+    assert listing(tmp_path) == known[-1]
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with simulated recordings: `leak.nc` (a large leak from second 30 of 60), `healthy_1.nc` to
+    `healthy_3.nc` (40 s, no leak)."""
+    folder = tmp_path_factory.mktemp("recordings")
+    leaky = sealscope.simulate(duration=60.0, leak="0.0135 L/min from 30 s", seed=7)
+    sealscope.write(leaky, folder / "leak.nc")
+    for seed in (1, 2, 3):
+        healthy = sealscope.simulate(duration=40.0, seed=seed)
+        sealscope.write(healthy, folder / f"healthy_{seed}.nc")
+    return folder
+
+
+def _stroke(seed: int, direction: int, leaks: bool) -> str:
+    """3 s of a stroke as a foreign logger writes it: raw 14-bit counts at 1000 Hz, no units, no seconds; a leak damps
+    the ringing."""
+    random = np.random.default_rng(seed)
+    t = np.arange(3000) / 1000
+    moved = 1500 * direction * np.tanh(3 * t)
+    ringing = (60 if leaks else 150) * np.sin(2 * np.pi * 90 * t) * np.exp(-((t - 1.0) ** 2))
+    sides = [8000 + sign * (moved + ringing) + random.normal(0, 12, t.size) for sign in (1, -1)]
+    first, second = (np.round(side * (1 + 0.01 * random.normal())).astype(int) for side in sides)
+    rows = [f"{k + 1}\t{11000 + k}\t0\t{first[k]}\t{second[k]}\tName_{k % 7}" for k in range(t.size)]
+    return "\n".join(["Time\tAngle\tTemp_1\tPG_1\tPG_2\tF_Names", *rows, ""])
+
+
+@pytest.fixture(scope="session")
+def strokes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of foreign logs of strokes in alternating directions: `healthy_00.txt` to `healthy_15.txt`,
+    `leak_00.txt` to `leak_03.txt`; even numbers go one way, odd ones the other."""
+    folder = tmp_path_factory.mktemp("strokes")
+    for kind, count, first in (("healthy", 16, 100), ("leak", 4, 200)):
+        for k in range(count):
+            text = _stroke(first + k, 1 if k % 2 == 0 else -1, kind == "leak")
+            (folder / f"{kind}_{k:02d}.txt").write_text(text)
+    return folder
