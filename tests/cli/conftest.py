@@ -76,28 +76,21 @@ def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> 
     return called
 
 
-def environment(**more: str) -> dict[str, str]:
-    """This process's environment, with the package that is under test on the path of a child."""
-    known = os.pathsep.join(part for part in (str(SOURCES), os.environ.get("PYTHONPATH", "")) if part)
-    return {**os.environ, "PYTHONPATH": known, **more}
+@pytest.fixture(scope="session")
+def shell() -> Run:
+    """Run a command in a process of its own with the package under test on its path; the first word is the program,
+    `sealscope` for the command itself."""
 
-
-def command(*words: object) -> list[str]:
-    """The words that start the command in a process of its own."""
-    return [sys.executable, "-m", "sealscope", *map(str, words)]
-
-
-@pytest.fixture
-def process() -> Run:
-    """Call the command in a process of its own, as a shell does."""
-
-    def called(*words: object, **more: str) -> Call:
+    def ran(*words: object, **more: str) -> Call:
+        known = os.pathsep.join(part for part in (str(SOURCES), os.environ.get("PYTHONPATH", "")) if part)
+        surroundings = {**os.environ, "PYTHONPATH": known, "PYTHON": sys.executable, **more}
+        program = [sys.executable, "-m", "sealscope"] if words[0] == "sealscope" else [str(words[0])]
         done = subprocess.run(
-            command(*words), capture_output=True, text=True, check=False, env=environment(**more), timeout=120
+            [*program, *map(str, words[1:])], capture_output=True, check=False, env=surroundings, timeout=120
         )
-        return Call(done.returncode, done.stdout, done.stderr)
+        return Call(done.returncode, done.stdout.decode(), done.stderr.decode())
 
-    return called
+    return ran
 
 
 def listing(folder: Path) -> Listing:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from sealscope.cli import recordings, simulation
+from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
+
+_WRONG_CALL, _INTERRUPTED = 2, 130
 
 app = typer.Typer(
     name="sealscope",
@@ -101,12 +104,21 @@ def main() -> None:
     except BrokenPipeError:
         status = 1
     except SealscopeError as error:
-        _complain(error)
+        complain(error)
         status = _WRONG_CALL if isinstance(error, InputError) and not isinstance(error, UnreadableFile) else 1
     except (OSError, MemoryError) as error:
-        _complain(str(error) or "out of memory")
+        complain(str(error) or "out of memory")
         status = 1
     if status == _INTERRUPTED:  # typer may have turned the interrupt into this status
-        _complain("interrupted")
+        complain("interrupted")
     _let_go_of_output()
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _let_go_of_output() -> None:
+    """Flush standard output; where nobody takes it any more, send the rest nowhere, so that Python's own flush at its
+    end is silent."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -89,3 +89,25 @@ def channel_map_of(options: Sequence[str] | None) -> dict[str, str]:
             raise InputError(f"--map {channel} must be given once, got {found[channel]} and {column}")
         found[channel] = column
     return found
+
+
+def complain(words: object) -> None:
+    """One line on standard error, whatever characters a file's name or header brought."""
+    printable = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(words))
+    typer.echo(f"sealscope: {printable}", err=True)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder to write into; raises InputError where it cannot be one."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"a folder to write into must be one or become one, got: {error.strerror} ({folder})"
+        ) from None
+
+
+def check_folder(file: Path) -> None:
+    """Refuse a file whose folder is not there before the long work, not after it."""
+    if not file.parent.is_dir():
+        raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sealscope.cli.options import BaselineOption, FalseAlarmOption, MapOption, RateOption, channel_map_of
+from sealscope.cli.options import (
+    BaselineOption,
+    FalseAlarmOption,
+    MapOption,
+    RateOption,
+    channel_map_of,
+    check_folder,
+    complain,
+    make_folder,
+)
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
 
 if TYPE_CHECKING:
@@ -35,7 +44,7 @@ def _read_all(
         try:
             yield file, read(file, channel_map=channel_map or None, rate=rate)
         except (UnreadableFile, MissingExtra) as error:
-            _complain(error)
+            complain(error)
             yield file, None
 
 
@@ -65,7 +74,7 @@ def _diagnoses(
             continue
         others = [one for path, one in known if path.resolve() != file.resolve()]
         if baseline and not others:
-            _complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
+            complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
             continue
         yield recording, diagnose(recording, others, false_alarm_probability=false_alarm, file=str(file))
@@ -118,9 +127,9 @@ def report(
             raise InputError(f"pages must have names of their own, got {page} for {pages[page]} and {file}")
         pages[page] = file
     if several:
-        _make_folder(output)
+        make_folder(output)
     else:
-        _check_folder(output)
+        check_folder(output)
     complete = True
     for found in _diagnoses(files, baseline or [], maps, rate, false_alarm):
         if found is None:

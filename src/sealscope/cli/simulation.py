@@ -11,7 +11,17 @@ from typing import Annotated
 
 import typer
 
-from sealscope.cli.options import RigOption, SeedOption, SetOption, complete_rigs, progress, rig_with
+from sealscope.cli.options import (
+    RigOption,
+    SeedOption,
+    SetOption,
+    check_folder,
+    complete_rigs,
+    make_folder,
+    progress,
+    rig_with,
+)
+from sealscope.errors import InputError
 
 
 class TableFormat(StrEnum):
@@ -59,7 +69,7 @@ def simulate(
 
     check_target(output)
     if truth is not None:
-        _check_folder(truth)
+        check_folder(truth)
         if truth.resolve() == output.resolve():
             raise InputError(f"recording and truth must be two files, got {output} for both")
     experiment = make_experiment(
@@ -133,7 +143,7 @@ def demo(
     from sealscope.demo import run_demo
     from sealscope.reporting import diagnosis_text
 
-    _make_folder(folder)
+    make_folder(folder)
     with progress() as told:
         made = run_demo(folder, seed, told)
     typer.echo(diagnosis_text(made.diagnosis))

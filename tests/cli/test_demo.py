@@ -1,0 +1,85 @@
+"""The main job, shown once: `sealscope demo`."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+import sealscope
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("demo")
+
+
+@pytest.fixture(scope="module")
+def first(shell, folder):
+    return shell("sealscope", "demo", "--output", folder / "first")
+
+
+def test_the_leak_is_found_within_ten_seconds_of_the_truth(first, folder):
+    assert (first.status, first.err) == (0, "")
+    assert first.out.startswith("recording.nc: leak\n")
+    said = re.search(r"^  since +([0-9.]+) s, between ([0-9.]+) s and ([0-9.]+) s$", first.out, re.MULTILINE)
+    truth = re.search(r"^truth: +([0-9.]+) L/min from ([0-9.]+) s$", first.out, re.MULTILINE)
+    assert float(truth[2]) == 90.0
+    assert float(truth[1]) == pytest.approx(0.0042, rel=0.002)
+    assert abs(float(said[1]) - float(truth[2])) <= 10.0
+    assert float(said[2]) <= float(said[1]) <= float(said[3])
+    for name in ("recording.nc", "report.html"):
+        assert str(folder / "first" / name) in first.out
+        assert (folder / "first" / name).stat().st_size > 10_000
+    assert sorted(path.name for path in (folder / "first").iterdir()) == ["recording.nc", "report.html"]
+
+
+def test_the_recording_is_a_recording_that_does_not_know_the_truth(first, folder):
+    recording = sealscope.read(folder / "first" / "recording.nc")
+    assert recording.duration == 180.0
+    assert "leak" not in str(dict(recording.provenance)).lower()
+    found = sealscope.diagnose(recording)
+    assert found.verdict == "leak"
+    assert abs(found.onset_s - 90.0) <= 10.0
+
+
+def test_the_page_needs_nothing_from_outside(first, folder):
+    page = (folder / "first" / "report.html").read_text(encoding="utf-8")
+    loads = r"<(?:script|img|iframe|link|source)\b[^>]*\b(?:src|href)\s*=\s*[\"'](?!data:|#)"
+    assert not re.search(loads, page, re.IGNORECASE)
+    assert not re.search(r"@import|url\(\s*[\"']?(?!data:|#)[a-z/]", page, re.IGNORECASE)
+    assert not re.search(r"\bfetch\s*\(|XMLHttpRequest|\bimport\s*\(", page)
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert page.rstrip().endswith("</html>")
+    assert "<svg" in page
+
+
+def test_a_second_run_gives_the_same_bytes_and_the_same_words(first, folder, call):
+    second = call("demo", "-o", folder / "second")
+    assert second.status == 0
+    assert second.out == first.out.replace(str(folder / "first"), str(folder / "second"))
+    for name in ("recording.nc", "report.html"):
+        assert (folder / "second" / name).read_bytes() == (folder / "first" / name).read_bytes()
+
+
+def test_another_seed_is_another_recording_with_the_same_verdict(first, folder, call):
+    other = call("demo", "-o", folder / "other", "--seed", 2)
+    assert other.status == 0
+    assert other.out.startswith("recording.nc: leak\n")
+    one, two = (sealscope.read(folder / name / "recording.nc") for name in ("first", "other"))
+    assert (one["p_A"] != two["p_A"]).any()
+    assert (one["u"] == two["u"]).mean() > 0.9
+
+
+def test_a_folder_that_cannot_be_one_is_refused_before_the_work(call, untouched, tmp_path, monkeypatch):
+    (tmp_path / "taken").write_text("a file")
+    untouched()
+
+    def not_called(*_):
+        raise AssertionError("simulated before the folder was looked at")
+
+    monkeypatch.setattr("sealscope.demo.run", not_called)
+    assert call("demo", "-o", "taken").refused() == (
+        "a folder to write into must be one or become one, got: File exists (taken)"
+    )
+    assert call("demo", "-o", "taken/below").refused().endswith("(taken/below)")

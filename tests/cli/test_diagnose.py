@@ -1,0 +1,209 @@
+"""`sealscope diagnose`: the output contract that other programs read, baselines, foreign logs, exit status."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from sealscope.cli import spread_baselines
+
+KEYS = {
+    "file": str,
+    "verdict": str,
+    "reason": str,
+    "onset_s": float | None,
+    "onset_interval_s": list | None,
+    "leak_lpm": float | None,
+    "leak_interval_lpm": list | None,
+    "false_alarm_probability": float,
+    "score": float | None,
+    "threshold": float | None,
+    "methods": list,
+    "quality": list,
+}
+VERDICTS = {"leak", "no leak", "cannot tell"}
+FOREIGN = ("--map", "p_A=PG_1", "--map", "p_B=PG_2", "--rate", "1000")
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real" / "vtnsi_actuator"
+
+
+def keep_contract(found):
+    """Every key with its type, in the stated order; verdicts among the stated three."""
+    assert list(found) == list(KEYS)
+    for key, kind in KEYS.items():
+        assert isinstance(found[key], kind), key
+    assert found["verdict"] in VERDICTS
+    assert found["reason"]
+    for interval in (found["onset_interval_s"], found["leak_interval_lpm"]):
+        assert interval is None or (len(interval) == 2 and interval[0] <= interval[1])
+    for method in found["methods"]:
+        assert {"name", "score", "threshold", "verdict"} <= set(method)
+        assert method["verdict"] in VERDICTS
+    for finding in found["quality"]:
+        assert {"code", "channel", "count", "severity", "text"} <= set(finding)
+
+
+def test_jsonl_is_one_object_a_line_and_nothing_else(call, recordings):
+    files = [recordings / "leak.nc", recordings / "healthy_1.nc"]
+    done = call("diagnose", *files, "--format", "jsonl")
+    assert (done.status, done.err) == (0, "")
+    leak, healthy = done.objects
+    for found, file in ((leak, files[0]), (healthy, files[1])):
+        keep_contract(found)
+        assert found["file"] == str(file)
+        assert found["false_alarm_probability"] == 0.01
+    assert leak["verdict"] == "leak"
+    assert leak["score"] > leak["threshold"]
+    assert abs(leak["onset_s"] - 30.0) <= 10.0
+    assert leak["onset_interval_s"][0] <= leak["onset_s"] <= leak["onset_interval_s"][1]
+    assert leak["leak_lpm"] is None  # these pressures alone do not tell how much
+    assert healthy["verdict"] == "no leak"
+    assert healthy["score"] <= healthy["threshold"]
+    assert healthy["onset_s"] is None
+
+
+def test_text_says_the_same(call, recordings):
+    files = [recordings / "leak.nc", recordings / "healthy_1.nc"]
+    done = call("diagnose", *files)
+    assert (done.status, done.err) == (0, "")
+    lines = done.out.splitlines()
+    assert f"{files[0]}: leak" in lines
+    assert f"{files[1]}: no leak" in lines
+    assert any(line.startswith("  since") for line in lines)
+
+
+def test_a_process_of_its_own_prints_the_same(shell, call, recordings):
+    words = ("diagnose", recordings / "leak.nc", "--format", "jsonl")
+    assert shell("sealscope", *words) == call(*words)
+
+
+def test_the_false_alarm_probability_sets_the_threshold(call, recordings):
+    thresholds = [
+        call("diagnose", recordings / "leak.nc", "--format", "jsonl", "--false-alarm", p).objects[0]["threshold"]
+        for p in (0.2, 0.01, 0.001)
+    ]
+    assert thresholds == sorted(thresholds)
+    assert len(set(thresholds)) == 3
+
+
+def test_baselines_after_one_flag_or_one_flag_each(call, recordings):
+    leak, *healthy = (recordings / name for name in ("leak.nc", "healthy_1.nc", "healthy_2.nc", "healthy_3.nc"))
+    one = call("diagnose", leak, "--baseline", *healthy, "--format", "jsonl")
+    each = call("diagnose", *(word for file in healthy for word in ("--baseline", file)), "--format", "jsonl", leak)
+    first = call("diagnose", "--baseline", *healthy, "--format=jsonl", "--", leak)
+    assert one.status == 0
+    assert one == each == first
+    (found,) = one.objects
+    keep_contract(found)
+    assert "3 comparable leak-free recordings" in found["reason"]
+
+
+def test_a_baseline_is_not_its_own_baseline(call, recordings):
+    files = [recordings / f"healthy_{k}.nc" for k in (1, 2, 3)]
+    done = call("diagnose", *files, "--baseline", *files, "--format", "jsonl")
+    assert done.status == 0
+    assert [one["file"] for one in done.objects] == [str(file) for file in files]
+    for one in done.objects:
+        assert "2 comparable leak-free recordings" in one["reason"]
+    alone = call("diagnose", recordings / "leak.nc", files[0], "--baseline", files[0])
+    assert "a baseline must be another recording than the file itself" in alone.refused(2)
+    assert alone.out == ""  # a wrong call gives no verdict at all
+
+
+def test_two_words_after_baseline_and_no_other_are_a_baseline_and_a_file(call, recordings):
+    baseline, file = recordings / "healthy_1.nc", recordings / "healthy_2.nc"
+    done = call("diagnose", "--format", "jsonl", "--baseline", baseline, file)
+    assert done.status == 0
+    assert [one["file"] for one in done.objects] == [str(file)]
+    assert "1 comparable leak-free recording" in done.objects[0]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("words", "spread"),
+    [
+        ("diagnose a", "diagnose a"),
+        ("diagnose --baseline b c a", "diagnose --baseline b c a"),
+        ("diagnose a --baseline b c", "diagnose --baseline b --baseline c a"),
+        ("diagnose a --baseline b --rate 5 c", "diagnose --baseline b a --rate 5 c"),
+        ("diagnose --baseline b --baseline c d", "diagnose --baseline b --baseline c d"),
+        ("diagnose --rate 5 --baseline b c", "diagnose --baseline b c --rate 5"),
+        ("diagnose --rate=5 --baseline b c", "diagnose --baseline b c --rate=5"),
+        ("diagnose --baseline=b a", "diagnose --baseline=b a"),
+        ("diagnose --baseline b c -- -a", "diagnose --baseline b --baseline c -- -a"),
+        ("report a -o p --baseline b c", "report --baseline b --baseline c a -o p"),
+        ("convert a --baseline b c", "convert a --baseline b c"),
+        ("", ""),
+    ],
+)
+def test_how_baselines_are_spread(words, spread):
+    assert spread_baselines(words.split()) == spread.split()
+
+
+def test_a_missing_file_among_good_ones_costs_the_others_nothing(call, recordings, untouched):
+    files = [recordings / "leak.nc", "absent.csv", recordings / "healthy_1.nc"]
+    done = call("diagnose", *files, "--format", "jsonl")
+    assert done.refused(1) == "a recording must exist, got no such file (absent.csv)"
+    assert [one["verdict"] for one in done.objects] == ["leak", "no leak"]
+
+
+def test_a_missing_baseline_among_good_ones(call, recordings, untouched):
+    healthy = recordings / "healthy_1.nc"
+    done = call("diagnose", recordings / "leak.nc", "--baseline", "absent.csv", healthy, "--format", "jsonl")
+    assert "absent.csv" in done.refused(1)
+    assert len(done.objects) == 1
+    done = call("diagnose", recordings / "leak.nc", healthy, "--baseline", "absent.csv", healthy, "--format", "jsonl")
+    assert done.status == 1
+    assert [one["file"] for one in done.objects] == [str(recordings / "leak.nc")]
+    assert len(done.err.splitlines()) == 2
+    assert str(healthy) in done.err.splitlines()[1]
+    done = call("diagnose", recordings / "leak.nc", "--baseline", "absent.csv")
+    assert done.status == 1
+    assert done.out == ""
+    assert done.err.splitlines()[1] == "sealscope: no baseline could be read, so nothing is diagnosed"
+
+
+def test_foreign_logs_with_a_map_and_a_rate(call, strokes):
+    files = sorted(strokes.glob("leak_*")) + sorted(strokes.glob("healthy_*"))[:4]
+    healthy = sorted(strokes.glob("healthy_*"))
+    done = call("diagnose", *files, "--baseline", *healthy, *FOREIGN, "--format", "jsonl")
+    assert (done.status, done.err) == (0, "")
+    assert [one["file"] for one in done.objects] == [str(file) for file in files]
+    assert [one["verdict"] for one in done.objects] == ["leak"] * 4 + ["no leak"] * 4
+    for one, count in zip(done.objects, [8] * 4 + [7] * 4, strict=True):
+        keep_contract(one)
+        assert f"{count} comparable leak-free recordings" in one["reason"]  # those of its own direction
+
+
+def test_strokes_of_opposite_direction_are_not_compared(call, strokes):
+    other_way = sorted(strokes.glob("healthy_*"))[1::2]
+    done = call("diagnose", strokes / "leak_00.txt", "--baseline", *other_way, *FOREIGN, "--format", "jsonl")
+    assert done.status == 0
+    (found,) = done.objects
+    assert found["verdict"] == "cannot tell"
+    assert "another direction of the stroke" in found["reason"]
+    assert found["score"] is None
+
+
+def test_a_foreign_log_without_a_rate_takes_its_time_column_and_without_a_map_is_refused(call, strokes, untouched):
+    file = strokes / "leak_00.txt"
+    assert "be given a map" in call("diagnose", file, "--rate", "1000").refused(1)
+    assert "PG_9" in call("diagnose", file, "--map", "p_A=PG_9", "--rate", "1000").refused(1)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/real/vtnsi_actuator is absent")
+def test_every_real_stroke_gets_a_verdict(call):
+    healthy, worn = (sorted((REAL / name).glob("*.txt")) for name in ("act_1_healthy", "act_4_seal_defect"))
+    done = call("diagnose", *worn, "--baseline", *healthy, *FOREIGN, "--format", "jsonl")
+    assert (done.status, done.err) == (0, "")
+    assert [one["file"] for one in done.objects] == [str(file) for file in worn]
+    verdicts = Counter(one["verdict"] for one in done.objects)
+    assert verdicts["leak"] > len(worn) / 2
+    own = call("diagnose", *healthy[:15], "--baseline", *healthy[15:], *FOREIGN, "--format", "jsonl")
+    assert (own.status, own.err) == (0, "")
+    assert len(own.objects) == 15
+    assert Counter(one["verdict"] for one in own.objects)["leak"] <= 1
+    for one in done.objects + own.objects:
+        keep_contract(one)
+    counts = {one["reason"].split("comparable")[0].split()[-1] for one in own.objects}
+    assert counts <= {"7", "8"}  # half of the fifteen strokes go the same way
