@@ -77,16 +77,26 @@ def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.fixture(scope="session")
-def shell() -> Run:
+def surroundings() -> dict[str, str]:
+    """This process's environment, with the package under test on the path of a child."""
+    known = os.pathsep.join(part for part in (str(SOURCES), os.environ.get("PYTHONPATH", "")) if part)
+    usual = {name: value for name, value in os.environ.items() if name not in ("PYTHONUNBUFFERED", "PYTHONIOENCODING")}
+    return {**usual, "PYTHONPATH": known, "PYTHON": sys.executable}
+
+
+@pytest.fixture(scope="session")
+def shell(surroundings: dict[str, str]) -> Run:
     """Run a command in a process of its own with the package under test on its path; the first word is the program,
     `sealscope` for the command itself."""
 
     def ran(*words: object, **more: str) -> Call:
-        known = os.pathsep.join(part for part in (str(SOURCES), os.environ.get("PYTHONPATH", "")) if part)
-        surroundings = {**os.environ, "PYTHONPATH": known, "PYTHON": sys.executable, **more}
         program = [sys.executable, "-m", "sealscope"] if words[0] == "sealscope" else [str(words[0])]
         done = subprocess.run(
-            [*program, *map(str, words[1:])], capture_output=True, check=False, env=surroundings, timeout=120
+            [*program, *map(str, words[1:])],
+            capture_output=True,
+            check=False,
+            env={**surroundings, **more},
+            timeout=120,
         )
         return Call(done.returncode, done.stdout.decode(), done.stderr.decode())
 
@@ -115,15 +125,19 @@ def untouched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calla
     assert listing(tmp_path) == known[-1]
 
 
+#: The rig of the demo: both throttles half closed.
+THROTTLED = {"line.orifices": "present", "line.closed_A": "50 %", "line.closed_B": "50 %"}
+
+
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with simulated recordings: `leak.nc` (a large leak from second 30 of 60), `healthy_1.nc` to
-    `healthy_3.nc` (40 s, no leak)."""
+    """A folder with simulated recordings: `leak.nc` (a leak from second 40 of 80), `healthy_1.nc` to `healthy_3.nc`
+    (40 s, no leak)."""
     folder = tmp_path_factory.mktemp("recordings")
-    leaky = sealscope.simulate(duration=60.0, leak="0.0135 L/min from 30 s", seed=7)
+    leaky = sealscope.simulate(duration=80.0, leak="0.0135 L/min from 40 s", values=THROTTLED, seed=8)
     sealscope.write(leaky, folder / "leak.nc")
     for seed in (1, 2, 3):
-        healthy = sealscope.simulate(duration=40.0, seed=seed)
+        healthy = sealscope.simulate(duration=40.0, values=THROTTLED, seed=seed)
         sealscope.write(healthy, folder / f"healthy_{seed}.nc")
     return folder
 

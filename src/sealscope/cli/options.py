@@ -17,15 +17,20 @@ if TYPE_CHECKING:
 
 
 def complete_rigs(incomplete: str) -> list[str]:
+    """Names of packaged rigs that begin so."""
     from sealscope.parameters import rig_names
 
     return [name for name in rig_names() if name.startswith(incomplete)]
 
 
 def complete_settings(incomplete: str) -> list[str]:
+    """Names of parameters that begin so, whole or as a symbol that only one has, ready for a value."""
     from sealscope.parameters import declared_names
 
-    return [f"{name}=" for name in declared_names() if name.startswith(incomplete)]
+    names = declared_names()
+    symbols = [name.rpartition(".")[2] for name in names]
+    unique = [symbol for symbol in symbols if symbols.count(symbol) == 1]
+    return [f"{name}=" for name in (*names, *unique) if name.startswith(incomplete)]
 
 
 RigOption = Annotated[
@@ -73,6 +78,7 @@ def progress() -> Iterator[Progress]:
 
 
 def rig_with(name: str, settings: Sequence[str] | None) -> Rig:
+    """The rig of that name or file with the values of `--set`."""
     from sealscope.parameters import load_rig, parse_settings
 
     rig = load_rig(name)
@@ -80,6 +86,7 @@ def rig_with(name: str, settings: Sequence[str] | None) -> Rig:
 
 
 def channel_map_of(options: Sequence[str] | None) -> dict[str, str]:
+    """Channel -> column of the `--map` options; raises InputError where a channel is given twice."""
     from sealscope.recordings import split_map_option
 
     found: dict[str, str] = {}

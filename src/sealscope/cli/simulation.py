@@ -76,11 +76,11 @@ def simulate(
         rig=rig_with(rig, settings),
         command=command,
         leak=leak,
-        duration=parse_quantity(duration, "s"),
-        x_0=parse_quantity(start, "m"),
+        duration=parse_quantity(duration, "s", name="--duration"),
+        x_0=parse_quantity(start, "m", name="--start-position"),
         seed=seed,
         method=method,
-        step=None if step is None else parse_quantity(step, "s"),
+        step=None if step is None else parse_quantity(step, "s", name="--step"),
         allow_unresolved=allow_unresolved,
     )
     with progress() as told:

@@ -1,0 +1,189 @@
+"""Files that are no recordings, or broken ones: one clear line, the right status, nothing left behind."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+HEAD = "t [s],p_A [Pa],p_B [Pa]\n"
+
+
+def rows(t, p_A, p_B) -> str:
+    return "".join(f"{a:.3f},{b:.1f},{c:.1f}\n" for a, b, c in zip(t, p_A, p_B, strict=True))
+
+
+def pressures(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n,) time at 500 Hz and the two chambers of a sinusoidal duty with noise."""
+    random, t = np.random.default_rng(5), np.arange(n) / 500
+    moved = 6e4 * np.sin(4 * t)
+    return t, 2e5 + moved + 8e3 * random.normal(size=n), 2e5 - moved + 8e3 * random.normal(size=n)
+
+
+def make(kind: str, path: Path) -> None:
+    """Write the broken file of that kind."""
+    t, p_A, p_B = pressures(200)
+    texts = {
+        "empty": "",
+        "header only": HEAD,
+        "one column": "p_A [Pa]\n1\n2\n3\n",
+        "text in numbers": HEAD + rows(t, p_A, p_B).replace("0.100,", "0.100,high "),
+        "reversed time": HEAD + rows(t[::-1], p_A, p_B),
+        "wrong unit": HEAD.replace("p_B [Pa]", "p_B [mm]") + rows(t, p_A, p_B),
+        "unknown unit": HEAD.replace("p_B [Pa]", "p_B [wibble]") + rows(t, p_A, p_B),
+    }
+    if kind == "binary":
+        path.write_bytes(np.random.default_rng(0).bytes(5000))
+    elif kind == "2 GB of nothing":
+        with path.open("wb") as file:
+            file.truncate(2 * 1024**3)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind != "missing":
+        path.write_text(texts[kind])
+
+
+UNREADABLE = {
+    "empty": "a recording must have samples, got an empty file",
+    "header only": "a recording must have samples, got no row of numbers after t [s], p_A [Pa], p_B [Pa]",
+    "one column": "a recording must have a time column such as t [s] or be given a rate",
+    "text in numbers": "a sample must be a number, got 'high ",
+    "reversed time": "time must increase between some samples",
+    "wrong unit": "p_B must have a unit of pressure, such as Pa, got mm",
+    "unknown unit": "p_B must have a unit of pressure, such as Pa, got wibble",
+    "2 GB of nothing": "a recording must be text, NetCDF, HDF5 or Parquet, got other binary data",
+    "binary": "a recording must be text, NetCDF, HDF5 or Parquet, got other binary data",
+    "folder": "a recording must be a file, got a folder",
+    "missing": "a recording must exist, got no such file",
+}
+
+
+@pytest.mark.parametrize("kind", UNREADABLE)
+def test_what_cannot_be_read(kind, call, untouched, tmp_path):
+    make(kind, tmp_path / "log.csv")
+    untouched()
+    start = time.perf_counter()
+    calls = (
+        call("diagnose", "log.csv"),
+        call("diagnose", "log.csv", "--format", "jsonl"),
+        call("report", "log.csv", "-o", "page.html"),
+        call("convert", "log.csv", "log.nc"),
+        call("simulate", "-o", "run.nc", "--duration", "1", "--command", "file log.csv"),
+    )
+    assert time.perf_counter() - start < 10.0
+    for done in calls:
+        complaint = done.refused(1)
+        assert complaint.startswith(UNREADABLE[kind])
+        assert "log.csv)" in complaint
+        assert done.out == ""
+
+
+@pytest.mark.parametrize("kind", ["text in numbers", "2 GB of nothing", "missing"])
+def test_what_cannot_be_read_in_a_process_of_its_own(kind, shell, untouched, tmp_path):
+    make(kind, tmp_path / "log.csv")
+    untouched()
+    done = shell("sealscope", "diagnose", "log.csv")
+    assert done.refused(1).startswith(UNREADABLE[kind])
+    assert done.out == ""
+
+
+def test_each_bad_file_among_good_ones_has_its_line(call, recordings, tmp_path, untouched):
+    kinds = ("empty", "wrong unit", "binary", "missing")
+    for kind in kinds:
+        make(kind, tmp_path / f"{kind}.csv")
+    untouched()
+    files = [recordings / "healthy_1.nc", *(f"{kind}.csv" for kind in kinds), recordings / "leak.nc"]
+    done = call("diagnose", *files, "--format", "jsonl")
+    assert done.status == 1
+    assert [one["verdict"] for one in done.objects] == ["no leak", "leak"]
+    lines = done.err.splitlines()
+    assert len(lines) == len(kinds)
+    for kind, line in zip(kinds, lines, strict=True):
+        assert line.startswith(f"sealscope: {UNREADABLE[kind]}")
+        assert line.endswith(f"({kind}.csv)")
+
+
+def diagnosed(call, path: Path, *options: str):
+    """The one verdict on a file that must be readable."""
+    done = call("diagnose", path, "--format", "jsonl", *options)
+    assert (done.status, done.err) == (0, "")
+    (found,) = done.objects
+    return found
+
+
+def findings(found) -> dict[str, dict]:
+    return {one["code"]: one for one in found["quality"]}
+
+
+def test_runs_of_nan_are_named_and_what_is_whole_is_analysed(call, tmp_path):
+    t, p_A, p_B = pressures(30_000)
+    p_A[2000:2400] = np.nan
+    p_A[28_000] = np.nan
+    (tmp_path / "log.csv").write_text(HEAD + rows(t, p_A, p_B))
+    found = diagnosed(call, tmp_path / "log.csv")
+    quality = findings(found)
+    assert (quality["missing"]["channel"], quality["missing"]["count"]) == ("p_A", 401)
+    assert quality["missing"]["first_t"] == pytest.approx(4.0)
+    assert quality["part_analysed"]["count"] == 2400 + 2000
+    assert found["verdict"] == "no leak"
+
+
+@pytest.mark.parametrize("whole", [0, 1, 5, 100])
+def test_hardly_any_number_between_the_nans(call, tmp_path, whole):
+    t, p_A, p_B = pressures(3000)
+    p_A[whole:] = np.nan
+    (tmp_path / "log.csv").write_text(HEAD + rows(t, p_A, p_B))
+    found = diagnosed(call, tmp_path / "log.csv")
+    assert found["verdict"] == "cannot tell"
+    assert findings(found)["missing"]["count"] == 3000 - whole
+
+
+def test_time_that_goes_back_for_a_while_is_named(call, tmp_path):
+    t, p_A, p_B = pressures(30_000)
+    t[2000:2050] = t[2000:2050][::-1].copy()
+    (tmp_path / "log.csv").write_text(HEAD + rows(t, p_A, p_B))
+    found = diagnosed(call, tmp_path / "log.csv")
+    quality = findings(found)
+    assert quality["reversed_time"]["count"] == 49
+    assert quality["part_analysed"]["count"] >= 2050
+    assert found["verdict"] in ("no leak", "cannot tell")
+
+
+@pytest.mark.parametrize("samples", [2, 30, 230])
+def test_a_file_of_few_samples_gets_the_verdict_that_it_is_too_short(call, tmp_path, samples):
+    (tmp_path / "log.csv").write_text(HEAD + rows(*pressures(samples)))
+    found = diagnosed(call, tmp_path / "log.csv")
+    assert found["verdict"] == "cannot tell"
+    assert str(samples) in found["reason"] or "too short" in found["reason"]
+    assert found["score"] is None
+    report = call("report", tmp_path / "log.csv", "-o", tmp_path / "page.html")
+    assert report.status == 0
+    assert "cannot tell" in (tmp_path / "page.html").read_text(encoding="utf-8").lower()
+
+
+def test_one_column_with_a_rate_is_a_recording(call, tmp_path):
+    (tmp_path / "log.csv").write_text("p_A [Pa]\n" + "".join(f"{v:.1f}\n" for v in pressures(500)[1]))
+    assert diagnosed(call, tmp_path / "log.csv", "--rate", "500")["verdict"] == "cannot tell"
+
+
+def test_channels_that_say_nothing_about_the_piston(call, tmp_path):
+    t, p_A, p_B = pressures(2000)
+    (tmp_path / "log.csv").write_text(HEAD.replace("p_A", "p_1").replace("p_B", "p_2") + rows(t, p_A, p_B))
+    found = diagnosed(call, tmp_path / "log.csv")
+    assert found["verdict"] == "cannot tell"
+    assert "p_A or p_B" in found["reason"]
+
+
+def test_a_name_with_a_line_break_is_still_one_line(call, tmp_path):
+    assert "two\N{REPLACEMENT CHARACTER}lines.csv" in call("diagnose", tmp_path / "two\nlines.csv").refused(1)
+
+
+def test_names_beyond_the_terminal_s_characters(shell, tmp_path):
+    path = tmp_path / "cylinder \N{SNOWMAN}.csv"
+    path.write_text(HEAD + rows(*pressures(400)))
+    done = shell("sealscope", "diagnose", path, PYTHONIOENCODING="latin-1")
+    assert (done.status, done.err) == (0, "")
+    assert "\\u2603.csv: cannot tell" in done.out
+    assert "\\u2603" in shell("sealscope", "diagnose", f"{path}.gone", PYTHONIOENCODING="latin-1").refused(1)
