@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import QUANTITIES, Blocks, cut, whole_log_rms
+from sealscope.diagnosis.blocks import QUANTITIES, Blocks, chambers_of, cut, whole_log_rms
 from sealscope.diagnosis.change import permutations_for, two_samples, upper_quantile
 from sealscope.diagnosis.operating_point import LEVEL_RATIO, OperatingPoint, difference, operating_point
 from sealscope.diagnosis.rms_results import JUDGED, excess, largest_changes, method_result
@@ -25,6 +25,8 @@ FEWEST_BLOCKS = 12
 #: How far outside the baseline's range of levels a recording may lie, as a share of the range and at least, in log
 #: units.
 LEVEL_MARGIN = 0.25
+#: Scatter of the log RMS between recordings below which they are copies of one another.
+_LEAST_SCATTER = 1e-9
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ def against(recording: Recording, baseline: Sequence[Recording], probability: fl
     if not alike:
         most = Counter(reason for reason in reasons if reason).most_common(1)[0][0]
         return Evidence("cannot tell", f"none of the {len(baseline)} baseline recordings is comparable: {most}")
+    alike = [k for place, k in enumerate(alike) if not any(_copies(baseline[j], baseline[k]) for j in alike[:place])]
     levels = np.array([points[k].level for k in alike])
     if _outside(point.level, levels):
         return Evidence(
@@ -95,6 +98,11 @@ def against(recording: Recording, baseline: Sequence[Recording], probability: fl
     return _by_blocks(recording, chosen, probability)
 
 
+def _copies(one: Recording, other: Recording) -> bool:
+    """Whether two recordings hold the same pressures: a file given twice says nothing about the scatter."""
+    return all(np.array_equal(one[name], other[name]) for name in chambers_of(one))
+
+
 def _level(point: OperatingPoint) -> str:
     return f"{np.exp(point.level):.4g} {point.units[0]} rms"
 
@@ -104,6 +112,12 @@ def _by_recordings(
 ) -> Evidence:
     known, measured = np.stack([whole_log_rms(one) for one in baseline]), whole_log_rms(recording)
     expected = predict(known, levels, level)
+    if not (np.all(np.isfinite(measured)) and np.all(expected.deviation > _LEAST_SCATTER)):
+        return Evidence(
+            "cannot tell",
+            f"the {len(baseline)} comparable baseline recordings do not scatter, or a pressure does not move: "
+            "nothing to judge a change by",
+        )
     changes = measured - expected.mean
     t = changes / expected.deviation
     chambers = operating_point(recording).chambers
@@ -158,6 +172,9 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
             f"{FEWEST_BLOCKS} of each are needed "
             f"(or {FEWEST_RECORDINGS} comparable baseline recordings, got {len(baseline)})",
         )
+    still = next((one.still for one in (after, *before) if one.still is not None), None)
+    if still is not None:
+        return Evidence("cannot tell", f"the pressures cannot be trusted: {still}")
     joint = after.columns(*JUDGED)
     score, single, t2_null, single_null = two_samples(x, split, joint, permutations_for(probability))
     threshold = float(upper_quantile(t2_null, probability))
@@ -165,7 +182,7 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
     changes = x[split:].mean(axis=0) - x[:split].mean(axis=0)
     noisy = any(abs(single[k]) > thresholds[k] for k in after.columns("d1"))
     if noisy:
-        beyond = np.concatenate([excess(one) for one in [*before, after]])
+        beyond = excess(x, split)
         score, _, t2_null, _ = two_samples(
             beyond, split, list(range(beyond.shape[1])), permutations_for(probability), seed=1
         )

@@ -19,9 +19,10 @@ LEVELS = 4
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Length a block should have [s]: long enough for the RMS of d4 to be steady, short enough to place an onset.
 BLOCK_SECONDS = 1.5
-#: ... and fewest samples it should have, at a low sampling rate: two periods of the slowest oscillation in d4, whose memory then ends in the next block.
+#: ... and fewest samples it should have: two periods of the slowest oscillation in d4, whose memory then ends in the
+#: next block. It counts at sampling rates under 43 Hz.
 BLOCK_SAMPLES = 64
-#: Details below this share of the pressure's largest value are the rounding of the transform: the reading does not move.
+#: Details below this share of the pressure's largest value are rounding of the transform: the reading does not move.
 _STILL = 1e-9
 _LONGEST_CYCLE = 20.0
 _CYCLE_CORRELATION = 0.6
@@ -33,7 +34,8 @@ class Blocks:
     """log RMS of every quantity in every block.
 
     `edges`: (n + 1,) boundaries [s]; `log_rms`: (n, 5 per chamber), the phase's own level taken out; `chambers`:
-    their names; `phases`: blocks a cycle (1: none); `cycle`: its length [s], None where no cycle was found.
+    their names; `phases`: blocks a cycle (1: none); `cycle`: its length [s], None where no cycle was found; `still`:
+    the first block in which a reading does not move, in words (its log RMS means nothing).
     """
 
     edges: Array
@@ -41,6 +43,7 @@ class Blocks:
     chambers: tuple[str, ...]
     phases: int
     cycle: float | None
+    still: str | None = None
 
     @property
     def names(self) -> list[str]:
@@ -124,16 +127,33 @@ def cut(recording: Recording) -> Blocks:
     transformed = [details(recording[chamber]) for chamber in chambers]
     inside = transformed[0].inside()
     cycle = find_cycle(recording)
-    phases = 1 if cycle is None else max(1, round(cycle / BLOCK_SECONDS))
-    length = BLOCK_SECONDS if cycle is None else cycle / phases * max(1, round(BLOCK_SECONDS / (cycle / phases)))
+    wanted = max(BLOCK_SECONDS, BLOCK_SAMPLES / recording.rate)
+    phases = 1 if cycle is None else max(1, round(cycle / wanted))
+    length = wanted if cycle is None else cycle / phases * max(1, round(wanted / (cycle / phases)))
     count = int((inside.stop - inside.start) / (length * recording.rate))
     bounds = inside.start + np.round(np.arange(count + 1) * length * recording.rate).astype(np.int64)
     if count == 0:
         return Blocks(recording.t[bounds], np.empty((0, len(QUANTITIES) * len(chambers))), chambers, phases, cycle)
-    log_rms = 0.5 * np.log(np.concatenate([mean_squares(found, bounds) for found in transformed], axis=1))
+    with np.errstate(divide="ignore", over="ignore"):
+        log_rms = 0.5 * np.log(np.concatenate([mean_squares(found, bounds) for found in transformed], axis=1))
+    ends = recording.t[0] + bounds / recording.rate
+    still = _still(recording, chambers, log_rms, ends)
+    if still is not None:
+        return Blocks(ends, log_rms, chambers, phases, cycle, still)
     if phases > 1:
         for phase in range(min(phases, count)):
             same = log_rms[phase::phases]
             log_rms[phase::phases] = same - same.mean(axis=0) + log_rms.mean(axis=0)
-    ends = recording.t[0] + bounds / recording.rate
     return Blocks(ends, log_rms, chambers, phases, cycle)
+
+
+def _still(recording: Recording, chambers: tuple[str, ...], log_rms: Array, edges: Array) -> str | None:
+    """The first block in which a chamber's details are mere rounding, or no number, in words."""
+    for chamber, name in enumerate(chambers):
+        levels = log_rms[:, chamber * len(QUANTITIES) : chamber * len(QUANTITIES) + LEVELS]
+        floor = np.log(_STILL * np.abs(recording[name]).max())
+        found = np.flatnonzero(~np.all(np.isfinite(levels) & (levels > floor), axis=1))
+        if found.size:
+            first = int(found[0])
+            return f"{name} does not move from {edges[first]:.4g} s to {edges[first + 1]:.4g} s"
+    return None

@@ -28,6 +28,8 @@ def analysable(recording: Recording) -> tuple[Recording, Finding | None]:
     """The longest stretch that is uniformly sampled with no chamber pressure missing, and a finding that says so
     where it is not all."""
     chambers = chambers_of(recording)
+    if "u" in recording and not np.any(np.isfinite(recording["u"])):  # `inspect` names it; the pressures can do without
+        recording = recording.only(name for name in recording.channels if name != "u")
     stretches = uniform_segments(recording, (*chambers, "u") if "u" in recording else chambers)
     if not stretches:
         return recording.between(math.inf, math.inf), None

@@ -15,7 +15,7 @@ import numpy as np
 
 from sealscope.diagnosis.against_baseline import against
 from sealscope.diagnosis.blocks import Blocks, chambers_of, cut
-from sealscope.diagnosis.change import null_maxima, onset_interval, permutations_for, scan, upper_quantile
+from sealscope.diagnosis.change import Scan, null_maxima, onset_interval, permutations_for, scan, upper_quantile
 from sealscope.diagnosis.rms_results import JUDGED, describe_change, excess, largest_changes, method_result
 from sealscope.diagnosis.verdict import Evidence, MethodResult, Verdict
 from sealscope.recordings.recording import Array, Recording
@@ -34,11 +34,11 @@ class RmsChange:
         chambers = chambers_of(recording)
         if not chambers:
             return "needs the pressure of a chamber (p_A or p_B)"
+        if len(recording) < shortest():
+            return f"needs {shortest()} samples or more without a gap, got {len(recording)}"
         for chamber in chambers:
             if np.ptp(recording[chamber]) == 0:
                 return f"{chamber} is constant"
-        if len(recording) < shortest():
-            return f"needs {shortest()} samples or more without a gap, got {len(recording)}"
         return None
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
@@ -55,6 +55,8 @@ class RmsChange:
                 f"too short to be its own baseline: {n} blocks, {FEWEST_BLOCKS} are needed; give leak-free "
                 f"recordings as --baseline",
             )
+        if blocks.still is not None:
+            return Evidence("cannot tell", f"the pressures cannot be trusted: {blocks.still}")
         x = blocks.log_rms
         joint = blocks.columns(*JUDGED)
         found = scan(x, joint)
@@ -68,8 +70,6 @@ class RmsChange:
         verdict: Verdict = "leak" if score > threshold else "no leak"
         changes = x[step + 1 :].mean(axis=0) - x[: step + 1].mean(axis=0)
         told = largest_changes(blocks.names, found.single[step], changes, thresholds)
-        first, last = onset_interval(found.joint)
-        onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
         if verdict == "no leak":
             reason = (
                 f"no change of the details' RMS within the recording beyond its scatter (T2 {score:.1f}, "
@@ -79,15 +79,20 @@ class RmsChange:
             return Evidence(verdict, reason, score, threshold, methods=methods)
         noise = np.abs(found.single).max(axis=0)
         if any(noise[k] > thresholds[k] for k in blocks.columns("d1")):
-            score, threshold, step = self._without_noise(blocks, probability)
+            loudest = max(blocks.columns("d1"), key=lambda k: noise[k])
+            split = int(np.argmax(np.abs(found.single[:, loudest]))) + 1
+            found, threshold = self._without_noise(x, split, probability)
+            step = int(np.argmax(found.joint))
+            score = float(found.joint[step])
             if score <= threshold:
                 reason = (
                     "the noise (d1) changed, and the other details by no more than it: a sensor or its "
                     "wiring changed, or the leak is hidden"
                 )
                 return Evidence("cannot tell", reason, score, threshold, methods=methods)
-            onset = float(blocks.edges[step + 1])
             told += ", beyond a change of the noise"
+        first, last = onset_interval(found.joint)
+        onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
         if not found.step_wins():
             reason = (
                 f"{told}, evenly over the recording (trend T2 {found.trend:.1f}, step "
@@ -98,13 +103,12 @@ class RmsChange:
         return Evidence(verdict, reason, score, threshold, onset, interval, methods=methods)
 
     @staticmethod
-    def _without_noise(blocks: Blocks, probability: float) -> tuple[float, float, int]:
-        x = excess(blocks)
-        joint = list(range(x.shape[1]))
-        found = scan(x, joint)
-        null, _ = null_maxima(x, joint, permutations_for(probability), seed=1)
-        step = int(np.argmax(found.joint))
-        return float(found.joint[step]), float(upper_quantile(null, probability)), step
+    def _without_noise(log_rms: Array, split: int, probability: float) -> tuple[Scan, float]:
+        beyond = excess(log_rms, split)
+        joint = list(range(beyond.shape[1]))
+        found = scan(beyond, joint)
+        null, _ = null_maxima(beyond, joint, permutations_for(probability), seed=1)
+        return found, float(upper_quantile(null, probability))
 
     @staticmethod
     def _methods(blocks: Blocks, single: Array, thresholds: Array) -> tuple[MethodResult, ...]:

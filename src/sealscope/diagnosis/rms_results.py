@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import QUANTITIES, Blocks
+from sealscope.diagnosis.blocks import QUANTITIES
 from sealscope.diagnosis.verdict import MethodResult, Verdict
 from sealscope.recordings.recording import Array
 
@@ -12,16 +12,27 @@ from sealscope.recordings.recording import Array
 JUDGED = ("d2", "d3", "d4")
 
 
-def excess(blocks: Blocks) -> Array:
-    """Energy of d2..d4 beyond that of d1, relative to its mean: (n, 3 per chamber). White noise, which every level
-    holds alike, drops out."""
-    energy = np.exp(2.0 * blocks.log_rms)
+def excess(log_rms: Array, split: int) -> Array:
+    """Energy of d2..d4 beyond that of d1, from its mean, in parts of the level's energy on either side of `split`.
+
+    `log_rms`: (n, 5 per chamber), `split`: the block from which the noise is another one; (n, 3 per chamber). White
+    noise, which every level holds alike, drops out of the mean. As the scatter of an energy goes with the energy, each
+    side has a scale s of its own and counts as n/s^2 in the mean: while nothing but the noise has changed, blocks of
+    both sides scatter alike, and the difference of their means no more than that of random halves.
+    """
+    energy = np.exp(2.0 * log_rms)
+    sides = (slice(None, split), slice(split, None))
     columns = []
-    for chamber in range(len(blocks.chambers)):
-        noise = energy[:, chamber * len(QUANTITIES)]
+    for first in range(0, energy.shape[1], len(QUANTITIES)):
         for quantity in JUDGED:
-            level = energy[:, chamber * len(QUANTITIES) + QUANTITIES.index(quantity)]
-            columns.append((level - noise) / level.mean())
+            level = energy[:, first + QUANTITIES.index(quantity)]
+            beyond = level - energy[:, first]
+            scales = [float(level[side].mean()) for side in sides]
+            weights = [level[side].size / scale**2 for side, scale in zip(sides, scales, strict=True)]
+            mean = np.average([beyond[side].mean() for side in sides], weights=weights)
+            columns.append(
+                np.concatenate([(beyond[side] - mean) / scale for side, scale in zip(sides, scales, strict=True)])
+            )
     return np.stack(columns, axis=1)
 
 

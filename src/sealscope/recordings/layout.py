@@ -79,6 +79,7 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 
 
 def is_number(cell: str, decimal: str) -> bool:
+    """Whether the cell is a number with this decimal sign."""
     return bool(_NUMBER[decimal].fullmatch(cell.strip()))
 
 

@@ -29,3 +29,26 @@ class Item:
     def input(self, name: str) -> str | float | tuple[str | float, ...]:
         """The input called `name`; KeyError where the item has none."""
         return dict(self.inputs)[name]
+
+
+State = Literal["made", "drawn", "kept", "left out", "failed", "not made"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What became of an item in a results folder.
+
+    `state`: made now, only drawn anew, kept from an earlier call, left out or failed (`reason` says why), or not made
+    (not asked for, or made by other sources); `files`: what was drawn of it, relative to the folder.
+    """
+
+    item: Item
+    state: State
+    reason: str = ""
+    seconds: float = 0.0
+    files: tuple[str, ...] = ()
+
+    @property
+    def there(self) -> bool:
+        """Whether its products can be shown."""
+        return self.state in ("made", "drawn", "kept")
