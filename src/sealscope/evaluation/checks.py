@@ -1,0 +1,54 @@
+"""What every evaluation asks of the numbers it is given, with one line of complaint."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from sealscope.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+
+def numbers(values: npt.ArrayLike, what: str, at_least: int = 1) -> Array:
+    """`values` as a flat array of finite doubles; InputError names the first that is not one, or that there are fewer
+    than `at_least`."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} must be numbers") from None
+    if array.ndim != 1:
+        raise InputError(f"{what} must be one flat list, got {array.ndim} dimensions")
+    if array.size < at_least:
+        raise InputError(f"{what} must be at least {at_least}, got {array.size}")
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise InputError(f"{what} must be finite, got {array[bad[0]]} (number {bad[0] + 1} of {array.size})")
+    return array
+
+
+def sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
+    """`values` as sizes of leaks, all > 0: records without a leak belong to the false alarms."""
+    array = numbers(values, what)
+    bad = np.flatnonzero(array <= 0.0)
+    if bad.size:
+        raise InputError(f"{what} must be > 0, got {array[bad[0]]} (a record without a leak is no size of leak)")
+    return array
+
+
+def flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
+    """`values` as n answers yes or no (True/False or 1/0)."""
+    array = numbers(np.asarray(values, dtype=np.float64), what)
+    if array.size != n:
+        raise InputError(f"{what} must be as many as the records, got {array.size} for {n}")
+    bad = np.flatnonzero((array != 0.0) & (array != 1.0))
+    if bad.size:
+        raise InputError(f"{what} must be yes or no (1 or 0), got {array[bad[0]]}")
+    return np.asarray(array == 1.0, dtype=np.bool_)
+
+
+def share(value: float, what: str) -> float:
+    """`value` as a probability strictly between 0 and 1."""
+    if not 0.0 < value < 1.0:
+        raise InputError(f"{what} must be between 0 and 1, got {value}")
+    return float(value)

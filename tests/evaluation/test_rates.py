@@ -1,0 +1,185 @@
+"""Rates in time, quantiles and errors of estimates: published tables, hand counts and coverage."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sealscope.errors import InputError
+from sealscope.evaluation.quantiles import order_ranks, quantile_of
+from sealscope.evaluation.rates import (
+    delays,
+    estimate_error,
+    false_alarms,
+    hourly_rate,
+    mean_of,
+    onset_errors,
+    poisson_interval,
+)
+
+# Garwood, Biometrika 28 (1936) 437-442, as in Pearson and Hartley, Biometrika Tables for Statisticians, table 40: 95 %
+GARWOOD = [
+    (0, 0.0, 3.69),
+    (1, 0.0253, 5.57),
+    (2, 0.242, 7.22),
+    (3, 0.619, 8.77),
+    (5, 1.62, 11.67),
+    (10, 4.80, 18.39),
+    (20, 12.22, 30.89),
+    (50, 37.11, 65.92),
+]
+
+
+@pytest.mark.parametrize(("count", "low", "high"), GARWOOD)
+def test_garwood_s_table(count, low, high):
+    assert poisson_interval(count) == pytest.approx((low, high), abs=6e-3)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 300), st.floats(0.5, 0.999))
+def test_the_limits_are_those_of_the_two_tails(count, confidence):
+    low, high = poisson_interval(count, confidence)
+    assert low <= count <= high
+    tail = (1 - confidence) / 2
+    log_terms = [i * math.log(high) - high - math.lgamma(i + 1) for i in range(count + 1)]
+    assert math.fsum(map(math.exp, log_terms)) == pytest.approx(tail, rel=1e-6)
+    if count:
+        below = [i * math.log(low) - low - math.lgamma(i + 1) for i in range(count)]
+        assert math.fsum(map(math.exp, below)) == pytest.approx(1 - tail, rel=1e-9)
+
+
+def test_false_alarms_per_record_and_hour():
+    found = false_alarms([0, 2, 0, 1, 0, 0, 0, 0], 0.5, 0.95)
+    assert (found.per_record.count, found.per_record.n) == (2, 8)
+    assert (found.hourly.count, found.hourly.hours, found.hourly.per_hour) == (3, 4.0, 0.75)
+    assert (found.hourly.low, found.hourly.high) == pytest.approx((0.6187 / 4, 8.7673 / 4), abs=1e-4)
+    assert found.run_hours == pytest.approx(4 / 3)
+    assert (found.run_low, found.run_high) == pytest.approx((4 / 8.7673, 4 / 0.6187), rel=1e-3)
+    quiet = false_alarms(np.zeros(100), np.full(100, 0.05))
+    assert (quiet.run_hours, quiet.run_high) == (math.inf, math.inf)
+    assert quiet.run_low == pytest.approx(5 / 3.6889, rel=1e-4)
+
+
+def test_the_hourly_interval_covers():
+    rng = np.random.default_rng(1)
+    found = [hourly_rate(int(k), 20.0, 0.9) for k in rng.poisson(0.3 * 20.0, 400)]
+    assert np.mean([one.low <= 0.3 <= one.high for one in found]) >= 0.88
+
+
+# ranks of the 95 % interval of a median, as in Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2
+@pytest.mark.parametrize(("n", "r", "s"), [(5, 0, 6), (6, 1, 6), (10, 2, 9), (20, 6, 15), (30, 10, 21), (50, 18, 33)])
+def test_the_ranks_around_a_median(n, r, s):
+    assert order_ranks(n, 0.5) == (r, s)
+
+
+@settings(deadline=None)
+@given(st.integers(1, 80), st.floats(0.02, 0.98), st.floats(0.5, 0.99))
+def test_the_ranks_hold_their_confidence_and_no_closer_ones_do(n, order, confidence):
+    r, s = order_ranks(n, order, confidence)
+    weights = [math.comb(n, i) * order**i * (1 - order) ** (n - i) for i in range(n + 1)]
+    tail = (1 - confidence) / 2
+    assert 0 <= r < s <= n + 1
+    assert sum(weights[:r]) <= tail + 1e-12
+    assert sum(weights[: r + 1]) >= tail - 1e-12
+    assert sum(weights[s:]) <= tail + 1e-12
+    assert sum(weights[s - 1 :]) >= tail - 1e-12
+
+
+def test_quantiles_bear_values_that_were_never_reached():
+    found = quantile_of([3.0, 1.0, math.inf, 2.0, math.inf], 0.5)
+    assert found.value == 3.0
+    assert quantile_of([3.0, 1.0, math.inf, 2.0, math.inf], 0.9).value == math.inf
+    assert (found.low, found.high) == (-math.inf, math.inf)
+    many = quantile_of(np.arange(1.0, 51.0), 0.5)
+    assert (many.value, many.low, many.high) == (25.0, 18.0, 33.0)
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.floats(0.05, 0.95))
+def test_a_quantile_follows_its_values(values, order):
+    found, turned = quantile_of(values, order), quantile_of([2 * v + 1 for v in values], order)
+    assert turned.value == 2 * found.value + 1
+    assert found.low <= found.value <= found.high
+    assert np.mean(np.array(values) <= found.value) >= order - 1e-9
+
+
+def test_the_quantile_s_interval_covers():
+    rng = np.random.default_rng(2)
+    found = [quantile_of(rng.exponential(size=40), 0.9, 0.9) for _ in range(400)]
+    assert np.mean([one.low <= math.log(10) <= one.high for one in found]) >= 0.88
+
+
+def test_student_s_sleep():
+    """Student, Biometrika 6 (1908) 1-25: hours gained by ten patients, mean 1.58; 95 % interval 0.70 to 2.46."""
+    found = mean_of([1.2, 2.4, 1.3, 1.3, 0.0, 1.0, 1.8, 0.8, 4.6, 1.4])
+    assert (found.value, found.low, found.high) == pytest.approx((1.58, 0.70, 2.46), abs=5e-3)
+    assert (mean_of([2.0]).low, mean_of([2.0]).high) == (-math.inf, math.inf)
+    assert math.isnan(mean_of([]).value)
+
+
+def test_errors_of_an_estimate_by_hand():
+    found = estimate_error(
+        [1.0, 2.0, math.nan, 5.0], [1.0, 1.0, 1.0, 4.0], [0.5, 1.5, math.nan, 3.0], [1.5, 2.5, math.nan, 6.0]
+    )
+    assert found.without == 1
+    assert found.bias.value == pytest.approx(2 / 3)
+    assert found.rmse.value == pytest.approx(math.sqrt(2 / 3))
+    assert found.rmse.low == 0.0
+    assert (found.coverage.count, found.coverage.n) == (2, 3)
+    assert estimate_error([1.0, 2.0], [1.0, 2.5]).coverage.n == 0
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-50, 50), min_size=2, max_size=30), st.floats(-5, 5))
+def test_a_constant_error_is_bias(errors, shift):
+    truth = np.arange(len(errors), dtype=float)
+    found = estimate_error(truth + errors, truth)
+    moved = estimate_error(truth + errors + shift, truth)
+    assert moved.bias.value == pytest.approx(found.bias.value + shift, abs=1e-9)
+    assert found.rmse.value >= abs(found.bias.value) - 1e-9
+    assert found.rmse.low <= found.rmse.value <= found.rmse.high
+
+
+def test_delays_count_a_miss_as_infinite_and_an_early_alarm_as_a_miss():
+    alarms = [95.0, 100.0, math.nan, 50.0, 92.0, 91.0, 99.0, 98.0, 97.0, 96.0, 90.0]
+    found = delays(alarms, [90.0] * 11)
+    assert (found.detected.count, found.premature.count, found.n) == (9, 1, 11)
+    assert found.median.value == 7.0  # 0 1 2 5 6 | 7 | 8 9 10 inf inf
+    assert found.ninety.value == math.inf
+    late = delays([a + 3 for a in alarms], [93.0] * 11)
+    assert late == found
+
+
+def test_errors_of_an_onset():
+    found = onset_errors([92.0, math.nan, 85.0, 90.0], [90.0] * 4, [88, math.nan, 80, 91], [95, math.nan, 89, 93])
+    assert (found.n, found.without) == (3, 1)
+    assert found.median.value == 0.0
+    assert (found.median_size.value, found.ninety_size.value) == (2.0, 5.0)
+    assert (found.coverage.count, found.coverage.n) == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("call", "line"),
+    [
+        (lambda: poisson_interval(-1), "a number of events must be whole and >= 0, got -1"),
+        (lambda: hourly_rate(1, 0.0), "operating hours must be > 0, got 0.0"),
+        (lambda: false_alarms([0, 0.5], 1.0), "alarms must be whole numbers >= 0, got 0.5"),
+        (lambda: false_alarms([0, 1], [1.0, -1.0]), "operating hours must be > 0 in each record"),
+        (lambda: false_alarms([0, 1], [1.0] * 3), "operating hours must be one number or as many as the records (2)"),
+        (lambda: quantile_of([], 0.5), "values for a quantile must be at least 1 and none of them nan"),
+        (lambda: quantile_of([1.0], 1.0), "the order of a quantile must be between 0 and 1, got 1.0"),
+        (lambda: estimate_error([1.0], [1.0, 2.0]), "estimates must be as many as the true values, got (1,) for 2"),
+        (
+            lambda: onset_errors([math.nan], [1.0]),
+            "onset errors need at least one estimated onset, got none in 1 records",
+        ),
+    ],
+)
+def test_impossible_times(call, line):
+    with pytest.raises(InputError) as error:
+        call()
+    assert str(error.value) == line
