@@ -1,9 +1,11 @@
 """Measure the false-alarm rate and the detection rate of `diagnose` on simulated records with fresh noise.
 
-    python benchmarks/false_alarms.py [--records 100] [--leaky 20] [--probability 0.01] [--duration 180] [--seed 0] [--json FILE]
+    python benchmarks/false_alarms.py [--records 100] [--leaky 20] [--probability 0.01] [--duration 180] [--seed 0]
+        [--json FILE]
 
-Each case (command, throttles, leak) is integrated once; its instruments are read once a record, each time with noise of a seed of its own, derived
-from the case. A rate stands with its 95 % Clopper-Pearson interval; `onset` is the share of the alarms within 10 s of the truth.
+Each case (command, throttles, leak) is integrated once; its instruments are read once a record, each time with noise
+of a seed of its own, derived from the case. A rate stands with its 95 % Clopper-Pearson interval; `onset` is the share
+of the alarms within 10 s of the truth.
 """
 
 from __future__ import annotations
@@ -113,7 +115,8 @@ def main() -> None:
 
     start = time.perf_counter()
     print(f"diagnose at a nominal {100 * chosen.probability:g} %, records of {chosen.duration:g} s, no baseline")
-    print(f"{'leak [L/min], command, throttles':<34}{'records':>8}{'leak':>6}{'no leak':>9}{'cannot tell':>13}{'alarms (95 %)':>27}{'onset':>10}")
+    heads = f"{'records':>8}{'leak':>6}{'no leak':>9}{'cannot tell':>13}{'alarms (95 %)':>27}{'onset':>10}"
+    print(f"{'leak [L/min], command, throttles':<34}{heads}")
     totals: dict[str, Count] = {}
     rows: dict[str, Count] = {}
     for leak in (0.0, *LEAKS):

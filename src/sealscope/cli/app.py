@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import recordings, simulation
+from sealscope.cli import recordings, reproduction, simulation
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -31,6 +31,7 @@ for command in (
     recordings.report,
     simulation.parameters,
     recordings.convert,
+    reproduction.reproduce,
 ):
     app.command()(command)
 

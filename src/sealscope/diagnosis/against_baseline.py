@@ -156,7 +156,12 @@ def _without_noise(known: Array, measured: Array, expected: Prediction, judged: 
     after = np.exp(2 * (measured[judged] - expected.mean[judged])) - np.exp(
         2 * (measured[noise] - expected.mean[judged])
     )
-    scatter = np.sqrt(np.sum((before - before.mean(axis=0)) ** 2, axis=0) / expected.freedom * (1.0 + 1.0 / len(known)))
+    # more noise means more scatter of the energy, too: in proportion to it
+    added = np.exp(2 * (measured[noise] - expected.mean[judged])) - np.exp(
+        2 * (expected.mean[noise] - expected.mean[judged])
+    )
+    own = (1.0 + np.maximum(added, 0.0)) ** 2
+    scatter = np.sqrt(np.sum((before - before.mean(axis=0)) ** 2, axis=0) / expected.freedom * (own + 1.0 / len(known)))
     return np.asarray((after - before.mean(axis=0)) / scatter)
 
 

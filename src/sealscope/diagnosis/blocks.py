@@ -141,9 +141,10 @@ def cut(recording: Recording) -> Blocks:
     if still is not None:
         return Blocks(ends, log_rms, chambers, phases, cycle, still)
     if phases > 1:
+        level = log_rms.mean(axis=0)
         for phase in range(min(phases, count)):
             same = log_rms[phase::phases]
-            log_rms[phase::phases] = same - same.mean(axis=0) + log_rms.mean(axis=0)
+            log_rms[phase::phases] = same - same.mean(axis=0) + level
     return Blocks(ends, log_rms, chambers, phases, cycle)
 
 

@@ -72,7 +72,7 @@ def diagnose(
     if cut_down is not None:
         quality.append(cut_down)
     spoilt = [
-        finding for finding in quality if finding.channel in chambers_of(recording) and _spoils(finding, len(part))
+        finding for finding in quality if finding.channel in chambers_of(recording) and spoils(finding, len(part))
     ]
     whole = [analysable(one)[0] for one in baseline]
     evidence = [
@@ -97,7 +97,8 @@ def diagnose(
     )
 
 
-def _spoils(finding: Finding, samples: int) -> bool:
+def spoils(finding: Finding, samples: int) -> bool:
+    """Whether a finding on a chamber pressure of so many samples leaves no trust in its details."""
     return finding.code in _SPOILING or (finding.code == "clipped" and finding.count > _MOST_CLIPPED * samples)
 
 

@@ -77,11 +77,13 @@ class RmsChange:
                 "a leak that was there from the start would need a --baseline to be seen"
             )
             return Evidence(verdict, reason, score, threshold, methods=methods)
+        scans = [found]
         noise = np.abs(found.single).max(axis=0)
         if any(noise[k] > thresholds[k] for k in blocks.columns("d1")):
             loudest = max(blocks.columns("d1"), key=lambda k: noise[k])
             split = int(np.argmax(np.abs(found.single[:, loudest]))) + 1
             found, threshold = self._without_noise(x, split, probability)
+            scans.append(found)
             step = int(np.argmax(found.joint))
             score = float(found.joint[step])
             if score <= threshold:
@@ -93,10 +95,11 @@ class RmsChange:
             told += ", beyond a change of the noise"
         first, last = onset_interval(found.joint)
         onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
-        if not found.step_wins():
+        drift = next((one for one in scans if not one.step_wins()), None)
+        if drift is not None:
             reason = (
-                f"{told}, evenly over the recording (trend T2 {found.trend:.1f}, step "
-                f"{found.joint.max():.1f}): a drift and a growing leak look alike"
+                f"{told}, evenly over the recording (trend T2 {drift.trend:.1f}, step "
+                f"{drift.joint.max():.1f}): a drift and a growing leak look alike"
             )
             return Evidence("cannot tell", reason, score, threshold, methods=methods)
         reason = f"{told} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"

@@ -1,4 +1,4 @@
-"""One entry of the reproduction: a case, figure, table or list of claims under the thesis's own number, and how it is made."""
+"""Cases, figures, tables and claims under the thesis's own numbers, and how each is made."""
 
 from __future__ import annotations
 

@@ -1,0 +1,99 @@
+"""Time `diagnose` on 180 s at 500 Hz, and the import of what it needs in a fresh interpreter.
+
+    python benchmarks/bench_diagnosis.py [--rounds 15] [--imports 7] [--json FILE]
+
+Prints the median and the middle half (25 % to 75 %) of each [s]. `first call` is the first diagnosis of a fresh
+interpreter, imports apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.simulation.simulate import simulate
+
+_FRESH = """
+import time
+start = time.perf_counter()
+{imported}
+imported = time.perf_counter()
+{then}
+print(imported - start, time.perf_counter() - imported)
+"""
+_IMPORT = "from sealscope.diagnosis.diagnose import diagnose"
+_FIRST_CALL = """
+import numpy as np
+from sealscope.recordings.recording import Recording
+noise = np.random.default_rng(0).standard_normal((2, 90000))
+prepared = Recording(np.arange(90000) / 500, dict(zip(("p_A", "p_B"), noise)), {"p_A": "Pa", "p_B": "Pa"}, 500.0)
+imported = time.perf_counter()
+diagnose(prepared)
+"""
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Wall time of one call [s]."""
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def fresh(imported: str, then: str = "") -> tuple[float, float]:
+    """Seconds of the import and of what follows, in an interpreter of its own."""
+    code = _FRESH.format(imported=imported, then=then)
+    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    first, second = (float(word) for word in out.split())
+    return first, second
+
+
+def quartiles(values: list[float]) -> list[float]:
+    return [float(q) for q in np.percentile(values, [50, 25, 75])]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--imports", type=int, default=7)
+    parser.add_argument("--json", type=Path)
+    chosen = parser.parse_args()
+    if min(chosen.rounds, chosen.imports) < 1:
+        parser.error("--rounds and --imports must be 1 or more")
+    values = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
+    sound = [simulate(seed=seed, values=values) for seed in range(6)]
+    leaky = simulate(seed=9, leak="0.0042 L/min from 90 s", values=values)
+    cases: dict[str, Callable[[], object]] = {
+        "within the recording, no leak": lambda: diagnose(sound[0]),
+        "within the recording, leak": lambda: diagnose(leaky),
+        "within the recording, at 0.1 %": lambda: diagnose(sound[0], false_alarm_probability=1e-3),
+        "against 1 recording": lambda: diagnose(leaky, sound[:1]),
+        "against 6 recordings": lambda: diagnose(leaky, sound),
+    }
+    figures: dict[str, list[float]] = {}
+    for name, call in cases.items():
+        call()
+        figures[name] = quartiles([seconds(call) for _ in range(chosen.rounds)])
+    fresh(_IMPORT, _FIRST_CALL)
+    figures["import sealscope"] = quartiles([fresh("import sealscope")[0] for _ in range(chosen.imports)])
+    both = [fresh(_IMPORT, _FIRST_CALL) for _ in range(chosen.imports)]
+    figures["import of diagnose"] = quartiles([one[0] for one in both])
+    figures["first call in a fresh interpreter"] = quartiles([one[1] for one in both])
+    print("180 s at 500 Hz, two chambers and the command; median (25 % .. 75 %) [s]")
+    for name, (middle, low, high) in figures.items():
+        print(f"{name:<40}{middle:8.3f} ({low:.3f} .. {high:.3f})")
+    if chosen.json:
+        partial = chosen.json.with_name(chosen.json.name + ".partial")
+        partial.write_text(json.dumps(figures, indent=2) + "\n")
+        partial.replace(chosen.json)
+
+
+if __name__ == "__main__":
+    main()

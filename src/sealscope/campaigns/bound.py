@@ -1,0 +1,154 @@
+"""The Cramer-Rao bound: how small a leak the channels of a run can tell at all, whatever the detector.
+
+For samples y_t = m_t(theta) + e_t with e_t white over time and normal with covariance R over the channels, the Fisher
+information is ``F = sum_t J_t' R^-1 J_t``, J_t = d m_t / d theta, and no unbiased estimate of theta_k has a variance
+below ``(F^-1)_kk`` (Rao, Bull. Calcutta Math. Soc. 37 (1945) 81-91; Kay, Fundamentals of Statistical Signal
+Processing I, 1993, eq. 3.31). What is left out of R (drift, hum, a leak's own scatter) can only raise the true limit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.faults import LITRE_PER_MINUTE
+from sealscope.simulation.sensitivity import CHAMBERS, REFERENCE_DP, leak_sensitivity, parameter_sensitivity
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: What a machine does not tell of itself: the friction law (level, viscous slope, breakaway, its decay), the oil's
+#: stiffness and the gain of the speed loop.
+UNKNOWN = (
+    "friction.F_pr",
+    "friction.F_v",
+    "friction.K_brk",
+    "friction.C_c",
+    "fluid.K_oil",
+    "motor.omega_per_volt",
+)
+#: Reciprocal condition of the scaled information below which a parameter cannot be told from the others.
+_SINGULAR = 1e-12
+
+
+@dataclass(frozen=True)
+class LeakBound:
+    """Standard deviation of the best unbiased estimate of a small leak over one run, as conductance G [m^3/(s Pa)].
+
+    `known`: all else known; `unknown`: the parameters `unknown_parameters` estimated from the same run, None where
+    there are none; `duration` [s]; `nonlinearity`: of the worst derivative.
+    """
+
+    known: float
+    unknown: float | None
+    unknown_parameters: tuple[str, ...]
+    duration: float
+    nonlinearity: float
+
+
+def in_lpm(conductance: float, dp: float = REFERENCE_DP) -> float:
+    """The mean flow [L/min] of a laminar leak G [m^3/(s Pa)] under a mean pressure difference `dp` [Pa]."""
+    return conductance * dp / LITRE_PER_MINUTE
+
+
+def noise_covariance(rig: Rig, channels: Sequence[str] = CHAMBERS) -> Array:
+    """Covariance (c, c) [Pa^2] of one sample of the pressure channels: own and common white noise, and the
+    conversion's step as white noise of variance step^2/12.
+
+    Raises InputError where a channel is not a pressure or has no noise at all, for then no bound exists.
+    """
+    sensors, daq = rig.sensors, rig.daq
+    covariance = np.full((len(channels), len(channels)), sensors.common_noise**2)
+    for k, name in enumerate(channels):
+        if name not in ("p_A", "p_B", "p_1", "p_2"):
+            raise InputError(f"the bound is made from pressure channels (p_A, p_B, p_1, p_2), got {name}")
+        sensor = getattr(sensors, name)
+        step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
+        covariance[k, k] += sensor.noise**2 + step**2 / 12.0
+    return covariance
+
+
+def information(slopes: Array, covariance: Array) -> Array:
+    """Fisher information (k, k) from derivatives `slopes` (k, c, n) and the covariance (c, c) of one sample.
+
+    Raises InputError where shapes do not fit or the covariance is not positive definite.
+    """
+    slopes, covariance = np.asarray(slopes, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    if slopes.ndim != 3 or covariance.shape != (slopes.shape[1], slopes.shape[1]):
+        raise InputError(
+            f"slopes must be (parameters, channels, samples) and the covariance (channels, channels), got "
+            f"{slopes.shape} and {covariance.shape}"
+        )
+    try:
+        root = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise InputError("the covariance of the noise must be positive definite, got one that is not") from None
+    white = np.linalg.solve(root, slopes)
+    flat = white.reshape(len(white), -1)
+    return np.asarray(flat @ flat.T)
+
+
+def cramer_rao(fisher: Array) -> Array:
+    """The bound (k, k) on the covariance of unbiased estimates, F^-1; raises InputError where F is singular: some
+    parameter cannot be told from the others."""
+    fisher = np.asarray(fisher, dtype=np.float64)
+    size = np.sqrt(np.diag(fisher))
+    if np.all(size > 0.0):
+        scaled = fisher / np.outer(size, size)
+        if np.linalg.eigvalsh(scaled)[0] > _SINGULAR * len(scaled):
+            return np.asarray(np.linalg.inv(scaled) / np.outer(size, size))
+    raise InputError("the parameters must be told apart by the channels, got a singular information matrix")
+
+
+def leak_bound(
+    experiment: Experiment,
+    *,
+    channels: Sequence[str] = CHAMBERS,
+    covariance: Array | None = None,
+    unknown: Sequence[str] = (),
+    progress: Callable[[float], None] | None = None,
+) -> LeakBound:
+    """The bound on a small leak that is open over the whole experiment, with its channels and their noise.
+
+    `covariance` (c, c) of one sample, default that of the rig's sensors; `unknown`: parameters that the estimate must
+    find beside the leak. The command and everything not named are taken as known.
+
+    Raises InputError for a parameter that cannot vary and where the leak cannot be told from the unknown ones,
+    SimulationFailed where a derivative cannot be had.
+    """
+    R = noise_covariance(experiment.rig, channels) if covariance is None else covariance
+    told = progress or (lambda share: None)
+    found = [leak_sensitivity(experiment, channels)]
+    for k, name in enumerate(unknown):
+        told((k + 1.0) / (len(unknown) + 1.0))
+        found.append(parameter_sensitivity(experiment, name, channels))
+    told(1.0)
+    fisher = information(np.stack([one.slope for one in found]), R)
+    return LeakBound(
+        known=1.0 / math.sqrt(fisher[0, 0]),
+        unknown=math.sqrt(cramer_rao(fisher)[0, 0]) if unknown else None,
+        unknown_parameters=tuple(unknown),
+        duration=experiment.duration,
+        nonlinearity=max(one.nonlinearity for one in found),
+    )
+
+
+def smallest_found(deviation: float, false_alarm: float, detection: float = 0.9) -> float:
+    """The leak that the best one-sided test finds with probability `detection` at this false-alarm rate, when the
+    leak's estimate is normal with this standard deviation: ``(z_{1-alpha} + z_detection) s``, in the unit of s.
+
+    Raises InputError for probabilities outside 0..1 (Neyman and Pearson, doi 10.1098/rsta.1933.0009).
+    """
+    from scipy.special import ndtri
+
+    for name, value in (("the false-alarm rate", false_alarm), ("the probability of detection", detection)):
+        if not 0.0 < value < 1.0:
+            raise InputError(f"{name} must be between 0 and 1, got {value}")
+    return float(ndtri(1.0 - false_alarm) + ndtri(detection)) * deviation

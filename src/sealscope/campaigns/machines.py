@@ -1,0 +1,124 @@
+"""From a case to the machine it is run on: the bench's draw, the case's duty on it, the leak sized for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from sealscope.campaigns.cases import Case, digest
+from sealscope.campaigns.plan import Plan
+from sealscope.errors import InputError
+
+if TYPE_CHECKING:
+    from sealscope.simulation.experiment import Experiment
+    from sealscope.simulation.faults import Leak
+
+#: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
+SIZING_SECONDS = 13.0
+
+
+def closing_values(level: str | float) -> dict[str, str | float]:
+    """The rig's parameters for both throttles closed by that share; none in the line where they are fully open."""
+    from sealscope.units import parse_quantity
+
+    share = parse_quantity(level, "1") if isinstance(level, str) else float(level)
+    if not 0.0 <= share < 1.0:
+        raise InputError(f"closed must be 0 to under 100 %, got {level!r}")
+    values: dict[str, str | float] = {"line.closed_A": share, "line.closed_B": share}
+    return {**values, "line.orifices": "present" if share > 0 else "absent"}
+
+
+def load_profile(name: str) -> Any:
+    """The bench profile of that name or file."""
+    from sealscope.simulation.bench import load_profile as load
+
+    return load(name)
+
+
+def profile_key(name: str) -> str:
+    """A name for what a bench profile says, the same wherever its file lies."""
+    return digest(repr(load_profile(name)))
+
+
+def fault_of(words: str, onset_s: float) -> Any:
+    """A fault other than a piston leak, from words; it sets in at the plan's onset unless they say when."""
+    from sealscope.simulation.fault_words import parse_fault
+
+    timed = any(f" {word} " in f" {words} " for word in ("from", "growing", "table"))
+    return parse_fault(words if timed else f"{words} from {onset_s:g} s")
+
+
+def leak_of(plan: Plan, case: Case) -> tuple[Leak, ...]:
+    """The case's leak, open from the plan's onset on; its size still a mean flow."""
+    from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
+
+    if not case.leak_lpm:
+        return ()
+    law: Any = case.law
+    return (Leak(law, mean=case.leak_lpm * LITRE_PER_MINUTE, opening=From(plan.onset_s)),)
+
+
+def experiment_of(plan: Plan, case: Case) -> Experiment:
+    """The experiment of a case: the machine that its seed draws from the bench, with the case's levels on top."""
+    from sealscope.simulation.commands import parse_command
+    from sealscope.simulation.experiment import Experiment
+
+    settings: dict[str, str | float] = {}
+    more: dict[str, Any] = {}
+    command = "3 sin(4t)"
+    if plan.profile:
+        from sealscope.simulation.bench import draw
+
+        machine = draw(load_profile(plan.profile), case.machine_seed)
+        settings |= machine.values
+        command = machine.command
+        more = drifts_of(machine)
+    for name, level in case.levels.items():
+        if name == "command":
+            command = str(level)
+        else:
+            settings |= closing_values(level) if name == "closed" else {name: level}
+    if case.fault:
+        more["faults"] = (fault_of(case.fault, plan.onset_s),)
+    experiment = Experiment(
+        rig=plan.rig.with_values(_once(settings), source="set by the campaign") if settings else plan.rig,
+        command=parse_command(command) if isinstance(command, str) else command,
+        duration=plan.duration_s,
+        seed=case.noise_seed,
+        **more,
+    )
+    return replace(experiment, leaks=sized_once(experiment, leak_of(plan, case)))
+
+
+def drifts_of(machine: Any) -> dict[str, Any]:
+    """What a drawn machine adds to an experiment beside its values."""
+    return {"drifts": machine.drifts}
+
+
+def _once(settings: Mapping[str, str | float]) -> dict[str, str | float]:
+    """Settings by their full names, a later one in place of an earlier."""
+    from sealscope.parameters import declared_names
+    from sealscope.parameters.names import resolve
+
+    return {resolve(name, declared_names()): value for name, value in settings.items()}
+
+
+def sized_once(experiment: Experiment, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
+    """The leaks with coefficients that give their means on this machine over a short run of its own.
+
+    Sizing on the whole record would cost it two or three times over; the mean that the record really had is told in
+    its row.
+    """
+    from sealscope.simulation.faults import From
+    from sealscope.simulation.simulate import sized_leaks
+
+    if not leaks:
+        return ()
+    short = replace(
+        experiment,
+        duration=min(experiment.duration, SIZING_SECONDS),
+        leaks=tuple(replace(leak, opening=From(0.0)) for leak in leaks),
+    )
+    found = sized_leaks(short)
+    return tuple(replace(one, opening=leak.opening) for one, leak in zip(found, leaks, strict=True))

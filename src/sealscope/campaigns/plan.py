@@ -1,0 +1,349 @@
+"""A campaign's plan: what is simulated, how often, and which detectors judge it; read from TOML, checked whole."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from sealscope.errors import InputError
+
+if TYPE_CHECKING:
+    from sealscope.campaigns.held_out_plan import HeldOutPlan
+    from sealscope.parameters import Rig
+
+Use = Literal["calibrate", "judge"]
+Promise = Literal["average", "bound"]
+
+_PACKAGED = Path(__file__).parent / "plans"
+_LARGEST_FILE = 1_000_000
+#: Most records a campaign may have: a slip of the keyboard shall not plan a year of work.
+MOST_RECORDS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Records:
+    """`count` records spread evenly over the cells of the factors.
+
+    `use`: `calibrate` sets thresholds (leak-free), `judge` is judged by them, on seeds of its own; `leak_lpm`: mean
+    flow [L/min] of a leak of that `law` from the plan's onset on, 0 for none; `fault`: another fault in words.
+    """
+
+    use: Use
+    count: int
+    leak_lpm: float = 0.0
+    law: Literal["laminar", "orifice"] = "laminar"
+    fault: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A simulated campaign.
+
+    `profile`: the bench whose nuisances each record draws, "" for the rig as it stands; `factors`: name -> levels,
+    every combination is a cell; `command` and `closed` are the duty, other names parameters of the rig; `seed`: the
+    base of every case's seed.
+    """
+
+    name: str
+    title: str
+    rig: Rig
+    profile: str
+    duration_s: float
+    onset_s: float
+    false_alarm: float
+    promise: Promise
+    confidence: float
+    seed: int
+    detectors: tuple[str, ...]
+    keep_recordings: bool
+    records: tuple[Records, ...]
+    factors: Mapping[str, tuple[str | float, ...]] = field(default_factory=dict)
+    place: str = ""
+
+    @property
+    def size(self) -> int:
+        """Number of records."""
+        return sum(one.count for one in self.records)
+
+
+def plan_names() -> tuple[str, ...]:
+    """Names of the packaged plans."""
+    return tuple(sorted(path.stem for path in _PACKAGED.glob("*.toml")))
+
+
+def load_plan(name_or_path: str | os.PathLike[str]) -> Plan | HeldOutPlan:
+    """The plan of that name, or in a TOML file; raises InputError, in one line with the place, for whatever breaks a
+    rule."""
+    text = os.fspath(name_or_path)
+    if text in plan_names():
+        return read_plan(_tree(_PACKAGED / f"{text}.toml", f"plans/{text}.toml"), f"plans/{text}.toml")
+    if not (text.endswith(".toml") or Path(text).is_file()):
+        raise InputError(f"{text!r} is no packaged plan ({', '.join(plan_names())}) and no .toml file")
+    return read_plan(_tree(Path(text), text), text)
+
+
+def _tree(path: Path, place: str) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            data = file.read(_LARGEST_FILE + 1)
+    except OSError as error:
+        raise InputError(f"a plan must be readable, got: {error.strerror or error} ({place})") from None
+    if len(data) > _LARGEST_FILE:
+        raise InputError(f"a plan must be at most {_LARGEST_FILE} bytes, got more ({place})")
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        raise InputError(f"a plan must be UTF-8 text, got other bytes ({place})") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"a plan must be TOML: {str(error).splitlines()[0]} ({place})") from None
+
+
+def read_plan(tree: Mapping[str, Any], place: str = "plan") -> Plan | HeldOutPlan:
+    """The plan in a TOML file's tables."""
+    if "held_out" in tree:
+        from sealscope.campaigns.held_out_plan import read_held_out
+
+        return read_held_out(tree, place)
+    return _Reader(place).plan(tree)
+
+
+class Table:
+    """One table of a plan as it is read: each entry by its rule, then none left over."""
+
+    def __init__(self, given: Any, name: str, place: str) -> None:
+        if not isinstance(given, Mapping):
+            raise InputError(f"[{name}] must be a table, got {given!r} ({place})")
+        self.left, self.name, self.place = dict(given), name, place
+
+    def fail(self, rule: str) -> InputError:
+        """The error that says the rule and the place."""
+        return InputError(f"{self.name}.{rule} ({self.place})")
+
+    def take(self, key: str, default: Any = None) -> Any:
+        """The entry, or the default; InputError where there is neither."""
+        if key in self.left:
+            return self.left.pop(key)
+        if default is None:
+            raise self.fail(f"{key} is missing")
+        return default
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """An entry that is a text of one line."""
+        value = self.take(key, default)
+        if not isinstance(value, str) or "\n" in value or (default is None and not value.strip()):
+            raise self.fail(f"{key} must be a text, got {value!r}")
+        return value
+
+    def number(self, key: str, default: float | None = None, unit: str = "") -> float:
+        """An entry that is a finite number, or a text of a number with a unit of the dimension of `unit`."""
+        value = self.take(key, default)
+        if isinstance(value, str) and unit:
+            from sealscope.units import parse_quantity
+
+            try:
+                return parse_quantity(value, unit)
+            except InputError as error:
+                raise self.fail(f"{key}: {error}") from None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            wanted = f"a number with its unit such as '180 {unit}'" if unit else "a number"
+            raise self.fail(f"{key} must be {wanted}, got {value!r}")
+        return float(value)
+
+    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
+        """An entry that is a whole number of at least `least`."""
+        value = self.take(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise self.fail(f"{key} must be a whole number >= {least}, got {value!r}")
+        return value
+
+    def choice(self, key: str, words: tuple[str, ...], default: str | None = None) -> str:
+        """An entry that is one of the words."""
+        value = self.take(key, default)
+        if value not in words:
+            raise self.fail(f"{key} must be one of {', '.join(words)}, got {value!r}")
+        return str(value)
+
+    def share(self, key: str, default: float | None = None) -> float:
+        """An entry that is a number between 0 and 1."""
+        value = self.number(key, default)
+        if not 0.0 < value < 1.0:
+            raise self.fail(f"{key} must be between 0 and 1, got {value:g}")
+        return value
+
+    def end(self) -> None:
+        """Refuse what is left over."""
+        if self.left:
+            raise self.fail(f"{next(iter(self.left))} is not known")
+
+
+class _Reader:
+    """Reads a simulated plan."""
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+
+    def plan(self, tree: Mapping[str, Any]) -> Plan:
+        for key in tree:
+            if key not in ("campaign", "factors", "records"):
+                raise InputError(f"[{key}] is not known; a plan has [campaign], [factors] and [[records]] ({self.place})")
+        head = Table(tree.get("campaign", {}), "campaign", self.place)
+        name = head.text("name")
+        if not all(c.isalnum() or c in "-_." for c in name) or name.startswith("."):
+            raise head.fail(f"name must be of letters, digits, '-', '_' and '.', got {name!r}")
+        duration = head.number("duration", unit="s")
+        onset = head.number("onset", duration / 2, unit="s")
+        if not 0.0 < onset < duration:
+            raise head.fail(f"onset must be within the duration, 0 s to {duration:g} s, got {onset:g}")
+        rig = self._rig(head)
+        factors = self._factors(tree.get("factors", {}), rig)
+        plan = Plan(
+            name=name,
+            title=head.text("title", name),
+            rig=rig,
+            profile=self._profile(head),
+            duration_s=duration,
+            onset_s=onset,
+            false_alarm=head.share("false_alarm", 0.01),
+            promise=head.choice("promise", get_args(Promise), "average"),  # type: ignore[arg-type]
+            confidence=head.share("confidence", 0.95),
+            seed=head.whole("seed", 0),
+            detectors=self._detectors(head),
+            keep_recordings=self._keep(head),
+            records=self._records(tree.get("records", ()), onset),
+            factors=factors,
+            place=self.place,
+        )
+        head.end()
+        if plan.size > MOST_RECORDS:
+            raise InputError(f"a campaign must have at most {MOST_RECORDS} records, got {plan.size} ({self.place})")
+        self._whole(plan)
+        return plan
+
+    def _said(self, what: str, made: Callable[[], Any]) -> Any:
+        try:
+            return made()
+        except InputError as error:
+            raise InputError(f"{what}: {error} ({self.place})") from None
+
+    def _rig(self, head: Table) -> Rig:
+        from sealscope.parameters import load_rig
+
+        name = head.text("rig", "thesis")
+        rig = self._said("campaign.rig", lambda: load_rig(self._beside(name)))
+        settings: dict[str, float | str] = {}
+        if "rate" in head.left:
+            settings["daq.sample_rate"] = head.number("rate", unit="Hz")
+        given = head.take("set", {})
+        if not isinstance(given, Mapping):
+            raise head.fail(f"set must be a table of parameters, got {given!r}")
+        settings |= given
+        if not settings:
+            return rig  # type: ignore[no-any-return]
+        return self._said("campaign.set", lambda: rig.with_values(settings, source="set by the plan"))  # type: ignore[no-any-return]
+
+    def _beside(self, name: str) -> str:
+        """A file named in a plan lies beside the plan."""
+        return os.fspath(Path(self.place).parent / name) if name.endswith(".toml") else name
+
+    def _profile(self, head: Table) -> str:
+        name = head.text("profile", "none")
+        if name == "none":
+            return ""
+        from sealscope.campaigns.machines import load_profile
+
+        name = self._beside(name)
+        self._said("campaign.profile", lambda: load_profile(name))
+        return name
+
+    def _detectors(self, head: Table) -> tuple[str, ...]:
+        from sealscope.diagnosis.scorers import scorer
+
+        given = head.take("detectors")
+        if not isinstance(given, list) or not given:
+            raise head.fail(f"detectors must be a list of names, got {given!r}")
+        for name in given:
+            self._said("campaign.detectors", lambda name=name: scorer(name))
+        if len(set(given)) < len(given):
+            raise head.fail("detectors must be named once each")
+        return tuple(given)
+
+    @staticmethod
+    def _keep(head: Table) -> bool:
+        value = head.left.pop("keep_recordings", False)
+        if not isinstance(value, bool):
+            raise head.fail(f"keep_recordings must be true or false, got {value!r}")
+        return value
+
+    def _factors(self, given: Any, rig: Rig) -> dict[str, tuple[str | float, ...]]:
+        table = Table(given, "factors", self.place)
+        found: dict[str, tuple[str | float, ...]] = {}
+        for name, levels in list(table.left.items()):
+            if not isinstance(levels, list) or not levels:
+                raise table.fail(f"{name} must be a list of levels, got {levels!r}")
+            if len({repr(one) for one in levels}) < len(levels):
+                raise table.fail(f"{name} must hold each level once")
+            for level in levels:
+                if isinstance(level, bool) or not isinstance(level, (str, int, float)):
+                    raise table.fail(f"{name} must be texts or numbers, got {level!r}")
+                self._said(f"factors.{name}", lambda name=name, level=level: self._level(name, level, rig))
+            found[name] = tuple(levels)
+        return found
+
+    @staticmethod
+    def _level(name: str, level: str | float, rig: Rig) -> None:
+        from sealscope.campaigns.machines import closing_values
+        from sealscope.simulation.commands import parse_command
+
+        if name == "command":
+            if not isinstance(level, str):
+                raise InputError(f"a command must be a text such as '3 sin(4t)', got {level!r}")
+            parse_command(level)
+        else:
+            rig.with_values(closing_values(level) if name == "closed" else {name: level})
+
+    def _records(self, given: Any, onset: float) -> tuple[Records, ...]:
+        if not isinstance(given, list) or not given:
+            raise InputError(f"a plan must have [[records]], got none ({self.place})")
+        found: list[Records] = []
+        for number, one in enumerate(given, 1):
+            table = Table(one, f"records[{number}]", self.place)
+            use = table.choice("use", get_args(Use), "judge")
+            count = table.whole("count", least=1)
+            leak = table.number("leak", 0.0, unit="L/min") if "leak" in table.left else 0.0
+            law = table.choice("law", ("laminar", "orifice"), "laminar")
+            fault = table.text("fault", "")
+            table.end()
+            if leak < 0:
+                raise table.fail(f"leak must be >= 0 L/min, got {leak:g}")
+            if use == "calibrate" and (leak or fault):
+                raise table.fail("use = 'calibrate' must be leak-free and without a fault")
+            if fault:
+                from sealscope.campaigns.machines import fault_of
+
+                self._said(f"records[{number}].fault", lambda fault=fault: fault_of(fault, onset))
+            made = Records(use, count, leak, law, fault)  # type: ignore[arg-type]
+            if any((made.use, made.leak_lpm, made.law, made.fault) == (o.use, o.leak_lpm, o.law, o.fault) for o in found):
+                raise table.fail("records must differ from the others in use, leak, law or fault")
+            found.append(made)
+        return tuple(found)
+
+    def _whole(self, plan: Plan) -> None:
+        """What only the plan as a whole can break."""
+        from sealscope.diagnosis.scorers import scorer
+        from sealscope.evaluation.thresholds import records_needed
+
+        if not any(one.use == "judge" for one in plan.records):
+            raise InputError(f"a plan must have records to judge, got none ({self.place})")
+        calibrated = [name for name in plan.detectors if scorer(name).threshold is None]
+        known = sum(one.count for one in plan.records if one.use == "calibrate")
+        needed = records_needed(plan.false_alarm, plan.confidence if plan.promise == "bound" else None)
+        if calibrated and known < needed:
+            raise InputError(
+                f"records to calibrate must be at least {needed} for false_alarm = {plan.false_alarm:g}, got {known} "
+                f"({self.place})"
+            )

@@ -1,0 +1,124 @@
+"""The command that reproduces the thesis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sealscope.cli.options import complain
+
+if TYPE_CHECKING:
+    from sealscope.thesis.reproduce import Outcome, Progress
+
+
+def complete_items(incomplete: str) -> list[str]:
+    """Ids that begin so."""
+    from sealscope.thesis.registry import collect
+
+    items = collect()
+    words = ["all", *(f"chapter-{number}" for number in sorted({item.chapter for item in items}))]
+    return [word for word in (*words, *(item.id for item in items)) if word.startswith(incomplete)]
+
+
+def reproduce(
+    ids: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ID...]",
+            help="What to reproduce: ids such as fig-5.58, all, chapter-4, or wildcards such as 'fig-5.*'.",
+            autocompletion=complete_items,
+        ),
+    ] = None,
+    listing: Annotated[bool, typer.Option("--list", help="List what there is, and what it needs.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer and shorter simulations.")] = False,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder of the results; a second call goes on there.")
+    ] = Path("sealscope-thesis"),
+    sheet: Annotated[
+        Path | None,
+        typer.Option(
+            "--sheet",
+            help="Folder with the thesis's data sheet (appendix_c_pa.csv, appendix_c_pb.csv); else $SEALSCOPE_SHEET or "
+            "./data.",
+        ),
+    ] = None,
+    jobs: Annotated[int | None, typer.Option("--jobs", "-j", help="Processes; by default one a core.")] = None,
+) -> None:
+    """Make the thesis's tables and figures anew, with a verdict on each claim. Exit status 1 where one failed."""
+    if listing:
+        _list(ids or ["all"], sheet)
+        return
+    from sealscope.errors import InputError
+    from sealscope.reporting.plots import require_drawing
+    from sealscope.reporting.thesis_files import publish
+    from sealscope.reporting.thesis_page import write_thesis_page
+    from sealscope.thesis.reproduce import reproduce as carry_out
+
+    if not ids:
+        raise InputError("an item must be named: an id, chapter-N or all (sealscope reproduce --list)")
+    require_drawing()
+    with _progress() as told:
+        outcome = carry_out(ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish, progress=told)
+    page = write_thesis_page(output, outcome.shown(), quick=quick, sheet=outcome.job.sheet is not None)
+    _summarise(outcome, page)
+    if outcome.among("failed"):
+        raise typer.Exit(1)
+
+
+def _summarise(outcome: Outcome, page: Path) -> None:
+    for entry in outcome.among("failed"):
+        complain(f"{entry.item.id} failed: {entry.reason}")
+    counts = {
+        "made": len(outcome.among("made")),
+        "drawn anew": len(outcome.among("drawn")),
+        "kept from before": len(outcome.among("kept")),
+        "failed": len(outcome.among("failed")),
+    }
+    typer.echo("items: " + ", ".join(f"{count} {word}" for word, count in counts.items() if count))
+    left_out = outcome.among("left out")
+    if left_out:
+        typer.echo(f"left out: {len(left_out)} ({left_out[0].reason})")
+    typer.echo(f"page:  {page}")
+
+
+def _list(words: Sequence[str], sheet: Path | None) -> None:
+    from sealscope.thesis.registry import collect, select
+    from sealscope.thesis.sheet import MISSING, find_sheet
+
+    given = find_sheet(sheet) is not None
+    items = select(collect(), words)
+    width = max(len(item.id) for item in items)
+    for item in items:
+        note = f"  ({MISSING})" if item.needs_sheet and not given else ""
+        typer.echo(f"{item.id:<{width}}  {item.kind:<6}  {item.title}{note}")
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    """One bar on standard error with the items in work and the time left; silent where nobody looks."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )  # fmt: skip
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None)
+
+        def told(ended: int, total: int, in_work: Sequence[str]) -> None:
+            bar.update(task, completed=ended, total=total, description=", ".join(in_work))
+
+        yield told

@@ -1,0 +1,213 @@
+"""Scorers: what a detector makes of a recording before any threshold, one number, higher where it looks more like a leak.
+
+A threshold comes from leak-free recordings (`calibration.py`); a scorer that has one of its own (a bare sign rule, a
+detector with a threshold from within the recording) states it as `threshold`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import CHAMBERS, QUANTITIES, mean_squares
+from sealscope.diagnosis.verdict import Evidence
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array, Recording
+
+Sided = Literal["one-sided", "two-sided"]
+#: What is left out at the beginning of a recording: this long, but no more than this share of the first part, so that
+#: the machine's start does not stand against its running.
+START_SECONDS, START_SHARE = 2.0, 0.05
+
+
+@dataclass(frozen=True)
+class Score:
+    """A score, None where the scorer cannot tell (`reason`); `onset_s` [s] where it finds one."""
+
+    value: float | None
+    onset_s: float | None = None
+    reason: str = ""
+
+
+class Look:
+    """A recording as all scorers see it, each transform computed once.
+
+    `split_s` [s]: the moment on the recording's time axis before and after which it is compared, half-way by default;
+    `false_alarm_probability`: what a scorer with a threshold of its own sets it for. The recording is uniformly
+    sampled without missing samples (`diagnose.analysable`).
+    """
+
+    def __init__(
+        self, recording: Recording, split_s: float | None = None, false_alarm_probability: float = 0.01
+    ) -> None:
+        self.recording = recording
+        start = float(recording.t[0]) if len(recording) else 0.0
+        self.split_s = start + recording.duration / 2 if split_s is None else float(split_s)
+        self.false_alarm_probability = false_alarm_probability
+
+    @cached_property
+    def log_rms(self) -> Mapping[str, tuple[Array, Array, Array]]:
+        """Chamber -> log RMS of d1..d4 and d3d4, (5,) each: before the split, after it, over both.
+
+        Coefficients that saw the other side of the split or the recording's ends are in neither part.
+        """
+        from sealscope.signals.details import details, edge_samples
+
+        recording = self.recording
+        n, rate = len(recording), recording.rate
+        split = round((self.split_s - float(recording.t[0])) * rate)
+        before, after = (int(samples) for samples in edge_samples()[-1])
+        begin = max(before, int(min(START_SECONDS * rate, START_SHARE * split)))
+        first, second = (begin, split - after), (split + before, n - after)
+        found = {}
+        for chamber in CHAMBERS:
+            if chamber not in recording or min(first[1] - first[0], second[1] - second[0]) < 1:
+                continue
+            transformed = details(recording[chamber])
+            parts = [mean_squares(transformed, np.array(part))[0] for part in (first, second)]
+            sizes = [part[1] - part[0] for part in (first, second)]
+            with np.errstate(divide="ignore"):
+                both = np.average(parts, axis=0, weights=sizes)
+                found[chamber] = tuple(0.5 * np.log(one) for one in (*parts, both))
+        return found  # type: ignore[return-value]
+
+    @cached_property
+    def rms_change(self) -> Evidence:
+        """The evidence of the detector `rms change`, with no baseline."""
+        from sealscope.diagnosis.rms_change import RmsChange
+
+        detector = RmsChange()
+        unusable = detector.usable(self.recording)
+        if unusable is not None:
+            return Evidence("cannot tell", unusable)
+        with np.errstate(all="ignore"):
+            return detector.examine(self.recording, (), self.false_alarm_probability)
+
+    def of(self, chamber: str, quantity: str, what: Literal["change", "level"]) -> float | None:
+        """Change of a quantity's log RMS over the split, or its level; None where it has none."""
+        found = self.log_rms.get(chamber)
+        if found is None:
+            return None
+        before, after, both = (float(one[QUANTITIES.index(quantity)]) for one in found)
+        value = after - before if what == "change" else both
+        return value if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """One way to score a recording.
+
+    `sided`: whether a change either way raises the score; `timing`: whether it compares the two sides of the split,
+    judges the whole, or searches for the onset; `threshold`: its own, None where leak-free recordings must set one.
+    """
+
+    name: str
+    sided: Sided
+    timing: Literal["split", "whole", "search"]
+    about: str
+    score: Callable[[Look], Score]
+    threshold: float | None = None
+
+
+def _number(value: float | None, what: str) -> Score:
+    return Score(None, reason=f"{what} cannot be computed: too short, or its reading does not move") if value is None else Score(value)
+
+
+def _of_details() -> Iterator[Scorer]:
+    """Scorers on one quantity of one chamber."""
+    for chamber in CHAMBERS:
+        for quantity in QUANTITIES:
+            name = f"{quantity} of {chamber}"
+
+            def change(look: Look, sign: float, chamber: str = chamber, quantity: str = quantity) -> Score:
+                found = look.of(chamber, quantity, "change")
+                value = found if found is None else abs(found) if sign == 0 else sign * found
+                return _number(value, f"the change of {quantity} of {chamber}")
+
+            def level(look: Look, sign: float, chamber: str = chamber, quantity: str = quantity) -> Score:
+                found = look.of(chamber, quantity, "level")
+                return _number(found if found is None else sign * found, f"the level of {quantity} of {chamber}")
+
+            for word, sign in (("fell", -1.0), ("rose", 1.0)):
+
+                def moved(look: Look, sign: float = sign, change: Callable[[Look, float], Score] = change) -> Score:
+                    return change(look, sign)
+
+                about = f"the RMS of {name} {word} after the split, as change of its logarithm"
+                yield Scorer(f"{name} {word}", "one-sided", "split", about, moved)
+                yield Scorer(f"sign rule: {name} {word}", "one-sided", "split", f"{about}; any change at all", moved, 0.0)
+
+            def either(look: Look, change: Callable[[Look, float], Score] = change) -> Score:
+                return change(look, 0.0)
+
+            about = f"the RMS of {name} changed either way over the split, as size of the change of its logarithm"
+            yield Scorer(f"{name} changed", "two-sided", "split", about, either)
+            for word, sign in (("low", -1.0), ("high", 1.0)):
+
+                def at(look: Look, sign: float = sign, level: Callable[[Look, float], Score] = level) -> Score:
+                    return level(look, sign)
+
+                about = f"the RMS of {name} over the whole recording is {word}, as its logarithm"
+                yield Scorer(f"{name} {word}", "one-sided", "whole", about, at)
+
+
+def _both_products(look: Look) -> Score:
+    """The thesis's cumulative rule: d3d4 fell in chamber A and rose in chamber B, the lesser of both."""
+    a, b = (look.of(chamber, "d3d4", "change") for chamber in CHAMBERS)
+    return _number(None if a is None or b is None else min(-a, b), "the change of d3d4 in both chambers")
+
+
+def _scan(look: Look) -> Score:
+    found = look.rms_change
+    return Score(found.score, found.onset_s, found.reason)
+
+
+def _own_scan(look: Look) -> Score:
+    found = look.rms_change
+    if found.verdict == "cannot tell" or found.score is None or found.threshold is None:
+        return Score(None, reason=found.reason)
+    return Score(found.score - found.threshold, found.onset_s, found.reason)
+
+
+def _all() -> Iterator[Scorer]:
+    yield from _of_details()
+    both = "d3d4 of both chambers as the thesis says"
+    about = "the RMS of d3d4 fell in p_A and rose in p_B, the lesser of both changes"
+    yield Scorer(both, "one-sided", "split", about, _both_products)
+    yield Scorer(f"sign rule: {both}", "one-sided", "split", f"{about}; any change at all", _both_products, 0.0)
+    yield Scorer(
+        "rms change",
+        "two-sided",
+        "search",
+        "the largest T2 of a step of d2..d4 of both chambers at any instant",
+        _scan,
+    )
+    yield Scorer(
+        "rms change, own threshold",
+        "two-sided",
+        "search",
+        "T2 less the threshold that random orders of the recording's own blocks give: what diagnose does alone",
+        _own_scan,
+        0.0,
+    )
+
+
+#: Every scorer by name.
+SCORERS: Mapping[str, Scorer] = MappingProxyType({one.name: one for one in _all()})
+
+
+def scorer(name: str) -> Scorer:
+    """The scorer of that name; raises InputError for a name it does not know."""
+    if name not in SCORERS:
+        import difflib
+
+        near = difflib.get_close_matches(str(name), SCORERS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"a detector must be a scorer's name such as 'd3 of p_A fell' or 'rms change', got {name!r}{hint}")
+    return SCORERS[name]

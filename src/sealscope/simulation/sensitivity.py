@@ -1,0 +1,119 @@
+"""How the noise-free channels of a run answer to a small leak, and to a small change of a parameter.
+
+Derivatives are differences of converged runs. A leak cannot be negative, so its derivative at no leak is a forward
+difference at h and h/2, extrapolated to h = 0 (Richardson); a parameter's is a central difference. Either is taken at
+two steps, and the step is halved until the two agree: what is returned is the slope, not a chord.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sealscope.errors import InputError, SimulationFailed
+from sealscope.recordings.recording import Array
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.faults import LITRE_PER_MINUTE, Leak
+from sealscope.simulation.instruments import decimate
+from sealscope.simulation.simulate import oversampling, trajectory
+
+#: The first step of a leak's derivative: this mean flow [m^3/s] ...
+FIRST_LEAK = 1e-4 * LITRE_PER_MINUTE
+#: ... at this pressure difference [Pa], which friction alone makes in the thesis's rig.
+REFERENCE_DP = 0.115e6
+#: The first step of a parameter's derivative, as a share of its value.
+FIRST_SHARE = 1e-3
+#: Largest rms difference between the derivatives at h and h/2, as a share of the derivative's rms.
+LINEARITY = 0.02
+_MOST_HALVINGS = 8
+CHAMBERS = ("p_A", "p_B")
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """A derivative of the channels: `slope` (c, n), in the channels' units for one unit of the parameter.
+
+    `step`: the step h it was taken with; `nonlinearity`: rms(D(h) - D(h/2)) / rms(D), how far the answer is from a
+    straight line over that step.
+    """
+
+    parameter: str
+    channels: tuple[str, ...]
+    slope: Array
+    step: float
+    nonlinearity: float
+
+
+def clean_channels(
+    experiment: Experiment, leaks: Sequence[Leak] = (), channels: Sequence[str] = CHAMBERS, *, step: float | None = None
+) -> Array:
+    """The channels (c, n) without noise, at the recording's samples and behind its anti-alias filter.
+
+    `leaks` take the place of the experiment's and have coefficients; `step` [s] of the solver, default its own.
+    Raises SimulationFailed as `sealscope.simulation.simulate.run` does.
+    """
+    n = round(experiment.duration * experiment.rate)
+    path = trajectory(experiment, tuple(leaks), step=step)
+    return np.stack([decimate(path[name], oversampling(experiment), n) for name in channels])
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _settled(name: str, channels: tuple[str, ...], first: float, quotient: Callable[[float], Array]) -> Sensitivity:
+    """The derivative at a step over which the answer is a straight line, both orders of difference extrapolated by
+    the caller's `quotient`."""
+    step, coarse = first, quotient(first)
+    for _ in range(_MOST_HALVINGS):
+        fine = quotient(step / 2.0)
+        size = _rms(fine)
+        bent = _rms(coarse - fine) / size if size > 0.0 else 0.0
+        if bent <= LINEARITY:
+            return Sensitivity(name, channels, fine, step, bent)
+        step, coarse = step / 2.0, fine
+    raise SimulationFailed(
+        f"the channels must answer in proportion to a small change of {name}, got {100 * bent:.2g} % apart between "
+        f"steps of {step:.3g} and its half; the run may meet a stop or a limit of the drive"
+    )
+
+
+def leak_sensitivity(experiment: Experiment, channels: Sequence[str] = CHAMBERS) -> Sensitivity:
+    """d channel / d G at G = 0, a laminar leak open over the whole run: (c, n) [Pa per m^3/(s Pa)] for pressures.
+
+    ``D(h) = (y(h) - y(0)) / h``; returned is ``2 D(h/2) - D(h)``, whose error is O(h^2). h begins at `FIRST_LEAK`
+    over `REFERENCE_DP` and is halved until D(h) and D(h/2) are within `LINEARITY`. Leaks of the experiment are left
+    out. Raises SimulationFailed where no step is small enough.
+    """
+    names = tuple(channels)
+    none = clean_channels(experiment, (), names)
+
+    def quotient(h: float) -> Array:
+        return np.asarray((clean_channels(experiment, (Leak("laminar", coefficient=h),), names) - none) / h)
+
+    found = _settled("G", names, FIRST_LEAK / REFERENCE_DP, quotient)
+    return replace(found, slope=2.0 * found.slope - quotient(found.step))
+
+
+def parameter_sensitivity(experiment: Experiment, name: str, channels: Sequence[str] = CHAMBERS) -> Sensitivity:
+    """d channel / d ln(parameter), no leak: (c, n) [Pa] for pressures; central difference from `FIRST_SHARE` on.
+
+    Raises InputError for a parameter that is a choice or zero (its logarithm has no derivative), SimulationFailed
+    where no step is small enough.
+    """
+    value = experiment.rig[name]
+    if isinstance(value, str) or not (math.isfinite(value) and value != 0.0):
+        raise InputError(f"a sensitivity needs a parameter whose value is a number other than 0, got {name} = {value}")
+    names = tuple(channels)
+
+    def at(share: float) -> Array:
+        rig = experiment.rig.with_values({name: value * (1.0 + share)}, source="varied for a sensitivity")
+        return clean_channels(replace(experiment, rig=rig), (), names)
+
+    def quotient(h: float) -> Array:
+        return np.asarray((at(h) - at(-h)) / (2.0 * h))
+
+    return _settled(name, names, FIRST_SHARE, quotient)

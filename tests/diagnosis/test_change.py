@@ -1,0 +1,189 @@
+"""The scan against plain loops, its thresholds against known order statistics, its power on steps that were put in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sealscope.diagnosis.change import (
+    ONSET_CUT,
+    least_blocks,
+    null_maxima,
+    onset_interval,
+    permutations_for,
+    scan,
+    two_samples,
+    upper_quantile,
+)
+from sealscope.diagnosis.change import _orders as orders
+
+
+def slow_scan(x: np.ndarray, joint: list[int], least: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """T2, single and trend by plain sums, as the formulas of the module stand."""
+    n, f = x.shape
+    mean = [sum(x[i, j] for i in range(n)) / n for j in range(f)]
+    s = np.zeros((f, f))
+    for i in range(1, n):
+        step = x[i] - x[i - 1]
+        s += np.outer(step, step) / (2 * (n - 1))
+    inverse = np.linalg.inv(s[np.ix_(joint, joint)])
+    t2, single = np.zeros(n - 1), np.zeros((n - 1, f))
+    for k in range(least, n - least + 1):
+        c = np.array([sum(x[i, j] - mean[j] for i in range(k)) for j in range(f)])
+        weight = n / (k * (n - k))
+        t2[k - 1] = weight * c[joint] @ inverse @ c[joint]
+        for j in range(f):
+            difference = x[k:, j].mean() - x[:k, j].mean()
+            single[k - 1, j] = difference / np.sqrt(s[j, j] * (1 / k + 1 / (n - k)))
+    time = np.arange(n) - (n - 1) / 2
+    slope = np.array([sum(time[i] * (x[i, j] - mean[j]) for i in range(n)) for j in joint])
+    return t2, single, float(slope @ inverse @ slope / sum(time**2))
+
+
+@settings(max_examples=25, deadline=None)
+@given(n=st.integers(12, 60), f=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
+def test_scan_is_what_plain_loops_give(n: int, f: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    x = random.standard_normal((n, f)) @ (np.eye(f) + 0.3 * random.standard_normal((f, f))) + random.normal(size=f)
+    joint = sorted(random.permutation(f)[: max(1, f - 1)].tolist())
+    t2, single, trend = slow_scan(x, joint, least_blocks(n))
+    found = scan(x, joint)
+    np.testing.assert_allclose(found.joint, t2, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.single, single, rtol=1e-6, atol=1e-9)
+    assert found.trend == pytest.approx(trend, rel=1e-6)
+
+
+def test_scan_leaves_out_steps_near_the_ends() -> None:
+    x = np.random.default_rng(0).standard_normal((100, 2))
+    t2 = scan(x, [0, 1]).joint
+    least = least_blocks(100)
+    assert least == 3
+    assert np.all(t2[: least - 1] == 0)
+    assert np.all(t2[-(least - 1) :] == 0)
+    assert np.all(t2[least - 1 : -(least - 1)] > 0)
+
+
+def test_a_column_twice_adds_nothing() -> None:
+    x = np.random.default_rng(1).standard_normal((80, 2))
+    doubled = np.column_stack([x, x[:, 0]])
+    np.testing.assert_allclose(scan(doubled, [0, 1, 2]).joint, scan(x, [0, 1]).joint, rtol=1e-6)
+
+
+def test_t2_of_nothing_is_chi_squared() -> None:
+    """At a fixed instant T2 has f degrees of freedom: mean f, 95 % point 7.815 for f = 3 (any chi-squared table)."""
+    random = np.random.default_rng(3)
+    t2 = np.array([scan(random.standard_normal((200, 3)), [0, 1, 2]).joint[99] for _ in range(2000)])
+    assert t2.mean() == pytest.approx(3.0, rel=0.08)
+    assert np.mean(t2 > 7.815) == pytest.approx(0.05, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("m", "p", "rank"), [(999, 0.01, 990), (999, 0.05, 950), (1999, 0.01, 1980), (100, 0.01, 100), (9, 0.01, 9)]
+)
+def test_quantile_is_the_order_statistic(m: int, p: float, rank: int) -> None:
+    shuffled = np.random.default_rng(0).permutation(np.arange(1.0, m + 1))
+    assert upper_quantile(shuffled, p) == rank
+    both = np.stack([shuffled, -shuffled], axis=1)
+    np.testing.assert_array_equal(upper_quantile(both, p), [rank, rank - m - 1])
+
+
+@pytest.mark.parametrize("p", [0.01, 0.05, 0.1, 0.13])
+def test_quantile_keeps_the_rate_exactly(p: float) -> None:
+    """Of m + 1 exchangeable values each is as likely the observed one: at most p may exceed the rest's quantile."""
+    values = np.arange(100.0)
+    exceeding = sum(value > upper_quantile(np.delete(values, k), p) for k, value in enumerate(values))
+    assert exceeding == int(100 * p + 1e-9)
+
+
+def test_permutations_reach_beyond_the_quantile() -> None:
+    assert permutations_for(0.05) == 999
+    assert permutations_for(0.01) == 1999
+    assert permutations_for(1e-4) == 199999
+
+
+@pytest.mark.parametrize("n", [24, 25])
+def test_orders_keep_neighbours_together(n: int) -> None:
+    found = orders(n, 50, np.random.default_rng(0))
+    np.testing.assert_array_equal(np.sort(found, axis=1), np.tile(np.arange(n), (50, 1)))
+    for order in found:
+        together = np.sum(np.diff(order) % n == 1)
+        assert together >= n // 2
+    assert len({tuple(order) for order in found}) == 50
+
+
+def test_random_orders_are_an_argument() -> None:
+    x = np.random.default_rng(0).standard_normal((40, 3))
+    one, same, other = (null_maxima(x, [0, 2], 300, seed) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one[0], same[0])
+    np.testing.assert_array_equal(one[1], same[1])
+    assert not np.array_equal(one[0], other[0])
+    assert one[0].shape == (300,)
+    assert one[1].shape == (300, 3)
+
+
+def test_nothing_alarms_as_seldom_as_stated() -> None:
+    random = np.random.default_rng(11)
+    alarms = 0
+    for _ in range(60):
+        x = random.standard_normal((40, 4))
+        null, _ = null_maxima(x, [0, 1, 2, 3], 399)
+        alarms += scan(x, [0, 1, 2, 3]).joint.max() > upper_quantile(null, 0.05)
+    assert alarms <= 9  # of 60 at 5 %: more has a probability of 0.1 %
+
+
+def stepped(random: np.random.Generator, n: int, at: int, size: float) -> np.ndarray:
+    x = random.standard_normal((n, 3))
+    x[at:, 1] += size
+    return x
+
+
+def test_a_step_is_found_where_it_is() -> None:
+    random = np.random.default_rng(12)
+    found, near = 0, 0
+    for _ in range(30):
+        x = stepped(random, 100, 40, 1.2)
+        null, _ = null_maxima(x, [0, 1, 2], 199)
+        result = scan(x, [0, 1, 2])
+        found += result.joint.max() > upper_quantile(null, 0.01)
+        near += abs(int(np.argmax(result.joint)) + 1 - 40) <= 5
+        assert result.single[39, 1] > 0
+    assert found >= 27
+    assert near >= 25
+
+
+def test_onset_interval_covers_the_truth_as_often_as_stated() -> None:
+    assert pytest.approx(7.35, abs=0.01) == ONSET_CUT  # the 95 % value of Eo and Morley's table
+    assert onset_interval(np.array([0.0, 5.0, 10.0, 9.0, 1.0])) == (2, 4)
+    random = np.random.default_rng(13)
+    covered = 0
+    for _ in range(300):
+        first, last = onset_interval(scan(stepped(random, 100, 60, 1.0), [1]).joint)
+        covered += first <= 60 <= last
+    assert covered >= 0.93 * 300
+
+
+def test_a_step_beats_a_trend_and_a_trend_a_step() -> None:
+    random = np.random.default_rng(14)
+    steps = sum(scan(stepped(random, 100, 50, 1.5), [0, 1, 2]).step_wins() for _ in range(60))
+    drifts = 0
+    for _ in range(60):
+        x = random.standard_normal((100, 3))
+        x[:, 1] += np.linspace(-1.5, 1.5, 100)
+        drifts += scan(x, [0, 1, 2]).step_wins()
+    assert steps >= 57
+    assert drifts <= 6
+
+
+def test_two_samples_is_the_scan_at_one_instant() -> None:
+    x = np.random.default_rng(15).standard_normal((200, 3))
+    score, single, null, single_null = two_samples(x, 20, [0, 1], 999)
+    whole = scan(x, [0, 1])
+    assert score == pytest.approx(whole.joint[19])
+    np.testing.assert_allclose(single, whole.single[19])
+    assert null.shape == (999,)
+    assert single_null.shape == (999, 3)
+    assert np.median(null) == pytest.approx(1.386, rel=0.25)  # chi-squared with 2 degrees of freedom
+    again = two_samples(x, 20, [0, 1], 999)
+    np.testing.assert_array_equal(again[2], null)

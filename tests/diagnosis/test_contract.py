@@ -1,0 +1,169 @@
+"""One contract for every detector: never raises, says `cannot tell` where it must, sees nothing it must not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.contract import DETECTORS
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.verdict import Evidence
+from sealscope.recordings.recording import COUNTS, Recording
+
+P = 0.01
+VERDICTS = {"leak", "no leak", "cannot tell"}
+Change = Callable[[Recording], Recording]
+
+
+def with_channels(recording: Recording, **channels: np.ndarray) -> Recording:
+    return replace(recording, channels={**recording.channels, **channels})
+
+
+def counts(recording: Recording) -> Recording:
+    """The pressures as a mapped channel without a unit would bring them: whole numbers of a converter."""
+    pressures = recording.only(["p_A", "p_B"])
+    channels = {name: np.rint(pressures[name] / 2500.0) for name in ("p_A", "p_B")}
+    return replace(pressures, channels=channels, units={"p_A": COUNTS, "p_B": COUNTS})
+
+
+def holding(recording: Recording, start: int, stop: int, value: float) -> Recording:
+    p_A = np.array(recording["p_A"])
+    p_A[start:stop] = value
+    return with_channels(recording, p_A=p_A)
+
+
+def every_second_missing(recording: Recording) -> Recording:
+    p_A = np.array(recording["p_A"])
+    p_A[1::2] = np.nan
+    return with_channels(recording, p_A=p_A)
+
+
+#: Recordings that a detector must be able to judge ...
+GOOD: dict[str, Change] = {
+    "whole": lambda r: r,
+    "p_A alone": lambda r: r.only(["p_A"]),
+    "pressures alone": lambda r: r.only(["p_A", "p_B"]),
+    "p_B and command": lambda r: r.only(["p_B", "u"]),
+    "counts": counts,
+    "one gap near the end": lambda r: with_channels(r, p_A=np.where(np.arange(len(r)) == 50000, np.nan, r["p_A"])),
+    "command without a value": lambda r: with_channels(r, u=np.full(len(r), np.nan)),
+    "very slow sampling": lambda r: replace(r, t=np.arange(len(r)) * 10.0, rate=0.1),
+}
+#: ... and recordings on which it must say `cannot tell`, with what its reason has to name.
+HOPELESS: dict[str, tuple[Change, str]] = {
+    "no samples": (lambda r: r.samples(slice(0, 0)), "226 samples"),
+    "30 samples": (lambda r: r.samples(slice(0, 30)), "226 samples"),
+    "one block": (lambda r: r.between(0.0, 3.0), "too short"),
+    "no pressure": (lambda r: r.only(["u", "x", "p_1", "p_2"]), "p_A or p_B"),
+    "constant pressure": (lambda r: with_channels(r, p_A=np.full(len(r), 3e5)), "p_A is constant"),
+    "no value at all": (lambda r: with_channels(r, p_A=np.full(len(r), np.nan)), "226 samples"),
+    "every second value missing": (every_second_missing, "226 samples"),
+    "time runs backwards": (lambda r: replace(r, t=r.t[::-1]), "226 samples"),
+    "10 s at the rail": (lambda r: holding(r, 5000, 10000, float(r["p_A"].min())), "p_A does not move"),
+    "10 s at zero": (lambda r: holding(r, 5000, 10000, 0.0), "p_A"),
+    "a straight line": (
+        lambda r: with_channels(r, p_A=np.arange(len(r)) * 1.0, p_B=np.arange(len(r)) * 2.0),
+        "p_A does not move",
+    ),
+    "beyond floating point": (lambda r: with_channels(r, p_A=r["p_A"] * 1e200), "p_A"),
+}
+
+
+@pytest.fixture(params=DETECTORS)
+def detector(request: pytest.FixtureRequest):  # type: ignore[no-untyped-def]
+    return DETECTORS[request.param]()
+
+
+def examined(detector, recording: Recording, probability: float = P) -> Evidence:  # type: ignore[no-untyped-def]
+    assert detector.usable(recording) is None
+    return detector.examine(recording, [], probability)
+
+
+@pytest.mark.parametrize("change", GOOD)
+def test_judges_what_it_can(change: str, leaky: Recording) -> None:
+    found = diagnose(GOOD[change](leaky))
+    assert found.verdict in ("leak", "no leak"), found.reason
+    assert found.score is not None
+    assert found.threshold is not None
+    assert found.verdict == ("leak" if found.score > found.threshold else "no leak")
+
+
+@pytest.mark.parametrize("change", HOPELESS)
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
+def test_cannot_tell_where_it_must_and_says_why(change: str, leaky: Recording) -> None:
+    make, named = HOPELESS[change]
+    found = diagnose(make(leaky))
+    assert found.verdict == "cannot tell"
+    assert named in found.reason
+    assert "\n" not in found.reason
+    assert found.score is None
+    assert found.onset_s is None
+
+
+def test_unusable_is_one_line(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    assert isinstance(detector.name, str)
+    for change in ("no samples", "30 samples", "no pressure", "constant pressure"):
+        reason = detector.usable(HOPELESS[change][0](leaky))
+        assert isinstance(reason, str)
+        assert reason
+        assert "\n" not in reason
+
+
+def test_deterministic(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    assert examined(detector, leaky) == examined(detector, leaky)
+
+
+@pytest.mark.parametrize("case", ["leaky", "sound"])
+@pytest.mark.parametrize("factor, offset", [(3.0, 0.0), (1.0, 1.0e5), (1.0 / 6894.757, -50.0)])
+def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
+    detector, factor: float, offset: float, case: str, request: pytest.FixtureRequest
+) -> None:
+    recording = request.getfixturevalue(case)
+    scaled = with_channels(recording, **{name: factor * recording[name] + offset for name in ("p_A", "p_B")})
+    before, after = examined(detector, recording), examined(detector, scaled)
+    assert after.verdict == before.verdict
+    assert after.score == pytest.approx(before.score, rel=1e-6)
+    assert after.threshold == pytest.approx(before.threshold, rel=1e-6)
+    assert after.onset_s == before.onset_s
+
+
+def test_never_sees_the_flow_meter_the_pump_ports_or_where_the_data_come_from(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    plain = examined(detector, leaky)
+    lying = with_channels(leaky, q_leak=np.linspace(0.0, 1.0, len(leaky)), p_1=np.zeros(len(leaky)))
+    assert examined(detector, lying) == plain
+    assert (
+        examined(detector, replace(leaky, provenance={"experiment": {"leak": "none"}}, history=("no leak",))) == plain
+    )
+    without = leaky.only(name for name in leaky.channels if name != "q_leak")
+    assert examined(detector, without) == plain
+
+
+def test_onset_is_on_the_recordings_own_clock(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    here, later = examined(detector, leaky), examined(detector, replace(leaky, t=leaky.t + 1000.0))
+    assert here.verdict == later.verdict == "leak"
+    assert here.onset_s is not None
+    assert here.onset_interval_s is not None
+    assert later.onset_s == pytest.approx(here.onset_s + 1000.0, abs=1e-6)
+    assert later.onset_interval_s == pytest.approx([one + 1000.0 for one in here.onset_interval_s], abs=1e-6)
+    assert here.score == pytest.approx(later.score, rel=1e-9)
+
+
+def test_a_smaller_false_alarm_probability_asks_for_more(detector, sound: Recording) -> None:  # type: ignore[no-untyped-def]
+    thresholds = [examined(detector, sound, p).threshold for p in (0.2, 0.05, 0.01)]
+    assert thresholds == sorted(thresholds)
+    assert len(set(thresholds)) == 3
+
+
+def test_methods_state_their_own_evidence(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    found = examined(detector, leaky)
+    assert found.methods
+    for method in found.methods:
+        assert method.verdict in VERDICTS
+        assert method.score is not None
+        assert method.threshold is not None
+        assert (method.verdict == "no leak") == (method.score <= method.threshold)
+        if method.name.startswith("RMS of d1 "):
+            assert method.verdict != "leak"  # noise alone never is a leak

@@ -1,0 +1,149 @@
+"""The output contract: keys, types, plain JSON, whatever the input."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.verdict import Diagnosis
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Recording
+
+KEYS = [
+    "file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm",
+    "false_alarm_probability", "score", "threshold", "methods", "quality",
+]  # fmt: skip
+VERDICTS = ("leak", "no leak", "cannot tell")
+
+
+def is_number(value: object) -> bool:
+    return value is None or (type(value) is float and math.isfinite(value))
+
+
+def is_pair(value: object) -> bool:
+    return value is None or (isinstance(value, list) and len(value) == 2 and all(type(one) is float for one in value))
+
+
+def check(found: Diagnosis) -> None:
+    """Everything that another program may rely on, after a way through text."""
+    line = json.dumps(found.as_dict(), allow_nan=False)
+    assert "\n" not in line
+    told = json.loads(line)
+    assert list(told) == KEYS
+    assert type(told["file"]) is str
+    assert told["verdict"] in VERDICTS
+    assert told["reason"]
+    assert type(told["reason"]) is str
+    assert "\n" not in told["reason"]
+    assert is_number(told["onset_s"])
+    assert is_number(told["score"])
+    assert is_number(told["threshold"])
+    assert is_number(told["leak_lpm"])
+    assert is_pair(told["onset_interval_s"])
+    assert is_pair(told["leak_interval_lpm"])
+    assert type(told["false_alarm_probability"]) is float
+    assert told["methods"]
+    for method in told["methods"]:
+        assert list(method) == ["name", "score", "threshold", "verdict", "reason"]
+        assert type(method["name"]) is str
+        assert type(method["reason"]) is str
+        assert method["verdict"] in VERDICTS
+        assert is_number(method["score"])
+        assert is_number(method["threshold"])
+    for finding in told["quality"]:
+        assert list(finding) == ["code", "channel", "count", "first_t", "severity", "text"]
+        assert type(finding["count"]) is int
+        assert finding["severity"] in ("note", "warning", "fatal")
+        assert is_number(finding["first_t"])
+    if told["onset_s"] is not None:
+        first, last = told["onset_interval_s"]
+        assert told["verdict"] == "leak"
+        assert first <= told["onset_s"] <= last
+
+
+def test_contract_of_a_leak(leaky: Recording) -> None:
+    found = diagnose(leaky, file="rig.csv")
+    assert (found.verdict, found.file) == ("leak", "rig.csv")
+    check(found)
+    told = found.as_dict()
+    assert told["leak_lpm"] is None
+    assert told["leak_interval_lpm"] is None
+    assert told["false_alarm_probability"] == 0.01
+    assert told["methods"][0] == {
+        "name": "rms change",
+        "score": told["score"],
+        "threshold": told["threshold"],
+        "verdict": "leak",
+        "reason": told["reason"],
+    }
+    assert [one["name"] for one in told["methods"][1:]] == [
+        f"RMS of {quantity} of {chamber}" for chamber in ("p_A", "p_B") for quantity in ("d1", "d2", "d3", "d4", "d3d4")
+    ]
+
+
+def test_contract_of_the_other_verdicts(sound: Recording) -> None:
+    for found, verdict in ((diagnose(sound), "no leak"), (diagnose(sound.between(0, 3)), "cannot tell")):
+        assert found.verdict == verdict
+        check(found)
+
+
+def test_numbers_that_json_does_not_know_become_null() -> None:
+    found = Diagnosis("f", "leak", "r", math.inf, (-math.inf, 3.0), None, None, 0.01, math.nan, math.inf, (), ())
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert told["onset_s"] is told["score"] is told["threshold"] is None
+    assert told["onset_interval_s"] == [None, 3.0]
+
+
+def test_a_part_analysed_is_told(leaky: Recording) -> None:
+    p_A = np.array(leaky["p_A"])
+    p_A[1000] = np.nan
+    found = diagnose(Recording(leaky.t, {**leaky.channels, "p_A": p_A}, leaky.units, leaky.rate))
+    codes = {finding.code: finding for finding in found.quality}
+    assert codes["part_analysed"].count == 1001
+    assert codes["missing"].channel == "p_A"
+    check(found)
+
+
+@pytest.mark.parametrize("probability", [0.0, -0.1, 1e-5, 0.21, 1.0, math.nan, math.inf])
+def test_a_probability_no_threshold_can_be_set_for(probability: float, sound: Recording) -> None:
+    with pytest.raises(InputError, match=r"^false-alarm probability must be 0\.0001 to 0\.2, got "):
+        diagnose(sound, false_alarm_probability=probability)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_any_recording_gets_a_verdict(data: st.DataObject) -> None:
+    """Channels of every kind of trouble, in any mixture and length, with or without a baseline of the same kind."""
+    random = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    rate = data.draw(st.sampled_from([0.5, 10.0, 100.0, 1000.0]))
+    names = data.draw(st.sets(st.sampled_from(["p_A", "p_B", "u", "x", "q_leak"]), min_size=1))
+
+    def channel(n: int) -> np.ndarray:
+        kind = data.draw(
+            st.sampled_from(["noise", "sine", "constant", "integers", "holes", "half rest", "huge", "none"])
+        )
+        noise = random.standard_normal(n)
+        k = np.arange(n)
+        return {
+            "noise": noise,
+            "sine": np.sin(k / 20.0) + 1e-3 * noise,
+            "constant": np.full(n, 5.0),
+            "integers": np.rint(2 * noise),
+            "holes": np.where(random.random(n) < 0.01, np.nan, noise),
+            "half rest": np.where(k < n // 2, 0.0, noise),
+            "huge": noise * 1e160,
+            "none": np.full(n, np.nan),
+        }[kind]
+
+    def one() -> Recording:
+        n = data.draw(st.sampled_from([0, 1, 2, 30, 226, 1000, 4000]))
+        return Recording(np.arange(n) / rate, {name: channel(n) for name in names}, dict.fromkeys(names, "count"), rate)
+
+    check(diagnose(one(), [one() for _ in range(data.draw(st.integers(0, 4)))], false_alarm_probability=0.05))

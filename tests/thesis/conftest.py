@@ -1,0 +1,150 @@
+"""A small chapter of makers, and a made-up data sheet of the right form."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sealscope.thesis import sources
+from sealscope.thesis.conditions import APPENDIX_C
+from sealscope.thesis.sheet import FILES, QUANTITIES
+
+CHAPTER = """
+import os, time
+from pathlib import Path
+from sealscope.thesis.context import RunSpec
+from sealscope.thesis.products import Claim, Curve, Figure, Panel, Table
+
+FACTOR = 1
+
+
+def _note(item):
+    with open(os.environ["FAKE_LOG"], "a") as log:
+        log.write(item.id + "\\n")
+
+
+def table(context, item):
+    _note(item)
+    return (Table(item.id, item.title, ("a", "b [Pa]"), ((1 * FACTOR, 2.5), ("x", None))),)
+
+
+def doubled(context, item):
+    _note(item)
+    found = context.product("t-1")
+    return (Table(item.id, item.title, ("a",), ((2 * found[0].rows[0][0],),)),)
+
+
+def slow(context, item):
+    time.sleep(0.4)
+    _note(item)
+    return (Table(item.id, item.title, ("a",), ((1,),)),)
+
+
+def broken(context, item):
+    _note(item)
+    raise RuntimeError("no such curve\\nsecond line")
+
+
+def interrupted(context, item):
+    if not Path(os.environ["FAKE_LOG"] + ".go").exists():
+        raise KeyboardInterrupt
+    _note(item)
+    return (Table(item.id, item.title, ("a",), ((1,),)),)
+
+
+def dies(context, item):
+    os._exit(3)
+
+
+def unknown_need(context, item):
+    return context.product("t-1")
+
+
+def measured(context, item):
+    _note(item)
+    return (Table(item.id, item.title, ("d3",), ((float(context.sheet.rms["p_A"]["d3"][0, 0]),),)),)
+
+
+def perhaps_measured(context, item):
+    _note(item)
+    return (Table(item.id, item.title, ("there",), ((context.sheet is not None,),)),)
+
+
+def simulated(context, item):
+    _note(item)
+    run = context.run(RunSpec("3 sin(4t)", 2.0, prove=True))
+    curve = Curve(run.t, run.outputs["p_A"] / 1e6, "p_A", "A")
+    return (Figure(item.id, item.title, (Panel("t [s]", "p_A [MPa]", (curve,)),), resolved=run.resolved),)
+"""
+
+
+@pytest.fixture
+def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A chapter of makers that note each time they work; gives its file."""
+    package = tmp_path / "path" / "fakes"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package / "chapter.py").write_text(CHAPTER)
+    monkeypatch.syspath_prepend(str(package.parent))
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "log"))
+    monkeypatch.delenv("SEALSCOPE_SHEET", raising=False)
+    monkeypatch.chdir(tmp_path)
+    _forget()
+    return package / "chapter.py"
+
+
+def _forget() -> None:
+    """Let this process see edited sources, as a new call would."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "fakes"]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+    sources.sources_key.cache_clear()
+    sources._imported.cache_clear()
+    sources._file.cache_clear()
+
+
+@pytest.fixture
+def edit(fakes: Path) -> Callable[[str, str], None]:
+    """Edit the chapter's source, as somebody would between two calls."""
+
+    def edited(old: str, new: str) -> None:
+        text = fakes.read_text()
+        assert old in text
+        fakes.write_text(text.replace(old, new))
+        _forget()
+
+    return edited
+
+
+def _write_sheet(folder: Path, shift: float = 0.0) -> Path:
+    """A sheet of the right form with made-up values."""
+    folder.mkdir(exist_ok=True)
+    for name in FILES.values():
+        rows = []
+        for test in APPENDIX_C:
+            amplitude, rest = test.command.split(" sin(")
+            row = {
+                "mean_leak_lpm": test.mean_leak_lpm,
+                "input_amplitude_v": amplitude,
+                "input_omega_rad_s": rest.removesuffix("t)") or "1",
+                "orifice_closed_pct": test.closed_pct,
+                "leakage_level": test.level,
+            }
+            row |= {f"{one}_{when}": 1.0 + shift for one in QUANTITIES for when in ("no_leak", "leak")}
+            rows.append(row)
+        with (folder / name).open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0])
+            writer.writeheader()
+            writer.writerows(rows)
+    return folder
+
+
+@pytest.fixture
+def write_sheet() -> Callable[..., Path]:
+    """Write a made-up sheet into a folder (second argument: what its values are above 1) and give the folder."""
+    return _write_sheet

@@ -1,0 +1,172 @@
+"""Appendix C simulated: with the leak, with nothing, and with drift alone (on two conditions and short records)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sealscope.parameters import load_rig
+from sealscope.thesis import appendix_c, simulated_sheet
+from sealscope.thesis.conditions import APPENDIX_C
+from sealscope.thesis.context import Sheet
+from sealscope.thesis.products import Product, Table
+from sealscope.thesis.simulated_sheet import CHAMBERS, QUANTITIES, Drift, drift_of, log_change, sheet_of
+
+TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
+
+
+class Made:
+    """Hands out the tables of the items it was given."""
+
+    quick = True
+
+    def __init__(self, products: dict[str, tuple[Product, ...]], sheet: Sheet | None) -> None:
+        self.products, self.sheet = products, sheet
+
+    def product(self, item: str) -> tuple[Product, ...]:
+        return self.products[item]
+
+    def run(self, spec: object) -> object:
+        raise AssertionError("nothing here may run")
+
+
+@pytest.fixture(scope="module")
+def tables() -> dict[str, tuple[Table, ...]]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulated_sheet, "APPENDIX_C", TWO)
+        patch.setattr(simulated_sheet, "QUICK_HALF", 20.0)
+        context = Made({}, None)
+        items = {item.id: item for item in appendix_c.ITEMS}
+        makers = {
+            "appendix-c-leak": appendix_c.leak_table,
+            "appendix-c-no-leak": appendix_c.no_leak_table,
+            "appendix-c-drift": appendix_c.drift_table,
+        }
+        return {name: make(context, items[name]) for name, make in makers.items()}  # type: ignore[arg-type]
+
+
+def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[Table, ...]]) -> None:
+    (table,) = tables["appendix-c-leak"]
+    sheet = sheet_of(table)
+    row = dict(zip(table.columns, table.rows[2], strict=True))
+    assert row["test"] == 40
+    assert row["mean leak [L/min]"] == pytest.approx(0.0163, rel=0.01)
+    assert sheet.rms["p_B"]["d4"][2].tolist() == [row["p_B d4 no leak [psi]"], row["p_B d4 leak [psi]"]]
+    assert sheet.rms["p_A"]["d3d4"][2, 1] == row["p_A d3d4 leak [psi^2]"]
+
+
+def test_the_same_condition_gives_the_same_truth_and_other_noise(tables: dict[str, tuple[Table, ...]]) -> None:
+    sheet = sheet_of(tables["appendix-c-no-leak"][0])
+    first, second = (sheet.rms["p_A"]["d1"][k] for k in (0, 1))
+    assert np.all(first != second)
+    np.testing.assert_allclose(first, second, rtol=0.05)
+    ranges = simulated_sheet.column(tables["appendix-c-no-leak"][0], "p_A range [MPa]")
+    assert ranges[0] == ranges[1] != ranges[2]
+
+
+def test_nothing_moves_without_a_leak_beyond_the_noise_of_the_estimate(tables: dict[str, tuple[Table, ...]]) -> None:
+    sheet = sheet_of(tables["appendix-c-no-leak"][0])
+    for chamber in CHAMBERS:
+        assert np.abs(log_change(sheet, chamber, "d1")).max() < 0.05  # 7500 samples: deviation about 1 % a difference
+        assert np.abs(log_change(sheet, chamber, "d3")).max() < 0.25
+
+
+def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[Table, ...]]) -> None:
+    sheet = sheet_of(tables["appendix-c-drift"][0])
+    drawn = [np.log(drift_of(condition.number).noise) for condition in TWO]
+    np.testing.assert_allclose(log_change(sheet, "p_A", "d1"), drawn, atol=0.03)
+    assert all("friction x" in str(row[3]) for row in tables["appendix-c-drift"][0].rows)
+
+
+def test_drifts_keep_within_their_bounds_and_go_both_ways() -> None:
+    drifts = [drift_of(number, draw) for number in range(1, 42) for draw in range(3)]
+    friction = np.array([drift.friction for drift in drifts]) - 1.0
+    assert np.all((np.abs(friction) >= 0.04) & (np.abs(friction) <= 0.08))
+    assert np.allclose(np.abs(np.array([drift.bulk for drift in drifts]) - 1.0), 0.03)
+    assert np.allclose(np.abs(np.array([drift.noise for drift in drifts]) - 1.0), 0.04)
+    assert 0.35 < np.mean(friction > 0) < 0.65
+    assert drift_of(7, 1) == drift_of(7, 1) != drift_of(7, 2)
+
+
+def test_a_drifted_rig_differs_in_friction_bulk_modulus_and_noise_alone() -> None:
+    rig = load_rig("thesis")
+    moved = rig.with_values(Drift(1.05, 0.97, 1.04).values(rig))
+    before = {row.name: row.value for row in rig.table()}
+    ratios = {
+        row.name: float(row.value) / float(before[row.name]) for row in moved.table() if row.value != before[row.name]
+    }
+    assert ratios == pytest.approx(
+        {
+            "friction.F_pr": 1.05, "friction.F_cfr": 1.05, "friction.F_v": 1.05, "fluid.K_oil": 0.97,
+            "sensors.common_noise": 1.04, "sensors.p_A.noise": 1.04, "sensors.p_B.noise": 1.04,
+        }
+    )  # fmt: skip
+
+
+def made_sheet(seed: int, shift: float) -> Sheet:
+    """41 tests whose every change is `shift` and noise."""
+    random = np.random.default_rng(seed)
+    rms = {}
+    for chamber in CHAMBERS:
+        rms[chamber] = {}
+        for name in QUANTITIES:
+            before = np.exp(random.normal(0.5, 0.2, 41))
+            rms[chamber][name] = np.column_stack([before, before * np.exp(random.normal(shift, 0.01, 41))])
+    return Sheet(rms)
+
+
+def full_table(sheet: Sheet, item: str) -> Table:
+    rows = [
+        simulated_sheet.Row(
+            condition,
+            {c: {q: (sheet.rms[c][q][k, 0], sheet.rms[c][q][k, 1]) for q in QUANTITIES} for c in CHAMBERS},
+            condition.mean_leak_lpm,
+            (0.1, 0.1),
+            True,
+        )
+        for k, condition in enumerate(APPENDIX_C)
+    ]
+    return simulated_sheet.table_of(rows, item, "made")
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["with sheet", "without sheet"])
+def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) -> None:
+    measured = made_sheet(1, -0.2)
+    twice = Sheet({c: {q: 2.0 * pairs for q, pairs in of.items()} for c, of in measured.rms.items()})
+    leak = full_table(twice, "appendix-c-leak")
+    still = full_table(made_sheet(2, 0.0), "appendix-c-no-leak")
+    products: dict[str, tuple[Product, ...]] = {"appendix-c-leak": (leak,), "appendix-c-no-leak": (still,)}
+    context = Made(products, measured if given else None)
+    items = {item.id: item for item in appendix_c.ITEMS}
+    summary, of_a, of_b = appendix_c.appendix(context, items["appendix-c"])  # type: ignore[arg-type]
+    assert (summary.id, of_a.id, of_b.id) == ("appendix-c", "appendix-c-pa", "appendix-c-pb")
+    assert (len(summary.rows), len(of_a.rows), len(of_b.rows)) == (10, 41, 41)
+    first = dict(zip(summary.columns, summary.rows[0], strict=True))
+    assert first["leak-free RMS, simulated / measured"] == (pytest.approx(2.0) if given else None)
+    assert first["tests with the same sign of change [of 41]"] == (41 if given else None)
+    row = dict(zip(of_b.columns, of_b.rows[4], strict=True))
+    pair = twice.rms["p_B"]["d3"][4]
+    assert row["d3 diff, simulated [%]"] == pytest.approx(100 * (pair[1] / pair[0] - 1))
+    assert row["d3 no leak, measured [psi]"] == (pytest.approx(pair[0] / 2) if given else None)
+
+    (figure,) = appendix_c.difference_figure(context, items["fig-5.90"])  # type: ignore[arg-type]
+    roles = [curve.role for curve in figure.panels[0].curves]
+    assert roles == [*(["measured"] if given else []), "simulated", "no leak", "reference"]
+    counts = {number.name: number.value for number in figure.numbers}
+    assert counts["simulated: tests that go down"] == "41 of 41"
+    assert figure.resolved is True
+
+
+@pytest.mark.slow
+def test_the_thesis_s_rule_fires_like_a_coin_where_nothing_leaks() -> None:
+    context = Made({}, None)
+    items = {item.id: item for item in appendix_c.ITEMS}
+    still = sheet_of(appendix_c.no_leak_table(context, items["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
+    drift = sheet_of(appendix_c.drift_table(context, items["appendix-c-drift"])[0])  # type: ignore[arg-type]
+    leak = sheet_of(appendix_c.leak_table(context, items["appendix-c-leak"])[0])  # type: ignore[arg-type]
+    for sheet in (still, drift):  # beyond 9 to 32 one column in 4000 of coins
+        for chamber in CHAMBERS:
+            assert 9 <= np.sum(log_change(sheet, chamber, "d1") < 0) <= 32, chamber
+        assert 9 <= np.sum(log_change(sheet, "p_A", "d3") < 0) <= 32
+    assert np.sum(log_change(leak, "p_A", "d3") < 0) >= 35
+    assert log_change(leak, "p_A", "d3").mean() < -5 * abs(log_change(still, "p_A", "d3").mean())

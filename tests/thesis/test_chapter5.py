@@ -1,0 +1,269 @@
+"""Figs. 5.1 to 5.89: each number shows what the thesis's figure of that number shows, and its numbers hold."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.errors import SimulationFailed
+from sealscope.recordings.recording import CHANNEL_UNITS, Recording
+from sealscope.thesis.chapter5 import ITEMS, TESTS, test_of
+from sealscope.thesis.chapter5_views import figure, mean_slope, omega_of, spec_of, windowed
+from sealscope.thesis.conditions import APPENDIX_C
+from sealscope.thesis.context import RunSpec, SimulatedRun
+from sealscope.thesis.items import Item
+from sealscope.thesis.products import Figure
+from sealscope.thesis.shown_tests import best_step, shown
+from sealscope.thesis.simulated_sheet import PSI, detail_rms
+
+test_of.__test__ = False  # a function of the package, not a test
+
+THESIS = sorted((Path(__file__).resolve().parents[3] / "shared" / "thesis").glob("0*.txt"))
+
+
+class Direct:
+    """Simulates at once and keeps in memory."""
+
+    quick, sheet = True, None
+
+    def __init__(self) -> None:
+        self.runs: dict[RunSpec, SimulatedRun] = {}
+
+    def run(self, spec: RunSpec) -> SimulatedRun:
+        from sealscope.simulation.experiment import make_experiment
+        from sealscope.simulation.simulate import run
+
+        if spec not in self.runs:
+            made = run(
+                make_experiment(
+                    rig=spec.rig,
+                    command=spec.command,
+                    duration=spec.duration,
+                    leak=spec.leaks,
+                    values=dict(spec.values),
+                    seed=spec.seed,
+                )
+            )
+            self.runs[spec] = SimulatedRun(
+                made.recording, made.truth.t, made.truth.outputs, made.truth.mean_leak_lpm, True
+            )
+        return self.runs[spec]
+
+    def product(self, item: str) -> tuple[()]:
+        return ()
+
+
+@pytest.fixture(scope="module")
+def context() -> Direct:
+    return Direct()
+
+
+def item(number: int) -> Item:
+    return ITEMS[number - 1]
+
+
+def drawn(context: Direct, number: int) -> Figure:
+    (made,) = figure(context, item(number))
+    return made
+
+
+def numbers(made: Figure) -> dict[str, float]:
+    return {one.name: float(one.value) for one in made.numbers}
+
+
+def test_every_number_once_and_in_order() -> None:
+    assert [one.id for one in ITEMS] == [f"fig-5.{n}" for n in range(1, 90)]
+
+
+@pytest.mark.skipif(not THESIS, reason="../shared/thesis is absent")
+def test_each_number_shows_what_the_thesis_s_caption_says() -> None:
+    captions = dict(re.findall(r"^Fig\. 5\.(\d+) (.+)$", THESIS[0].read_text(encoding="utf-8"), flags=re.M))
+    views: dict[int, tuple[str, str, bool]] = {}
+    of_chamber: dict[int, str] = {}
+    for text, caption in sorted(captions.items(), key=lambda pair: int(pair[0])):
+        number = int(text)
+        if number > 89:
+            continue
+        source = int(found[1]) if (found := re.search(r"Fig\. ?5\.(\d+)\.?$", caption)) else 0
+        if caption.startswith("Close-up"):
+            start, stop = map(int, re.search(r"from (\d+)th to (\d+)th", caption).groups())  # type: ignore[union-attr]
+            views[number] = (*views[source][:2], True)
+            assert (item(number).input("from_s"), item(number).input("to_s")) == (start, stop)
+        elif caption.startswith("Experimental input"):
+            views[number] = ("input", "", False)
+        elif "level of internal leakage" in caption:
+            views[number] = ("leak", "", False)
+            assert caption.split()[0].lower() == test_of(str(item(number).input("test"))).level
+        elif caption.startswith("Four-level detail"):
+            chamber = f"p_{re.search(r'of P_([AB])', caption)[1]}"  # type: ignore[index]
+            views[number] = ("details", chamber, False)
+            of_chamber[number] = chamber
+        else:
+            assert caption.startswith("RMS values")
+            views[number] = ("rms", of_chamber[source], False)
+    assert sorted(views) == list(range(1, 90))
+    for number, (view, chamber, closeup) in views.items():
+        one = item(number)
+        assert (one.input("view"), one.input("chamber")) == (view, chamber), one.id
+        assert (one.input("from_s") != 0.0) == closeup, one.id
+
+
+def test_the_row_of_a_test_is_the_one_nearest_to_the_level_s_nominal_leak() -> None:
+    assert {test.section: test.condition.number for test in TESTS} == {
+        "5.2a": 39, "5.2b": 31, "5.3a": 37, "5.3b": 21, "5.4a": 35,
+        "5.4b": 13, "5.5a": 11, "5.5b": 5, "5.5c": 7, "5.5d": 1,
+    }  # fmt: skip
+    assert [row.number for row in test_of("5.5d").candidates] == [1, 2, 3, 4]
+
+
+def test_one_run_serves_all_figures_of_a_test() -> None:
+    assert len({spec_of(test) for test in TESTS}) == 10
+    assert spec_of(TESTS[0]).duration == 120.0
+    assert {spec_of(test).duration for test in TESTS[1:]} == {180.0}
+    assert all(spec_of(test).prove for test in TESTS)
+
+
+def test_command_speed_and_displacement(context: Direct) -> None:
+    made = drawn(context, 1)
+    assert [panel.y_label for panel in made.panels] == ["u [V]", "motor speed [rpm]", "x [mm]"]
+    assert made.panels[0].curves[0].y.max() == pytest.approx(3.0, abs=1e-3)
+    assert made.panels[0].marks == ((60.0, "leak opens"),)
+    assert made.resolved is True
+    assert "row 39" in made.notes
+
+
+def test_a_close_up_holds_its_twenty_seconds_alone(context: Direct) -> None:
+    made = drawn(context, 4)
+    for panel in made.panels:
+        assert panel.x_range == (50.0, 70.0)
+        for curve in panel.curves:
+            assert 50.0 <= curve.x.min() < 50.1
+            assert 69.9 < curve.x.max() <= 70.0
+
+
+def test_the_leak_is_the_sheet_s_and_none_before_it_opens(context: Direct) -> None:
+    made = drawn(context, 3)
+    told = numbers(made)
+    assert told["mean leak while open (true)"] == pytest.approx(APPENDIX_C[38].mean_leak_lpm, rel=2e-3)
+    flow = made.panels[0].curves[0]
+    before, after = flow.y[flow.x < 59.9], flow.y[flow.x > 60.1]
+    assert np.abs(before).max() < 0.002  # ten deviations of the flow meter's noise
+    assert np.abs(after).mean() > 0.01
+
+
+def test_details_are_pywavelets_in_psi_and_split_at_the_onset(context: Direct) -> None:
+    import pywt
+
+    made = drawn(context, 6)
+    assert [panel.y_label for panel in made.panels] == [
+        "d1 [psi]", "d2 [psi]", "d3 [psi]", "d4 [psi]", "d3d4 [psi^2]",
+    ]  # fmt: skip
+    assert [curve.role for curve in made.panels[2].curves] == ["no leak", "leak"]
+    recording = context.run(spec_of(test_of("5.2a"))).recording
+    assert recording is not None
+    pressure = recording["p_A"] / PSI
+    n = pressure.size // 16 * 16
+    deepest_first = pywt.swt(pressure[:n], "db8", level=4, trim_approx=True, norm=False)[1:]
+    d3 = deepest_first[1]
+    part = slice(round(20 * recording.rate), round(59 * recording.rate))
+    near = detail_rms(recording, ((20.0, 59.0),))["p_A"]["d3"][0]
+    assert near == pytest.approx(np.sqrt(np.mean(d3[part] ** 2)), rel=0.02)
+    shown_d3 = made.panels[2].curves[0]
+    at = np.round(shown_d3.x * recording.rate).astype(int)
+    np.testing.assert_allclose(shown_d3.y, d3[at], atol=1e-9)
+
+
+def test_the_numbers_of_details_and_of_their_rms_agree(context: Direct) -> None:
+    details, rms = numbers(drawn(context, 5)), numbers(drawn(context, 7))
+    assert {name: details[name] for name in rms} == rms
+    before, after = rms["RMS of d3 without leak"], rms["RMS of d3 with leak"]
+    assert rms["change of d3"] == pytest.approx(100 * (after / before - 1))
+    assert numbers(drawn(context, 10))["RMS of d3 without leak"] != before
+
+
+def test_windows_are_a_thousand_samples_five_hundred_apart(context: Direct) -> None:
+    recording = context.run(spec_of(test_of("5.2a"))).recording
+    assert recording is not None
+    centres, curves = windowed(recording, "p_A")
+    np.testing.assert_allclose(np.diff(centres), 500 / recording.rate)
+    assert centres[0] == pytest.approx((105 + 500) / recording.rate)
+    assert set(curves) == {"d3", "d4", "d3d4"}
+    levels = [c for c in drawn(context, 7).panels[0].curves if c.role == "reference"]
+    settled = curves["d3"][(centres > 7) & (centres < 58)]
+    assert levels[0].y[0] == pytest.approx(float(np.sqrt(np.mean(settled**2))), rel=0.01)
+
+
+def test_the_drift_of_the_piston_has_a_control_without_the_leak(context: Direct) -> None:
+    test = test_of("5.2a")
+    leaking, control = shown(context, test), shown(context, test, leak=False)
+    assert leaking.drift[0] == control.drift[0]
+    assert leaking.drift[1] != control.drift[1]
+    assert control.velocity[1] > leaking.velocity[1]  # what bypasses the piston does not move it
+
+
+def test_a_run_that_failed_is_told_and_not_drawn() -> None:
+    class Failing(Direct):
+        def run(self, spec: RunSpec) -> SimulatedRun:
+            return SimulatedRun(None, np.empty(0), {}, math.nan, False, diverged="p_A is not finite at t = 3 s")
+
+    with pytest.raises(SimulationFailed, match=r"test 5\.2a: p_A is not finite"):
+        figure(Failing(), item(1))
+
+
+def test_an_unresolved_run_marks_its_figure(context: Direct) -> None:
+    class Unresolved(Direct):
+        def run(self, spec: RunSpec) -> SimulatedRun:
+            return replace(context.run(spec), resolved=False)
+
+    assert figure(Unresolved(), item(4))[0].resolved is False
+
+
+def noise(values: np.ndarray, rate: float = 500.0) -> Recording:
+    t = np.arange(values.size) / rate
+    units = {name: CHANNEL_UNITS[name] for name in ("p_A", "p_B")}
+    return Recording(t, {"p_A": values, "p_B": 2 * values}, units, rate)
+
+
+def test_detail_rms_of_white_noise_is_its_deviation_in_psi() -> None:
+    values = 1.5 * PSI * np.random.default_rng(1).standard_normal(60_000)
+    found = detail_rms(noise(values), ((5.0, 60.0), (60.0, 120.0)))
+    for level in range(1, 5):
+        assert found["p_A"][f"d{level}"] == pytest.approx((1.5, 1.5), rel=0.04)
+        assert found["p_B"][f"d{level}"] == pytest.approx((3.0, 3.0), rel=0.04)
+
+
+def test_a_part_sees_nothing_outside_of_itself() -> None:
+    values = PSI * np.random.default_rng(2).standard_normal(20_000)
+    loud = values.copy()
+    loud[:5000] += 1e6 * np.random.default_rng(3).standard_normal(5000)
+    loud[15_000:] += 1e6 * np.random.default_rng(4).standard_normal(5000)
+    part = ((10.0, 30.0),)
+    quiet, beside = detail_rms(noise(values), part), detail_rms(noise(loud), part)
+    assert {c: {q: pytest.approx(rms) for q, rms in of.items()} for c, of in quiet.items()} == beside
+    wider = detail_rms(noise(loud), ((9.6, 30.0),))
+    assert wider["p_A"]["d1"][0] > 2 * beside["p_A"]["d1"][0]
+
+
+def test_the_mean_slope_is_that_beside_the_sine() -> None:
+    t = np.arange(0, 33.3, 0.01)
+    y = 0.7 + 0.02 * t + 3.0 * np.sin(2 * t + 0.4)
+    assert mean_slope(t, y, 2.0) == pytest.approx(0.02, abs=1e-10)
+
+
+@pytest.mark.parametrize(("command", "omega"), [("3 sin(4t)", 4.0), ("8 sin(t)", 1.0)])
+def test_omega_of_a_command(command: str, omega: float) -> None:
+    assert omega_of(command) == omega
+
+
+def test_best_step_finds_a_step_and_no_end_effect() -> None:
+    t = np.arange(100.0)
+    y = np.where(t < 63, 1.0, 0.8) + 0.02 * np.random.default_rng(5).standard_normal(100)
+    assert best_step(t, y) == 62.5
+    everywhere = [best_step(t, np.random.default_rng(k).standard_normal(100)) for k in range(40)]
+    assert min(everywhere) >= 4.5
+    assert max(everywhere) <= 94.5

@@ -1,0 +1,212 @@
+"""Claims are judged by numbers: the same claim on other data gets another verdict, and the sheet's own get theirs."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.thesis import claims, claims_rates, claims_rig, claims_tests, claims_trends
+from sealscope.thesis.chapter5 import TESTS, test_of
+from sealscope.thesis.conditions import APPENDIX_C
+from sealscope.thesis.context import Sheet
+from sealscope.thesis.evidence import NO_SHEET, Evidence, correlated
+from sealscope.thesis.products import Claim, Product
+from sealscope.thesis.shown_tests import Shown
+from sealscope.thesis.simulated_sheet import CHAMBERS, QUANTITIES, Row, table_of
+
+test_of.__test__ = False  # a function of the package, not a test
+
+FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
+needs_sheet = pytest.mark.skipif(
+    not (FOLDER / "appendix_c_pa.csv").is_file(), reason="../shared/data/appendix_c_pa.csv is absent"
+)
+#: Log changes of a rig on which everything the thesis says of its columns is true.
+AS_SAID = {("p_A", "d3"): -0.3, ("p_A", "d4"): -0.3, ("p_A", "d3d4"): -0.6}
+AS_SAID |= {("p_B", "d3"): 0.3, ("p_B", "d4"): 0.3, ("p_B", "d3d4"): 0.6}
+
+
+def made(seed: int, shifts: dict[tuple[str, str], float] | None = None) -> Sheet:
+    random = np.random.default_rng(seed)
+    rms: dict[str, dict[str, np.ndarray]] = {}
+    for chamber in CHAMBERS:
+        rms[chamber] = {}
+        for name in QUANTITIES:
+            before = np.exp(random.normal(0.5, 0.2, 41))
+            change = random.normal((shifts or {}).get((chamber, name), 0.0), 0.03, 41)
+            rms[chamber][name] = np.column_stack([before, before * np.exp(change)])
+    return Sheet(rms)
+
+
+def one_shown(section: str, step_s: float | None = None) -> Shown:
+    test = test_of(section)
+    rms = {chamber: {name: (2.0, 1.5) for name in QUANTITIES} for chamber in CHAMBERS}
+    pairs = {chamber: (0.12, 0.118) for chamber in CHAMBERS}
+    steps = {chamber: test.half + 1.0 if step_s is None else step_s for chamber in CHAMBERS}
+    return Shown(test, rms, (14.0, 14.01), (0.04, 0.002), (17.0, 16.5), pairs, pairs, steps, test.half, True)
+
+
+def evidence(measured: Sheet | None, leak: Sheet | None = None) -> Evidence:
+    leak = leak or made(11, AS_SAID)
+    rows = [
+        Row(
+            row,
+            {c: {q: (leak.rms[c][q][k, 0], leak.rms[c][q][k, 1]) for q in QUANTITIES} for c in CHAMBERS},
+            row.mean_leak_lpm,
+            (0.12 * (1 + row.closed_pct / 1000 * float(row.command[0])),) * 2,
+        )
+        for k, row in enumerate(APPENDIX_C)
+    ]
+    return Evidence(
+        measured,
+        leak,
+        made(12),
+        made(13),
+        table_of(rows, "appendix-c-leak", "made"),
+        {test.section: one_shown(test.section) for test in TESTS},
+        one_shown("5.2a"),
+    )
+
+
+def every_claim(of: Evidence) -> dict[str, Claim]:
+    found = (
+        *claims_rates.claims(of),
+        *claims_trends.claims(of),
+        *claims_tests.curves(of),
+        claims_tests.consistent(of),
+        *claims_rig.claims(of),
+    )
+    return {claim.id: claim for claim in found}
+
+
+@pytest.fixture(scope="module")
+def said() -> dict[str, Claim]:
+    return every_claim(evidence(made(14, AS_SAID)))
+
+
+@pytest.fixture(scope="module")
+def nothing() -> dict[str, Claim]:
+    return every_claim(evidence(made(15)))
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict[str, Claim]:
+    from sealscope.thesis.sheet import read_sheet
+
+    return every_claim(evidence(read_sheet(FOLDER)[0]))
+
+
+def test_ids_are_unique_and_every_part_is_told(said: dict[str, Claim]) -> None:
+    of = evidence(made(14, AS_SAID))
+    listed = [*claims_rates.claims(of), *claims_trends.claims(of), *claims_tests.curves(of), *claims_rig.claims(of)]
+    assert len({claim.id for claim in listed}) == len(listed)
+    for claim in said.values():
+        assert re.fullmatch(r"claim-[a1-6](\.\d+)+", claim.id)
+        assert all((claim.where, claim.claim, claim.sheet, claim.simulation, claim.why)), claim.id
+
+
+def test_the_same_rules_hold_on_a_sheet_that_does_as_said(said: dict[str, Claim]) -> None:
+    holding = ["claim-5.5.1", "claim-5.5.5", "claim-5.3.1", "claim-5.4.1", "claim-5.6.1", "claim-5.6.2"]
+    assert {name: said[name].verdict for name in holding} == dict.fromkeys(holding, "holds")
+    assert {said[f"claim-5.2.{k}"].verdict for k in range(1, 21)} == {"holds"}
+
+
+def test_and_do_not_on_a_sheet_of_noise(nothing: dict[str, Claim]) -> None:
+    assert nothing["claim-5.5.1"].verdict == "holds in part"  # that d1 and d2 do not move is true of it
+    for name in ("claim-a.1", "claim-5.5.5", "claim-5.6.2", "claim-5.4.1", "claim-5.4.3", "claim-6.1.1"):
+        assert nothing[name].verdict == "does not hold", name
+    assert sum(nothing[f"claim-5.2.{k}"].verdict == "holds" for k in range(1, 21)) <= 3
+
+
+def test_without_the_sheet_its_claims_cannot_be_tested() -> None:
+    of = every_claim(evidence(None))
+    for name in ("claim-a.1", "claim-a.2", "claim-5.2.4", "claim-5.3.1", "claim-5.4.2", "claim-5.5.3", "claim-6.1.4"):
+        assert (of[name].verdict, of[name].sheet) == ("cannot be tested", NO_SHEET), name
+    assert of["claim-5.7.1"].verdict == "holds"
+
+
+@needs_sheet
+def test_verdicts_on_the_thesis_s_own_sheet(measured: dict[str, Claim]) -> None:
+    verdicts = {
+        "claim-a.2": "does not hold",  # 0.0042 L/min 85 % of the time
+        "claim-5.4.1": "holds", "claim-5.4.2": "holds in part", "claim-5.4.3": "holds", "claim-5.4.4": "does not hold",
+        "claim-5.4.5": "holds", "claim-5.4.6": "holds in part", "claim-5.4.7": "holds in part",
+        "claim-5.5.1": "holds in part",  # d2 of P_A moves too, d4 of P_A no more than chance
+        "claim-5.5.2": "does not hold",  # d3d4 is no surer than d3 or d4
+        "claim-5.5.5": "holds in part", "claim-5.5.7": "does not hold",
+        "claim-6.1.1": "does not hold",
+    }  # fmt: skip
+    assert {name: measured[name].verdict for name in verdicts} == verdicts
+    assert "35/41" in measured["claim-5.5.1"].why
+    assert "0.0047" in measured["claim-6.1.1"].sheet
+    assert "+8.4 %" in measured["claim-a.2"].sheet
+    assert "3/4" in measured["claim-a.2"].sheet
+
+
+def test_leak_sizes_are_judged_by_the_conditions() -> None:
+    from sealscope.thesis import claims_levels
+
+    found = {claim.id: claim for claim in claims_levels.claims()}
+    assert found["claim-5.1.2"].verdict == "does not hold"
+    assert found["claim-5.1.3"].verdict == "does not hold"
+    assert "0.0163" in found["claim-5.1.3"].sheet
+    assert "row 19" in found["claim-5.1.3"].why
+
+
+def test_the_drift_of_the_piston_is_laid_to_the_leak_only_where_the_control_drifts_on() -> None:
+    of = evidence(None)
+    assert every_claim(of)["claim-5.7.2"].verdict == "does not hold"
+    drifting_on = replace(of, control=replace(one_shown("5.2a"), drift=(0.04, 0.04)))
+    assert every_claim(drifting_on)["claim-5.7.2"].verdict == "holds"
+
+
+def test_the_onset_must_be_near_in_every_test() -> None:
+    of = evidence(None)
+    assert every_claim(of)["claim-5.7.4"].verdict == "holds"
+    one_late = replace(of, shown={**of.shown, "5.5d": one_shown("5.5d", step_s=20.0)})
+    late = every_claim(one_late)["claim-5.7.4"]
+    assert late.verdict == "does not hold"
+    assert "9/10" in late.simulation
+
+
+def test_throttles_raise_the_range_where_they_do() -> None:
+    assert every_claim(evidence(None))["claim-6.1.3"].verdict == "holds"
+    flat = evidence(None)
+    rows = tuple((*row[:5], 0.12, 0.12, *row[7:]) for row in flat.table.rows)
+    told = every_claim(replace(flat, table=replace(flat.table, rows=rows)))["claim-6.1.3"]
+    assert told.verdict != "holds"
+
+
+def test_correlations_of_41_points_differ_from_zero_above_0_31() -> None:
+    assert not correlated(0.30, 41)
+    assert correlated(-0.32, 41)
+    assert not correlated(0.32, 41, controls=5)
+
+
+def test_the_table_of_claims_gathers_all_chapters_in_order() -> None:
+    def claim(name: str, verdict: str) -> Claim:
+        return Claim(name, "there", "so it is", "a", "b", verdict, "because")  # type: ignore[arg-type]
+
+    products: dict[str, tuple[Product | Claim, ...]] = {
+        "chapter-3-claims": (claim("claim-3.2", "holds"),),
+        "chapter-4-claims": (claim("claim-4.10", "holds"), claim("claim-4.2", "does not hold")),
+        "detection-claims": (claim("claim-5.1.1", "holds in part"), claim("claim-a.1", "holds")),
+    }
+
+    class Given:
+        quick, sheet = True, None
+
+        def product(self, item: str) -> tuple[Product | Claim, ...]:
+            return products[item]
+
+        def run(self, spec: object) -> object:
+            raise AssertionError("nothing here may run")
+
+    item = next(one for one in claims.ITEMS if one.id == "claims")
+    table, verdicts = claims.table(Given(), item)  # type: ignore[arg-type]
+    assert [row[0] for row in table.rows] == ["claim-a.1", "claim-3.2", "claim-4.2", "claim-4.10", "claim-5.1.1"]
+    assert dict(verdicts.rows) == {"holds": 3, "holds in part": 1, "does not hold": 1, "cannot be tested": 0}
+    assert "not given" in table.notes

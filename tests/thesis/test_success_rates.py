@@ -1,0 +1,225 @@
+"""Exact statistics against published examples, and Table 5.1 counted anew."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sealscope.errors import InputError
+from sealscope.thesis.binomial import at_least, clopper_pearson, holm, sign_test
+from sealscope.thesis.context import Sheet
+from sealscope.thesis.leak_size import (
+    area_under_curve,
+    change_columns,
+    condition_columns,
+    condition_groups,
+    left_out_r2,
+    mean_leaks,
+    partial_correlation,
+    told_by_levels,
+)
+from sealscope.thesis.simulated_sheet import CHAMBERS, QUANTITIES
+from sealscope.thesis.success_rates import (
+    CLAIMED,
+    RATES,
+    UNCLAIMED,
+    column_tests,
+    d1_threshold,
+    drift_threshold,
+    rates,
+    thresholds,
+)
+
+FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
+needs_sheet = pytest.mark.skipif(
+    not (FOLDER / "appendix_c_pa.csv").is_file(), reason="../shared/data/appendix_c_pa.csv is absent"
+)
+
+
+@pytest.fixture(scope="module")
+def measured() -> Sheet:
+    from sealscope.thesis.sheet import read_sheet
+
+    return read_sheet(FOLDER)[0]
+
+
+def made(seed: int, shifts: dict[tuple[str, str], float] | None = None, scatter: float = 0.05, n: int = 41) -> Sheet:
+    """Sheets whose log changes scatter about the stated shifts (0 elsewhere)."""
+    random = np.random.default_rng(seed)
+    rms: dict[str, dict[str, np.ndarray]] = {}
+    for chamber in CHAMBERS:
+        rms[chamber] = {}
+        for name in QUANTITIES:
+            before = np.exp(random.normal(0.5, 0.2, n))
+            change = random.normal((shifts or {}).get((chamber, name), 0.0), scatter, n)
+            rms[chamber][name] = np.column_stack([before, before * np.exp(change)])
+    return Sheet(rms)
+
+
+# Newcombe, Statistics in Medicine 17 (1998) 857-872, Table I, method 5 (Clopper-Pearson).
+@pytest.mark.parametrize(
+    ("k", "n", "low", "high"),
+    [(81, 263, 0.2527, 0.3676), (15, 148, 0.0578, 0.1617), (0, 20, 0.0, 0.1684), (1, 29, 0.0009, 0.1776)],
+)
+def test_clopper_pearson_as_newcombe_tabulates(k: int, n: int, low: float, high: float) -> None:
+    assert clopper_pearson(k, n) == pytest.approx((low, high), abs=5e-5)
+
+
+@given(st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))), st.floats(0.5, 0.999))
+def test_clopper_pearson_leaves_half_of_alpha_beyond_each_end(pair: tuple[int, int], confidence: float) -> None:
+    k, n = pair
+    low, high = clopper_pearson(k, n, confidence)
+    assert 0.0 <= low <= k / n <= high <= 1.0
+    tail = (1.0 - confidence) / 2.0
+    if k > 0:
+        assert at_least(k, n, low) == pytest.approx(tail, rel=1e-6)
+    if k < n:
+        assert 1.0 - at_least(k + 1, n, high) == pytest.approx(tail, rel=1e-6)
+
+
+@given(st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))), st.floats(0.01, 0.99))
+def test_the_tail_is_the_sum_of_its_terms(pair: tuple[int, int], p: float) -> None:
+    k, n = pair
+    terms = math.fsum(math.comb(n, i) * p**i * (1 - p) ** (n - i) for i in range(k, n + 1))
+    assert at_least(k, n, p) == pytest.approx(terms, rel=1e-9)
+
+
+def test_sign_test_of_arbuthnot_s_82_years() -> None:
+    assert at_least(82, 82) == pytest.approx(0.5**82)
+    assert sign_test(82, 82) == sign_test(0, 82) == pytest.approx(0.5**81)
+
+
+def test_sign_test_by_hand() -> None:
+    assert sign_test(8, 10) == pytest.approx(2 * (45 + 10 + 1) / 1024)
+    assert sign_test(5, 10) == 1.0
+
+
+def test_holm_by_hand_and_in_the_order_given() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx((0.03, 0.06, 0.06, 0.02))
+    assert holm([]) == ()
+    assert holm([0.9, 0.8]) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("call", [
+    lambda: clopper_pearson(3, 2), lambda: clopper_pearson(0, 0), lambda: clopper_pearson(1, 2, 1.0),
+    lambda: sign_test(-1, 4), lambda: holm([0.5, 1.5]), lambda: at_least(1, 2, -0.1),
+])  # fmt: skip
+def test_impossible_input_is_refused(call: object) -> None:
+    with pytest.raises(InputError, match="must be"):
+        call()  # type: ignore[operator]
+
+
+@needs_sheet
+def test_table_5_1_from_the_sheet(measured: Sheet) -> None:
+    counts = {rule.name: int(rule.fires(measured).sum()) for rule in (*CLAIMED, *UNCLAIMED)}
+    assert counts == {
+        "P_A d3 down": 41, "P_A d4 down": 27, "P_A d3d4 down": 35,
+        "P_B d3 up": 21, "P_B d4 up": 31, "P_B d3d4 up": 32, "both d3d4": 26,
+        "P_A d1 down": 25, "P_A d2 down": 35, "P_B d1 up": 22, "P_B d2 up": 15,
+    }  # fmt: skip
+
+
+@needs_sheet
+def test_what_the_columns_of_the_sheet_show_beyond_chance(measured: Sheet) -> None:
+    rows = {(row[0], row[1]): row for row in column_tests(measured)}
+    assert {key for key, row in rows.items() if row[-1] == "yes"} == {
+        ("p_A", "d2"), ("p_A", "d3"), ("p_A", "d3d4"), ("p_B", "d4"), ("p_B", "d3d4"),
+    }  # fmt: skip
+    assert rows["p_A", "d3"][5] == pytest.approx(2 * 0.5**41)
+    assert rows["p_A", "d4"][6] > 0.25  # 27 of 41 is no more than chance
+
+
+@needs_sheet
+def test_with_a_threshold_from_d1_the_sheet_s_d3_finds_35_of_41(measured: Sheet) -> None:
+    rows = {row[0]: row for row in thresholds(measured, made(1), made(2))}
+    assert rows["P_A d3 down"][2] == "35/41"
+    assert d1_threshold(measured, "p_A") == pytest.approx(0.0723, abs=5e-4)
+
+
+@needs_sheet
+def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured: Sheet) -> None:
+    leak, given_condition = mean_leaks(), condition_columns()
+    change = np.log(measured.rms["p_A"]["d3"][:, 1] / measured.rms["p_A"]["d3"][:, 0])
+    assert abs(partial_correlation(change, leak, given_condition)) < 0.1
+    assert np.corrcoef(change, leak)[0, 1] < -0.6
+    assert left_out_r2(given_condition, leak) == pytest.approx(0.76, abs=0.01)
+    assert left_out_r2(change_columns(measured), leak) == pytest.approx(0.45, abs=0.01)
+
+
+@needs_sheet
+def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured: Sheet) -> None:
+    by_test = told_by_levels(measured, np.arange(41))
+    by_condition = told_by_levels(measured, condition_groups())
+    assert by_test.accuracy > 0.9
+    assert by_test.auc > 0.95
+    assert by_condition.auc <= by_test.auc
+    assert by_condition.accuracy > 0.85
+
+
+def test_rates_stand_beside_their_controls() -> None:
+    leak = made(1, {("p_A", "d3"): -0.3, ("p_A", "d3d4"): -0.5, ("p_B", "d3d4"): 0.5})
+    drift = made(3, n=123)
+    rows = {str(row[0]): dict(zip(RATES, row, strict=True)) for row in rates(None, leak, made(2), drift)}
+    assert rows["P_A d3 down"]["simulated leak: fires"] == "41/41"
+    assert rows["both d3d4"]["simulated leak: rate [%]"] == 100.0
+    assert rows["P_A d3 down"]["sheet: fires"] is None
+    assert rows["always fires"]["simulated, drift only: fires"] == "123/123"
+    assert rows["never fires"]["simulated leak: fires"] == "0/41"
+    for rule in ("always fires", "never fires"):
+        assert rows[rule]["simulated leak less drift [points]"] == 0.0
+    chance = rows["P_A d4 down"]
+    assert 25.0 < chance["simulated, drift only: rate [%]"] < 75.0  # type: ignore[operator]
+    low, high = clopper_pearson(41, 41)
+    assert rows["P_A d3 down"]["simulated leak: 95 % low [%]"] == pytest.approx(100 * low)
+    assert rows["P_A d3 down"]["simulated leak: 95 % high [%]"] == pytest.approx(100 * high)
+
+
+def test_thresholds_let_the_stated_share_of_leak_free_tests_through() -> None:
+    still = made(4, n=20_000)
+    for chamber in CHAMBERS:
+        assert d1_threshold(still, chamber) == pytest.approx(1.645 * 0.05, rel=0.03)
+        assert d1_threshold(still, chamber, either_side=True) == pytest.approx(1.960 * 0.05, rel=0.03)
+        limit = drift_threshold(still, chamber, "d4")
+        change = np.log(still.rms[chamber]["d4"][:, 1] / still.rms[chamber]["d4"][:, 0])
+        way = -1 if chamber == "p_A" else 1
+        assert np.mean(change * way > limit) == pytest.approx(0.05, abs=1e-3)
+
+
+def test_column_tests_find_what_moves_and_little_else() -> None:
+    moved = {(row[0], row[1]) for row in column_tests(made(5, {("p_B", "d4"): 0.2})) if row[-1] == "yes"}
+    assert moved == {("p_B", "d4")}
+    false = sum(any(row[-1] == "yes" for row in column_tests(made(seed))) for seed in range(100, 300))
+    assert false <= 20  # 200 sheets of nothing: at most 5 % of them name any column, 20 is four deviations above
+
+
+def test_left_out_r2_is_that_of_leaving_each_out() -> None:
+    random = np.random.default_rng(6)
+    X = np.column_stack([np.ones(30), random.standard_normal((30, 2))])
+    y = X @ np.array([1.0, 2.0, -1.0]) + random.standard_normal(30)
+    predicted = np.array(
+        [X[k] @ np.linalg.lstsq(np.delete(X, k, 0), np.delete(y, k), rcond=None)[0] for k in range(30)]
+    )
+    assert left_out_r2(X, y) == pytest.approx(1 - np.sum((y - predicted) ** 2) / np.sum((y - y.mean()) ** 2))
+
+
+def test_partial_correlation_takes_the_common_cause_out() -> None:
+    random = np.random.default_rng(7)
+    cause = random.standard_normal(5000)
+    x, y = cause + random.standard_normal(5000), cause + random.standard_normal(5000)
+    given_cause = np.column_stack([np.ones(5000), cause])
+    assert np.corrcoef(x, y)[0, 1] > 0.45
+    assert abs(partial_correlation(x, y, given_cause)) < 0.05
+
+
+def test_levels_without_information_tell_nothing() -> None:
+    told = told_by_levels(made(8, scatter=0.4), np.arange(41))
+    assert 0.3 < told.auc < 0.7
+
+
+def test_area_under_the_curve_by_hand() -> None:
+    assert area_under_curve(np.array([3.0, 2.0]), np.array([1.0, 2.0])) == (1 + 1 + 1 + 0.5) / 4
