@@ -136,7 +136,9 @@ def calibrate(
     for name, values in scores.items():
         scorer(name)
         if len(values) != len(places):
-            raise InputError(f"scores of {name!r} must be as many as the recordings, got {len(values)} for {len(places)}")
+            raise InputError(
+                f"scores of {name!r} must be as many as the recordings, got {len(values)} for {len(places)}"
+            )
     needed = records_needed(rate, confidence if promise == "bound" else None)
     groups = []
     for members in grouped(places):
@@ -213,7 +215,9 @@ def load(path: str | os.PathLike[str]) -> Calibration:
     except OSError as error:
         raise UnreadableFile(f"a calibration must be readable, got: {error.strerror or error} ({file})") from None
     except (ValueError, RecursionError):
-        raise UnreadableFile(f"a calibration must be a JSON file of sealscope calibrate, got something else ({file})") from None
+        raise UnreadableFile(
+            f"a calibration must be a JSON file of sealscope calibrate, got something else ({file})"
+        ) from None
     if not isinstance(tree, dict) or tree.get("format") != FORMAT:
         got = tree.get("format") if isinstance(tree, dict) else type(tree).__name__
         raise UnreadableFile(f"a calibration must say format {FORMAT!r}, got {got!r} ({file})")
@@ -222,7 +226,9 @@ def load(path: str | os.PathLike[str]) -> Calibration:
     except InputError as error:
         raise UnreadableFile(f"{error} ({file})") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UnreadableFile(f"a calibration must be complete, got a wrong or missing entry: {error} ({file})") from None
+        raise UnreadableFile(
+            f"a calibration must be complete, got a wrong or missing entry: {error} ({file})"
+        ) from None
 
 
 def _from(tree: Mapping[str, Any]) -> Calibration:
@@ -234,7 +240,9 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
         thresholds = {name: Threshold(**values) for name, values in one["thresholds"].items()}
         for name, threshold in thresholds.items():
             if name not in detectors or not math.isfinite(threshold.value):
-                raise InputError(f"a threshold must be a finite number of a listed detector, got {threshold.value} of {name!r}")
+                raise InputError(
+                    f"a threshold must be a finite number of a listed detector, got {threshold.value} of {name!r}"
+                )
         low, high = (float(value) for value in one["levels"])
         short, long = (float(value) for value in one["durations_s"])
         groups.append(Group(OperatingPoint(**point), int(one["records"]), (low, high), (short, long), thresholds))

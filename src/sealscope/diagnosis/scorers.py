@@ -1,4 +1,5 @@
-"""Scorers: what a detector makes of a recording before any threshold, one number, higher where it looks more like a leak.
+"""Scorers: what a detector makes of a recording before any threshold, one number, higher where it looks more like a
+leak.
 
 A threshold comes from leak-free recordings (`calibration.py`); a scorer that has one of its own (a bare sign rule, a
 detector with a threshold from within the recording) states it as `threshold`.
@@ -116,7 +117,11 @@ class Scorer:
 
 
 def _number(value: float | None, what: str) -> Score:
-    return Score(None, reason=f"{what} cannot be computed: too short, or its reading does not move") if value is None else Score(value)
+    return (
+        Score(None, reason=f"{what} cannot be computed: too short, or its reading does not move")
+        if value is None
+        else Score(value)
+    )
 
 
 def _of_details() -> Iterator[Scorer]:
@@ -141,7 +146,9 @@ def _of_details() -> Iterator[Scorer]:
 
                 about = f"the RMS of {name} {word} after the split, as change of its logarithm"
                 yield Scorer(f"{name} {word}", "one-sided", "split", about, moved)
-                yield Scorer(f"sign rule: {name} {word}", "one-sided", "split", f"{about}; any change at all", moved, 0.0)
+                yield Scorer(
+                    f"sign rule: {name} {word}", "one-sided", "split", f"{about}; any change at all", moved, 0.0
+                )
 
             def either(look: Look, change: Callable[[Look, float], Score] = change) -> Score:
                 return change(look, 0.0)
@@ -209,5 +216,7 @@ def scorer(name: str) -> Scorer:
 
         near = difflib.get_close_matches(str(name), SCORERS, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"a detector must be a scorer's name such as 'd3 of p_A fell' or 'rms change', got {name!r}{hint}")
+        raise InputError(
+            f"a detector must be a scorer's name such as 'd3 of p_A fell' or 'rms change', got {name!r}{hint}"
+        )
     return SCORERS[name]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sealscope.thesis.calibration import Free
+from sealscope.thesis.calibration_search import Free
 
 #: Sampling rates tried [Hz].
 RATES = (1000.0, 500.0, 200.0, 100.0)

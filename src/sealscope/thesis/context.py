@@ -14,8 +14,9 @@ from sealscope.thesis.products import Claim, Product
 class RunSpec:
     """A simulated run, in words; equal specs are run once and kept on disk.
 
-    `values`: parameters by name, as text with unit or SI number; `leaks` as `simulation.faults.parse_leak` reads them; `prove`: do the halving test too (its outcome is in
-    `SimulatedRun.resolved`; an unresolved run is kept and marked, not raised).
+    `values`: parameters by name, as text with unit or SI number; `leaks` as `simulation.faults.parse_leak` reads
+    them; `prove`: do the halving test too (its outcome is in `SimulatedRun.resolved`; an unresolved run is kept and
+    marked, not raised).
     """
 
     command: str = "3 sin(4t)"
@@ -32,8 +33,9 @@ class RunSpec:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """What a run left: the recording, the true outputs at its samples (`simulation.simulate.TRUE_OUTPUTS`), the mean leak it had, and whether halving
-    the step moved nothing too far (None: not asked). `diverged` holds the one-line reason of a run that failed; recording and outputs are then empty."""
+    """What a run left: the recording, the true outputs at its samples (`simulation.simulate.TRUE_OUTPUTS`), the mean
+    leak it had, and whether halving the step moved nothing too far (None: not asked). `diverged` holds the one-line
+    reason of a run that failed; recording and outputs are then empty."""
 
     recording: Recording | None
     t: Array
@@ -48,7 +50,8 @@ class SimulatedRun:
 class Sheet:
     """The thesis's own data sheet (its Appendix C), read from the two files of it where they are given.
 
-    `rms[chamber][quantity]`: (41, 2) RMS without and with the leak, chambers "p_A", "p_B", quantities d1..d4, d3d4; rows in the order of `conditions.APPENDIX_C`.
+    `rms[chamber][quantity]`: (41, 2) RMS without and with the leak, chambers "p_A", "p_B", quantities d1..d4, d3d4;
+    rows in the order of `conditions.APPENDIX_C`.
     """
 
     rms: Mapping[str, Mapping[str, Array]]

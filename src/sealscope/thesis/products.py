@@ -9,7 +9,8 @@ import numpy as np
 
 from sealscope.recordings.recording import Array
 
-#: How a curve is drawn: what it stands for. `reporting.plots` gives each a line, a grey and a colour, readable without the colour.
+#: How a curve is drawn: what it stands for. `reporting.plots` gives each a line, a grey and a colour, readable
+#: without the colour.
 Role = Literal[
     "command", "A", "B", "line 1", "line 2", "literal", "converged", "no leak", "leak", "measured", "simulated",
     "25 %", "50 %", "75 %", "open", "d1", "d2", "d3", "d4", "d3d4", "reference", "other",
@@ -66,8 +67,8 @@ class Number:
 class Figure:
     """A figure under the thesis's own number.
 
-    `claims`: ids of the claims it bears on; `resolved`: whether every run in it passed the halving test (None: nothing simulated); a figure that
-    did not is marked on its face.
+    `claims`: ids of the claims it bears on; `resolved`: whether every run in it passed the halving test (None:
+    nothing simulated); a figure that did not is marked on its face.
     """
 
     id: str
@@ -99,7 +100,8 @@ Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
 
 @dataclass(frozen=True)
 class Claim:
-    """One testable sentence of the thesis, in our words: where it stands, what the sheet says, what the simulation says, the verdict, and why."""
+    """One testable sentence of the thesis, in our words: where it stands, what the sheet says, what the simulation
+    says, the verdict, and why."""
 
     id: str
     where: str
