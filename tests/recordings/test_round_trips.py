@@ -160,7 +160,7 @@ def test_interrupted_by_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     [
         (plain(), "log.xlsx", "must end in"),
         (plain(), "log", "must end in"),
-        (plain(), "absent/log.csv", "cannot write"),
+        (plain(), "absent/log.csv", "folder of a file to write must exist"),
         (plain(0), "log.nc", "at least one sample"),
         (Recording([0, 1], {"load": [1, 2]}, {"load": "N"}, 1.0), "log.csv", "channel to write must be one of"),
         (Recording([0, 1], {"p_A": [1, 2]}, {"p_A": "psi"}, 1.0), "log.csv", "must be in Pa or count"),
