@@ -41,6 +41,13 @@ def simulate(
     leak: Annotated[
         list[str] | None, typer.Option("--leak", help="Leak, e.g. '0.0042 L/min from 90 s'; repeat to combine.")
     ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            help="Another fault, e.g. 'air 1 % from 90 s', 'sensor p_A offset 2 psi'; repeat.",
+        ),
+    ] = None,
     duration: Annotated[str, typer.Option("--duration", help="Length [s].")] = "180",
     start: Annotated[
         str, typer.Option("--start-position", help="Piston position at the start, from mid-stroke [m].")
@@ -76,6 +83,7 @@ def simulate(
         rig=rig_with(rig, settings),
         command=command,
         leak=leak,
+        fault=fault,
         duration=parse_quantity(duration, "s", name="--duration"),
         x_0=parse_quantity(start, "m", name="--start-position"),
         seed=seed,
@@ -98,6 +106,8 @@ def simulate(
     )
     for one in made.truth.leaks:
         typer.echo(f"leak: {one}")
+    for other in made.truth.faults:
+        typer.echo(f"fault: {other}")
     if made.truth.leaks:
         typer.echo(f"mean leak while open: {made.truth.mean_leak_lpm:.5g} L/min")
 

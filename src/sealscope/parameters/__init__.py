@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sealscope.parameters.actuator import Cylinder, Friction
-    from sealscope.parameters.drive import Fluid, Line, Motor, Pump
+    from sealscope.parameters.drive import Fluid, Line, MakeUp, Motor, Pump
     from sealscope.parameters.instruments import Daq, PressureTransducer, Sensors
     from sealscope.parameters.load import load_rig, rig_names
     from sealscope.parameters.names import parse_setting, parse_settings
@@ -20,6 +20,7 @@ _HOMES = {
     "Fluid": "drive",
     "Friction": "actuator",
     "Line": "drive",
+    "MakeUp": "drive",
     "Motor": "drive",
     "PressureTransducer": "instruments",
     "Pump": "drive",
@@ -40,6 +41,7 @@ __all__ = [
     "Fluid",
     "Friction",
     "Line",
+    "MakeUp",
     "Motor",
     "PressureTransducer",
     "Pump",

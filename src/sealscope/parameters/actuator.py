@@ -19,6 +19,8 @@ class Cylinder(Part):
     k_stop: Annotated[float, quantity("stiffness of the end stop", "N/m", gt=0, le=1e12)]
     d_stop: Annotated[float, quantity("damping of the end stop", "N s/m", ge=0, le=1e9)]
     F_l: Annotated[float, quantity("constant external load", "N", ge=-1e8, le=1e8)]
+    G_ext_A: Annotated[float, quantity("leakage conductance of the rod seal of A", "m^3/(s Pa)", ge=0, le=1e-6)]
+    G_ext_B: Annotated[float, quantity("leakage conductance of the rod seal of B", "m^3/(s Pa)", ge=0, le=1e-6)]
 
 
 class Friction(Part):

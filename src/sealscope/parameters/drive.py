@@ -51,8 +51,22 @@ class Line(Part):
 
 
 class Fluid(Part):
-    """The oil and the pressure the closed circuit is charged to."""
+    """The oil, the air in it, and the pressure the closed circuit is charged to."""
 
     K_oil: Annotated[float, quantity("effective bulk modulus", "Pa", gt=0, le=1e11)]
     rho: Annotated[float, quantity("density", "kg/m^3", gt=0, le=1e4)]
     p_charge: Annotated[float, quantity("charge pressure: all pressures at the start", "Pa", ge=0, le=1e8)]
+    air: Annotated[float, quantity("free air in the oil, by volume of oil at atmospheric pressure", "1", ge=0, le=0.5)]
+    n_air: Annotated[float, quantity("polytropic exponent of the air in the oil", "1", ge=1, le=1.4)]
+
+
+class MakeUp(Part):
+    """Accumulator and check valves that replace the oil lost to the outside; `check_valves = "absent"`: none.
+
+    The accumulator holds the charge pressure at the start and feeds each side of the circuit through a check valve.
+    """
+
+    check_valves: Annotated[Literal["absent", "present"], choice("make-up from an accumulator in the model")]
+    p_crack: Annotated[float, quantity("pressure that opens a check valve", "Pa", ge=0, le=1e7)]
+    G_check: Annotated[float, quantity("conductance of an open check valve", "m^3/(s Pa)", gt=0, le=1e-6)]
+    V_gas: Annotated[float, quantity("gas in the accumulator at the charge pressure", "m^3", gt=0, le=10)]

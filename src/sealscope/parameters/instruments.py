@@ -22,6 +22,7 @@ class PressureTransducer(Part):
     hum_frequency: Annotated[float, quantity("frequency of mains hum", "Hz", gt=0, le=1e3)]
     stuck_rate: Annotated[float, quantity("rate at which the reading gets stuck", "1/s", ge=0, le=1e3)]
     drop_rate: Annotated[float, quantity("rate of lost samples", "1/s", ge=0, le=1e6)]
+    delay: Annotated[float, quantity("delay: the reading is the pressure of this time before", "s", ge=0, le=1)]
 
     @model_validator(mode="after")
     def _range_is_a_range(self) -> Self:
@@ -35,6 +36,7 @@ class PositionEncoder(Part):
 
     resolution: Annotated[float, quantity("length of one count (0: no quantisation)", "m", ge=0, le=0.1)]
     noise: Annotated[float, quantity("white noise before counting, standard deviation", "m", ge=0, le=0.1)]
+    scale_error: Annotated[float, quantity("relative error of the scale", "1", gt=-1, le=1)]
 
 
 class AngleEncoder(Part):

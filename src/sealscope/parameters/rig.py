@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 
 from sealscope.errors import InputError
 from sealscope.parameters.actuator import Cylinder, Friction
-from sealscope.parameters.drive import Fluid, Line, Motor, Pump
+from sealscope.parameters.drive import Fluid, Line, MakeUp, Motor, Pump
 from sealscope.parameters.fields import Part, PartsDisagreeError, choices_of, leaves, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
 from sealscope.parameters.names import closest, resolve
@@ -60,6 +60,7 @@ class Rig(Part):
     cylinder: Cylinder
     friction: Friction
     fluid: Fluid
+    makeup: MakeUp
     sensors: Sensors
     daq: Daq
     _name: str = PrivateAttr(default="")

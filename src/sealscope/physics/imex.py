@@ -24,6 +24,7 @@ from sealscope.physics.rig import (
     P_B,
     POSITION,
     RigNumbers,
+    bulk_modulus,
     observe,
     rates_without_throttles,
     throttle_flow_A,
@@ -33,6 +34,10 @@ from sealscope.physics.rig import (
 #: Nodes of the step at which the inputs are needed.
 IMEX_NODES = (0.0, 1 / 2, 83 / 250, 31 / 50, 17 / 20, 1.0)
 GAMMA = 1 / 4
+#: With air in the oil an implicit stage is solved anew with the bulk moduli of the pressures that it found, until these
+#: move by less than this [Pa], or this many times (each brings them nearer by about a factor of ten).
+AIR_SETTLED = 1e-2
+AIR_TURNS = 12
 
 EXPLICIT = np.array(
     [
@@ -88,15 +93,17 @@ def advance_imex(
     every: int,
     rows: np.ndarray,
 ) -> None:
-    """Advance `y` (10,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
+    """Advance `y` (11,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
-    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 15).
+    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 17).
     """
     n, stages = u.shape
     size = y.size
     f = np.zeros((stages, size))  # explicit rates
     s = np.zeros((stages, 4))  # implicit rates of p_A, p_B, p_1, p_2
     z = np.empty(size)
+    known = np.empty(4)  # a stage's pressures without its own implicit rates
+    turns = 1 if len(p.aerated) == 0 else AIR_TURNS
     for step in range(n):
         if step % every == 0:
             observe(y, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
@@ -111,23 +118,33 @@ def advance_imex(
                 for m in range(4):
                     z[P_A + m] += b * s[j, m]
             V_A, V_B = chamber_volumes(z[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
-            if k == 0:
-                Q_A = throttle_flow_A(z, p)
-                Q_B = throttle_flow_B(z, p)
-            else:
-                g_A = GAMMA * h * (pressure_rate(1.0, V_A, p.K_oil) + pressure_rate(1.0, p.V_1, p.K_oil))
-                g_B = GAMMA * h * (pressure_rate(1.0, V_B, p.K_oil) + pressure_rate(1.0, p.V_2, p.K_oil))
-                total_A = z[P_1] - z[P_A]
-                total_B = z[P_B] - z[P_2]
-                Q_A = (total_A - implicit_orifice_drop(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)) / g_A
-                Q_B = (total_B - implicit_orifice_drop(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)) / g_B
-            s[k, 0] = pressure_rate(Q_A, V_A, p.K_oil)
-            s[k, 1] = pressure_rate(-Q_B, V_B, p.K_oil)
-            s[k, 2] = pressure_rate(-Q_A, p.V_1, p.K_oil)
-            s[k, 3] = pressure_rate(Q_B, p.V_2, p.K_oil)
-            if k > 0:
-                for m in range(4):
-                    z[P_A + m] += GAMMA * h * s[k, m]
+            for m in range(4):
+                known[m] = z[P_A + m]
+            for _ in range(1 if k == 0 else turns):
+                K_A, K_B = bulk_modulus(z[P_A], p), bulk_modulus(z[P_B], p)
+                K_1, K_2 = bulk_modulus(z[P_1], p), bulk_modulus(z[P_2], p)
+                if k == 0:
+                    Q_A = throttle_flow_A(z, p)
+                    Q_B = throttle_flow_B(z, p)
+                else:
+                    g_A = GAMMA * h * (pressure_rate(1.0, V_A, K_A) + pressure_rate(1.0, p.V_1, K_1))
+                    g_B = GAMMA * h * (pressure_rate(1.0, V_B, K_B) + pressure_rate(1.0, p.V_2, K_2))
+                    total_A = known[2] - known[0]
+                    total_B = known[1] - known[3]
+                    Q_A = (total_A - implicit_orifice_drop(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)) / g_A
+                    Q_B = (total_B - implicit_orifice_drop(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)) / g_B
+                s[k, 0] = pressure_rate(Q_A, V_A, K_A)
+                s[k, 1] = pressure_rate(-Q_B, V_B, K_B)
+                s[k, 2] = pressure_rate(-Q_A, p.V_1, K_1)
+                s[k, 3] = pressure_rate(Q_B, p.V_2, K_2)
+                moved = 0.0
+                if k > 0:
+                    for m in range(4):
+                        found = known[m] + GAMMA * h * s[k, m]
+                        moved = max(moved, abs(found - z[P_A + m]))
+                        z[P_A + m] = found
+                if moved < AIR_SETTLED:
+                    break
             rates_without_throttles(z, u[step, k], G[step, k], C[step, k], p, f[k])
         for k in range(stages):
             b = h * WEIGHTS[k]

@@ -1,10 +1,10 @@
 """Where the laws meet: the right-hand side of the whole rig, eqs. (4.1)-(4.22).
 
 State y, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega [rad/s] and
-angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa]. Without throttles
-the pump is connected to the chambers directly: there are no line volumes, p_1 = p_A and p_2 = p_B. With throttles the
-stiffness of the equations is in their two flows alone (microseconds, against milliseconds for all else), so the
-right-hand side comes in two parts: everything but the throttles, and the throttles.
+angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa], oil V_up [m^3] that
+the make-up has fed. Without throttles the pump is connected to the chambers directly: there are no line volumes, p_1 =
+p_A and p_2 = p_B. With throttles the stiffness of the equations is in their two flows alone (microseconds, against
+milliseconds for all else), so the right-hand side comes in two parts: everything but the throttles, and the throttles.
 """
 
 from __future__ import annotations
@@ -17,22 +17,19 @@ import numpy as np
 from sealscope.compiled import law
 from sealscope.parameters import Rig
 from sealscope.physics.cylinder import chamber_volumes, hard_stop_force, piston_acceleration, pressure_rate
+from sealscope.physics.external import accumulator_pressure, check_valve_flow, external_leakage
+from sealscope.physics.fluid import effective_bulk_modulus
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
 from sealscope.physics.leakage import piston_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
 from sealscope.physics.restrictors import one_way_coefficient, orifice_coefficient, orifice_flow
 
-STATES = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2")
-INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2 = range(len(STATES))
+STATES = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "V_up")
+INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP = range(len(STATES))
 
 #: What a run reports at each output instant: the states and the quantities that follow from them.
-OUTPUTS = (*STATES, "Q_1", "Q_A", "Q_B", "q_leak", "V")
-
-#: Most that h |lambda| may be for an oscillation that is to be resolved, and for a decay that is to stay stable
-#: (RK4's own limit: Hairer & Wanner, Solving Ordinary Differential Equations II, 1996, IV.2).
-OSCILLATION_LIMIT = 1.0
-DECAY_LIMIT = 2.785
+OUTPUTS = (*STATES, "Q_1", "Q_A", "Q_B", "q_leak", "V", "q_ext", "q_up")
 
 
 class RigNumbers(NamedTuple):
@@ -77,6 +74,17 @@ class RigNumbers(NamedTuple):
     coulomb_of_difference: bool
     literal_bracket: bool
     K_oil: float
+    aerated: tuple[bool, ...]  # empty where there is no air in the oil
+    air: float
+    n_air: float
+    open_circuit: tuple[bool, ...]  # empty, and so left out by the compiler, where no oil leaves or enters
+    G_ext_A: float
+    G_ext_B: float
+    made_up: bool
+    p_crack: float
+    G_check: float
+    V_gas: float
+    p_charge: float
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
@@ -102,6 +110,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
     """The rig's parameters for the compiled laws."""
     motor, pump, line, cylinder, friction, fluid = rig.motor, rig.pump, rig.line, rig.cylinder, rig.friction, rig.fluid
     c_A_in, c_A_out, c_B_in, c_B_out = throttle_coefficients(rig)
+    made_up = rig.makeup.check_valves == "present"
     return RigNumbers(
         omega_per_volt=motor.omega_per_volt,
         k_p=motor.k_p,
@@ -142,6 +151,17 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         coulomb_of_difference=friction.coulomb_pressure == "difference",
         literal_bracket=friction.bracket == "literal",
         K_oil=fluid.K_oil,
+        aerated=(True,) if fluid.air > 0 else (),
+        air=fluid.air,
+        n_air=fluid.n_air,
+        open_circuit=(True,) if made_up or cylinder.G_ext_A > 0 or cylinder.G_ext_B > 0 else (),
+        G_ext_A=cylinder.G_ext_A,
+        G_ext_B=cylinder.G_ext_B,
+        made_up=made_up,
+        p_crack=rig.makeup.p_crack,
+        G_check=rig.makeup.G_check,
+        V_gas=rig.makeup.V_gas,
+        p_charge=fluid.p_charge,
     )
 
 
@@ -181,6 +201,42 @@ def throttle_flow_B(y: np.ndarray, p: RigNumbers) -> float:
 
 
 @law
+def bulk_modulus(pressure: float, p: RigNumbers) -> float:
+    """Bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
+    if len(p.aerated) == 0:
+        return p.K_oil
+    return effective_bulk_modulus(pressure, p.K_oil, p.air, p.n_air)
+
+
+@law
+def make_up_flows(y: np.ndarray, p: RigNumbers) -> tuple[float, float]:
+    """Flows [m^3/s] of the make-up into side 1 (A) and side 2 (B): at the pump's ports, or at the chambers without
+    lines."""
+    if not p.made_up:
+        return 0.0, 0.0
+    supply = accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
+    one, two = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
+    return check_valve_flow(supply - one, p.p_crack, p.G_check), check_valve_flow(supply - two, p.p_crack, p.G_check)
+
+
+@law
+def add_outer_flows(y: np.ndarray, p: RigNumbers, dy: np.ndarray) -> None:
+    """Add to `dy` what leaves at the rod seals and what the make-up feeds."""
+    V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
+    K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
+    up_1, up_2 = make_up_flows(y, p)
+    dy[MADE_UP] = up_1 + up_2
+    dy[P_A] -= pressure_rate(external_leakage(y[P_A], p.G_ext_A), V_A, K_A)
+    dy[P_B] -= pressure_rate(external_leakage(y[P_B], p.G_ext_B), V_B, K_B)
+    if p.throttled:
+        dy[P_1] += pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
+        dy[P_2] += pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
+    else:
+        dy[P_A] += pressure_rate(up_1, V_A, K_A)
+        dy[P_B] += pressure_rate(up_2, V_B, K_B)
+
+
+@law
 def rates_without_throttles(y: np.ndarray, u: float, G: float, C: float, p: RigNumbers, dy: np.ndarray) -> None:
     """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients; written into
     `dy`."""
@@ -199,14 +255,19 @@ def rates_without_throttles(y: np.ndarray, u: float, G: float, C: float, p: RigN
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
     V_A, V_B = chamber_volumes(x, p.V, p.A_A, p.A_B, p.position_dependent)
+    K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
     if p.throttled:
-        dy[P_A] = pressure_rate(-p.A_A * v - Q_L, V_A, p.K_oil)
-        dy[P_B] = pressure_rate(p.A_B * v + Q_L, V_B, p.K_oil)
-        dy[P_1] = pressure_rate(Q_1, p.V_1, p.K_oil)
-        dy[P_2] = pressure_rate(-Q_1, p.V_2, p.K_oil)
+        dy[P_A] = pressure_rate(-p.A_A * v - Q_L, V_A, K_A)
+        dy[P_B] = pressure_rate(p.A_B * v + Q_L, V_B, K_B)
+        dy[P_1] = pressure_rate(Q_1, p.V_1, bulk_modulus(y[P_1], p))
+        dy[P_2] = pressure_rate(-Q_1, p.V_2, bulk_modulus(y[P_2], p))
     else:
-        dy[P_A] = pressure_rate(Q_1 - p.A_A * v - Q_L, V_A, p.K_oil)
-        dy[P_B] = pressure_rate(-Q_1 + p.A_B * v + Q_L, V_B, p.K_oil)
+        dy[P_A] = pressure_rate(Q_1 - p.A_A * v - Q_L, V_A, K_A)
+        dy[P_B] = pressure_rate(-Q_1 + p.A_B * v + Q_L, V_B, K_B)
+    dy[MADE_UP] = 0.0
+    if len(p.open_circuit) > 0:
+        add_outer_flows(y, p, dy)
+    if not p.throttled:
         dy[P_1] = dy[P_A]
         dy[P_2] = dy[P_B]
 
@@ -219,10 +280,10 @@ def rates(y: np.ndarray, u: float, G: float, C: float, p: RigNumbers, dy: np.nda
         Q_A = throttle_flow_A(y, p)
         Q_B = throttle_flow_B(y, p)
         V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
-        dy[P_A] += pressure_rate(Q_A, V_A, p.K_oil)  # eq. (4.18)
-        dy[P_B] += pressure_rate(-Q_B, V_B, p.K_oil)  # eq. (4.19)
-        dy[P_1] += pressure_rate(-Q_A, p.V_1, p.K_oil)  # eq. (4.16)
-        dy[P_2] += pressure_rate(Q_B, p.V_2, p.K_oil)  # eq. (4.17)
+        dy[P_A] += pressure_rate(Q_A, V_A, bulk_modulus(y[P_A], p))  # eq. (4.18)
+        dy[P_B] += pressure_rate(-Q_B, V_B, bulk_modulus(y[P_B], p))  # eq. (4.19)
+        dy[P_1] += pressure_rate(-Q_A, p.V_1, bulk_modulus(y[P_1], p))  # eq. (4.16)
+        dy[P_2] += pressure_rate(Q_B, p.V_2, bulk_modulus(y[P_2], p))  # eq. (4.17)
 
 
 @law
@@ -236,52 +297,8 @@ def observe(y: np.ndarray, u: float, G: float, C: float, p: RigNumbers, row: np.
     row[y.size + 2] = throttle_flow_B(y, p) if p.throttled else Q_1
     row[y.size + 3] = piston_leakage(y[P_A] - y[P_B], G, C, p.dp_0)
     row[y.size + 4] = controller_voltage(speed_error(y, u, p), y[INTEGRAL], p.k_p, p.K_i, p.V_max)
-
-
-def stiffest_rate(p: RigNumbers) -> float:
-    """Fastest decay rate [1/s] of the throttled rig: a line volume against its chamber through the laminar slope at
-    dp = 0.
-
-    lambda = K_oil (1/V_1 + 1/V) c / sqrt(dp_0); an explicit method is stable only for h lambda below its own limit
-    (2.785 for RK4).
-    """
-    c = max(p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out)
-    return p.K_oil * (1.0 / min(p.V_1, p.V_2) + 1.0 / p.V) * c / math.sqrt(p.dp_0)
-
-
-def _longest_for_pair(damping: float, stiffness: float) -> float:
-    """Longest step [s] for s^2 + damping s + stiffness = 0: a radian of an oscillation, stability of a decay."""
-    square = damping * damping - 4.0 * stiffness
-    if square < 0.0:
-        return OSCILLATION_LIMIT / math.sqrt(stiffness)
-    decay = 0.5 * (damping + math.sqrt(square))
-    return DECAY_LIMIT / decay if decay > 0.0 else math.inf
-
-
-def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
-    """Longest step [s] at which an explicit method resolves all but the throttles, for leaks up to `G` and `C`.
-
-    The shortest of: speed loop (winding and shaft), piston between its oil columns (running, and within the linear part
-    of the friction), pump and motor between the volumes at the pump's ports, leakage between the chambers. An
-    oscillation needs h |lambda| <= 1, a decay h lambda <= 2.785 (stability of RK4, which the explicit part of
-    ARK4(3)6L[2]SA exceeds). Position-dependent volumes are taken at the end of the stroke, where the oil is stiffest.
-    """
-    V_A, V_B = p.V, p.V
-    if p.position_dependent:
-        V_A, V_B = p.V - 0.5 * p.A_A * p.L, p.V + 0.5 * p.A_B * p.L
-    chambers = p.K_oil * (1.0 / V_A + 1.0 / V_B)
-    ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if p.throttled else chambers
-    loop = _longest_for_pair(p.R_c / p.L_c + p.B_M / p.J_M, (p.R_c * p.B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M))
-    column = p.K_oil * (p.A_A**2 / V_A + p.A_B**2 / V_B) / p.M_eq
-    standing = p.F_pr * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
-    standing += 0.0 if p.literal_bracket else p.F_v
-    running = _longest_for_pair(p.F_v / p.M_eq, column)
-    stuck = _longest_for_pair(standing / p.M_eq, column)
-    pump = _longest_for_pair(ports * p.G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
-    leak = _longest_for_pair(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
-    return min(loop, running, stuck, pump, leak)
-
-
-def longest_step_on_stop(p: RigNumbers) -> float:
-    """Longest step [s] that resolves the piston against a cap: M_eq on k_stop and d_stop."""
-    return _longest_for_pair(p.d_stop / p.M_eq, p.k_stop / p.M_eq)
+    row[y.size + 5 :] = 0.0
+    if len(p.open_circuit) > 0:
+        row[y.size + 5] = external_leakage(y[P_A], p.G_ext_A) + external_leakage(y[P_B], p.G_ext_B)
+        up_1, up_2 = make_up_flows(y, p)
+        row[y.size + 6] = up_1 + up_2

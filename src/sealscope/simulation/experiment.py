@@ -1,4 +1,4 @@
-"""An experiment: a rig, a command, the leaks, how long, and how it is sampled and integrated."""
+"""An experiment: a rig, a command, leaks, other faults and drifts, how long, and how it is sampled and integrated."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
+from sealscope.simulation.changes import Effect
 from sealscope.simulation.commands import Command, Sine, check_command, parse_command
-from sealscope.simulation.faults import Leak, parse_leak
+from sealscope.simulation.drifts import Drift
+from sealscope.simulation.faults import Fault, Leak, parse_leak
 from sealscope.simulation.integrate import Method, choose_method
+from sealscope.simulation.readings import Readings
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -30,7 +33,8 @@ class Experiment:
 
     `duration` [s]; `seed` of the instruments' noise; `x_0` [m] piston position at the start, from mid-stroke;
     `method` and `step` [s] of the solver; `allow_unresolved` lets an unstable or under-resolved run through, marked
-    in its provenance. The sampling rate is the rig's `daq.sample_rate`.
+    in its provenance; `faults` beside the leaks across the piston, `drifts` within the run. The sampling rate is the
+    rig's `daq.sample_rate`.
     """
 
     rig: Rig
@@ -42,6 +46,8 @@ class Experiment:
     method: Method = "auto"
     step: float | None = None
     allow_unresolved: bool = False
+    faults: tuple[Fault, ...] = ()
+    drifts: tuple[Drift, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.duration) and self.duration > 0):
@@ -58,7 +64,31 @@ class Experiment:
         if not abs(self.x_0) <= half:
             raise InputError(f"x_0 must be within the stroke, -{half:g} m to {half:g} m, got {self.x_0}")
         choose_method(self.rig, self.method)
-        check_command(self.command, self.sample_times(), self.rig.daq.u_max)
+        check_command(self.commanded, self.sample_times(), self.rig.daq.u_max)
+        for drift in self.drifts:
+            drift.check(np.linspace(0.0, self.duration, 2001))
+        self.effects()
+
+    @property
+    def commanded(self) -> Command:
+        """The command that the rig gets: `command` as the faults of the duty leave it."""
+        command = self.command
+        for fault in self.faults:
+            command = fault.commanded(command)
+        return command
+
+    def effects(self) -> tuple[Effect, ...]:
+        """What changes in the machine within the run."""
+        drifting = [effect for drift in self.drifts for effect in drift.effects()]
+        return (*drifting, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
+
+    def readings(self) -> Readings:
+        """What changes at the instruments within the run."""
+        drifting = [one for drift in self.drifts for one in drift.adjustments()]
+        return Readings(
+            (*drifting, *(one for fault in self.faults for one in fault.adjustments())),
+            tuple(hold for fault in self.faults for hold in fault.holds()),
+        )
 
     @property
     def rate(self) -> float:
@@ -76,7 +106,7 @@ class Experiment:
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """The experiment in plain words and numbers, without what only the truth may know (the leaks)."""
+        """The experiment in plain words and numbers, without what only the truth may know (leaks, faults, drifts)."""
         return {
             "rig": self.rig.name,
             "parameters_set": {
@@ -95,6 +125,7 @@ class Experiment:
         """A short name that is the same for equal experiments only."""
         values = {row.name: repr(row.value) for row in self.rig.table()}
         inputs = [_exact(self.command), *(_exact(leak) for leak in self.leaks)]
+        inputs += [_exact(one) for one in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -114,11 +145,12 @@ def make_experiment(
     rig: Rig | str = "thesis",
     command: Command | str = "3 sin(4t)",
     leak: Leak | str | Iterable[Leak | str] | None = None,
+    fault: Fault | str | Iterable[Fault | str] | None = None,
     values: Mapping[str, float | str] | None = None,
     **others: Any,
 ) -> Experiment:
-    """An Experiment from words: rig by name or file, command and leaks as text, parameters by name (`values={"V_1":
-    "50[cm^3]"}`).
+    """An Experiment from words: rig by name or file, command, leaks and faults as text, parameters by name
+    (`values={"V_1": "50[cm^3]"}`).
 
     Raises InputError for whatever breaks a rule, with rule, value and place.
     """
@@ -129,6 +161,12 @@ def make_experiment(
         loaded = loaded.with_values(values)
     given = [] if leak is None else [leak] if isinstance(leak, (str, Leak)) else list(leak)
     leaks = [parse_leak(one) if isinstance(one, str) else one for one in given]
+    if fault is not None:
+        from sealscope.simulation.fault_words import parse_fault
+
+        several = [fault] if isinstance(fault, (str, Fault)) else list(fault)
+        faults = [parse_fault(one) if isinstance(one, str) else one for one in several]
+        others["faults"] = (*others.get("faults", ()), *(one for one in faults if one is not None))
     return Experiment(
         rig=loaded,
         command=parse_command(command) if isinstance(command, str) else command,

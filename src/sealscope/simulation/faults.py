@@ -1,16 +1,22 @@
-"""Faults over time, as data: how far a leak is open at each instant, and how large it is when open."""
+"""Faults over time, as data: how far a fault is open at each instant, and how large a leak is when open."""
 
 from __future__ import annotations
 
 import math
 import re
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
+from sealscope.simulation.changes import Effect
+from sealscope.simulation.readings import Adjustment, Hold
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+    from sealscope.simulation.commands import Command
 
 #: One litre per minute [m^3/s].
 LITRE_PER_MINUTE = 1e-3 / 60.0
@@ -97,6 +103,50 @@ class Tabulated:
         return f"table of {self.t.size} points over {self.t[0]:g}..{self.t[-1]:g} s"
 
 
+class Fault:
+    """A fault other than a leak across the piston: what it changes in the machine, at the instruments, or in the duty.
+
+    Its `opening` says when: 0 is a healthy machine, 1 the whole fault; its words are those that `parse_fault` reads.
+    """
+
+    #: One word for all faults of a kind, for tables and confusion matrices.
+    kind: ClassVar[str]
+    opening: Opening
+
+    def onset(self) -> float:
+        """First time [s] at which it is there."""
+        return self.opening.onset()
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """What it changes in the machine; InputError where it cannot be on this rig."""
+        return ()
+
+    def adjustments(self) -> tuple[Adjustment, ...]:
+        """What it changes at the instruments."""
+        return ()
+
+    def holds(self) -> tuple[Hold, ...]:
+        """Readings that it makes stand still."""
+        return ()
+
+    def commanded(self, command: Command) -> Command:
+        """The command that the rig gets instead of `command`."""
+        return command
+
+
+#: Most of a fault that comes or goes from one block of the solver to the next.
+SHARE_RESOLUTION = 5e-3
+
+
+def bends(opening: Opening) -> tuple[float, ...]:
+    """Times [s] at which an opening jumps or bends, as far as its form tells."""
+    if isinstance(opening, Growing):
+        return opening.start, opening.stop
+    if isinstance(opening, Tabulated) and opening.t.size < 1000:
+        return tuple(map(float, opening.t))
+    return (opening.onset(),)
+
+
 @dataclass(frozen=True)
 class Leak:
     """Leakage across the piston.
@@ -128,7 +178,15 @@ class Leak:
 
 _N = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _SIZE = rf"(?:(?P<mean>{_N})\s*(?P<unit>[a-zA-Z^0-9]+/[a-zA-Z]+)|(?P<letter>[GC])\s*=\s*(?P<coefficient>{_N}))"
-_WHEN = rf"(?:from\s+(?P<at>{_N})\s*s?|growing\s+from\s+(?P<start>{_N})\s*s?\s+to\s+(?P<stop>{_N})\s*s?)"
+#: When, in the words of leaks and faults: `from 90 s`, `growing from 60 s to 120 s`.
+WHEN = rf"(?:from\s+(?P<at>{_N})\s*s?|growing\s+from\s+(?P<start>{_N})\s*s?\s+to\s+(?P<stop>{_N})\s*s?)"
+
+
+def opening_from(part: dict[str, str | None]) -> Opening:
+    """The opening that the groups of `WHEN` say; open from the start where they say nothing."""
+    if part["start"] is not None and part["stop"] is not None:
+        return Growing(float(part["start"]), float(part["stop"]))
+    return From(float(part["at"] or 0.0))
 
 
 def parse_leak(text: str) -> Leak | None:
@@ -150,16 +208,14 @@ def parse_leak(text: str) -> Leak | None:
         if not (np.all(np.isfinite(flow)) and peak > 0 and flow.min() >= 0):
             raise InputError(f"q_leak of a leak table must be finite, >= 0 and somewhere > 0 ({stripped[6:].strip()})")
         return Leak("laminar", mean=peak, opening=Tabulated(table.t, flow / peak))
-    found = re.fullmatch(rf"{_SIZE}(?:\s+(?P<law>laminar|orifice))?(?:\s+{_WHEN})?", stripped)
+    found = re.fullmatch(rf"{_SIZE}(?:\s+(?P<law>laminar|orifice))?(?:\s+{WHEN})?", stripped)
     if not found:
         raise InputError(
             "leak must be like '0.0042 L/min from 90 s', '0.01 L/min orifice growing from 60 s to 120 s', "
             f"'G = 6.1e-13 from 90 s', 'C = 2e-10', 'table LEAK.csv' or 'none', got {text!r}"
         )
     part = found.groupdict()
-    opening: Opening = From(float(part["at"] or 0.0))
-    if part["start"] is not None:
-        opening = Growing(float(part["start"]), float(part["stop"]))
+    opening = opening_from(part)
     if part["letter"]:
         law: Literal["laminar", "orifice"] = "laminar" if part["letter"] == "G" else "orifice"
         if part["law"] not in (None, law):

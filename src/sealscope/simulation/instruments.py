@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
+from sealscope.simulation.readings import Readings
 
 if TYPE_CHECKING:
     from sealscope.parameters import Daq, PressureTransducer, Rig
@@ -19,18 +22,22 @@ _KAISER_BETA = 8.0
 _PASS = 0.9  # cut-off (-6 dB) as a share of the Nyquist frequency
 
 
-def decimate(values: Array, factor: int, n: int) -> Array:
+def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     """`n` samples out of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc (-6 dB at 0.9 of the new
     Nyquist frequency).
 
     `values` runs FILTER_REACH new samples beyond the last one; before the first the signal is at rest at its first
-    value.
+    value. `delay` >= 0 in samples of `values`, whole or not: the samples are those of that much earlier (for a fraction
+    the same sinc, taken between its taps).
     """
-    if factor == 1:
+    if factor == 1 and delay == 0.0:
         return np.array(values[:n])
     reach = FILTER_REACH * factor
-    taps = np.sinc(_PASS / factor * np.arange(-reach, reach + 1)) * np.kaiser(2 * reach + 1, _KAISER_BETA)
-    padded = np.concatenate([np.full(reach, values[0]), values])
+    whole = math.floor(delay)
+    off = np.arange(-reach, reach + 1) + (delay - whole)
+    window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (off / reach) ** 2))) / np.i0(_KAISER_BETA)
+    taps = np.sinc((_PASS / factor if factor > 1 else 1.0) * off) * window
+    padded = np.concatenate([np.full(reach + whole, values[0]), values])
     windows = np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::factor]
     return np.asarray(windows[:n] @ (taps / taps.sum()))
 
@@ -48,15 +55,22 @@ def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
 
 
 def read_pressure(
-    true: Array, common: Array, sensor: PressureTransducer, daq: Daq, rate: float, random: np.random.Generator
+    true: Array,
+    common: Array,
+    sensor: PressureTransducer,
+    daq: Daq,
+    rate: float,
+    random: np.random.Generator,
+    of: Callable[[str, float], Array | float] = lambda _, own: own,
 ) -> Array:
     """What one pressure channel reads [Pa]: gain and offset, own and common noise, drift, hum, saturation,
-    conversion, stuck and lost samples."""
+    conversion, stuck and lost samples; `of(symbol, own)` is a parameter of the sensor over time."""
     t = np.arange(true.size) / rate
     walk = np.cumsum(random.standard_normal(true.size)) * sensor.drift / np.sqrt(rate)
-    hum = sensor.hum * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
-    own = sensor.noise * random.standard_normal(true.size)
-    read = convert((1.0 + sensor.gain_error) * true + sensor.offset + walk + hum + own + common, sensor, daq)
+    hum = of("hum", sensor.hum) * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
+    own = of("noise", sensor.noise) * random.standard_normal(true.size)
+    gain, offset = 1.0 + of("gain_error", sensor.gain_error), of("offset", sensor.offset)
+    read = convert(gain * true + offset + walk + hum + own + common, sensor, daq)
     if sensor.stuck_rate > 0:  # a stuck reading holds for a second on average
         for start in np.flatnonzero(random.random(true.size) < sensor.stuck_rate / rate):
             read[start : start + 1 + int(random.exponential(rate))] = read[start]
@@ -68,13 +82,15 @@ def _counted(values: Array, resolution: float) -> Array:
     return values if resolution == 0 else np.floor(values / resolution) * resolution
 
 
-def record(rig: Rig, trajectory: Trajectory, u: Array, factor: int, seed: int) -> Recording:
+def record(
+    rig: Rig, trajectory: Trajectory, u: Array, factor: int, seed: int, readings: Readings | None = None
+) -> Recording:
     """The Recording that the rig's instruments make of a trajectory.
 
     `trajectory` is sampled `factor` times faster than the recording and runs FILTER_REACH samples longer; `u`: (n,)
     command [V] at the recording's samples. Analog channels (pressures, flow meter) pass the anti-alias filter,
     encoders are read at the instant. The noise of each channel comes from a stream of its own under `seed`, so that
-    no channel's noise depends on another's settings.
+    no channel's noise depends on another's settings. `readings`: what changes at the instruments within the run.
     """
     n = u.size
     rate = rig.daq.sample_rate
@@ -83,11 +99,17 @@ def record(rig: Rig, trajectory: Trajectory, u: Array, factor: int, seed: int) -
     random = {name: np.random.default_rng(stream) for name, stream in streams.items()}
     sensors = rig.sensors
     instant = slice(0, n * factor, factor)
+    t = np.arange(n) / rate
+    readings = readings or Readings()
+
+    def of(channel: str) -> Callable[[str, float], Array | float]:
+        return lambda symbol, own: readings.value(f"sensors.{channel}.{symbol}", own, t)
 
     count = 2.0 * np.pi / sensors.theta.counts
     theta = _counted(trajectory["theta"][instant], count)
-    x = trajectory["x"][instant] + sensors.x.noise * random["x"].standard_normal(n)
-    common = sensors.common_noise * random["common"].standard_normal(n)
+    x = (1.0 + of("x")("scale_error", sensors.x.scale_error)) * trajectory["x"][instant] + of("x")("offset", 0.0)
+    x = x + of("x")("noise", sensors.x.noise) * random["x"].standard_normal(n)
+    common = readings.value("sensors.common_noise", sensors.common_noise, t) * random["common"].standard_normal(n)
     channels: dict[str, Array] = {
         "u": u,
         "omega": np.diff(theta, prepend=theta[:1]) * rate,
@@ -95,10 +117,14 @@ def record(rig: Rig, trajectory: Trajectory, u: Array, factor: int, seed: int) -
         "x": _counted(x, sensors.x.resolution),
     }
     for name in PRESSURES:
-        true = decimate(trajectory[name], factor, n)
-        channels[name] = read_pressure(true, common, getattr(sensors, name), rig.daq, rate, random[name])
+        sensor = getattr(sensors, name)
+        true = decimate(trajectory[name], factor, n, sensor.delay * rate * factor)
+        channels[name] = read_pressure(true, common, sensor, rig.daq, rate, random[name], of(name))
     flow = sensors.q_leak
-    read = decimate(trajectory["q_leak"], factor, n) + flow.noise * random["q_leak"].standard_normal(n)
+    true = (1.0 + of("q_leak")("gain_error", 0.0)) * decimate(trajectory["q_leak"], factor, n)
+    true = true + of("q_leak")("offset", 0.0)
+    read = true + of("q_leak")("noise", flow.noise) * random["q_leak"].standard_normal(n)
     read = np.clip(read, -flow.range_hi, flow.range_hi)
     channels["q_leak"] = read if flow.resolution == 0 else np.rint(read / flow.resolution) * flow.resolution
-    return Recording(np.arange(n) / rate, channels, CHANNEL_UNITS, rate)
+    channels = {name: readings.held(name, values, t) for name, values in channels.items()}
+    return Recording(t, channels, CHANNEL_UNITS, rate)

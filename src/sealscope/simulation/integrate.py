@@ -4,7 +4,7 @@ cannot be trusted."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
+from sealscope.simulation.changes import Effect, Schedule
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -33,7 +34,7 @@ _FINER = 10
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What the integration gives: (n,) times [s] and (n, 15) outputs in the order of
+    """What the integration gives: (n,) times [s] and (n, 17) outputs in the order of
     `sealscope.physics.rig.OUTPUTS`."""
 
     t: Array
@@ -77,37 +78,41 @@ def integrate(
     step: float | None = None,
     allow_unresolved: bool = False,
     progress: Progress | None = None,
+    effects: Sequence[Effect] = (),
 ) -> Trajectory:
     """Integrate from rest over `duration` [s] and report the outputs at `rate` [Hz].
 
     `inputs(t)` gives command [V] and the leakage coefficients G and C at times `t` of any shape. The step is the
     largest that divides the output interval and is not above `step` (default `DEFAULT_STEP`, down to a tenth of it
     for a quick rig or a large leak). Inputs may jump at a step's boundary: the step's first and last node are looked
-    up just inside it. `progress` is called with the time reached [s].
+    up just inside it. `effects` are numbers of the rig that change within the run, held over short blocks (`Schedule`).
+    `progress` is called with the time reached [s].
 
     Raises InputError for a step that is not positive; SimulationFailed when the step cannot resolve the rig, the leak
     or a stop that was hit, when a state is not finite, or when a pressure falls below vacuum; `allow_unresolved` lets
     all but a state that is not finite pass.
     """
     from sealscope.physics.imex import IMEX_NODES, advance_imex
-    from sealscope.physics.rig import OUTPUTS, POSITION, initial_state, longest_step, longest_step_on_stop, rig_numbers
+    from sealscope.physics.limits import longest_step, longest_step_on_stop
+    from sealscope.physics.rig import OUTPUTS, POSITION, initial_state, rig_numbers
     from sealscope.physics.rk4 import RK4_NODES, advance_rk4
 
     chosen = choose_method(rig, method)
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
-    p = rig_numbers(rig)
     n_out = round(duration * rate)
+    schedule = Schedule(effects, rig_numbers(rig), n_out, rate)
+
     if step is None:
         default = DEFAULT_STEP[chosen]
         _, G, C = inputs(np.arange(n_out) / rate)
-        step = max(
-            min(default, longest_step(p, float(G.max(initial=0.0)), float(C.max(initial=0.0)))), default / _FINER
-        )
+        worst = float(G.max(initial=0.0)), float(C.max(initial=0.0))
+        step = max(min(default, *(longest_step(p, *worst) for p in schedule.numbers)), default / _FINER)
     every = _steps_per_output(rate, step)
     h = 1.0 / (rate * every)
     if not allow_unresolved:
-        _refuse_unresolved(p, h, chosen)
+        for p in schedule.numbers:
+            _refuse_unresolved(p, h, chosen)
     nodes = np.array(IMEX_NODES if chosen == "imex" else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
     rows = np.empty((n_out, len(OUTPUTS)))
@@ -117,12 +122,16 @@ def integrate(
         last = min(first + block, n_out)
         start = np.arange(first * every, last * every, dtype=np.float64)
         u, G, C = inputs((start[:, None] + nodes) * h)
-        if not allow_unresolved:
-            _refuse_long(h, longest_step(p, float(G.max()), float(C.max())), "the leak")
-        if chosen == "imex":
-            advance_imex(y, h, u, G, C, p, every, rows[first:last])
-        else:
-            advance_rk4(y, h, u, G, C, p, rig.motor.integrator == "euler", every, rows[first:last])
+        worst = float(G.max()), float(C.max())
+        for k, stop, p in schedule.within(first, last):
+            if not allow_unresolved and max(worst) > 0.0:
+                _refuse_long(h, longest_step(p, *worst), "the leak")
+            steps = slice((k - first) * every, (stop - first) * every)
+            if chosen == "imex":
+                advance_imex(y, h, u[steps], G[steps], C[steps], p, every, rows[k:stop])
+            else:
+                euler = rig.motor.integrator == "euler"
+                advance_rk4(y, h, u[steps], G[steps], C[steps], p, euler, every, rows[k:stop])
         if not allow_unresolved and np.any(np.abs(rows[first:last, POSITION]) > 0.5 * p.L):
             _refuse_long(h, longest_step_on_stop(p), "the hard stop (cylinder.k_stop, d_stop)")
         _check(rows[first:last], first, rate, allow_unresolved)
@@ -137,7 +146,7 @@ def _refuse_long(h: float, limit: float, what: str) -> None:
 
 
 def _refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
-    from sealscope.physics.rig import DECAY_LIMIT, longest_step, stiffest_rate
+    from sealscope.physics.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
     _refuse_long(h, longest_step(p), "speed loop, oil columns and friction of this rig")
     limit = DECAY_LIMIT / stiffest_rate(p)
@@ -164,5 +173,6 @@ def _check(rows: Array, first: int, rate: float, allow_unresolved: bool) -> None
         raise SimulationFailed(
             f"{OUTPUTS[P_A + column]} must stay above vacuum ({VACUUM:g} Pa gauge: the model has no cavitation), got "
             f"{pressures[k, column]:.4g} Pa at t = {(first + k) / rate:.4g} s (x = {rows[k, 4]:.3f} m); "
-            "raise fluid.p_charge, take a smaller command or start further from the cap"
+            "raise fluid.p_charge, take a smaller command, start further from the cap, or replace what leaks out "
+            "(makeup.check_valves = present)"
         )

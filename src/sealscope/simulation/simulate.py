@@ -15,8 +15,9 @@ import numpy as np
 from sealscope.recordings.recording import Array, Recording
 from sealscope.recordings.whole import whole_file
 from sealscope.simulation.commands import check_command
+from sealscope.simulation.drifts import Drift
 from sealscope.simulation.experiment import Experiment, make_experiment
-from sealscope.simulation.faults import LITRE_PER_MINUTE, Leak
+from sealscope.simulation.faults import LITRE_PER_MINUTE, Fault, Leak
 from sealscope.simulation.instruments import FILTER_REACH, record
 from sealscope.simulation.integrate import DEFAULT_STEP, Trajectory, choose_method, integrate
 from sealscope.simulation.sizing import leak_flow, mean_while_open, sized
@@ -24,20 +25,22 @@ from sealscope.simulation.sizing import leak_flow, mean_while_open, sized
 #: Told what is being done and how far it is, 0..1.
 Progress = Callable[[str, float], None]
 #: What the truth of a run holds at each sample.
-TRUE_OUTPUTS = ("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak")
+TRUE_OUTPUTS = ("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak", "q_ext", "q_up")
 _OVERSAMPLING = 4
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What a real rig would not tell: the leaks that were put in, and every state without noise at the recording's
-    samples."""
+    """What a real rig would not tell: the leaks, faults and drifts that were put in, and every state without noise at
+    the recording's samples. `onset_s` and the mean are those of the leaks across the piston."""
 
     leaks: tuple[Leak, ...]
     onset_s: float | None
     mean_leak_lpm: float
     t: Array
     outputs: dict[str, Array]
+    faults: tuple[Fault, ...] = ()
+    drifts: tuple[Drift, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,14 +59,15 @@ def oversampling(experiment: Experiment) -> int:
 
 def _inputs(experiment: Experiment, leaks: tuple[Leak, ...]) -> Callable[[Array], tuple[Array, Array, Array]]:
     limit = experiment.rig.daq.u_max
+    command = experiment.commanded
 
     def inputs(t: Array) -> tuple[Array, Array, Array]:
         G, C = np.zeros_like(t), np.zeros_like(t)
         for leak in leaks:
             (G if leak.law == "laminar" else C)[...] += (leak.coefficient or 0.0) * leak.opening.share(t)
-        u = experiment.command.volts(t)
+        u = command.volts(t)
         if not np.abs(u).max(initial=0.0) <= limit:  # between samples, or beyond the end, where the filter still looks
-            check_command(experiment.command, t[t <= experiment.duration], limit)
+            check_command(command, t[t <= experiment.duration], limit)
             u = np.clip(u, -limit, limit)
         return u, G, C
 
@@ -89,6 +93,7 @@ def trajectory(
         step=step or experiment.step,
         allow_unresolved=experiment.allow_unresolved,
         progress=progress,
+        effects=experiment.effects(),
     )
 
 
@@ -129,7 +134,8 @@ def run(experiment: Experiment, progress: Progress | None = None) -> Run:
 
     path = trajectory(experiment, leaks, progress=told)
     times = experiment.sample_times()
-    made = record(experiment.rig, path, experiment.command.volts(times), factor, experiment.seed)
+    volts = experiment.commanded.volts(times)
+    made = record(experiment.rig, path, volts, factor, experiment.seed, experiment.readings())
     provenance: dict[str, Any] = {
         "origin": "simulation",
         "experiment": experiment.describe(),
@@ -140,7 +146,9 @@ def run(experiment: Experiment, progress: Progress | None = None) -> Run:
     recording = replace(made, provenance=provenance, history=history)
     instants = slice(0, n * factor, factor)
     outputs = {name: path[name][instants] for name in TRUE_OUTPUTS}
-    return Run(recording, Truth(leaks, experiment.onset(), _mean_leak(leaks, path, experiment), times, outputs))
+    mean = _mean_leak(leaks, path, experiment)
+    truth = Truth(leaks, experiment.onset(), mean, times, outputs, experiment.faults, experiment.drifts)
+    return Run(recording, truth)
 
 
 def _mean_leak(leaks: tuple[Leak, ...], path: Trajectory, experiment: Experiment) -> float:
@@ -151,16 +159,32 @@ def _mean_leak(leaks: tuple[Leak, ...], path: Trajectory, experiment: Experiment
 
 
 def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
-    """Write what was put in as JSON: leaks with their coefficients, onset [s], mean leak while open [L/min]."""
-    told = {
+    """Write what was put in as JSON: leaks with their coefficients, onset [s], mean leak while open [L/min], other
+    faults with their onsets [s], and what drifted from the start to the end, in per cent (or in the SI unit)."""
+    told: dict[str, Any] = {
         "onset_s": truth.onset_s,
         "mean_leak_lpm": truth.mean_leak_lpm,
         "leaks": [
             {"law": leak.law, "coefficient": leak.coefficient, "opening": str(leak.opening)} for leak in truth.leaks
         ],
     }
+    if truth.faults:
+        told["faults"] = [
+            {"kind": one.kind, "words": str(one), "onset_s": onset if math.isfinite(onset := one.onset()) else None}
+            for one in truth.faults
+        ]
+    if truth.drifts:
+        told["drifts"] = [_told_drift(drift, truth.t) for drift in truth.drifts]
     with whole_file(path) as temporary:
         temporary.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+
+
+def _told_drift(drift: Drift, t: Array) -> dict[str, Any]:
+    change = drift.shape.at(t)
+    span, end = float(np.ptp(change)), float(change[-1] - change[0])
+    if drift.absolute:
+        return {"parameter": drift.parameter, "span": span, "start_to_end": end}
+    return {"parameter": drift.parameter, "span_pct": 100.0 * span, "start_to_end_pct": 100.0 * end}
 
 
 def simulate(**experiment: Any) -> Recording:

@@ -1,0 +1,231 @@
+"""Faults other than a leak across the piston: their words, and what each does to the machine."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from sealscope.errors import InputError
+from sealscope.parameters import load_rig
+from sealscope.simulation.commands import Sine, Step
+from sealscope.simulation.duty import DutyChange
+from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.fault_words import parse_fault
+from sealscope.simulation.faults import From, Growing, Tabulated
+from sealscope.simulation.rig_faults import AirInOil, ExternalLeakage, FrictionChange, PumpLeakage
+from sealscope.simulation.sensor_faults import SensorGain, SensorOffset, SensorStuck
+from sealscope.simulation.simulate import run, write_truth
+
+PSI = 6894.757293168361
+LPM = 1e-3 / 60
+PRESSURES = ("p_1", "p_2", "p_A", "p_B")
+QUIET = {"sensors.common_noise": 0.0, "bits": 24} | {
+    f"sensors.{name}.{what}": 0.0 for name in PRESSURES for what in ("noise", "drift")
+}
+LEAKING_PUMP = {"G_pump": 2.4e-13}
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("pump leak x3 from 90 s", PumpLeakage(3.0, None, From(90.0))),
+        ("pump leakage +50 % growing from 1 s to 3 s", PumpLeakage(1.5, None, Growing(1.0, 3.0))),
+        ("pump leak G = 5e-13", PumpLeakage(None, 5e-13)),
+        ("rod seal A 0.012 L/min from 90 s", ExternalLeakage("A", None, 0.012 * LPM, From(90.0))),
+        ("external leak B G = 2e-13 from 90", ExternalLeakage("B", 2e-13, None, From(90.0))),
+        ("friction x1.3 from 90 s", FrictionChange(1.3, From(90.0))),
+        ("friction -20 %", FrictionChange(0.8)),
+        ("air 1 % growing from 60 s to 120 s", AirInOil(0.01, Growing(60.0, 120.0))),
+        ("sensor p_A offset -2 psi from 90 s", SensorOffset("p_A", -13789.514586336723, From(90.0))),
+        ("sensor x offset 1 mm", SensorOffset("x", 1e-3)),
+        ("sensor p_B gain +1 % from 9 s", SensorGain("p_B", 0.01, From(9.0))),
+        ("sensor p_1 stuck from 90 s to 100 s", SensorStuck("p_1", 90.0, 100.0)),
+        ("sensor q_leak stuck", SensorStuck("q_leak")),
+        ("duty amplitude x1.5 from 90 s", DutyChange(1.5, 1.0, From(90.0))),
+        ("duty amplitude x0.5 frequency x2 growing from 1 s to 2 s", DutyChange(0.5, 2.0, Growing(1.0, 2.0))),
+        ("duty frequency x0.8", DutyChange(1.0, 0.8)),
+    ],
+)
+def test_faults_are_read_from_words_and_their_own_words_read_back(text, fault):
+    found = parse_fault(text)
+    again = parse_fault(str(found))
+    for one in (found, again):
+        assert type(one) is type(fault)
+        assert str(one) == str(fault)
+        assert one.onset() == fault.onset()
+    assert make_experiment(values=LEAKING_PUMP, duration=1.0, fault=found).faults[0].kind == fault.kind
+
+
+def test_no_fault_is_none():
+    assert parse_fault("none") is None
+    assert make_experiment(fault=["none", "friction x2"], duration=1.0).faults == (FrictionChange(2.0),)
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("", "fault must be like"),
+        ("pump leak", "fault must be like"),
+        ("pump leak x-3", "must change by a factor >= 0, got -3"),
+        ("rod seal C 0.01 L/min", "fault must be like"),
+        ("rod seal A 0.01 psi", "psi"),
+        ("friction x1e999", "factor >= 0, got inf"),
+        ("air 80 %", "0 % to 50 %"),
+        ("sensor p_9 offset 2 psi", "must be one of p_1, p_2, p_A, p_B, x, q_leak, got 'p_9'"),
+        ("sensor p_A offset 2 mm", "mm"),
+        ("sensor p_A gain -100 %", "must be > -100 %"),
+        ("sensor p_A stuck from 9 s to 3 s", "until later than 9 s"),
+        ("duty", "fault must be like"),
+        ("duty amplitude x1.5 from 3 s; rm", "fault must be like"),
+        ("friction x1.3 growing from 9 s to 3 s", "stop growing after it starts"),
+    ],
+)
+def test_other_words_are_refused_in_one_line(text, rule):
+    with pytest.raises(InputError) as caught:
+        parse_fault(text)
+    assert rule in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_fault_that_cannot_be_on_this_rig_is_refused():
+    with pytest.raises(InputError, match=r"needs pump.G_pump > 0, got 0 \(pump leak x3 from 90 s\)"):
+        make_experiment(fault="pump leak x3 from 90 s")
+    with pytest.raises(InputError, match=r"command must stay within \+-10 V, got -?1\d"):
+        make_experiment(fault="duty amplitude x2 from 90 s", command="7 sin(4t)")
+    with pytest.raises(InputError, match="got a table"):
+        DutyChange(2.0, opening=Tabulated(np.array([0.0]), np.array([1.0])))
+
+
+def pair(fault: str, *, values: dict | None = None, duration: float = 8.0, **others):
+    """The same experiment without and with a fault from half time on."""
+    common = {"duration": duration, "values": values or {}, **others}
+    return run(make_experiment(**common)), run(make_experiment(**common, fault=f"{fault} from {duration / 2:g} s"))
+
+
+def halves(found) -> tuple[np.ndarray, np.ndarray]:
+    t = found.truth.t
+    return t < 0.5 * t[-1] - 0.01, t > 0.5 * t[-1] + 0.5
+
+
+def test_until_its_onset_a_fault_changes_nothing_and_then_it_does():
+    for fault, values in (
+        ("pump leak x3", LEAKING_PUMP),
+        ("friction x1.3", {}),
+        ("rod seal A 0.001 L/min", {"check_valves": "present"}),
+        ("duty amplitude x1.2", {}),
+    ):
+        healthy, faulty = pair(fault, values=values)
+        first, second = halves(healthy)
+        np.testing.assert_array_equal(healthy.recording["p_A"][first][:-20], faulty.recording["p_A"][first][:-20])
+        difference = np.abs(healthy.truth.outputs["p_A"] - faulty.truth.outputs["p_A"])
+        assert difference[first].max() == 0.0, fault
+        assert difference[second].max() > 500.0, fault
+
+
+def test_air_that_comes_later_is_not_there_before():
+    healthy, faulty = pair("air 1 %")
+    first, second = halves(healthy)
+    np.testing.assert_allclose(
+        healthy.truth.outputs["p_A"][first], faulty.truth.outputs["p_A"][first], atol=1e-3, rtol=0
+    )
+    assert np.abs(healthy.truth.outputs["p_A"] - faulty.truth.outputs["p_A"])[second].max() > 2e3
+
+
+def test_a_worn_pump_delivers_less_by_its_own_law():
+    healthy, faulty = pair("pump leak x4", values=LEAKING_PUMP)
+    first, second = halves(healthy)
+    rig = load_rig()
+    for part, factor in ((first, 1.0), (second, 4.0)):
+        o = faulty.truth.outputs
+        lost = rig.pump.q_b / (2 * np.pi) * o["omega"] - o["Q_1"]
+        np.testing.assert_allclose(
+            lost[part], factor * 2.4e-13 * (o["p_1"] - o["p_2"])[part], atol=1e-6 * np.ptp(o["Q_1"]), rtol=1e-6
+        )
+
+
+def test_friction_takes_more_pressure():
+    healthy, faulty = pair("friction +30 %")
+    _, second = halves(healthy)
+    rms = [np.sqrt(np.mean((r.truth.outputs["p_A"] - r.truth.outputs["p_B"])[second] ** 2)) for r in (healthy, faulty)]
+    assert rms[1] / rms[0] == pytest.approx(1.3, abs=0.03)
+
+
+def test_a_rod_seal_loses_what_it_says():
+    values = {"check_valves": "present"}
+    _, faulty = pair("rod seal B 0.02 L/min", values=values, duration=20.0)
+    o, t = faulty.truth.outputs, faulty.truth.t
+    p_charge = load_rig().fluid.p_charge
+    after = t >= 10.0
+    assert np.all(o["q_ext"][~after] == 0.0)
+    np.testing.assert_allclose(o["q_ext"][after], 0.02 * LPM * o["p_B"][after] / p_charge, rtol=1e-9)
+    assert np.mean(o["q_up"][t > 15.0]) == pytest.approx(np.mean(o["q_ext"][t > 15.0]), rel=0.02)
+
+
+def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
+    common = {"duration": 4.0, "values": QUIET}
+    healthy = run(make_experiment(**common))
+    t = healthy.recording.t
+    after = t >= 2.0
+    for words, expected in (
+        ("sensor p_A offset 2 psi from 2 s", lambda p: p + 2 * PSI * after),
+        ("sensor p_A gain +2 % from 2 s", lambda p: p * (1 + 0.02 * after)),
+        ("sensor p_A offset 2 psi growing from 1 s to 3 s", lambda p: p + 2 * PSI * np.clip((t - 1) / 2, 0, 1)),
+        ("sensor p_A stuck from 2 s", lambda p: np.where(after, p[1000], p)),
+        ("sensor p_A stuck from 2 s to 3 s", lambda p: np.where(after & (t < 3.0), p[1000], p)),
+    ):
+        faulty = run(make_experiment(**common, fault=words))
+        step = 3000 * PSI / 2**23
+        np.testing.assert_allclose(
+            faulty.recording["p_A"], expected(healthy.recording["p_A"]), atol=1.6 * step, err_msg=words
+        )
+        for name in ("p_1", "p_2", "p_B", "x", "q_leak"):
+            np.testing.assert_array_equal(faulty.recording[name], healthy.recording[name])
+        np.testing.assert_array_equal(faulty.truth.outputs["p_A"], healthy.truth.outputs["p_A"])
+    shifted = run(make_experiment(**common, fault=["sensor x offset 1 mm", "sensor q_leak offset 3 mL/min"])).recording
+    np.testing.assert_allclose(shifted["x"], healthy.recording["x"] + 1e-3, atol=21e-6)
+    np.testing.assert_allclose(shifted["q_leak"], healthy.recording["q_leak"] + 5e-8, atol=2e-9)
+
+
+def test_a_changed_duty_changes_size_and_pace_without_a_jump_in_phase():
+    t = np.arange(0.0, 20.0, 1e-3)
+    command = DutyChange(1.5, 0.5, From(10.0)).commanded(Sine(3.0, 4.0))
+    u = command.volts(t)
+    np.testing.assert_allclose(u[t < 10], 3 * np.sin(4 * t[t < 10]))
+    np.testing.assert_allclose(u[t >= 10], 4.5 * np.sin(40 + 2 * (t[t >= 10] - 10)), atol=1e-9)
+    gradual = DutyChange(1.0, 2.0, Growing(5.0, 10.0)).commanded(Sine(1.0, 3.0))
+    pace = np.gradient(gradual.change.clock(t), t)
+    np.testing.assert_allclose(pace, 1.0 + np.clip((t - 5) / 5, 0, 1), atol=2e-3)
+    assert np.abs(np.diff(gradual.volts(t))).max() < 6.5e-3
+    assert Step(1.0).volts(t).shape == DutyChange(2.0).commanded(Step(1.0)).volts(t).shape
+    recorded = run(make_experiment(duration=4.0, fault="duty amplitude x1.5 frequency x0.5 from 2 s")).recording
+    late = recorded.t >= 2.0
+    np.testing.assert_allclose(recorded["u"][late], 4.5 * np.sin(8 + 2 * (recorded.t[late] - 2)), atol=1e-9)
+
+
+def test_the_truth_lists_the_faults_and_the_recording_does_not(tmp_path):
+    made = run(
+        make_experiment(
+            duration=4.0,
+            leak="G = 6e-13 from 3 s",
+            fault=["friction x1.3 from 2 s", "sensor p_A stuck from 1 s"],
+        )
+    )
+    write_truth(made.truth, tmp_path / "truth.json")
+    told = json.loads((tmp_path / "truth.json").read_text())
+    assert told["onset_s"] == 3.0
+    assert told["faults"] == [
+        {"kind": "friction", "words": "friction x1.3 from 2 s", "onset_s": 2.0},
+        {"kind": "sensor stuck", "words": "sensor p_A stuck from 1 s", "onset_s": 1.0},
+    ]
+    public = str(dict(made.recording.provenance)) + str(made.recording.history)
+    for word in ("friction", "stuck", "1.3"):
+        assert word not in public
+
+
+def test_faults_tell_experiments_apart():
+    common = {"duration": 2.0, "values": LEAKING_PUMP}
+    faults = (None, "pump leak x3", "pump leak x3.0000001", "pump leak x3 from 1 s", ["pump leak x3", "friction x1.1"])
+    keys = {make_experiment(**common, fault=fault).key() for fault in faults}
+    assert len(keys) == len(faults)
