@@ -119,9 +119,15 @@ def test_a_rule_across_values_names_the_file_that_was_asked_for(tmp_path: Path) 
         ('rig = "x"', "rig must be a table, got 'x'"),
         ('[rig]\nextend = "thesis"', "rig.extend is not known; [rig] has name, title and extends"),
         ("[rig]\nname = 3", "rig.name must be a text, got 3"),
-        ('[rig]\nextends = "thesys"', "extends must be a packaged rig (thesis) or a .toml file, got 'thesys'"),
+        (
+            '[rig]\nextends = "thesys"',
+            "extends must be a packaged rig (thesis, thesis-calibrated) or a .toml file, got 'thesys'",
+        ),
         ('[rig]\nextends = "lab.toml"', "extends must end at a rig of its own, got a circle"),
-        ('[rig]\nextends = "a\\u0000b.toml"', "extends must be a packaged rig (thesis) or a .toml file, got "),
+        (
+            '[rig]\nextends = "a\\u0000b.toml"',
+            "extends must be a packaged rig (thesis, thesis-calibrated) or a .toml file, got ",
+        ),
         ('[rig]\nextends = "none.toml"', "rig file cannot be read: No such file or directory"),
         ("[valve]\nk = 3", "valve.k is not a parameter"),
         ("a = " + "[" * 5000, "a rig file must be TOML: "),
@@ -146,6 +152,9 @@ def test_what_is_no_text_file(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_lists_the_rigs() -> None:
-    assert refused("thesys") == "'thesys' is no packaged rig (thesis) and no .toml file; did you mean thesis?"
+    assert (
+        refused("thesys")
+        == "'thesys' is no packaged rig (thesis, thesis-calibrated) and no .toml file; did you mean thesis?"
+    )
     assert refused("").startswith("'' is no packaged rig")
     assert "is no packaged rig" in refused("a\0b.toml")

@@ -4,7 +4,7 @@ against the thesis's own sheet where that is present."""
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import pytest
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig, load_rig
 from sealscope.signals.details import Transform, details
-from sealscope.thesis.calibration import Budget, Calibration, Free, fit, leak_free, predict_leaks, residuals
+from sealscope.thesis.calibration import ITEMS, Calibration, fit, leak_free, predict_leaks, residuals
 from sealscope.thesis.calibration_forward import (
     CHAMBERS,
     QUANTITIES,
@@ -26,9 +26,12 @@ from sealscope.thesis.calibration_forward import (
     own_noise,
 )
 from sealscope.thesis.calibration_hypotheses import Hypothesis, outcome
+from sealscope.thesis.calibration_items import fit_table, parameters
 from sealscope.thesis.calibration_rig import rig_toml, write_rig
+from sealscope.thesis.calibration_search import Budget, Free
 from sealscope.thesis.conditions import APPENDIX_C, Condition, experiment_values, groups
-from sealscope.thesis.context import Sheet
+from sealscope.thesis.context import RunSpec, Sheet, SimulatedRun
+from sealscope.thesis.products import Claim, Product
 from sealscope.thesis.sheet import read_sheet
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -45,6 +48,20 @@ TRUTH = {"K_oil": 150e6, "omega_per_volt": 12.0, "V_1": 30e-6, "V_2": 30e-6, "or
 FREE = (Free(("fluid.K_oil",), 230e6, 60e6, 600e6), Free(("motor.omega_per_volt",), 9.0, 5.0, 20.0))
 COMMON: dict[str, float | str] = {"line.orifices": "present", "line.V_1": 30e-6, "line.V_2": 30e-6}
 NOISE = {"p_A": 1.2, "p_B": 1.6}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A context of the reproduction with a sheet, or none, and nothing simulated."""
+
+    sheet: Sheet | None
+    quick: bool = True
+
+    def run(self, spec: RunSpec) -> SimulatedRun:
+        raise AssertionError(spec)
+
+    def product(self, item: str) -> tuple[Product | Claim, ...]:
+        raise AssertionError(item)
 
 
 def bench_rig(rate: float = 500.0) -> Rig:
@@ -210,8 +227,9 @@ def test_the_sign_of_d3_on_p_A_is_predicted_from_leak_free_data() -> None:
     made = predict_leaks(load_rig("thesis-calibrated"))
     change, real = (np.log(of.rms["p_A"]["d3"][:, 1] / of.rms["p_A"]["d3"][:, 0]) for of in (made, sheet))
     assert np.sum(np.sign(change) == np.sign(real)) >= 39
-    assert np.corrcoef(change, real)[0, 1] > 0.4
-    assert np.mean(change) == pytest.approx(np.mean(real), abs=0.08)
+    assert np.corrcoef(change, real)[0, 1] > 0.6
+    # the size is predicted too small, about half (docs/decisions/0006-calibration.md)
+    assert 0.35 < np.mean(change) / np.mean(real) < 0.65
 
 
 @needs_sheet
@@ -221,3 +239,24 @@ def test_only_the_leak_free_columns_are_read() -> None:
         {c: {q: np.stack([v[:, 0], np.full(41, np.nan)], axis=1) for q, v in of.items()} for c, of in sheet.rms.items()}
     )
     assert np.array_equal(leak_free(sheet), leak_free(blind))
+
+
+def test_the_tables_of_the_calibration_show_every_fitted_value_with_its_interval() -> None:
+    table = parameters(Asked(None), ITEMS[0])[0]
+    values = {row[0]: row for row in table.rows}
+    assert {"fluid.K_oil", "motor.omega_per_volt", "line.V_1", "line.V_2", "sensors.p_A.noise"} <= set(values)
+    assert all(
+        "95 %" in str(row[-1])
+        for name, row in values.items()
+        if str(row[-1]).startswith("fitted") and name != "daq.sample_rate"
+    )
+
+
+@needs_sheet
+def test_the_table_of_the_fit_has_every_condition_once() -> None:
+    summary, by_condition = fit_table(Asked(read_sheet(DATA)[0]), ITEMS[1])
+    assert [row[:2] for row in summary.rows] == [(c, q) for c in CHAMBERS for q in QUANTITIES]
+    assert sum(int(str(row[2])) for row in by_condition.rows) == 41
+    weights = np.array([float(str(row[2])) for row in by_condition.rows])
+    logs = np.log(np.array([row[3:] for row in by_condition.rows], dtype=float))
+    np.testing.assert_allclose(np.exp(weights @ logs / 41), [row[2] for row in summary.rows], rtol=1e-9)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError
-from sealscope.thesis.binomial import at_least, clopper_pearson, holm, sign_test
+from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
 from sealscope.thesis.context import Sheet
 from sealscope.thesis.leak_size import (
     area_under_curve,

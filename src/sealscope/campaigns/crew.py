@@ -11,15 +11,12 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from sealscope.campaigns.cases import Case
 from sealscope.campaigns.plan import Plan
 from sealscope.campaigns.work import Row, failed, work
 from sealscope.errors import InputError, MissingExtra
-
-if TYPE_CHECKING:
-    from typing import Any
 
 #: Carries out one case.
 Task = Callable[[Plan, Case, "Path | None"], Row]
@@ -54,19 +51,17 @@ def together(
                 yield failed(case, "the process that carried it out died")
 
 
-def _pool(
-    plan: Plan, waiting: list[Case], jobs: int, keep: Path | None, task: Task, lost: list[Case]
-) -> Iterator[Row]:
+def _pool(plan: Plan, waiting: list[Case], jobs: int, keep: Path | None, task: Task, lost: list[Case]) -> Iterator[Row]:
     """Rows of the cases taken off the end of `waiting`, until none is left or a process has died; then `lost` holds
     those that were handed out."""
     context = multiprocessing.get_context("spawn")
     with _one_thread_each():
-        pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin)
+        pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(plan, keep, task))
         handed: dict[Future[Row], Case] = {}
         try:
             while waiting or handed:
                 while waiting and len(handed) < jobs * _AHEAD:
-                    handed[pool.submit(task, plan, waiting[-1], keep)] = waiting[-1]
+                    handed[pool.submit(_carry_out, waiting[-1])] = waiting[-1]
                     waiting.pop()
                 done, _ = wait(handed, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -87,12 +82,27 @@ def _pool(
                     process.terminate()
 
 
-def _begin() -> None:
+#: What a process of the pool carries out its cases with.
+_mine: list[tuple[Plan, Path | None, Task]] = []
+
+
+def _carry_out(case: Case) -> Row:
+    plan, keep, task = _mine[0]
+    return task(plan, case, keep)
+
+
+def _begin(plan: Plan, keep: Path | None, task: Task) -> None:
     """In a new process: leave the interrupt to the parent, and end when the parent does."""
+    _mine[:] = [(plan, keep, task)]
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager
@@ -113,14 +123,16 @@ def on_cluster(
 ) -> Iterator[Row]:
     """The cases on the workers of the Dask scheduler at `address` (`tcp://host:8786`), each row as it is ready.
 
-    The workers need the same Sealscope. Raises MissingExtra without Dask, InputError where no scheduler answers.
+    The workers need the same Sealscope, and the folder where recordings are kept. Raises MissingExtra without Dask,
+    InputError where no scheduler answers.
     """
     try:
-        from distributed import Client, as_completed
+        import distributed
     except ImportError:
         raise MissingExtra("a cluster needs Dask: pip install 'sealscope[cluster]'") from None
+    dask: Any = distributed
     try:
-        client = Client(address, timeout=10, set_as_default=False)
+        client = dask.Client(address, timeout=10, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(f"--cluster must be the address of a Dask scheduler, got {address}: {error}") from None
     with client:
@@ -135,11 +147,11 @@ def on_cluster(
 
         width = _DASK_AHEAD * max(1, sum(client.nthreads().values()))
         first = [hand(case) for _, case in zip(range(width), left, strict=False)]
-        ready = as_completed(first)
+        ready = dask.as_completed(first, loop=client.loop)
         for future in ready:
             case = by_key.pop(future.key)
-            error = future.exception()
-            yield failed(case, f"a worker failed: {error}".splitlines()[0]) if error is not None else future.result()
+            wrong = future.exception()
+            yield future.result() if wrong is None else failed(case, f"a worker failed: {wrong}".splitlines()[0])
             future.release()
             following = next(left, None)
             if following is not None:
@@ -155,6 +167,8 @@ def _same_code(client: Any, address: str) -> None:
     try:
         theirs = client.run(code_key)
     except Exception as error:
-        raise InputError(f"the cluster's workers must have Sealscope, got: {error} ({address})".splitlines()[0]) from None
+        raise InputError(
+            f"the cluster's workers must have Sealscope, got: {error} ({address})".splitlines()[0]
+        ) from None
     if any(key != code_key() for key in theirs.values()):
         raise InputError(f"the cluster's workers must have the same Sealscope as this machine, got another ({address})")

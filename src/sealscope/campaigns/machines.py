@@ -12,41 +12,39 @@ from sealscope.errors import InputError
 
 if TYPE_CHECKING:
     from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.faults import Leak
+    from sealscope.simulation.faults import Fault, Leak
 
 #: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
 SIZING_SECONDS = 13.0
 
 
 def closing_values(level: str | float) -> dict[str, str | float]:
-    """The rig's parameters for both throttles closed by that share; none in the line where they are fully open."""
+    """The rig's parameters for both throttles closed by that share; fully open ones leave `line.orifices` as it is."""
     from sealscope.units import parse_quantity
 
     share = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= share < 1.0:
         raise InputError(f"closed must be 0 to under 100 %, got {level!r}")
     values: dict[str, str | float] = {"line.closed_A": share, "line.closed_B": share}
-    return {**values, "line.orifices": "present" if share > 0 else "absent"}
-
-
-def load_profile(name: str) -> Any:
-    """The bench profile of that name or file."""
-    from sealscope.simulation.bench import load_profile as load
-
-    return load(name)
+    return {**values, "line.orifices": "present"} if share > 0 else values
 
 
 def profile_key(name: str) -> str:
     """A name for what a bench profile says, the same wherever its file lies."""
-    return digest(repr(load_profile(name)))
+    from sealscope.simulation.profile import load_profile
+
+    return digest(repr(replace(load_profile(name), place="")))
 
 
-def fault_of(words: str, onset_s: float) -> Any:
+def fault_of(words: str, onset_s: float) -> Fault:
     """A fault other than a piston leak, from words; it sets in at the plan's onset unless they say when."""
     from sealscope.simulation.fault_words import parse_fault
 
-    timed = any(f" {word} " in f" {words} " for word in ("from", "growing", "table"))
-    return parse_fault(words if timed else f"{words} from {onset_s:g} s")
+    timed = any(f" {word} " in f" {words} " for word in ("from", "growing"))
+    fault = parse_fault(words if timed else f"{words} from {onset_s:g} s")
+    if fault is None:
+        raise InputError(f"a fault must be one, got {words!r}")
+    return fault
 
 
 def leak_of(plan: Plan, case: Case) -> tuple[Leak, ...]:
@@ -60,40 +58,27 @@ def leak_of(plan: Plan, case: Case) -> tuple[Leak, ...]:
 
 
 def experiment_of(plan: Plan, case: Case) -> Experiment:
-    """The experiment of a case: the machine that its seed draws from the bench, with the case's levels on top."""
-    from sealscope.simulation.commands import parse_command
-    from sealscope.simulation.experiment import Experiment
+    """The experiment of a case: the machine that its seed draws from the bench (or the rig as it stands), the case's
+    levels on top, its leak sized on that machine."""
+    from sealscope.simulation.bench import Machine, draw
+    from sealscope.simulation.commands import Sine, parse_command
 
-    settings: dict[str, str | float] = {}
-    more: dict[str, Any] = {}
-    command = "3 sin(4t)"
     if plan.profile:
-        from sealscope.simulation.bench import draw
-
-        machine = draw(load_profile(plan.profile), case.machine_seed)
-        settings |= machine.values
-        command = machine.command
-        more = drifts_of(machine)
+        machine = draw(plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s)
+    else:
+        machine = Machine("none", case.machine_seed, plan.rig, plan.duration_s, {}, (), Sine(3.0, 4.0), 0.0)
+    settings = dict(machine.values)
     for name, level in case.levels.items():
         if name == "command":
-            command = str(level)
+            machine = replace(machine, command=parse_command(str(level)))
+        elif name == "closed":
+            settings |= {"line.orifices": str(plan.rig["line.orifices"])} | closing_values(level)
         else:
-            settings |= closing_values(level) if name == "closed" else {name: level}
-    if case.fault:
-        more["faults"] = (fault_of(case.fault, plan.onset_s),)
-    experiment = Experiment(
-        rig=plan.rig.with_values(_once(settings), source="set by the campaign") if settings else plan.rig,
-        command=parse_command(command) if isinstance(command, str) else command,
-        duration=plan.duration_s,
-        seed=case.noise_seed,
-        **more,
-    )
+            settings[name] = level
+    machine = replace(machine, values=_once(settings))
+    fault = fault_of(case.fault, plan.onset_s) if case.fault else None
+    experiment = machine.experiment(seed=case.noise_seed, fault=fault)
     return replace(experiment, leaks=sized_once(experiment, leak_of(plan, case)))
-
-
-def drifts_of(machine: Any) -> dict[str, Any]:
-    """What a drawn machine adds to an experiment beside its values."""
-    return {"drifts": machine.drifts}
 
 
 def _once(settings: Mapping[str, str | float]) -> dict[str, str | float]:

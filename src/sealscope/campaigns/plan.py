@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import os
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
+from sealscope.campaigns.plan_table import Table
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
     from sealscope.campaigns.held_out_plan import HeldOutPlan
+    from sealscope.campaigns.recorded import RecordedPlan
     from sealscope.parameters import Rig
 
+AnyPlan: TypeAlias = "Plan | HeldOutPlan | RecordedPlan"
 Use = Literal["calibrate", "judge"]
 Promise = Literal["average", "bound"]
 
@@ -64,6 +67,8 @@ class Plan:
     records: tuple[Records, ...]
     factors: Mapping[str, tuple[str | float, ...]] = field(default_factory=dict)
     place: str = ""
+    unit: str = "L/min"
+    note: str = ""
 
     @property
     def size(self) -> int:
@@ -76,7 +81,7 @@ def plan_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _PACKAGED.glob("*.toml")))
 
 
-def load_plan(name_or_path: str | os.PathLike[str]) -> Plan | HeldOutPlan:
+def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
     """The plan of that name, or in a TOML file; raises InputError, in one line with the place, for whatever breaks a
     rule."""
     text = os.fspath(name_or_path)
@@ -103,82 +108,17 @@ def _tree(path: Path, place: str) -> dict[str, Any]:
         raise InputError(f"a plan must be TOML: {str(error).splitlines()[0]} ({place})") from None
 
 
-def read_plan(tree: Mapping[str, Any], place: str = "plan") -> Plan | HeldOutPlan:
+def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     """The plan in a TOML file's tables."""
+    if "recordings" in tree:
+        from sealscope.campaigns.recorded import read_recorded
+
+        return read_recorded(tree, place)
     if "held_out" in tree:
         from sealscope.campaigns.held_out_plan import read_held_out
 
         return read_held_out(tree, place)
     return _Reader(place).plan(tree)
-
-
-class Table:
-    """One table of a plan as it is read: each entry by its rule, then none left over."""
-
-    def __init__(self, given: Any, name: str, place: str) -> None:
-        if not isinstance(given, Mapping):
-            raise InputError(f"[{name}] must be a table, got {given!r} ({place})")
-        self.left, self.name, self.place = dict(given), name, place
-
-    def fail(self, rule: str) -> InputError:
-        """The error that says the rule and the place."""
-        return InputError(f"{self.name}.{rule} ({self.place})")
-
-    def take(self, key: str, default: Any = None) -> Any:
-        """The entry, or the default; InputError where there is neither."""
-        if key in self.left:
-            return self.left.pop(key)
-        if default is None:
-            raise self.fail(f"{key} is missing")
-        return default
-
-    def text(self, key: str, default: str | None = None) -> str:
-        """An entry that is a text of one line."""
-        value = self.take(key, default)
-        if not isinstance(value, str) or "\n" in value or (default is None and not value.strip()):
-            raise self.fail(f"{key} must be a text, got {value!r}")
-        return value
-
-    def number(self, key: str, default: float | None = None, unit: str = "") -> float:
-        """An entry that is a finite number, or a text of a number with a unit of the dimension of `unit`."""
-        value = self.take(key, default)
-        if isinstance(value, str) and unit:
-            from sealscope.units import parse_quantity
-
-            try:
-                return parse_quantity(value, unit)
-            except InputError as error:
-                raise self.fail(f"{key}: {error}") from None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            wanted = f"a number with its unit such as '180 {unit}'" if unit else "a number"
-            raise self.fail(f"{key} must be {wanted}, got {value!r}")
-        return float(value)
-
-    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
-        """An entry that is a whole number of at least `least`."""
-        value = self.take(key, default)
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise self.fail(f"{key} must be a whole number >= {least}, got {value!r}")
-        return value
-
-    def choice(self, key: str, words: tuple[str, ...], default: str | None = None) -> str:
-        """An entry that is one of the words."""
-        value = self.take(key, default)
-        if value not in words:
-            raise self.fail(f"{key} must be one of {', '.join(words)}, got {value!r}")
-        return str(value)
-
-    def share(self, key: str, default: float | None = None) -> float:
-        """An entry that is a number between 0 and 1."""
-        value = self.number(key, default)
-        if not 0.0 < value < 1.0:
-            raise self.fail(f"{key} must be between 0 and 1, got {value:g}")
-        return value
-
-    def end(self) -> None:
-        """Refuse what is left over."""
-        if self.left:
-            raise self.fail(f"{next(iter(self.left))} is not known")
 
 
 class _Reader:
@@ -190,7 +130,9 @@ class _Reader:
     def plan(self, tree: Mapping[str, Any]) -> Plan:
         for key in tree:
             if key not in ("campaign", "factors", "records"):
-                raise InputError(f"[{key}] is not known; a plan has [campaign], [factors] and [[records]] ({self.place})")
+                raise InputError(
+                    f"[{key}] is not known; a plan has [campaign], [factors] and [[records]] ({self.place})"
+                )
         head = Table(tree.get("campaign", {}), "campaign", self.place)
         name = head.text("name")
         if not all(c.isalnum() or c in "-_." for c in name) or name.startswith("."):
@@ -212,11 +154,12 @@ class _Reader:
             promise=head.choice("promise", get_args(Promise), "average"),  # type: ignore[arg-type]
             confidence=head.share("confidence", 0.95),
             seed=head.whole("seed", 0),
-            detectors=self._detectors(head),
+            detectors=head.detectors(),
             keep_recordings=self._keep(head),
             records=self._records(tree.get("records", ()), onset),
             factors=factors,
             place=self.place,
+            note=head.text("note", ""),
         )
         head.end()
         if plan.size > MOST_RECORDS:
@@ -254,23 +197,11 @@ class _Reader:
         name = head.text("profile", "none")
         if name == "none":
             return ""
-        from sealscope.campaigns.machines import load_profile
+        from sealscope.simulation.profile import load_profile
 
         name = self._beside(name)
         self._said("campaign.profile", lambda: load_profile(name))
         return name
-
-    def _detectors(self, head: Table) -> tuple[str, ...]:
-        from sealscope.diagnosis.scorers import scorer
-
-        given = head.take("detectors")
-        if not isinstance(given, list) or not given:
-            raise head.fail(f"detectors must be a list of names, got {given!r}")
-        for name in given:
-            self._said("campaign.detectors", lambda name=name: scorer(name))
-        if len(set(given)) < len(given):
-            raise head.fail("detectors must be named once each")
-        return tuple(given)
 
     @staticmethod
     def _keep(head: Table) -> bool:
@@ -290,7 +221,7 @@ class _Reader:
             for level in levels:
                 if isinstance(level, bool) or not isinstance(level, (str, int, float)):
                     raise table.fail(f"{name} must be texts or numbers, got {level!r}")
-                self._said(f"factors.{name}", lambda name=name, level=level: self._level(name, level, rig))
+                self._said(f"factors.{name}", partial(self._level, name, level, rig))
             found[name] = tuple(levels)
         return found
 
@@ -325,9 +256,11 @@ class _Reader:
             if fault:
                 from sealscope.campaigns.machines import fault_of
 
-                self._said(f"records[{number}].fault", lambda fault=fault: fault_of(fault, onset))
+                self._said(f"records[{number}].fault", partial(fault_of, fault, onset))
             made = Records(use, count, leak, law, fault)  # type: ignore[arg-type]
-            if any((made.use, made.leak_lpm, made.law, made.fault) == (o.use, o.leak_lpm, o.law, o.fault) for o in found):
+            if any(
+                (made.use, made.leak_lpm, made.law, made.fault) == (o.use, o.leak_lpm, o.law, o.fault) for o in found
+            ):
                 raise table.fail("records must differ from the others in use, leak, law or fault")
             found.append(made)
         return tuple(found)
@@ -339,11 +272,14 @@ class _Reader:
 
         if not any(one.use == "judge" for one in plan.records):
             raise InputError(f"a plan must have records to judge, got none ({self.place})")
-        calibrated = [name for name in plan.detectors if scorer(name).threshold is None]
+        if all(scorer(name).threshold is not None for name in plan.detectors):
+            return
         known = sum(one.count for one in plan.records if one.use == "calibrate")
         needed = records_needed(plan.false_alarm, plan.confidence if plan.promise == "bound" else None)
-        if calibrated and known < needed:
+        commands = len(plan.factors.get("command", ("one",)))  # each an operating point, with thresholds of its own
+        if known < needed * commands:
+            each = f" ({needed} for each of {commands} commands)" if commands > 1 else ""
             raise InputError(
-                f"records to calibrate must be at least {needed} for false_alarm = {plan.false_alarm:g}, got {known} "
-                f"({self.place})"
+                f"records to calibrate must be at least {needed * commands}{each} for false_alarm = "
+                f"{plan.false_alarm:g}, got {known} ({self.place})"
             )

@@ -13,52 +13,51 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
-from sealscope.campaigns.bound import UNKNOWN, LeakBound, in_lpm, leak_bound, noise_covariance
+from sealscope.campaigns.bound import UNKNOWN, LeakBound, in_lpm, leak_bound, noise_covariance, smallest_found
 from sealscope.campaigns.outlook import BoundFigures, CommandRow, Outlook
-from sealscope.campaigns.prediction import THESIS_DETECTORS, ChangeDetector, Prediction, Responses, predict
+from sealscope.campaigns.prediction import THESIS_DETECTORS, ChangeDetector, Responses, predict
+from sealscope.diagnosis.blocks import QUANTITIES, mean_squares
 from sealscope.diagnosis.scorers import Look
 from sealscope.errors import InputError, SealscopeError
 from sealscope.parameters import Rig
+from sealscope.physics.rig import OUTPUTS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.details import details, edge_samples
+from sealscope.simulation.bench import centred_start
 from sealscope.simulation.commands import Command, parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
+from sealscope.simulation.instruments import PRESSURES, decimate, record
+from sealscope.simulation.integrate import Trajectory
 from sealscope.simulation.sensitivity import CHAMBERS, clean_channels
-from sealscope.simulation.simulate import run
+from sealscope.simulation.simulate import oversampling, trajectory
 
 Progress = Callable[[str, float], None]
+_T = TypeVar("_T")
 
 #: The commands of the thesis's tests that a plan compares, and the closings of both throttles (None: no throttles).
 STANDARD_COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)", "8 sin(t)")
 STANDARD_CLOSINGS = (None, 0.25, 0.50, 0.75)
 #: Sizes of leaks that are simulated [L/min]; a prediction never goes beyond the largest.
 SIZES = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
-TABLE_SIZES = (0.001, 0.004, 0.016)
+TABLE_SIZES = (0.001, 0.004, 0.012, 0.032)
 #: Shortest record planned for [s]: each half must hold whole cycles of the slowest standard command.
 SHORTEST = 20.0
+#: How much of a command is looked at to centre its sweep [s].
+LONGEST_LOOK = 1000.0
 #: Noise records laid over the run: for the rig's own command, and for each row of the table.
-NOISES, TABLE_NOISES = 24, 12
-#: Records with a leak that each size's change is averaged over; they carry the noise of the leak-free ones.
-_PAIRED = 2
-
-
-def ideal_sweep(command: Command, rig: Rig, t: Array) -> Array:
-    """Position [m] at the times `t` if the speed loop followed at once and no oil slipped: the pump's volume over the
-    piston's area."""
-    speed = rig.motor.omega_per_volt * command.volts(t)
-    angle = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))])
-    return np.asarray(angle * rig.pump.q_b / (2.0 * math.pi) / rig.cylinder.A_A)
-
-
-def centred_start(command: Command, rig: Rig, duration: float) -> float:
-    """The piston's position at the start [m] that puts the middle of the sweep at mid-stroke, within the stroke."""
-    t = np.arange(max(2, round(duration * rig.daq.sample_rate))) / rig.daq.sample_rate
-    x = ideal_sweep(command, rig, t)
-    half = rig.cylinder.L / 2.0
-    return float(np.clip(-0.5 * (x.min() + x.max()), -half, half))
+NOISES, TABLE_NOISES = 24, 8
+#: Most values of noise kept in memory (8 bytes each).
+MOST_NOISE = 3e7
+#: Blocks of a half over which the noise is taken as independent.
+BLOCKS = 16
+#: Records that each mean change is averaged over; those with a leak carry the noise of the leak-free ones.
+_PAIRED = 3
 
 
 def with_closing(rig: Rig, closing: float | None) -> Rig:
@@ -90,17 +89,53 @@ class Noise:
         return Recording(np.arange(n) / rate, channels, dict.fromkeys(CHAMBERS, "Pa"), rate)
 
 
-def instrument_noise(experiment: Experiment, clean: Array, records: int, seed: int) -> Noise:
+def filtered(experiment: Experiment) -> Trajectory:
+    """The leak-free trajectory at the recording's samples, pressures behind the anti-alias filter: what many records
+    of one run have in common."""
+    path, factor = trajectory(experiment, ()), oversampling(experiment)
+    n = round(experiment.duration * experiment.rate)
+    rows = path.rows[: n * factor : factor].copy()
+    for name in PRESSURES:
+        rows[:, OUTPUTS.index(name)] = decimate(path[name], factor, n)
+    return Trajectory(path.t[: n * factor : factor], rows, path.method, path.step)
+
+
+def instrument_noise(experiment: Experiment, records: int, seed: int) -> Noise:
     """Readings less the truth of `records` leak-free records, by the rig's own instruments; samples that would be
     lost or stuck are not."""
     whole = {f"sensors.{name}.{rate}": 0.0 for name in CHAMBERS for rate in ("stuck_rate", "drop_rate")}
     rig = experiment.rig.with_values(whole, source="varied for a plan")
-    seeds = np.random.SeedSequence(seed).generate_state(records, np.uint32)
+    times = experiment.sample_times()
+    path, u = filtered(experiment), experiment.command.volts(times)
+    clean = np.stack([path[name] for name in CHAMBERS])
     made = []
-    for one in seeds:
-        recording = run(replace(experiment, rig=rig, leaks=(), seed=int(one))).recording
-        made.append(np.stack([recording[name] for name in CHAMBERS]) - clean)
+    for one in np.random.SeedSequence(seed).generate_state(records, np.uint32):
+        read = record(rig, path, u, 1, int(one))
+        made.append(np.stack([read[name] for name in CHAMBERS]) - clean)
     return Noise(np.stack(made))
+
+
+def noise_scatter(clean: Array, noise: Noise, rate: float, detectors: Sequence[ChangeDetector]) -> tuple[Array, int]:
+    """Standard deviation (d,) of the detectors' changes under noise alone, without a leak, and its degrees of freedom.
+
+    A half's mean square is the mean of its blocks', whose noise is independent (the filters reach over a thousandth of
+    a block), so ``Var(change) = 1/4 sum_halves Var(mean square) / (mean square)^2`` with the variance of each block
+    taken over the records: `BLOCKS` times the freedom that the records' changes alone would give.
+    """
+    n = clean.shape[1]
+    before, after = (int(samples) for samples in edge_samples()[-1])
+    halves = ((before, n // 2 - after), (n // 2 + before, n - after))
+    bounds = [np.linspace(first, last, BLOCKS + 1).astype(np.int64) for first, last in halves]
+    squares = np.empty((len(noise.values), len(CHAMBERS), 2, BLOCKS, len(QUANTITIES)))
+    for k in range(len(noise.values)):
+        read = noise.over(clean, k, rate)
+        for c, name in enumerate(CHAMBERS):
+            found = details(read[name])
+            squares[k, c] = [mean_squares(found, half) for half in bounds]
+    variance = squares.var(axis=0, ddof=1).mean(axis=2) / BLOCKS
+    relative = 0.25 * (variance / squares.mean(axis=(0, 3)) ** 2).sum(axis=1)
+    chosen = [relative[CHAMBERS.index(one.chamber), QUANTITIES.index(one.quantity)] for one in detectors]
+    return np.sqrt(np.array(chosen)), 2 * BLOCKS * (len(noise.values) - 1)
 
 
 def _changes(recording: Recording, detectors: Sequence[ChangeDetector]) -> Array:
@@ -117,45 +152,197 @@ def responses(
 ) -> tuple[Responses, float]:
     """How the detectors' changes answer to leaks of about these `sizes` [L/min] from the middle on, under noise alone;
     and the mean pressure difference [Pa] that drives them."""
-    middle = experiment.duration / 2.0
-    steps = len(sizes) + 1
+    middle, rate = experiment.duration / 2.0, experiment.rate
     clean = clean_channels(experiment)
     later = slice(clean.shape[1] // 2, None)
     dp = float(np.mean(np.abs(clean[0, later] - clean[1, later])))
-    told(1.0 / steps)
-    free = np.stack(
-        [_changes(noise.over(clean, k, experiment.rate), detectors) for k in range(len(noise.values))]
-    )
-    scatter = free.std(axis=0, ddof=1)
+    scatter, freedom = noise_scatter(clean, noise, rate, detectors)
+    free = np.stack([_changes(noise.over(clean, k, rate), detectors) for k in range(_PAIRED)])
     got, mean = [], [free.mean(axis=0)]
-    for number, size in enumerate(sizes, start=2):
+    for number, size in enumerate(sizes, start=1):
+        told(number / (len(sizes) + 1))
         G = size * LITRE_PER_MINUTE / dp
         leaky = clean_channels(experiment, (Leak("laminar", coefficient=G, opening=From(middle)),))
         got.append(in_lpm(G, float(np.mean(np.abs(leaky[0, later] - leaky[1, later])))))
-        paired = [_changes(noise.over(leaky, k, experiment.rate), detectors) - free[k] for k in range(_PAIRED)]
-        mean.append(mean[0] + np.mean(paired, axis=0))
-        told(number / steps)
+        mean.append(np.mean([_changes(noise.over(leaky, k, rate), detectors) for k in range(_PAIRED)], axis=0))
     table = np.stack(mean)
-    return Responses(np.array(got), table, np.broadcast_to(scatter, table.shape), len(free)), dp
+    spread = np.broadcast_to(scatter, table.shape)
+    return Responses(np.array(got), table, spread, len(noise.values), freedom), dp
 
 
-def _workers() -> int:
-    return max(1, min(4, os.cpu_count() or 1))
-
-
-def _in_parallel(jobs: Sequence[Callable[[], object]], words: str, progress: Progress) -> list[object]:
+def _in_parallel(jobs: Sequence[Callable[[], _T]], words: str, progress: Progress) -> list[_T]:
     """Results of the jobs in their order; compiled kernels run outside the interpreter's lock, so threads serve."""
-    done = 0
-    results: list[object] = []
+    results: list[_T] = []
     progress(words, 0.0)
-    with ThreadPoolExecutor(_workers()) as pool:
+    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
         futures = [pool.submit(job) for job in jobs]
         try:
             for future in futures:
                 results.append(future.result())
-                done += 1
-                progress(words, done / len(jobs))
+                progress(words, len(results) / len(jobs))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
     return results
+
+
+def bound_figures(bound: LeakBound, dp: float, false_alarm: float, detection: float) -> BoundFigures:
+    """The bound of one half as mean leaks [L/min] under the pressure difference `dp` [Pa], and of the change between
+    two such halves, whose variance is twice as large."""
+    known, unknown = in_lpm(bound.known, dp), in_lpm(bound.unknown or bound.known, dp)
+    change_known, change_unknown = (math.sqrt(2.0) * one for one in (known, unknown))
+    smallest_known, smallest_unknown = (
+        smallest_found(one, false_alarm, detection) for one in (change_known, change_unknown)
+    )
+    return BoundFigures(
+        half_s=bound.duration,
+        known=known,
+        unknown=unknown,
+        change_known=change_known,
+        change_unknown=change_unknown,
+        smallest_known=smallest_known,
+        smallest_unknown=smallest_unknown,
+        unknown_parameters=bound.unknown_parameters,
+    )
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a plan is asked for: the false-alarm rate, the probability of detection, the detectors, the noise's seed.
+
+    Raises InputError for probabilities outside 0..1, no detector or a negative seed.
+    """
+
+    false_alarm: float = 0.01
+    detection: float = 0.9
+    detectors: tuple[ChangeDetector, ...] = THESIS_DETECTORS
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        smallest_found(1.0, self.false_alarm, self.detection)
+        if not self.detectors:
+            raise InputError("a plan must have one detector or more, got none")
+        if self.seed < 0:
+            raise InputError(f"seed must be >= 0, got {self.seed}")
+
+
+def experiment_for(rig: Rig, command: Command | str, duration: float, x_0: float | None = None) -> Experiment:
+    """The leak-free experiment of a plan; `x_0` [m] by default such that the sweep's middle is at mid-stroke.
+
+    Raises InputError for a record too short to plan for.
+    """
+    if not duration >= SHORTEST:
+        raise InputError(f"duration must be >= {SHORTEST:g} s for a plan, got {duration:g} s")
+    parsed = parse_command(command) if isinstance(command, str) else command
+    start = centred_start(rig, parsed, min(duration, LONGEST_LOOK)) if x_0 is None else x_0
+    return Experiment(rig=rig, command=parsed, duration=duration, x_0=start)
+
+
+def command_row(rig: Rig, command: str, duration: float, noise: Noise, wish: Wish) -> CommandRow:
+    """One line of the comparison: every detector's smallest leak, and the bound's with all else known.
+
+    What cannot be simulated (a command over the converter's range, a stop, vacuum) is told in the row's note.
+    """
+    throttles = closing_words(rig)
+    try:
+        experiment = experiment_for(rig, command, duration)
+        found, dp = responses(experiment, TABLE_SIZES, wish.detectors, noise)
+        bound = bound_figures(leak_bound(half_of(experiment)), dp, wish.false_alarm, wish.detection)
+    except SealscopeError as error:
+        return CommandRow(command, throttles, {}, None, str(error))
+    predicted = predict(found, wish.detectors, wish.false_alarm, wish.detection)
+    sizes = {one.detector: one.smallest for one in predicted}
+    return CommandRow(command, throttles, sizes, bound.smallest_known)
+
+
+def half_of(experiment: Experiment) -> Experiment:
+    """The experiment at half its length: what the bound is made from."""
+    return replace(experiment, duration=experiment.duration / 2.0)
+
+
+def outlook(
+    experiment: Experiment,
+    wish: Wish = Wish(),
+    *,
+    commands: Iterable[str] = STANDARD_COMMANDS,
+    closings: Iterable[float | None] = STANDARD_CLOSINGS,
+    bench: str = "",
+    draws: int = 24,
+    results: Path | None = None,
+    progress: Progress = lambda words, share: None,
+) -> Outlook:
+    """The plan for an experiment (`experiment_for`): every detector's smallest leak, the bound, and the `commands`
+    under every one of the `closings` compared under instrument noise alone.
+
+    `bench`: name or file of a profile of machines and drifts, of which `draws` machines are simulated; `results`: the
+    folder of a campaign whose rows tell instead; without either the rig is taken as it stands. Raises InputError for
+    values that break a rule, SimulationFailed where the experiment itself cannot be simulated.
+    """
+    rig = experiment.rig
+    if bench and results is not None:
+        raise InputError("a plan must come from a bench or from a campaign's results, got both")
+    noise_covariance(rig)
+    told = partial(progress, "this command")
+    told(0.0)
+    measured = _elsewhere(experiment, wish, bench, draws, results, progress)
+    noise = instrument_noise(experiment, _affordable(experiment, NOISES), wish.seed)
+    found, dp = responses(experiment, SIZES, wish.detectors, noise, lambda share: told(0.5 * share))
+    found = measured or found
+    bound = leak_bound(half_of(experiment), unknown=UNKNOWN, progress=lambda share: told(0.5 + 0.5 * share))
+    told(1.0)
+    some = Noise(noise.values[:TABLE_NOISES])
+    places = [(command, with_closing(rig, closing)) for command in commands for closing in closings]
+    jobs = [partial(command_row, where, command, experiment.duration, some, wish) for command, where in places]
+    rows = _in_parallel(jobs, "commands compared", progress) if jobs else []
+    described = experiment.describe()
+    return Outlook(
+        rig=rig.name,
+        parameters_set=described["parameters_set"],
+        command=str(experiment.command),
+        orifices=closing_words(rig),
+        duration_s=experiment.duration,
+        sample_rate_hz=experiment.rate,
+        start_position_m=experiment.x_0,
+        false_alarm=wish.false_alarm,
+        detection=wish.detection,
+        pressure_difference=dp,
+        noise={name: math.sqrt(value) for name, value in zip(CHAMBERS, np.diag(noise_covariance(rig)), strict=True)},
+        origin=_origin(bench, results),
+        records=found.records,
+        largest=float(found.sizes[-1]),
+        detectors=predict(found, wish.detectors, wish.false_alarm, wish.detection),
+        bound=bound_figures(bound, dp, wish.false_alarm, wish.detection),
+        commands=tuple(rows),
+        largest_compared=TABLE_SIZES[-1],
+    )
+
+
+def _elsewhere(
+    experiment: Experiment, wish: Wish, bench: str, draws: int, results: Path | None, progress: Progress
+) -> Responses | None:
+    """Responses from a campaign's rows or from machines of a bench; None where instrument noise alone shall tell."""
+    if results is not None:
+        from sealscope.campaigns.measured_responses import measured_responses
+
+        command = str(experiment.command)
+        return measured_responses(results, command, experiment.rig, experiment.duration, wish.detectors)
+    if not bench:
+        return None
+    from sealscope.campaigns.bench_responses import bench_responses
+
+    def spread(jobs: Sequence[Callable[[], _T]]) -> list[_T]:
+        return _in_parallel(jobs, f"{draws} machines of the bench", progress)
+
+    return bench_responses(experiment, bench, draws, wish.seed, wish.false_alarm, wish.detectors, spread)
+
+
+def _origin(bench: str, results: Path | None) -> str:
+    """Where the scatter comes from, in words."""
+    if results is not None:
+        return f"rows of the campaign in {results}"
+    return f"machines and drifts of the profile {bench}" if bench else "instrument noise alone, no drift"
+
+
+def _affordable(experiment: Experiment, records: int) -> int:
+    """Fewer noise records where they are long, so that they stay within `MOST_NOISE` values."""
+    return max(TABLE_NOISES, min(records, int(MOST_NOISE / (2.0 * experiment.duration * experiment.rate))))

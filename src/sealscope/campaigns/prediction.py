@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -25,9 +25,12 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
 Side = Literal["fell", "rose", "changed"]
-#: The confidence of a prediction's interval, which comes from the scatter's own uncertainty.
+#: The confidence of a prediction's interval.
 CONFIDENCE = 0.9
 _FINE = 400
+_RESAMPLED, _QUANTILES = 200, 41
+#: Sizes [L/min] at which a prediction gives its probability of detection.
+CURVE_SIZES = (0.0005, 0.001, 0.0042, 0.0075, 0.015)
 
 
 @dataclass(frozen=True)
@@ -72,21 +75,51 @@ THESIS_DETECTORS = tuple(
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """How the changes answer to leaks: `sizes` (m,) rising [L/min]; `mean` and `scatter` (m + 1, d) over the
-    detectors, row 0 without a leak; `records`: how many leak-free records the scatter comes from."""
+    """How the changes answer to leaks: `sizes` (m,) rising [L/min]; `mean` and `scatter` (m + 1, d) over the detectors,
+    row 0 without a leak; `records`: leak-free records behind the scatter, of `freedom` degrees of freedom.
+
+    `samples`: the changes (n, d) themselves of each row, where they were counted; `paired`: whether sample k of every
+    row is the same machine.
+    """
 
     sizes: Array
     mean: Array
     scatter: Array
     records: int
+    freedom: int
+    samples: tuple[Array, ...] = ()
+    paired: bool = False
 
     def __post_init__(self) -> None:
         if self.sizes.size == 0 or np.any(np.diff(self.sizes) <= 0) or not self.sizes[0] > 0:
             raise InputError("the sizes of leaks must be one or more, rise and be > 0")
         if self.mean.shape != self.scatter.shape or len(self.mean) != self.sizes.size + 1:
             raise InputError("mean and scatter must have a row for no leak and one for each size")
-        if self.records < 2:
+        if self.freedom < 1:
             raise InputError(f"a scatter needs 2 leak-free records or more, got {self.records}")
+
+    def resampled(self, random: np.random.Generator) -> Responses:
+        """The responses that another draw of as many samples might have given (Efron, doi 10.1214/aos/1176344552)."""
+        n = [len(one) for one in self.samples]
+        same = random.integers(n[0], size=n[0])
+        drawn = [
+            one[same] if self.paired else one[random.integers(k, size=k)]
+            for one, k in zip(self.samples, n, strict=True)
+        ]
+        return counted(self.sizes, drawn, paired=self.paired)
+
+
+def counted(sizes: Array, samples: Sequence[Array], *, paired: bool) -> Responses:
+    """Responses from the changes (n, d) of records without a leak and with each of the `sizes`."""
+    return Responses(
+        sizes=sizes,
+        mean=np.stack([one.mean(axis=0) for one in samples]),
+        scatter=np.stack([one.std(axis=0, ddof=1) for one in samples]),
+        records=len(samples[0]),
+        freedom=len(samples[0]) - 1,
+        samples=tuple(samples),
+        paired=paired,
+    )
 
 
 @dataclass(frozen=True)
@@ -94,9 +127,10 @@ class Prediction:
     """What one detector finds.
 
     `smallest` [L/min]: the smallest leak found with the probability asked for, None where none of the sizes is;
-    `low`, `high`: its interval, `CONFIDENCE` of it, from the scatter's own uncertainty (None: beyond the sizes);
+    `low`, `high`: its interval, `CONFIDENCE` of it, from the chance in the samples (None: beyond the sizes);
     `lost_above` [L/min]: where a larger leak escapes again; `scatter`: of the leak-free change of the log RMS;
-    `threshold`: the change beyond which it fires; `rate`: the largest probability of detection over the sizes.
+    `threshold`: the change beyond which it fires; `rate`: the largest probability of detection over the sizes;
+    `curve`: (size, probability) at `CURVE_SIZES`, as far as they were simulated.
     """
 
     detector: str
@@ -107,6 +141,7 @@ class Prediction:
     scatter: float
     threshold: float
     rate: float
+    curve: tuple[tuple[float, float], ...] = ()
 
 
 def probability(
@@ -142,34 +177,78 @@ def predict(
 ) -> tuple[Prediction, ...]:
     """The smallest leak that each detector finds with probability `detection`; its columns are those of `responses`.
 
-    A size below the smallest simulated one is read off the line to zero, where the change is proportional to the leak.
+    Sizes below the smallest simulated one are read off the curve that goes to no change at no leak.
     Raises InputError for probabilities outside 0..1.
     """
-    from scipy.stats import chi2
-
     for name, value in (("the false-alarm rate", false_alarm), ("the probability of detection", detection)):
         if not 0.0 < value < 1.0:
             raise InputError(f"{name} must be between 0 and 1, got {value}")
-    knots = np.concatenate([[0.0], responses.sizes])
     fine = np.geomspace(responses.sizes[0] / 100.0, responses.sizes[-1], _FINE)
-    freedom = responses.records - 1
-    tail = (1.0 - CONFIDENCE) / 2.0
-    wide, narrow = (math.sqrt(freedom / float(chi2.ppf(share, freedom))) for share in (tail, 1.0 - tail))
+    shown = [size for size in CURVE_SIZES if size <= responses.sizes[-1]]
+    again = _again(responses)
     found = []
     for k, detector in enumerate(detectors):
-        mean, scatter = responses.mean[:, k], responses.scatter[:, k]
-        if not (np.all(np.isfinite(mean)) and np.all(scatter > 0.0)):
+        if not (np.all(np.isfinite(responses.mean[:, k])) and np.all(responses.scatter[:, k] > 0.0)):
             found.append(Prediction(detector.name, None, None, None, None, math.nan, math.nan, math.nan))
             continue
-        shift = np.interp(fine, knots, mean - mean[0])
-        spread = np.interp(fine, knots, scatter)
-        rates, limit = probability(shift, spread, float(scatter[0]), detector.side, false_alarm)
+        curve = _Curve(responses, k, detector.side, false_alarm)
+        rates = curve.at(fine)
         smallest, lost = _crossing(fine, rates, detection)
-        low, high = (
-            _crossing(fine, probability(shift, f * spread, f * float(scatter[0]), detector.side, false_alarm)[0], detection)[0]
-            for f in (narrow, wide)
-        )
+        others = [_Curve(one, k, detector.side, false_alarm).at(fine) for one in again]
+        low, high = _interval([_crossing(fine, one, detection)[0] for one in others])
         found.append(
-            Prediction(detector.name, smallest, low, high, lost, float(scatter[0]), limit, float(rates.max()))
+            Prediction(
+                detector=detector.name,
+                smallest=smallest,
+                low=low,
+                high=high,
+                lost_above=lost,
+                scatter=curve.leak_free,
+                threshold=curve.limit,
+                rate=float(rates.max()),
+                curve=tuple(zip(shown, map(float, curve.at(np.array(shown))), strict=True)),
+            )
         )
     return tuple(found)
+
+
+def _again(responses: Responses) -> list[Responses]:
+    """Responses as chance might have given them: the samples drawn again, or, where only a scatter is known, the
+    scatter at even quantiles of its own distribution (chi squared)."""
+    if responses.samples:
+        random = np.random.default_rng(0)
+        return [responses.resampled(random) for _ in range(_RESAMPLED)]
+    from scipy.stats import chi2
+
+    shares = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+    factors = np.sqrt(responses.freedom / chi2.ppf(shares, responses.freedom))
+    return [replace(responses, scatter=factor * responses.scatter) for factor in factors]
+
+
+def _interval(sizes: Sequence[float | None]) -> tuple[float | None, float | None]:
+    """The middle `CONFIDENCE` of the sizes, None for an end that lies beyond what was tried."""
+    tail = (1.0 - CONFIDENCE) / 2.0
+    ordered = np.sort([math.inf if one is None else one for one in sizes])
+    ends = (ordered[int(share * (len(ordered) - 1))] for share in (tail, 1.0 - tail))
+    low, high = (float(end) if math.isfinite(end) else None for end in ends)
+    return low, high
+
+
+class _Curve:
+    """One detector's probability of detection as a function of the size."""
+
+    def __init__(self, responses: Responses, column: int, side: Side, false_alarm: float) -> None:
+        from scipy.interpolate import PchipInterpolator
+
+        self._knots = np.concatenate([[0.0], responses.sizes])
+        self._shift = PchipInterpolator(self._knots, responses.mean[:, column] - responses.mean[0, column])
+        self._spread = responses.scatter[:, column]
+        self._side, self._false_alarm = side, false_alarm
+        self.leak_free = float(self._spread[0])
+        self.limit = probability(np.zeros(1), self._spread[:1], self.leak_free, side, false_alarm)[1]
+
+    def at(self, sizes: Array) -> Array:
+        """POD at sizes (m,) [L/min]."""
+        shift = np.asarray(self._shift(sizes), dtype=np.float64)
+        spread = np.interp(sizes, self._knots, self._spread)
+        return probability(shift, spread, self.leak_free, self._side, self._false_alarm)[0]

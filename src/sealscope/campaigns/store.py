@@ -14,6 +14,13 @@ from sealscope.campaigns.work import Row
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.whole import whole_file
 
+#: What rows of one folder must share, and how it is called.
+_SAME = {
+    "name": "campaign",
+    "world": "rig, bench, length, onset or seed",
+    "code": "program code",
+    "rate_within": "false-alarm rate, at which its detectors search within a record",
+}
 ROWS, HEAD, LOCK = "rows.jsonl", "campaign.json", ".lock"
 
 
@@ -31,7 +38,9 @@ def read_rows(folder: Path) -> dict[str, Row]:
             try:
                 row = Row.from_dict(json.loads(line))
             except (ValueError, TypeError, KeyError, AttributeError, IndexError):
-                raise UnreadableFile(f"a line of a campaign must be a row, got something else ({path}, line {number})") from None
+                raise UnreadableFile(
+                    f"a line of a campaign must be a row, got something else ({path}, line {number})"
+                ) from None
             found[row.id] = row
     return found
 
@@ -58,7 +67,7 @@ def begin(folder: Path, made_from: Mapping[str, Any]) -> None:
         raise InputError(f"a campaign's folder must be one or become one, got: {error.strerror} ({folder})") from None
     before = head(folder)
     if before is not None and (folder / ROWS).is_file():
-        for key, words in (("name", "campaign"), ("world", "rig, bench, length, onset or seed"), ("code", "program code")):
+        for key, words in _SAME.items():
             if before.get(key) != made_from[key]:
                 raise InputError(
                     f"a campaign goes on only with the same {words}: its rows would not belong together; choose "
@@ -120,5 +129,7 @@ def alone_in(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise InputError(f"a campaign must be run by one process at a time, got another at work ({folder})") from None
+            raise InputError(
+                f"a campaign must be run by one process at a time, got another at work ({folder})"
+            ) from None
         yield

@@ -12,6 +12,8 @@ from sealscope.campaigns.cases import Case
 from sealscope.campaigns.plan import Plan
 from sealscope.errors import InputError, SealscopeError
 
+#: Channels that a scorer or the operating point reads; looking through the others for findings would cost a third more.
+_LOOKED_AT = ("u", "x", "p_A", "p_B")
 #: detector -> (score, None where it cannot tell; onset [s], None where it finds none)
 Scores = Mapping[str, tuple[float | None, float | None]]
 
@@ -81,7 +83,7 @@ def _work(plan: Plan, case: Case, keep: Path | None) -> Row:
         from sealscope.recordings import write
 
         write(made.recording, keep / f"{case.id}.nc")
-    part, _, reason = looked_at(made.recording)
+    part, _, reason = looked_at(made.recording.only(name for name in _LOOKED_AT if name in made.recording))
     if reason is not None:
         raise InputError(f"the record cannot be judged: {reason}")
     place = place_of(part)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import recordings, reproduction, simulation
+from sealscope.cli import campaign, recordings, reproduction, simulation
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -32,8 +32,10 @@ for command in (
     simulation.parameters,
     recordings.convert,
     reproduction.reproduce,
+    campaign.calibrate,
 ):
     app.command()(command)
+app.add_typer(campaign.campaign)
 
 
 @app.callback(invoke_without_command=True)
@@ -52,9 +54,9 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
     All words after `--baseline` up to the next option belong to it; but where no other word could be a FILE, only the
     first one does.
     """
-    if not arguments or arguments[0] not in ("diagnose", "report"):
+    if not arguments or arguments[0] not in ("diagnose", "report", "calibrate"):
         return list(arguments)
-    takes_value = {"--format", "--map", "--rate", "--false-alarm", "--output", "-o"}
+    takes_value = {"--format", "--map", "--rate", "--false-alarm", "--output", "-o", "--calibration"}
     groups: list[list[str]] = []
     plain: list[str] = []
     index, files = 1, 0
@@ -81,6 +83,7 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
                 files += 1
     if not all(groups):
         raise InputError("--baseline must be followed by one file or more, got none")
+    files = files or (arguments[0] == "calibrate")  # which takes no FILE beside its baseline
     options = [word for group in groups for name in (group if files else group[:1]) for word in ("--baseline", name)]
     left = [] if files else [name for group in groups for name in group[1:]]
     return [arguments[0], *options, *left, *plain]

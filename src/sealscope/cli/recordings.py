@@ -12,6 +12,7 @@ import typer
 
 from sealscope.cli.options import (
     BaselineOption,
+    CalibrationOption,
     FalseAlarmOption,
     MapOption,
     RateOption,
@@ -54,12 +55,16 @@ def _diagnoses(
     maps: Sequence[str] | None,
     rate: float | None,
     false_alarm: float,
+    calibration: Path | None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
     """Recording and diagnosis of each file, None for one that cannot be read; a file is never its own baseline."""
     from sealscope.diagnosis.diagnose import check_probability, diagnose
 
     check_probability(false_alarm)
     channel_map = channel_map_of(maps)
+    if calibration is not None:
+        yield from _calibrated(files, baseline, channel_map, rate, calibration)
+        return
     for file in files if baseline else ():
         if all(path.resolve() == file.resolve() for path in baseline):
             raise InputError(f"a baseline must be another recording than the file itself, got {file}")
@@ -80,6 +85,20 @@ def _diagnoses(
         yield recording, diagnose(recording, others, false_alarm_probability=false_alarm, file=str(file))
 
 
+def _calibrated(
+    files: Sequence[Path], baseline: Sequence[Path], channel_map: dict[str, str], rate: float | None, calibration: Path
+) -> Iterator[tuple[Recording, Diagnosis] | None]:
+    """Recording and diagnosis of each file by the thresholds of a calibration, at its false-alarm rate."""
+    from sealscope.diagnosis.calibrated import diagnose_calibrated
+    from sealscope.diagnosis.calibration import load
+
+    if baseline:
+        raise InputError("--calibration must stand without --baseline: its leak-free recordings are in it")
+    known = load(calibration)
+    for file, recording in _read_all(files, channel_map, rate):
+        yield None if recording is None else (recording, diagnose_calibrated(recording, known, file=str(file)))
+
+
 def diagnose(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Recordings: CSV or text, NetCDF, HDF5, Parquet.")
@@ -89,12 +108,13 @@ def diagnose(
     maps: MapOption = None,
     rate: RateOption = None,
     false_alarm: FalseAlarmOption = 0.01,
+    calibration: CalibrationOption = None,
 ) -> None:
     """Say for each file whether oil bypasses the piston. Exit status 1 where a file could not be read."""
     from sealscope.reporting import diagnosis_text
 
     complete = True
-    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm):
+    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration):
         if found is None:
             complete = False
         elif output is TextFormat.jsonl:
@@ -112,6 +132,7 @@ def report(
     maps: MapOption = None,
     rate: RateOption = None,
     false_alarm: FalseAlarmOption = 0.01,
+    calibration: CalibrationOption = None,
 ) -> None:
     """Diagnose each file and write a self-contained HTML page of it."""
     from sealscope.reporting import write_page
@@ -131,7 +152,7 @@ def report(
     else:
         check_folder(output)
     complete = True
-    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm):
+    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration):
         if found is None:
             complete = False
             continue

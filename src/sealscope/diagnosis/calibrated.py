@@ -126,7 +126,7 @@ def _result(name: str, score: Score, group: Group, calibration: Calibration) -> 
     sign = "over" if verdict == "leak" else "not over"
     reason = (
         f"{name}: score {score.value:.4g} {sign} the threshold {threshold.value:.4g}, set from {threshold.n} leak-free "
-        f"recordings for a false-alarm rate of {calibration.rate:g} (truly {threshold.low:.2g} to {threshold.high:.2g} at "
-        f"{100 * threshold.confidence:g} % confidence)"
+        f"recordings for a false-alarm rate of {calibration.rate:g} (truly {threshold.low:.2g} to {threshold.high:.2g} "
+        f"at {100 * threshold.confidence:g} % confidence)"
     )
     return MethodResult(name, score.value, threshold.value, verdict, reason)

@@ -76,7 +76,7 @@ class Look:
             with np.errstate(divide="ignore"):
                 both = np.average(parts, axis=0, weights=sizes)
                 found[chamber] = tuple(0.5 * np.log(one) for one in (*parts, both))
-        return found  # type: ignore[return-value]
+        return found
 
     @cached_property
     def rms_change(self) -> Evidence:

@@ -6,8 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from sealscope.errors import SimulationFailed
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import PRESSURES, decimate
@@ -67,24 +65,21 @@ class Proof:
         return max(judged, key=lambda one: one.difference / (one.tolerance or math.inf))
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
     """Differences between two trajectories of one experiment: rms of each channel, and change of each detail's RMS in
     both chambers."""
     from sealscope.signals.details import details
+    from sealscope.signals.windows import rms
 
     n = round(experiment.duration * experiment.rate)
     factor = oversampling(experiment)
     units = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
     found = [
-        Difference(name, _rms(coarse[name][: n * factor] - fine[name][: n * factor]), units[name], None)
+        Difference(name, rms(coarse[name][: n * factor] - fine[name][: n * factor]), units[name], None)
         for name in _STATES
     ]
     found += [
-        Difference(name, _rms(coarse[name][: n * factor] - fine[name][: n * factor]), "Pa", PRESSURE_TOLERANCE)
+        Difference(name, rms(coarse[name][: n * factor] - fine[name][: n * factor]), "Pa", PRESSURE_TOLERANCE)
         for name in PRESSURES
     ]
     for name in ("p_A", "p_B"):
@@ -92,7 +87,7 @@ def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tup
         sensor = getattr(experiment.rig.sensors, name)
         noise = math.hypot(sensor.noise, experiment.rig.sensors.common_noise)
         for level in range(1, one.levels + 1):
-            a, b = _rms(one[level][one.inside(level)]), _rms(other[level][other.inside(level)])
+            a, b = rms(one[level][one.inside(level)]), rms(other[level][other.inside(level)])
             recorded = math.hypot(b, noise)
             change = abs(math.hypot(a, noise) - recorded)
             found.append(Difference(f"RMS of d{level} of {name}", change, "Pa", DETAIL_TOLERANCE * recorded))

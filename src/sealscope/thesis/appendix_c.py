@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.recordings.recording import Array
-from sealscope.thesis.binomial import clopper_pearson
 from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.context import Context, Sheet
 from sealscope.thesis.items import Item

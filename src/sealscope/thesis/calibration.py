@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from sealscope.errors import SimulationFailed
 from sealscope.recordings.recording import Array
 from sealscope.thesis.calibration_forward import (
     CHAMBERS,
@@ -88,11 +89,15 @@ def leave_conditions_out(problem: Problem, z: Array) -> tuple[Array, float]:
     refits, left = [], np.empty_like(residual)
     for group in parts:
         out = np.array([condition.group == group for condition in problem.conditions])
-        others = problem.without(group)
+        others, alone = problem.without(group), problem.only(group)
         moved = stepped(others, z, residual[~out], slope[~out])
+        try:
+            unseen = alone.squares(moved)
+        except SimulationFailed:  # the step suits the others and is impossible here: it is refused
+            moved, unseen = z, alone.squares(z)
         log_noise = others.residuals(others.squares(moved))[1]
         refits.append([*moved, *log_noise])
-        left[out] = problem.only(group).residuals(problem.only(group).squares(moved), log_noise)[0]
+        left[out] = alone.residuals(unseen, log_noise)[0]
     n = len(parts)
     spread = np.array(refits) - np.mean(refits, axis=0)
     deviation = np.sqrt((n - 1) / n * np.sum(np.square(spread), axis=0))

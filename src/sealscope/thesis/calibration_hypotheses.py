@@ -1,13 +1,13 @@
 """What could explain the rest: named hypotheses on the calibrated rig, each held against both halves of the sheet.
 
-The model is symmetric: both chambers ring alike, and a leak damps both. On the rig a leak lowers d3 of p_A and raises
-d4 of p_B. Each hypothesis changes the rig in both halves of a test (`always`) or between them (`then`).
+The model is symmetric: both chambers ring alike, and a leak damps both. In Appendix C d3 of p_A falls with the leak and
+d4 of p_B rises. Each hypothesis changes the rig in both halves of a test (`always`) or between them (`then`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -47,14 +47,21 @@ HYPOTHESES: tuple[Hypothesis, ...] = (
     Hypothesis("the calibrated rig"),
     Hypothesis("the bypass leaks as an orifice", law="orifice"),
     Hypothesis("volumes change with the stroke", _MOVES),
-    Hypothesis("less oil in A by 25 mm of stroke", _MOVES, x_0=-0.10, x_0_then=-0.10),
-    Hypothesis("piston 100 mm nearer to cap B with the leak", _MOVES, x_0=-0.10, x_0_then=0.0),
-    Hypothesis("piston 200 mm nearer to cap B with the leak", _MOVES, x_0=-0.15, x_0_then=0.05),
+    Hypothesis("the piston starts 100 mm nearer to cap A", _MOVES, x_0=-0.10, x_0_then=-0.10),
+    Hypothesis("it moves 100 mm towards cap B between the halves", _MOVES, x_0=-0.10, x_0_then=0.0),
+    Hypothesis("it moves 200 mm towards cap B between the halves", _MOVES, x_0=-0.20, x_0_then=0.0),
     Hypothesis("throttle B 10 % further closed", more_closed_B=0.10),
     Hypothesis("line volume 1 twice line volume 2", factors={"line.V_1": 1.4, "line.V_2": 0.7}),
     Hypothesis("sensor B reads 10 % less", gain_B=0.9),
     Hypothesis("bulk modulus 10 % lower with the leak (air)", then={"fluid.K_oil": 0.9}),
-    Hypothesis("friction 10 % higher with the leak", then={"friction.F_pr": 1.1}),
+    Hypothesis("breakaway 5 % higher with the leak", then={"friction.K_brk": 1.05}),
+    Hypothesis(
+        "it moves 100 mm towards cap B, breakaway 5 % higher",
+        _MOVES,
+        then={"friction.K_brk": 1.05},
+        x_0=-0.10,
+        x_0_then=0.0,
+    ),
 )
 
 
@@ -103,7 +110,7 @@ def outcome(rig: Rig, hypothesis: Hypothesis, conditions: tuple[Condition, ...] 
                 read = squares[k] * np.array([h.gain_B**2] * 4 + [h.gain_B**4]) if k else squares[k]
                 made[row, half, k] = np.exp(log_rms(read, noise_of(rig, chamber)))
     return Outcome(
-        replace(h),
+        h,
         Sheet({c: {q: made[:, :, k, j] for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)}),
     )
 

@@ -20,7 +20,8 @@ _FITTED = (
 )
 _HEAD = f"""\
 # The rig of the thesis as its own measurements say it is: what the thesis leaves unknown, fitted to the leak-free
-# columns of its Appendix C. Made by sealscope.thesis.calibration.fit; {_RECORD} tells how and how well.
+# columns of its Appendix C. Made by sealscope.thesis.calibration.fit; how and how well is told in
+# {_RECORD}.
 
 [rig]
 name = "thesis-calibrated"
@@ -75,9 +76,9 @@ def _values(calibration: Calibration, base: Rig) -> Iterator[tuple[str, float | 
         told = f"with common noise and conversion {sigma:.3g} psi, 95 % {low:.3g} to {high:.3g} psi, see {_RECORD}"
         found.append((f"sensors.{chamber}.noise", own, f"{_FITTED}: {told}"))
         found.append((f"sensors.{port}.noise", own, f"assumed: as {chamber}; no record of {port} is analysed"))
-    rates = sorted({trial.rate for trial in calibration.trials})
-    tried = ", ".join(f"{rate:g}" for rate in rates)
-    found.append(("daq.sample_rate", best.rate, f"{_FITTED}: best of {tried} Hz, see {_RECORD}"))
+    tried = ", ".join(f"{trial.misfit:.3f} at {trial.rate:g} Hz" for trial in calibration.trials)
+    told = f"{_FITTED}: least root-mean-square log residual of {tried}, see {_RECORD}"
+    found.append(("daq.sample_rate", best.rate, told))
     order = {row.name: place for place, row in enumerate(base.table())}
     yield from sorted(found, key=lambda one: order[one[0]])
 

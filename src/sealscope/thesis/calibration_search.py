@@ -44,8 +44,8 @@ class Free:
 class Budget:
     """How long to search: settings drawn over the whole box, then steps of the simplex, for each rate and transform."""
 
-    drawn: int = 24
-    steps: int = 70
+    drawn: int = 32
+    steps: int = 110
 
 
 @dataclass(frozen=True)
@@ -130,6 +130,7 @@ class Problem:
 
 
 def root_mean_square(values: Array) -> float:
+    """Root mean square of residuals; not finite where one of them is not (`signals.windows.rms` refuses those)."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -171,14 +172,20 @@ def search(problem: Problem, budget: Budget, seed: int = 0, progress: Callable[[
 
 def slopes(problem: Problem, z: Array, step: float = 0.06) -> tuple[Array, Array]:
     """Residuals at `z`, (tests, 2, 5), and their derivatives to the free parameters' and the noises' logarithms,
-    (tests, 2, 5, free + 2), by central differences over +-`step`."""
+    (tests, 2, 5, free + 2), by central differences over +-`step`, one-sided where the rig fails on the other side."""
     here = problem.squares(z)
     residual, log_noise = problem.residuals(here)
+
+    def nudged(k: int, by: float) -> tuple[Array, float]:
+        try:
+            return problem.residuals(problem.squares(z + by * np.eye(len(z))[k]), log_noise)[0], by
+        except (InputError, SimulationFailed):
+            return residual, 0.0
+
     columns = []
     for k in range(len(z)):
-        nudge = step * np.eye(len(z))[k]
-        up, down = (problem.residuals(problem.squares(z + sign * nudge), log_noise)[0] for sign in (1.0, -1.0))
-        columns.append((up - down) / (2.0 * step))
+        (up, above), (down, below) = nudged(k, step), nudged(k, -step)
+        columns.append((up - down) / max(above - below, 1e-9))
     for k in range(len(CHAMBERS)):
         nudge = 1e-3 * np.eye(len(CHAMBERS))[k]
         up, down = (problem.residuals(here, log_noise + sign * nudge)[0] for sign in (1.0, -1.0))

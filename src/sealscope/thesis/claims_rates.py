@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sealscope.thesis.binomial import at_least
+from sealscope.evaluation.binomial import at_least
 from sealscope.thesis.chapter5 import NOMINAL_LPM
 from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.context import Sheet

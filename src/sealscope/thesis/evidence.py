@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
 from sealscope.recordings.recording import Array
 from sealscope.thesis.appendix_c import simulated
-from sealscope.thesis.binomial import clopper_pearson, holm, sign_test
 from sealscope.thesis.chapter5 import test_of
 from sealscope.thesis.context import Context, Sheet
 from sealscope.thesis.judging import verdict_of

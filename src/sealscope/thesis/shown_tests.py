@@ -49,10 +49,6 @@ def best_step(t: Array, y: Array, least: int = 5) -> float:
     return float((t[k - 1] + t[k]) / 2.0)
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def _spread(values: Array) -> float:
     low, high = np.percentile(values, [5.0, 95.0])
     return float(high - low)
@@ -62,7 +58,7 @@ def _mean(values: Array) -> float:
     return float(values.mean())
 
 
-_MEASURES = {"rms": _rms, "range": _spread, "mean": _mean}
+_MEASURES = {"rms": rms, "range": _spread, "mean": _mean}
 
 
 def _whole_cycles(recording: Recording, start: float, stop: float, omega: float) -> Mask:

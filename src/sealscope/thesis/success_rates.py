@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
 from sealscope.thesis.appendix_c import simulated
-from sealscope.thesis.binomial import clopper_pearson, holm, sign_test
 from sealscope.thesis.context import Context, Sheet
 from sealscope.thesis.items import Item
 from sealscope.thesis.products import Table

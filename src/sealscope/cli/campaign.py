@@ -1,0 +1,317 @@
+"""The commands that measure: campaign run, status and report; calibrate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sealscope.cli.options import (
+    FalseAlarmOption,
+    MapOption,
+    RateOption,
+    channel_map_of,
+    check_folder,
+    complain,
+)
+from sealscope.errors import InputError
+
+if TYPE_CHECKING:
+    from sealscope.campaigns.held_out import Samples
+    from sealscope.campaigns.plan import AnyPlan
+    from sealscope.campaigns.results import Result
+    from sealscope.campaigns.run import Progress, Standing
+
+campaign = typer.Typer(
+    name="campaign",
+    help="Measure what detectors find, at what false-alarm rate, over many simulated or measured records.",
+    no_args_is_help=True,
+)
+
+
+def complete_plans(incomplete: str) -> list[str]:
+    """Names of packaged plans that begin so."""
+    from sealscope.campaigns.plan import plan_names
+
+    return [name for name in plan_names() if name.startswith(incomplete)]
+
+
+def complete_detectors(incomplete: str) -> list[str]:
+    """Names of scorers that begin so."""
+    from sealscope.diagnosis.scorers import SCORERS
+
+    return [name for name in SCORERS if name.startswith(incomplete)]
+
+
+PlanArgument = Annotated[
+    str, typer.Argument(metavar="PLAN", help="Plan by name, or a TOML file.", autocompletion=complete_plans)
+]
+FolderOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Folder of the campaign; by default sealscope-campaigns/NAME."),
+]
+SheetOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--sheet",
+        help="Folder with the thesis's data sheet (appendix_c_pa.csv, appendix_c_pb.csv), for plans over it; else "
+        "$SEALSCOPE_SHEET or ./data.",
+    ),
+]
+
+DataOption = Annotated[
+    Path | None, typer.Option("--data", help="Folder of the measured data, for plans over recordings or data sets.")
+]
+
+
+@campaign.command()
+def run(
+    plan: PlanArgument,
+    folder: FolderOption = None,
+    jobs: Annotated[int | None, typer.Option("--jobs", "-j", help="Processes; by default one a core.")] = None,
+    cluster: Annotated[
+        str | None, typer.Option("--cluster", metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786.")
+    ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Carry failed records out again.")] = False,
+    sheet: SheetOption = None,
+    data: DataOption = None,
+) -> None:
+    """Carry out what is missing of a plan, then report. Interrupted, the same call goes on. Exit status 1 where a
+    record failed."""
+    from sealscope.campaigns.plan import Plan, load_plan
+    from sealscope.campaigns.run import run as carry_out
+
+    loaded = load_plan(plan)
+    place = _folder(loaded, folder)
+    if isinstance(loaded, Plan):
+        with _progress() as told:
+            standing = carry_out(loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=told)
+        typer.echo(_standing(standing))
+    _report(loaded, place, sheet, data)
+    if isinstance(loaded, Plan) and standing.failed:
+        raise typer.Exit(1)
+
+
+@campaign.command()
+def status(plan: PlanArgument, folder: FolderOption = None) -> None:
+    """Say how far a campaign is, and what is left."""
+    from sealscope.campaigns.plan import Plan, load_plan
+    from sealscope.campaigns.run import standing
+
+    loaded = load_plan(plan)
+    if not isinstance(loaded, Plan):
+        typer.echo("a campaign over measured data has nothing to wait for; report it")
+        return
+    typer.echo(_standing(standing(loaded, _folder(loaded, folder))))
+
+
+@campaign.command()
+def report(plan: PlanArgument, folder: FolderOption = None, sheet: SheetOption = None, data: DataOption = None) -> None:
+    """Judge the rows that are there; write tables, calibration and page."""
+    from sealscope.campaigns.plan import load_plan
+
+    loaded = load_plan(plan)
+    _report(loaded, _folder(loaded, folder), sheet, data)
+
+
+def _folder(plan: AnyPlan, given: Path | None) -> Path:
+    return given if given is not None else Path("sealscope-campaigns") / plan.name
+
+
+def _standing(standing: Standing) -> str:
+    words = f"records: {standing.done} of {standing.records} done"
+    if standing.failed:
+        words += f", {standing.failed} of them failed"
+    if standing.seconds is not None:
+        left = (standing.records - standing.done) * standing.seconds
+        words += f"; {standing.seconds:.2f} s of one core each"
+        words += f", about {_span(left)} of one core left" if left else ""
+    return words
+
+
+def _span(seconds: float) -> str:
+    return (
+        f"{seconds / 3600:.1f} h"
+        if seconds > 5400
+        else f"{seconds / 60:.0f} min"
+        if seconds > 90
+        else f"{seconds:.0f} s"
+    )
+
+
+def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> None:
+    from sealscope.campaigns.results import write_result
+    from sealscope.reporting.campaign_page import PAGE, campaign_text, write_campaign_page
+
+    result = _result(plan, folder, sheet, data)
+    files = write_result(result, folder)
+    write_campaign_page(result, folder / PAGE, [path.name for path in files])
+    typer.echo(campaign_text(result))
+    for row in result.judgement.failed[:5]:
+        complain(f"record {row.id} failed: {row.error}")
+    typer.echo(f"tables: {folder}")
+    typer.echo(f"page:   {folder / PAGE}")
+
+
+def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> Result:
+    """The plan's result: from the rows in its folder, or from the measured data that it is about."""
+    from sealscope.campaigns.measured import hydraulic_samples, needs_folder
+    from sealscope.campaigns.plan import Plan
+    from sealscope.campaigns.recorded import RecordedPlan
+    from sealscope.campaigns.results import held_out_result, recorded_result, simulated_result
+
+    if isinstance(plan, Plan):
+        return simulated_result(plan, folder)
+    if isinstance(plan, RecordedPlan):
+        with _progress() as told:
+            return recorded_result(plan, needs_folder(data, "recordings"), told)
+    if plan.data == "hydraulic":
+        return held_out_result(plan, hydraulic_samples(needs_folder(data, "the hydraulic data set")))
+    return held_out_result(plan, _sheet_samples(sheet))
+
+
+def _sheet_samples(folder: Path | None) -> Samples:
+    """The thesis's data sheet as samples: log RMS of each detail, each test without and with its leak."""
+    import numpy as np
+
+    from sealscope.campaigns.held_out import Samples
+    from sealscope.thesis.conditions import APPENDIX_C
+    from sealscope.thesis.sheet import MISSING, find_sheet, read_sheet
+
+    found = find_sheet(folder)
+    if found is None:
+        raise InputError(MISSING)
+    sheet, _ = read_sheet(found)
+    features = {
+        f"{quantity} of {chamber}": np.log(values).T.ravel()
+        for chamber, quantities in sheet.rms.items()
+        for quantity, values in quantities.items()
+    }
+    leaks = [one.mean_leak_lpm for one in APPENDIX_C]
+    return Samples(
+        features=features,
+        leak_lpm=np.array([0.0] * len(leaks) + leaks),
+        tests=[one.number for one in APPENDIX_C] * 2,
+        levels=[{"command": one.command, "closed": f"{one.closed_pct:g} %"} for one in APPENDIX_C] * 2,
+    )
+
+
+def calibrate(
+    baseline: Annotated[
+        list[Path],
+        typer.Option("--baseline", metavar="FILE...", help="Leak-free recordings of the machine."),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration to write (JSON).")],
+    detectors: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--detector",
+            help="Detector to calibrate; repeat, the first makes the verdict.",
+            autocompletion=complete_detectors,
+        ),
+    ] = None,
+    false_alarm: FalseAlarmOption = 0.01,
+    promise: Annotated[
+        str, typer.Option("--promise", help="'average': the rate holds on average; 'bound': with --confidence.")
+    ] = "average",
+    confidence: Annotated[float, typer.Option("--confidence", help="Confidence of the stated intervals.")] = 0.95,
+    split: Annotated[
+        float, typer.Option("--split", help="Where recordings are split, as share of their length.")
+    ] = 0.5,
+    maps: MapOption = None,
+    rate: RateOption = None,
+) -> None:
+    """Set thresholds from leak-free recordings of your own machine, for `diagnose --calibration`."""
+    from hashlib import sha256
+
+    from sealscope import __version__
+    from sealscope.diagnosis.calibrated import DEFAULT_DETECTORS, calibrate_on
+    from sealscope.diagnosis.calibration import save
+    from sealscope.recordings import read
+
+    check_folder(output)
+    if len({path.resolve() for path in baseline}) < len(baseline):
+        raise InputError("baseline recordings must be given once each")
+    if output.resolve() in {path.resolve() for path in baseline}:
+        raise InputError(f"a calibration must not replace a recording, got {output}")
+    if promise not in ("average", "bound"):
+        raise InputError(f"--promise must be average or bound, got {promise}")
+    channel_map = channel_map_of(maps)
+    recordings = {str(path): read(path, channel_map=channel_map or None, rate=rate) for path in baseline}
+    files = [{"file": path.name, "sha256": sha256(path.read_bytes()).hexdigest()} for path in baseline]
+    found = calibrate_on(
+        recordings,
+        tuple(detectors or DEFAULT_DETECTORS),
+        false_alarm_probability=false_alarm,
+        split_share=split,
+        promise=promise,
+        confidence=confidence,
+        made_from={"recordings": files, "channel_map": dict(channel_map), "version": str(__version__)},
+    )
+    save(found, output)
+    for group in found.groups:
+        point = group.point
+        words = [f"{group.records} recordings at {point.rate:g} Hz"]
+        words += [f"command {point.command_rms:.3g} V rms"] if point.command_rms is not None else []
+        words += [f"stroke {point.direction:+d}"] if point.direction else []
+        typer.echo(", ".join(words))
+        for name in found.detectors:
+            one = group.thresholds.get(name)
+            typer.echo(
+                f"  {name}: too few recordings"
+                if one is None
+                else f"  {name}: threshold {one.value:.4g}, false alarms {100 * one.expected:.3g} % expected "
+                f"({100 * one.low:.2g} % to {100 * one.high:.2g} %)"
+            )
+    typer.echo(f"calibration: {output}")
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    """One bar on standard error with the records, failures and the time left; without a terminal a line a minute."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _Lines()
+        return
+    columns = (
+        TextColumn("records"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(), TextColumn("{task.description}"),
+    )  # fmt: skip
+    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
+        task = bar.add_task("", total=None)
+
+        def told(done: int, total: int, failures: int) -> None:
+            bar.update(task, completed=done, total=total, description=f"{failures} failed" if failures else "")
+
+        yield told
+
+
+class _Lines:
+    """Progress where nobody watches: a line a minute, for the log."""
+
+    def __init__(self) -> None:
+        self.began, self.last, self.first = time.monotonic(), time.monotonic(), -1
+
+    def __call__(self, done: int, total: int, failures: int) -> None:
+        now = time.monotonic()
+        self.first = done if self.first < 0 else self.first
+        if now - self.last < 60.0 or done == self.first:
+            return
+        self.last = now
+        left = (now - self.began) / (done - self.first) * (total - done)
+        failed = f", {failures} failed" if failures else ""
+        typer.echo(f"{done} of {total} records{failed}, about {_span(left)} left", err=True)

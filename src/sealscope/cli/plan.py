@@ -1,0 +1,85 @@
+"""The command that plans: what a rig, its sensors and a command will let a detector find, before anyone measures."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sealscope.cli.options import RigOption, SetOption, progress, rig_with
+
+
+class PlanFormat(StrEnum):
+    """How a plan is printed."""
+
+    text = "text"
+    json = "json"
+
+
+def plan(
+    rig: RigOption = "thesis",
+    command: Annotated[str, typer.Option("--command", help="Command of the test, e.g. '3 sin(4t)'.")] = "3 sin(4t)",
+    duration: Annotated[
+        str, typer.Option("--duration", help="Length of a record [s]; the leak opens in its middle.")
+    ] = "180",
+    false_alarm: Annotated[
+        float, typer.Option("--false-alarm", help="Probability of an alarm on a leak-free record.")
+    ] = 0.01,
+    detection: Annotated[
+        float, typer.Option("--detection", help="Probability with which the smallest leak is to be found.")
+    ] = 0.9,
+    settings: SetOption = None,
+    detectors: Annotated[
+        list[str] | None,
+        typer.Option("--detector", help="Detector, e.g. 'd3 of p_A fell', 'd2 of p_B changed'; repeat. The thesis's."),
+    ] = None,
+    bench: Annotated[
+        str,
+        typer.Option("--bench", help="Machines and drifts from this bench profile (name or file), not noise alone."),
+    ] = "",
+    results: Annotated[
+        Path | None,
+        typer.Option("--results", help="Folder of a campaign with this duty: its records, not a simulation, tell."),
+    ] = None,
+    draws: Annotated[int, typer.Option("--draws", help="Machines drawn from the bench.")] = 24,
+    start: Annotated[
+        str | None,
+        typer.Option("--start-position", help="Piston at the start, from mid-stroke [m]; by default centred."),
+    ] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare/--no-compare", help="Compare the standard commands and throttles.")
+    ] = True,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of noise and draws.")] = 0,
+    output: Annotated[PlanFormat, typer.Option("--format", help="Text, or one JSON object.")] = PlanFormat.text,
+) -> None:
+    """Predict the smallest leak that each detector finds, with the Cramer-Rao bound beside it."""
+    from sealscope.campaigns.planning import STANDARD_COMMANDS, Wish, experiment_for, outlook
+    from sealscope.campaigns.prediction import THESIS_DETECTORS, change_detector
+    from sealscope.units import parse_quantity
+
+    wish = Wish(
+        false_alarm=false_alarm,
+        detection=detection,
+        detectors=tuple(change_detector(name) for name in dict.fromkeys(detectors)) if detectors else THESIS_DETECTORS,
+        seed=seed,
+    )
+    experiment = experiment_for(
+        rig_with(rig, settings),
+        command,
+        parse_quantity(duration, "s", name="--duration"),
+        None if start is None else parse_quantity(start, "m", name="--start-position"),
+    )
+    with progress() as told:
+        made = outlook(
+            experiment,
+            wish,
+            commands=STANDARD_COMMANDS if compare else (),
+            bench=bench,
+            draws=draws,
+            results=results,
+            progress=told,
+        )
+    typer.echo(json.dumps(made.as_dict(), allow_nan=False) if output is PlanFormat.json else made.text())

@@ -1,0 +1,144 @@
+"""Campaigns and calibrations from the command line, and their page."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+
+import pytest
+
+from sealscope import cli
+from sealscope.campaigns.plan import load_plan
+from sealscope.recordings import write
+from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.simulate import run
+
+
+@pytest.fixture
+def call(monkeypatch, capfd):
+    """Status, output and complaint of one call within this process."""
+
+    def called(*words):
+        monkeypatch.setattr(sys, "argv", ["sealscope", *map(str, words)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        out, err = capfd.readouterr()
+        assert "Traceback" not in err
+        return ended.value.code, out, err
+
+    return called
+
+
+def test_run_status_and_report(call, tiny, tmp_path):
+    folder = tmp_path / "mine"
+    status, out, _ = call("campaign", "status", tiny, "-o", folder)
+    assert (status, out) == (0, "records: 0 of 26 done\n")
+    status, out, err = call("campaign", "run", tiny, "-o", folder, "-j", "1")
+    assert status == 0, err
+    assert re.search(r"^records: 26 of 26 done; [\d.]+ s of one core each$", out, re.MULTILINE)
+    for name in ("d3 of p_A changed", "sign rule: d3 of p_A fell", "always fire", "never fire"):
+        assert re.search(rf"^{name} .*%", out, re.MULTILINE)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    again = call("campaign", "report", tiny, "-o", folder)
+    assert again[0] == 0
+    assert (folder / "report.html").read_text(encoding="utf-8") == page
+    assert json.loads((folder / "calibration.json").read_text())["made_from"]["campaign"]["name"] == "tiny"
+
+
+def test_the_page_is_whole_and_asks_nothing_of_a_network(call, tiny, tmp_path):
+    call("campaign", "run", tiny, "-o", tmp_path / "mine", "-j", "1")
+    page = (tmp_path / "mine" / "report.html").read_text(encoding="utf-8")
+    assert "http" not in page.replace("http-equiv", "")
+    for href in re.findall(r'href="([^"]+)"', page):
+        assert (tmp_path / "mine" / href).is_file()
+    plan = load_plan(tiny)
+    for name in plan.detectors:
+        assert page.count(f"<summary>{name}</summary>") == 1
+    assert page.count('<svg class="curve"') == 2 * len(plan.detectors)
+    numbers = re.findall(r' d="([^"]+)"', page)
+    assert numbers
+    assert not any("nan" in one or "inf" in one for one in numbers)
+    assert not re.search(r">(nan|inf|None)<", page)
+
+
+def test_an_incomplete_campaign_says_so(call, tiny, tmp_path):
+    call("campaign", "run", tiny, "-o", tmp_path / "mine", "-j", "1")
+    rows = (tmp_path / "mine" / "rows.jsonl").read_bytes().splitlines(keepends=True)
+    (tmp_path / "mine" / "rows.jsonl").write_bytes(b"".join(rows[:-3]))
+    status, out, _ = call("campaign", "report", tiny, "-o", tmp_path / "mine")
+    assert status == 0
+    assert "Not complete: 3 records of the plan have no row yet." in out
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("campaign", "run", "no-such-plan"), "no packaged plan"),
+        (("campaign", "report", "TINY", "-o", "nowhere"), "must have rows to report on"),
+        (("campaign", "run", "TINY", "-o", "nowhere", "-j", "0"), "--jobs must be >= 1"),
+        (("calibrate", "--baseline", "none.csv", "-o", "c.json"), "none.csv"),
+        (("calibrate", "--baseline", "-o", "c.json"), "--baseline must be followed by one file or more"),
+    ],
+)
+def test_wrong_calls_are_one_line(call, tiny, tmp_path, monkeypatch, words, told):
+    monkeypatch.chdir(tmp_path)
+    status, _, err = call(*(tiny if word == "TINY" else word for word in words))
+    assert status in (1, 2)
+    assert told in err
+    assert len(err.splitlines()) == 1
+    assert not (tmp_path / "c.json").exists()
+
+
+@pytest.fixture
+def logs(tmp_path):
+    """Leak-free and leaky recordings of one machine, as files."""
+    files = {}
+    for seed in range(10):
+        path = tmp_path / f"sound-{seed}.csv"
+        write(run(make_experiment(command="3 sin(4t)", duration=8.0, seed=seed)).recording, path)
+        files[path.stem] = path
+    leaky = tmp_path / "leaky.csv"
+    write(run(make_experiment(command="3 sin(4t)", duration=8.0, seed=77, leak="0.3 L/min from 4 s")).recording, leaky)
+    other = tmp_path / "other.csv"
+    write(run(make_experiment(command="5 sin(2t)", duration=8.0, seed=78)).recording, other)
+    return files, leaky, other
+
+
+def test_calibrate_on_the_own_machine_and_diagnose_by_it(call, logs, tmp_path):
+    sound, leaky, other = logs
+    target = tmp_path / "calibration.json"
+    status, out, err = call(
+        "calibrate", "--baseline", *sound.values(), "-o", target, "--false-alarm", "0.1",
+        "--detector", "d3 of p_A changed", "--detector", "d4 of p_A changed",
+    )  # fmt: skip
+    assert status == 0, err
+    assert "10 recordings at 500 Hz" in out
+    made = json.loads(target.read_text())["made_from"]
+    assert [one["file"] for one in made["recordings"]] == [path.name for path in sound.values()]
+    status, out, err = call("diagnose", leaky, other, "--calibration", target, "--format", "jsonl")
+    assert status == 0, err
+    first, second = (json.loads(line) for line in out.splitlines())
+    assert (first["verdict"], second["verdict"]) == ("leak", "cannot tell")
+    assert first["false_alarm_probability"] == 0.1
+    assert first["score"] > first["threshold"]
+    assert "outside the calibrated operating points: another command" in second["reason"]
+    status, _, err = call("report", leaky, "--calibration", target, "-o", tmp_path / "page.html")
+    assert status == 0, err
+    assert "leak" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    status, _, err = call("diagnose", leaky, "--calibration", target, "--baseline", sound["sound-1"])
+    assert status == 2
+    assert "--calibration must stand without --baseline" in err
+    (tmp_path / "bad.json").write_text("{}")
+    status, _, err = call("diagnose", leaky, "--calibration", tmp_path / "bad.json")
+    assert status == 1
+    assert "bad.json" in err
+
+
+def test_too_few_recordings_are_refused_and_nothing_is_written(call, logs, tmp_path):
+    sound, _, _ = logs
+    status, _, err = call("calibrate", "--baseline", *sound.values(), "-o", tmp_path / "c.json")
+    assert status == 2
+    assert "must be at least 99" in err
+    assert not (tmp_path / "c.json").exists()

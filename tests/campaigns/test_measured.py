@@ -1,0 +1,146 @@
+"""Campaigns over recordings and data sets that somebody else measured."""
+
+from __future__ import annotations
+
+import csv
+import re
+
+import pytest
+
+from sealscope.campaigns.measured import hydraulic_samples, needs_folder
+from sealscope.campaigns.plan import load_plan
+from sealscope.campaigns.recorded import recorded_rows
+from sealscope.campaigns.results import held_out_result, recorded_result, write_result
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings import write
+from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.simulate import run
+
+PLAN = """
+[campaign]
+name = "mine"
+false_alarm = 0.1
+detectors = ["d3 of p_A changed", "sign rule: d3 of p_A fell"]
+
+[recordings]
+rate = "500 Hz"
+
+[[recordings.sets]]
+files = "sound-*.csv"
+use = "calibrate"
+end = 11
+
+[[recordings.sets]]
+files = "sound-*.csv"
+first = 11
+
+[[recordings.sets]]
+files = "leaky-*.csv"
+size = 0.3
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Twelve sound recordings and two leaky ones of one machine."""
+    for seed in range(1, 13):
+        made = run(make_experiment(command="3 sin(4t)", duration=8.0, seed=seed)).recording
+        write(made, tmp_path / f"sound-{seed}.csv")
+    for seed in range(2):
+        leak = run(make_experiment(command="3 sin(4t)", duration=8.0, seed=50 + seed, leak="0.3 L/min from 4 s"))
+        write(leak.recording, tmp_path / f"leaky-{seed}.csv")
+    return tmp_path
+
+
+def plan_of(folder, text=PLAN):
+    path = folder / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_plan(path)
+
+
+def test_recordings_are_calibrated_and_judged(folder):
+    result = recorded_result(plan_of(folder), folder)
+    assert (result.judgement.calibrated_on, result.judgement.judged, len(result.rows)) == (10, 4, 14)
+    table = {row.detector: row for row in result.judgement.table}
+    assert table["d3 of p_A changed"].detection.count == 2
+    assert table["d3 of p_A changed"].false_alarm.n == 2
+    files = write_result(result, folder / "out")
+    assert {path.name for path in files} >= {"table.csv", "records.csv", "calibration.json"}
+    before = {path.name: path.read_bytes() for path in files}
+    again = write_result(recorded_result(plan_of(folder), folder), folder / "out")
+    assert {path.name: path.read_bytes() for path in again} == before
+
+
+def test_numbers_in_names_count_as_numbers(folder):
+    """`sound-10` comes after `sound-9`: the first ten are those numbered 1 to 10."""
+    rows = recorded_rows(plan_of(folder), folder)
+    judged = recorded_rows(plan_of(folder, PLAN.replace("first = 11", "first = 12")), folder)
+    assert sum(row.use == "calibrate" for row in rows) == 10
+    left_out = {row.id for row in rows} - {row.id for row in judged}
+    assert len(left_out) == 1
+
+
+def test_a_file_that_cannot_be_judged_is_a_row_with_its_error(folder):
+    (folder / "leaky-9.csv").write_text("t [s],p_A [Pa]\n0,1\n", encoding="utf-8")
+    rows = recorded_rows(plan_of(folder), folder)
+    errors = [row.error for row in rows if row.error]
+    assert len(errors) == 1
+    assert "leaky-9.csv" in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ('files = "leaky-*.csv"', 'files = "../*.csv"', "files must be a pattern within the folder"),
+        ("size = 0.3", "size = -1.0", "size must be >= 0"),
+        ("end = 11", "end = 11\nsize = 1.0", "0 to calibrate"),
+        ('rate = "500 Hz"', "map = 3", "map must be a table"),
+        ("size = 0.3", "colour = 1", "colour is not known"),
+    ],
+)
+def test_a_wrong_plan_is_one_line(tmp_path, before, after, told):
+    assert before in PLAN
+    with pytest.raises(InputError, match=re.escape(told)):
+        plan_of(tmp_path, PLAN.replace(before, after))
+
+
+def test_a_set_without_files_and_a_file_in_two_sets_are_refused(folder):
+    with pytest.raises(InputError, match="got none for"):
+        recorded_rows(plan_of(folder, PLAN.replace("leaky-*", "nothing-*")), folder)
+    with pytest.raises(InputError, match="must be in one set"):
+        recorded_rows(plan_of(folder, PLAN.replace("first = 11", "first = 10")), folder)
+
+
+def test_data_that_are_not_there_are_named(tmp_path):
+    with pytest.raises(InputError, match="give its folder with --data"):
+        needs_folder(None, "the set")
+    with pytest.raises(InputError, match="--data must be the folder"):
+        needs_folder(tmp_path / "none", "the set")
+    with pytest.raises(UnreadableFile, match=r"profile\.txt"):
+        hydraulic_samples(tmp_path)
+    (tmp_path / "profile.txt").write_text("1\t2\n3\t4\n", encoding="utf-8")
+    with pytest.raises(UnreadableFile, match="must hold 2205 x 5 numbers"):
+        hydraulic_samples(tmp_path)
+
+
+def test_rotary_strokes(real_folder):
+    """Levels of d3 lie high where the seal is defective; ten sound strokes raise one alarm at 10 %."""
+    result = recorded_result(load_plan("rotary-seal"), real_folder / "vtnsi_actuator")
+    assert (result.judgement.calibrated_on, result.judgement.judged, len(result.judgement.failed)) == (20, 40, 0)
+    assert len(result.judgement.calibration.groups) == 2  # the two directions
+    table = {row.detector: row for row in result.judgement.table}
+    assert table["d3 of p_B high"].detection.rate > 0.5
+    assert table["d3 of p_B high"].false_alarm.count <= 4
+    assert {"always fire", "never fire"} <= set(table)
+
+
+def test_pump_leakage_at_an_unseen_oil_temperature(real_folder, tmp_path):
+    """Pressures alone lose most of what random folds promise; with flow and motor power it holds."""
+    samples = hydraulic_samples(real_folder / "zema_hydraulic")
+    assert len(set(samples.tests)) == 194
+    result = held_out_result(load_plan("hydraulic-pump"), samples)
+    write_result(result, tmp_path)
+    with (tmp_path / "roc.csv").open(encoding="utf-8") as file:
+        areas = {row["detector"]: float(row["AUC"]) for row in csv.DictReader(file) if row["leak [grade]"] == "any"}
+    assert areas["logistic on six pressures"] < 0.8
+    assert areas["logistic on pressures, flow, power"] > 0.97

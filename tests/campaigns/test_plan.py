@@ -1,0 +1,127 @@
+"""A plan says what it wants or is refused in one line; a case's name and seeds are what it is."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from sealscope.campaigns.cases import cases_of
+from sealscope.campaigns.plan import Plan, load_plan, plan_names
+from sealscope.errors import InputError
+
+
+def plan_of(tmp_path, text):
+    path = tmp_path / "plan.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_plan(path)
+
+
+def test_a_plan_is_read_with_its_units(tiny):
+    plan = load_plan(tiny)
+    assert (plan.duration_s, plan.onset_s, plan.size) == (6.0, 3.0, 26)
+    assert [one.leak_lpm for one in plan.records] == pytest.approx([0.0, 0.0, 0.015, 0.03])
+    assert plan.factors["closed"] == ("0 %", "50 %")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ('name = "tiny"', 'name = "../tiny"', "name must be of letters"),
+        ('duration = "6 s"', 'duration = "6 V"', "duration"),
+        ('onset = "3 s"', 'onset = "7 s"', "onset must be within the duration, 0 s to 6 s, got 7"),
+        ("false_alarm = 0.2", "false_alarm = 1.5", "false_alarm must be between 0 and 1, got 1.5"),
+        (
+            "false_alarm = 0.2",
+            "false_alarm = 0.01",
+            "records to calibrate must be at least 198 (99 for each of 2 commands)",
+        ),
+        ("detectors = [", 'detectors = "all" # [', "detectors must be a list of names, got 'all'"),
+        ('"d3 of p_A fell", ', '"d3 of p_A fel", ', "did you mean 'd3 of p_A fell'"),
+        ('command = ["3 sin(4t)"', 'command = ["3 sinus(4t)"', "factors.command"),
+        ('closed = ["0 %"', 'closed = ["100 %"', "closed must be 0 to under 100 %"),
+        ('closed = ["0 %", "50 %"]', 'opened = ["0 %"]', "factors.opened"),
+        ('use = "calibrate"', 'use = "guess"', "use must be one of calibrate, judge, got 'guess'"),
+        ("count = 6", "count = 0", "count must be a whole number >= 1, got 0"),
+        ('leak = "0.015 L/min"', 'leak = "0.015 L"', "leak"),
+        ('leak = "30 cm^3/min"', 'leak = "0.015 L/min"', "records must differ"),
+        ('use = "calibrate"', 'use = "calibrate"\nleak = "1 L/min"', "must be leak-free"),
+        ("seed = 3", "seed = 3\ncolour = 2", "campaign.colour is not known"),
+        ("[factors]", "[factor]", "[factor] is not known"),
+        ("seed = 3", "seed = ", "must be TOML"),
+        ("seed = 3", 'seed = 3\nrig = "nowhere"', "campaign.rig"),
+        ("seed = 3", 'seed = 3\nset = { "V_9" = 1.0 }', "campaign.set"),
+        ("seed = 3", 'seed = 3\nkeep_recordings = "yes"', "keep_recordings must be true or false"),
+    ],
+)
+def test_what_breaks_a_rule_is_one_line_with_the_place(tmp_path, text, before, after, told):
+    assert before in text
+    with pytest.raises(InputError, match=re.escape(told)) as error:
+        plan_of(tmp_path, text.replace(before, after, 1))
+    assert "plan.toml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_the_packaged_plans_are_sound():
+    pytest.importorskip("sealscope.simulation.bench")
+    for name in plan_names():
+        plan = load_plan(name)
+        assert plan.name == name
+    bench = load_plan("bench-thesis")
+    sizes = {one.leak_lpm: one.count for one in bench.records if one.use == "judge"}
+    assert {0.0005: 500, 0.001: 500, 0.0042: 500, 0.0075: 500, 0.015: 500}.items() <= sizes.items()
+    assert bench.duration_s == 180.0
+    assert bench.rig.daq.sample_rate == 500.0
+    assert len(bench.factors["command"]) == len(bench.factors["closed"]) == 4
+
+
+def test_records_go_round_the_cells(tiny):
+    cases = cases_of(load_plan(tiny))
+    assert len({case.id for case in cases}) == len(cases) == 26
+    assert len({case.machine_seed for case in cases} | {case.noise_seed for case in cases}) == 52
+    per_cell = {}
+    for case in cases:
+        if case.use == "calibrate":
+            key = tuple(case.levels.items())
+            per_cell[key] = per_cell.get(key, 0) + 1
+    assert sorted(per_cell.values()) == [2, 2, 3, 3]
+
+
+def test_more_records_leave_the_others_what_they_were(tmp_path, text):
+    few = {case.id for case in cases_of(plan_of(tmp_path, text))}
+    more = {case.id for case in cases_of(plan_of(tmp_path, text.replace("count = 6", "count = 16")))}
+    assert few < more
+    assert len(more - few) == 10
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("seed = 3", "seed = 4"),
+        ('duration = "6 s"', 'duration = "7 s"'),
+        ("seed = 3", 'seed = 3\nset = { "V_1" = "51 cm^3" }'),
+    ],
+)
+def test_another_world_gives_other_cases(tmp_path, text, change):
+    few = {case.id for case in cases_of(plan_of(tmp_path, text))}
+    other = {case.id for case in cases_of(plan_of(tmp_path, text.replace(*change)))}
+    assert not few & other
+
+
+def test_detectors_do_not_change_the_records(tmp_path, text):
+    plain = cases_of(plan_of(tmp_path, text))
+    other = cases_of(plan_of(tmp_path, text.replace('"d3 of p_A changed", ', "")))
+    assert [case.id for case in plain] == [case.id for case in other]
+
+
+def test_names_and_seeds_are_the_same_in_another_process(tiny):
+    code = (
+        "import sys; from sealscope.campaigns.plan import load_plan; from sealscope.campaigns.cases import cases_of\n"
+        "print([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(load_plan(sys.argv[1]))])"
+    )
+    found = subprocess.run([sys.executable, "-c", code, str(tiny)], capture_output=True, text=True, check=True)
+    plan = load_plan(tiny)
+    assert isinstance(plan, Plan)
+    assert found.stdout.strip() == str([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(plan)])

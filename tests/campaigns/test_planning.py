@@ -1,0 +1,268 @@
+"""Plans: predictions against closed forms, recordings and a campaign's rows; the words and the contract."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from sealscope.campaigns.cases import cases_of
+from sealscope.campaigns.judge import calibration_of, judge
+from sealscope.campaigns.outlook import Outlook
+from sealscope.campaigns.plan import Plan, Records
+from sealscope.campaigns.planning import (
+    Noise,
+    Wish,
+    closing_words,
+    experiment_for,
+    instrument_noise,
+    outlook,
+    responses,
+    with_closing,
+)
+from sealscope.campaigns.prediction import (
+    THESIS_DETECTORS,
+    ChangeDetector,
+)
+from sealscope.campaigns.work import work
+from sealscope.cli.plan import plan
+from sealscope.diagnosis.scorers import Look
+from sealscope.errors import InputError
+from sealscope.parameters import Rig, load_rig
+from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
+from sealscope.simulation.sensitivity import clean_channels
+from sealscope.simulation.simulate import run
+
+FELL, ROSE, CHANGED = (ChangeDetector("d3", "p_A", side) for side in ("fell", "rose", "changed"))
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The thesis's rig with a faster drive, half-closed throttles and quieter sensors, so that short records do."""
+    values = {
+        "omega_per_volt": 26.7,
+        "G_pump": 2.4e-13,
+        "orifices": "present",
+        "closed_A": 0.5,
+        "closed_B": 0.5,
+        "sensors.p_A.noise": 3e3,
+        "sensors.p_B.noise": 3e3,
+        "common_noise": 1e3,
+    }
+    return load_rig("thesis").with_values(values)
+
+
+def test_start_keeps_the_widest_sweep_off_the_caps(rig: Rig) -> None:
+    experiment = experiment_for(with_closing(rig, None), "8 sin(t)", 20.0)
+    assert -0.3 < experiment.x_0 < -0.15
+    assert np.abs(run(experiment).truth.outputs["x"]).max() < 0.28
+    assert experiment_for(rig, "8 sin(t)", 20.0, 0.01).x_0 == 0.01
+
+
+def test_throttles_are_told_in_words(rig: Rig) -> None:
+    assert closing_words(with_closing(rig, None)) == "none"
+    assert closing_words(with_closing(rig, 0.25)) == "25 %"
+    assert closing_words(rig.with_values({"closed_A": 0.25})) == "25 % at A, 50 % at B"
+
+
+def test_prediction_agrees_with_recordings_made_afresh(rig: Rig) -> None:
+    """Mean and scatter of the change, leak-free and leaky, against 40 whole simulated recordings of each."""
+    experiment = experiment_for(rig, "7 sin(4t)", 20.0)
+    noise = instrument_noise(experiment, 24, 0)
+    detectors = (FELL, ChangeDetector("d4", "p_B", "changed"), ChangeDetector("d3d4", "p_A", "fell"))
+    found, dp = responses(experiment, (0.01,), detectors, noise)
+    leak = Leak("laminar", coefficient=0.01 * LITRE_PER_MINUTE / dp, opening=From(10.0))
+    for row, leaks in ((0, ()), (1, (leak,))):
+        fresh = []
+        for seed in range(1000, 1040):
+            made = run(replace(experiment, leaks=leaks, seed=seed))
+            look = Look(made.recording)
+            fresh.append([one.change(look) for one in detectors])
+        table = np.array(fresh)
+        error = found.scatter[0] * math.sqrt(1 / 40 + 1 / 24)
+        assert np.all(np.abs(table.mean(axis=0) - found.mean[row]) < 4 * error)
+        ratio = table.std(axis=0, ddof=1) / found.scatter[row]
+        assert np.all((ratio > 0.55) & (ratio < 1.8))
+    assert found.sizes[0] == pytest.approx(made.truth.mean_leak_lpm, rel=0.01)
+    assert found.mean[1, 0] < found.mean[0, 0] - 5 * error[0]  # the leak damps the ringing: the test is not empty
+
+
+def test_scatter_falls_with_the_root_of_time_and_rises_with_noise(rig: Rig) -> None:
+    def scatter(duration: float, machine: Rig) -> float:
+        experiment = experiment_for(machine, "3 sin(4t)", duration)
+        noise = instrument_noise(experiment, 40, 1)
+        return float(responses(experiment, (0.01,), (FELL,), noise)[0].scatter[0, 0])
+
+    still = scatter(20.0, rig)
+    assert still / scatter(80.0, rig) == pytest.approx(2.0, rel=0.4)
+    louder = rig.with_values({"sensors.p_A.noise": 9e3, "sensors.p_B.noise": 9e3})
+    assert scatter(20.0, louder) > 1.2 * still
+
+
+def test_noise_holds_what_the_instruments_add_and_loses_no_sample(rig: Rig) -> None:
+    flaky = rig.with_values({"sensors.p_A.drop_rate": 5.0, "sensors.p_B.stuck_rate": 1.0, "sensors.p_A.offset": 1e3})
+    experiment = experiment_for(flaky, "3 sin(4t)", 20.0)
+    noise = instrument_noise(experiment, 3, 2)
+    assert isinstance(noise, Noise)
+    assert noise.values.shape == (3, 2, 10_000)
+    assert np.all(np.isfinite(noise.values))
+    assert noise.values[:, 0].mean() == pytest.approx(1e3, abs=250)
+    step = flaky.daq.step / 10.0 * 3000 * 6894.757
+    assert noise.values.std(axis=2)[:, 0] == pytest.approx(math.sqrt(3e3**2 + 1e3**2 + step**2 / 12), rel=0.03)
+    over = noise.over(clean_channels(experiment), 1, experiment.rate)
+    assert set(over.channels) == {"p_A", "p_B"}
+
+
+@pytest.fixture(scope="module")
+def made(rig: Rig) -> Outlook:
+    told: list[tuple[str, float]] = []
+    found = outlook(
+        experiment_for(rig, "7 sin(4t)", 20.0),
+        commands=("7 sin(4t)", "11 sin(4t)"),
+        closings=(None,),
+        progress=lambda words, share: told.append((words, share)),
+    )
+    assert {words for words, _ in told} == {"this command", "commands compared"}
+    assert all(0.0 <= share <= 1.0 for _, share in told)
+    return found
+
+
+def test_plan_names_every_detector_and_keeps_the_bound_below_them(made: Outlook) -> None:
+    assert [one.detector for one in made.detectors] == [one.name for one in THESIS_DETECTORS]
+    found = [one.smallest for one in made.detectors if one.smallest is not None]
+    assert found
+    bound = made.bound
+    assert bound.smallest_known < min(found)  # no detector beats the bound
+    assert bound.known < bound.unknown
+    assert bound.change_known == pytest.approx(math.sqrt(2.0) * bound.known)
+    assert bound.half_s == 10.0
+
+
+def test_a_command_that_cannot_be_run_is_told_in_its_row(made: Outlook) -> None:
+    good, bad = made.commands
+    assert good.note == "" and good.smallest_known is not None
+    assert "must stay within +-10 V" in bad.note and bad.best is None
+    assert bad.note in made.text()
+
+
+def test_text_says_what_was_asked_and_the_best_command(made: Outlook) -> None:
+    text = made.text()
+    for words in (
+        "7 sin(4t), throttles 50 %, 20 s",
+        "1 % false alarms, 90 % found",
+        "d3d4 of p_B changed",
+        "Cramer-Rao",
+    ):
+        assert words in text
+    assert text.splitlines()[-1] == made.advice()
+    assert all(len(line) <= 160 for line in text.splitlines())
+
+
+def test_same_seed_same_plan(rig: Rig) -> None:
+    experiment = experiment_for(rig, "3 sin(4t)", 20.0)
+    one, other, third = (outlook(experiment, Wish(seed=seed), commands=()).as_dict() for seed in (1, 1, 2))
+    assert one == other
+    assert one["detectors"] != third["detectors"]
+
+
+runner = CliRunner()
+application = typer.Typer()
+application.command()(plan)
+
+
+def test_json_is_one_object_with_the_stated_fields() -> None:
+    words = ["--duration", "20", "--no-compare", "--format", "json", "--false-alarm", "0.02", "--command", "7 sin(4t)"]
+    found = runner.invoke(application, [*words, "--set", "sensors.p_A.noise=0.5[psi]", "--detector", "d3 of p_A fell"])
+    assert found.exit_code == 0, found.output
+    tree = json.loads(found.stdout)
+    assert tree["rig"] == "thesis"
+    assert (
+        tree["parameters_set"] == {"sensors.p_A.noise": pytest.approx("3447.378646584177 Pa")} or tree["parameters_set"]
+    )
+    assert (tree["duration_s"], tree["onset_s"], tree["false_alarm_probability"]) == (20.0, 10.0, 0.02)
+    assert set(tree["noise_pa"]) == {"p_A", "p_B"}
+    (one,) = tree["detectors"]
+    assert set(one) == {
+        "name",
+        "smallest_leak_lpm",
+        "interval_lpm",
+        "lost_above_lpm",
+        "scatter",
+        "threshold",
+        "largest_detection_probability",
+        "detection_probability_at",
+    }
+    assert [point["leak_lpm"] for point in one["detection_probability_at"]] == [0.0005, 0.001, 0.0042, 0.0075, 0.015]
+    assert set(tree["bound"]) == {
+        "half_s",
+        "known_lpm",
+        "unknown_lpm",
+        "change_known_lpm",
+        "change_unknown_lpm",
+        "smallest_known_lpm",
+        "smallest_unknown_lpm",
+        "unknown_parameters",
+    }
+    assert tree["commands"] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--duration", "5"], "duration must be >= 20 s for a plan, got 5 s"),
+        (["--duration", "nan"], "duration must be"),
+        (["--false-alarm", "1"], "the false-alarm rate must be between 0 and 1, got 1.0"),
+        (["--detection", "0"], "the probability of detection must be between 0 and 1"),
+        (["--detector", "rms change"], "a detector to plan for must be like"),
+        (["--command", "12 sin(t)"], "command must stay within"),
+        (["--seed", "-1"], "seed must be >= 0"),
+        (["--bench", "bench", "--results", "here"], "from a bench or from a campaign's results, got both"),
+        (["--results", "nowhere"], "a campaign must hold 8 leak-free rows"),
+        (["--start-position", "2[m]"], "x_0 must be within the stroke"),
+        (["--set", "sensors.p_A.noise=0", "--set", "common_noise=0", "--set", "bits=40"], "bits must be"),
+    ],
+)
+def test_a_wrong_call_is_one_clear_line(words: list[str], complaint: str) -> None:
+    found = runner.invoke(application, [*words, "--no-compare"])
+    assert isinstance(found.exception, InputError), found
+    assert complaint in str(found.exception)
+    assert "\n" not in str(found.exception)
+
+
+@pytest.mark.slow
+def test_prediction_agrees_with_a_campaigns_a90(rig: Rig) -> None:
+    """300 leak-free records set the threshold, 4 x 60 leaky ones the curve through hits and misses."""
+    detector = FELL
+    experiment = experiment_for(rig, "7 sin(4t)", 20.0)
+    wish = Wish(false_alarm=0.02, detectors=(detector,))
+    (predicted,) = outlook(experiment, wish, commands=()).detectors
+    assert predicted.smallest is not None and predicted.low is not None
+    sizes = [round(share * predicted.smallest, 5) for share in (0.3, 0.6, 1.0, 1.5)]
+    campaign = Plan(
+        name="check",
+        title="check of a plan",
+        rig=rig,
+        profile="",
+        duration_s=20.0,
+        onset_s=10.0,
+        false_alarm=0.02,
+        promise="average",
+        confidence=0.95,
+        seed=0,
+        detectors=(detector.name,),
+        keep_recordings=False,
+        records=(Records("calibrate", 300), Records("judge", 60), *(Records("judge", 60, size) for size in sizes)),
+        factors={"command": ("7 sin(4t)",)},
+    )
+    rows = [work(campaign, case) for case in cases_of(campaign)]
+    calibration = calibration_of(rows, campaign.detectors, rate=0.02)
+    (found,) = judge(rows, campaign.detectors, calibration).pods
+    assert found.curve is not None
+    a90 = found.curve.size_at(0.9)
+    assert predicted.low / 1.2 < a90 < 1.2 * (predicted.high or predicted.smallest * 2)
+    assert a90 == pytest.approx(predicted.smallest, rel=0.5)

@@ -1,0 +1,256 @@
+"""However a campaign was carried out - in one go, in pieces, by one process, by many, on a cluster - its result is
+the same bytes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sealscope.campaigns import run as campaign
+from sealscope.campaigns import store
+from sealscope.campaigns.cases import cases_of
+from sealscope.campaigns.plan import load_plan
+from sealscope.campaigns.results import simulated_result, write_result
+from sealscope.campaigns.work import failed, work
+from sealscope.errors import InputError, MissingExtra, SimulationFailed, UnreadableFile
+
+SOURCES = Path(campaign.__file__).resolve().parents[2]
+
+
+def files_of(plan, folder):
+    """Name -> bytes of every result file."""
+    return {path.name: path.read_bytes() for path in write_result(simulated_result(plan, folder), folder)}
+
+
+@pytest.fixture
+def once(tiny, tmp_path):
+    """The plan, and the files of a campaign that ran through in this process."""
+    plan = load_plan(tiny)
+    folder = tmp_path / "once"
+    standing = campaign.run(plan, folder, jobs=1)
+    assert (standing.done, standing.failed, standing.complete) == (26, 0, True)
+    return plan, files_of(plan, folder)
+
+
+def test_processes_make_the_same_bytes(once, tmp_path):
+    plan, expected = once
+    assert {"records.csv", "table.csv", "pod.csv", "cells.csv", "calibration.json"} <= set(expected)
+    assert campaign.run(plan, tmp_path / "two", jobs=2).complete
+    assert files_of(plan, tmp_path / "two") == expected
+
+
+def start(plan, folder):
+    environment = {**os.environ, "PYTHONPATH": str(SOURCES)}
+    words = [sys.executable, "-m", "sealscope", "campaign", "run", str(plan), "-o", str(folder), "-j", "2"]
+    return subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def wait_for_rows(folder, count, process):
+    """Until so many rows are there."""
+    path = folder / store.ROWS
+    until = time.monotonic() + 120
+    while time.monotonic() < until:
+        if path.is_file() and path.read_bytes().count(b"\n") >= count:
+            return
+        assert process.poll() is None, "it ended before it could be killed"
+        time.sleep(0.005)
+    pytest.fail("no rows within two minutes")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
+def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
+    plan, expected = once
+    folder = tmp_path / "killed"
+    for count in (4, 12):
+        process = start(tiny, folder)
+        wait_for_rows(folder, count, process)
+        process.kill()
+        process.wait()
+        with (folder / store.ROWS).open("ab") as file:  # the line that was being written when it died
+            file.write(b'{"id": "0123", "sco')
+    before = campaign.standing(plan, folder)
+    assert 12 <= before.done < 26
+    told = []
+    assert campaign.run(plan, folder, jobs=2, progress=lambda *words: told.append(words)).complete
+    assert told[0] == (before.done, 26, 0)
+    assert files_of(plan, folder) == expected
+    ids = [json.loads(line)["id"] for line in (folder / store.ROWS).read_bytes().splitlines()]
+    assert len(ids) == len(set(ids)) == 26
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="looks at processes in /proc")
+def test_no_process_outlives_a_killed_campaign(tiny, tmp_path):
+    process = start(tiny, tmp_path / "killed")
+    wait_for_rows(tmp_path / "killed", 3, process)
+
+    def children():
+        found = []
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            try:
+                words = stat.read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if words[1] == str(process.pid) and words[0] != "Z":
+                found.append(int(stat.parent.name))
+        return found
+
+    workers = children()
+    assert len(workers) >= 2
+    process.kill()
+    process.wait()
+
+    def alive(pid):
+        stat = Path(f"/proc/{pid}/stat")
+        try:
+            return stat.read_text().rpartition(")")[2].split()[0] != "Z"
+        except OSError:
+            return False
+
+    until = time.monotonic() + 20
+    while any(alive(pid) for pid in workers) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not [pid for pid in workers if alive(pid)]
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGINT") or os.name == "nt", reason="interrupts as POSIX does")
+def test_an_interrupt_ends_it_and_keeps_the_rows(tiny, tmp_path):
+    process = start(tiny, tmp_path / "stopped")
+    wait_for_rows(tmp_path / "stopped", 3, process)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+    assert campaign.standing(load_plan(tiny), tmp_path / "stopped").done >= 3
+
+
+def test_on_a_cluster_the_same_bytes(once, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    plan, expected = once
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        assert campaign.run(plan, tmp_path / "cluster", cluster=cluster.scheduler_address).complete
+    assert files_of(plan, tmp_path / "cluster") == expected
+
+
+def test_a_cluster_that_is_not_there_is_one_line(tiny, tmp_path):
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="--cluster must be the address of a Dask scheduler, got nowhere"):
+        campaign.run(load_plan(tiny), tmp_path / "none", cluster="nowhere")
+
+
+def test_without_dask_it_says_what_to_install(tiny, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[cluster\]'"):
+        campaign.run(load_plan(tiny), tmp_path / "none", cluster="tcp://127.0.0.1:1")
+
+
+def doomed(case):
+    return case.use == "judge" and int(case.id, 16) % 3 == 0
+
+
+def break_some(plan, case, keep=None):
+    """A task that fails on a third of the records to judge."""
+    if doomed(case):
+        return failed(case, str(SimulationFailed("the run diverged")))
+    return work(plan, case, keep)
+
+
+def die_on_one(plan, case, keep=None):
+    """A task that kills its process on one case, for good."""
+    if case.id == min(one.id for one in cases_of(plan)):
+        os._exit(3)
+    return work(plan, case, keep)
+
+
+def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
+    plan = load_plan(tiny)
+    bad = sum(doomed(case) for case in cases_of(plan))
+    assert 0 < bad < 16
+    standing = campaign.run(plan, tmp_path / "bad", jobs=1, task=break_some)
+    assert (standing.done, standing.failed) == (26, bad)
+    again = campaign.run(plan, tmp_path / "bad", jobs=1)
+    assert again.failed == bad
+    result = simulated_result(plan, tmp_path / "bad")
+    assert {row.error for row in result.judgement.failed} == {"the run diverged"}
+    found = [row for row in result.judgement.table if row.detector == "d3 of p_A changed"]
+    assert [row.n for row in found] == [5, 5]  # a failed record stays in the count, as one that cannot be told
+    leaky_bad = sum(row.leak_lpm > 0 for row in result.judgement.failed)
+    assert sum(row.cannot_tell.count for row in found) == leaky_bad
+    assert campaign.run(plan, tmp_path / "bad", jobs=1, retry=True).failed == 0
+
+
+def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path):
+    plan, _ = once
+    standing = campaign.run(plan, tmp_path / "dead", jobs=2, task=die_on_one)
+    assert (standing.done, standing.failed) == (26, 1)
+    rows = campaign.kept_rows(plan, tmp_path / "dead")
+    assert [row.error for row in rows.values() if row.error] == ["the process that carried it out died"]
+
+
+def test_a_fault_of_the_program_is_told_in_the_row(tiny, monkeypatch):
+    plan = load_plan(tiny)
+    case = cases_of(plan)[0]
+
+    def broken(*_):
+        raise ZeroDivisionError("by nought")
+
+    monkeypatch.setattr("sealscope.campaigns.machines.experiment_of", broken)
+    assert work(plan, case).error == "ZeroDivisionError: by nought"
+
+
+def test_rows_of_another_campaign_are_not_mixed_in(tiny, text, tmp_path):
+    folder = tmp_path / "mine"
+    campaign.run(load_plan(tiny), folder, jobs=1)
+    other = tmp_path / "other.toml"
+    other.write_text(text.replace("seed = 3", "seed = 4"), encoding="utf-8")
+    with pytest.raises(InputError, match="goes on only with the same rig, bench, length, onset or seed"):
+        campaign.run(load_plan(other), folder, jobs=1)
+
+
+def test_more_records_and_detectors_are_added_to_what_is_there(tiny, text, tmp_path):
+    folder = tmp_path / "mine"
+    campaign.run(load_plan(tiny), folder, jobs=1)
+    more = tmp_path / "more.toml"
+    more.write_text(text.replace("count = 6", "count = 8"), encoding="utf-8")
+    told = []
+    campaign.run(load_plan(more), folder, jobs=1, progress=lambda *words: told.append(words))
+    assert told[0] == (26, 28, 0)
+    more.write_text(text.replace('"d3 of p_A changed"', '"d4 of p_A changed"'), encoding="utf-8")
+    assert campaign.standing(load_plan(more), folder).done == 0
+    campaign.run(load_plan(more), folder, jobs=1)
+    assert campaign.standing(load_plan(more), folder).complete
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no lock of this kind")
+def test_two_at_once_are_refused(tiny, tmp_path):
+    plan = load_plan(tiny)
+    store.begin(tmp_path / "mine", campaign.made_from(plan))
+    with store.alone_in(tmp_path / "mine"), pytest.raises(InputError, match="by one process at a time"):
+        campaign.run(plan, tmp_path / "mine", jobs=1)
+
+
+def test_a_spoilt_line_is_refused_with_its_place(tiny, tmp_path):
+    plan = load_plan(tiny)
+    store.begin(tmp_path, campaign.made_from(plan))
+    (tmp_path / store.ROWS).write_bytes(b'{"id": 3}\n')
+    with pytest.raises(UnreadableFile, match=r"rows.jsonl, line 1"):
+        campaign.standing(plan, tmp_path)
+
+
+def test_recordings_are_kept_only_where_asked(tiny, text, tmp_path):
+    few = text.replace("count = 6", "count = 1").replace("count = 5", "count = 1").replace("count = 10", "count = 8")
+    path = tmp_path / "keep.toml"
+    path.write_text(few.replace("seed = 3", "seed = 3\nkeep_recordings = true"), encoding="utf-8")
+    plan = load_plan(path)
+    assert campaign.run(plan, tmp_path / "kept", jobs=1).failed == 0
+    names = {path.stem for path in (tmp_path / "kept" / "recordings").glob("*.nc")}
+    assert names == {case.id for case in cases_of(plan)}
+    path.write_text(few, encoding="utf-8")
+    campaign.run(load_plan(path), tmp_path / "bare", jobs=1)
+    assert not (tmp_path / "bare" / "recordings").exists()
