@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.windows import rms
 from sealscope.thesis.chapter5 import TESTS, ShownTest
 from sealscope.thesis.chapter5_views import Mask, changes, mean_slope, omega_of, recording_of, spec_of, windowed
 from sealscope.thesis.context import Context
