@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import campaign, recordings, reproduction, simulation
+from sealscope.cli import campaign, plan, recordings, reproduction, simulation
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -30,6 +30,7 @@ for command in (
     recordings.diagnose,
     recordings.report,
     simulation.parameters,
+    plan.plan,
     recordings.convert,
     reproduction.reproduce,
     campaign.calibrate,
