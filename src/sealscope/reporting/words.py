@@ -55,7 +55,7 @@ def since(diagnosis: DiagnosisLike) -> str | None:
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
-        return "not told: the recording as a whole was compared with leak-free ones"
+        return "not within this recording: as a whole it was compared with leak-free ones"
     text = clock(diagnosis.onset_s)
     if diagnosis.onset_interval_s is not None:
         low, high = diagnosis.onset_interval_s
