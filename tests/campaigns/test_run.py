@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -161,13 +162,6 @@ def break_some(plan, case, keep=None):
     return work(plan, case, keep)
 
 
-def die_on_one(plan, case, keep=None):
-    """A task that kills its process on one case, for good."""
-    if case.id == min(one.id for one in cases_of(plan)):
-        os._exit(3)
-    return work(plan, case, keep)
-
-
 def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     plan = load_plan(tiny)
     bad = sum(doomed(case) for case in cases_of(plan))
@@ -185,7 +179,9 @@ def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     assert campaign.run(plan, tmp_path / "bad", jobs=1, retry=True).failed == 0
 
 
-def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path):
+def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    die_on_one = import_module("dying_task").die_on_one
     plan, _ = once
     standing = campaign.run(plan, tmp_path / "dead", jobs=2, task=die_on_one)
     assert (standing.done, standing.failed) == (26, 1)

@@ -74,7 +74,8 @@ def test_nothing_moves_without_a_leak_beyond_the_noise_of_the_estimate(tables: d
 def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[Table, ...]]) -> None:
     sheet = sheet_of(tables["appendix-c-drift"][0])
     drawn = [np.log(drift_of(condition.number).noise) for condition in TWO]
-    np.testing.assert_allclose(log_change(sheet, "p_A", "d1"), drawn, atol=0.03)
+    moved = np.mean([log_change(sheet, chamber, "d1") for chamber in CHAMBERS], axis=0)
+    np.testing.assert_allclose(moved, drawn, atol=0.03)  # deviation under 1 % where both chambers are averaged
     assert all("friction x" in str(row[3]) for row in tables["appendix-c-drift"][0].rows)
 
 
