@@ -32,7 +32,7 @@ THROTTLED = ("--set", "orifices=present", "--set", "closed_A=50 %", "--set", "cl
         (("--leak", "-0.01 L/min"), "leak must be like '0.0042 L/min from 90 s'"),
         (("--leak", "0.01 L/min growing from 3 s to 2 s"), "a growing leak must stop growing after it starts"),
         (("--rig", "nowhere"), "'nowhere' is no packaged rig (thesis, thesis-calibrated) and no .toml file"),
-        (("--rig", "absent.toml"), "rig file cannot be read: No such file or directory (absent.toml)"),
+        (("--rig", "absent.toml"), "a rig file must be readable, got: No such file or directory (absent.toml)"),
         (("--rig", "unsourced.toml"), "q_b must have a source, got none (unsourced.toml)"),
         (("--rig", "broken.toml"), "a rig file must be TOML: "),
         (("--duration", "0"), "duration must be > 0 s and finite, got 0.0"),

@@ -128,7 +128,7 @@ def test_a_rule_across_values_names_the_file_that_was_asked_for(tmp_path: Path) 
             '[rig]\nextends = "a\\u0000b.toml"',
             "extends must be a packaged rig (thesis, thesis-calibrated) or a .toml file, got ",
         ),
-        ('[rig]\nextends = "none.toml"', "rig file cannot be read: No such file or directory"),
+        ('[rig]\nextends = "none.toml"', "a rig file must be readable, got: No such file or directory"),
         ("[valve]\nk = 3", "valve.k is not a parameter"),
         ("a = " + "[" * 5000, "a rig file must be TOML: "),
     ],
@@ -145,10 +145,10 @@ def test_what_is_no_text_file(tmp_path: Path) -> None:
     with sparse.open("wb") as file:
         file.truncate(2_000_000_000)
     assert refused(sparse) == f"a rig file must be at most 1000000 bytes, got more ({sparse})"
-    assert "rig file cannot be read: " in refused(tmp_path / "none.toml")
+    assert "rig file must be readable, got: " in refused(tmp_path / "none.toml")
     folder = tmp_path / "folder.toml"
     folder.mkdir()
-    assert "rig file cannot be read: " in refused(folder)
+    assert "rig file must be readable, got: " in refused(folder)
 
 
 def test_an_unknown_name_lists_the_rigs() -> None:

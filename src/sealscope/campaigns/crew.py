@@ -55,7 +55,7 @@ def _pool(plan: Plan, waiting: list[Case], jobs: int, keep: Path | None, task: T
     """Rows of the cases taken off the end of `waiting`, until none is left or a process has died; then `lost` holds
     those that were handed out."""
     context = multiprocessing.get_context("spawn")
-    with _one_thread_each():
+    with one_thread_each():
         pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(plan, keep, task))
         handed: dict[Future[Row], Case] = {}
         try:
@@ -106,7 +106,7 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
+def one_thread_each() -> Iterator[None]:
     """Let new processes keep to one thread for linear algebra: the processes are the parallelism."""
     before = {name: os.environ.get(name) for name in _SINGLE}
     os.environ.update({name: "1" for name, value in before.items() if value is None})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 from sealscope.campaigns.plan_table import Table
 from sealscope.errors import InputError
+from sealscope.parameters.toml_file import read_toml
 
 if TYPE_CHECKING:
     from sealscope.campaigns.held_out_plan import HeldOutPlan
@@ -23,7 +23,6 @@ Use = Literal["calibrate", "judge"]
 Promise = Literal["average", "bound"]
 
 _PACKAGED = Path(__file__).parent / "plans"
-_LARGEST_FILE = 1_000_000
 #: Most records a campaign may have: a slip of the keyboard shall not plan a year of work.
 MOST_RECORDS = 1_000_000
 
@@ -86,26 +85,10 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
     rule."""
     text = os.fspath(name_or_path)
     if text in plan_names():
-        return read_plan(_tree(_PACKAGED / f"{text}.toml", f"plans/{text}.toml"), f"plans/{text}.toml")
+        return read_plan(read_toml(_PACKAGED / f"{text}.toml", "a plan", f"plans/{text}.toml"), f"plans/{text}.toml")
     if not (text.endswith(".toml") or Path(text).is_file()):
         raise InputError(f"{text!r} is no packaged plan ({', '.join(plan_names())}) and no .toml file")
-    return read_plan(_tree(Path(text), text), text)
-
-
-def _tree(path: Path, place: str) -> dict[str, Any]:
-    try:
-        with path.open("rb") as file:
-            data = file.read(_LARGEST_FILE + 1)
-    except OSError as error:
-        raise InputError(f"a plan must be readable, got: {error.strerror or error} ({place})") from None
-    if len(data) > _LARGEST_FILE:
-        raise InputError(f"a plan must be at most {_LARGEST_FILE} bytes, got more ({place})")
-    try:
-        return tomllib.loads(data.decode("utf-8-sig"))
-    except UnicodeDecodeError:
-        raise InputError(f"a plan must be UTF-8 text, got other bytes ({place})") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"a plan must be TOML: {str(error).splitlines()[0]} ({place})") from None
+    return read_plan(read_toml(Path(text), "a plan", text), text)
 
 
 def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:

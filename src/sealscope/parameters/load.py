@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from sealscope.errors import InputError
 from sealscope.parameters.names import closest
 from sealscope.parameters.rig import Entry, Rig, flatten
+from sealscope.parameters.toml_file import read_toml
 
 _PACKAGED = Path(__file__).parent / "rigs"
-_LARGEST_FILE = 1_000_000
 _DEEPEST = 8
 
 
@@ -57,7 +55,7 @@ def _collect(path: Path, place: str, seen: tuple[Path, ...]) -> tuple[dict[str, 
     here = path.resolve()
     if here in seen or len(seen) >= _DEEPEST:
         raise InputError(f"extends must end at a rig of its own, got a circle or more than {_DEEPEST} files ({place})")
-    tree = _parse(path, place)
+    tree = read_toml(path, "a rig file", place)
     head = tree.pop("rig", {})
     if not isinstance(head, dict):
         raise InputError(f"rig must be a table, got {head!r} ({place})")
@@ -77,19 +75,3 @@ def _collect(path: Path, place: str, seen: tuple[Path, ...]) -> tuple[dict[str, 
             f"extends must be a packaged rig ({', '.join(rig_names())}) or a .toml file, got {base!r} ({place})"
         )
     return head, entries | flatten(tree.items(), place)
-
-
-def _parse(path: Path, place: str) -> dict[str, Any]:
-    try:
-        with path.open("rb") as file:
-            data = file.read(_LARGEST_FILE + 1)
-    except OSError as error:
-        raise InputError(f"rig file cannot be read: {error.strerror or error} ({place})") from None
-    if len(data) > _LARGEST_FILE:
-        raise InputError(f"a rig file must be at most {_LARGEST_FILE} bytes, got more ({place})")
-    try:
-        return tomllib.loads(data.decode("utf-8-sig"))
-    except UnicodeDecodeError as error:
-        raise InputError(f"a rig file must be UTF-8 text, got byte {data[error.start]:#04x} ({place})") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"a rig file must be TOML: {str(error).splitlines()[0]} ({place})") from None

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from sealscope.errors import InputError
+from sealscope.parameters.toml_file import read_toml
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.drifts import Drift, Linear, drifts_absolutely
 
 _PACKAGED = Path(__file__).parent / "profiles"
-_LARGEST_FILE = 1_000_000
 _SHAPES = ("linear", "wander")
 
 
@@ -85,7 +84,7 @@ def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
 
 
 def _profile(path: Path, place: str) -> Profile:
-    tree = _parse(path, place)
+    tree = read_toml(path, "a profile", place)
     _known(tree, ("profile", "duty", "nuisance"), "a profile", place)
     head = tree.get("profile", {})
     _known(head, ("name", "title"), "[profile]", place)
@@ -104,21 +103,6 @@ def _profile(path: Path, place: str) -> Profile:
         raise InputError(f"nuisances must have names of their own ({place})")
     name, title = (_text(head, key, "[profile]", place) for key in ("name", "title"))
     return Profile(name, title, _duty(tree.get("duty"), place), nuisances, place)
-
-
-def _parse(path: Path, place: str) -> dict[str, Any]:
-    try:
-        with path.open("rb") as file:
-            data = file.read(_LARGEST_FILE + 1)
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise InputError(f"profile cannot be read: {reason} ({place})") from None
-    if len(data) > _LARGEST_FILE:
-        raise InputError(f"a profile must be at most {_LARGEST_FILE} bytes, got more ({place})")
-    try:
-        return tomllib.loads(data.decode("utf-8-sig"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"a profile must be TOML: {str(error).splitlines()[0]} ({place})") from None
 
 
 def _known(table: Any, keys: tuple[str, ...], what: str, place: str) -> None:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from sealscope.campaigns.crew import one_thread_each
 from sealscope.thesis.bench import Bench, Job
 from sealscope.thesis.items import Entry
 
 #: Told the entry that has just ended (None at the start) and the ids in work.
 Told = Callable[[Entry | None, Sequence[str]], None]
-_SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def alone(
@@ -94,7 +93,7 @@ class _Worker:
         self.pipe, theirs = context.Pipe()
         self.item = ""
         self.process = context.Process(target=_serve, args=(job, theirs), daemon=True)
-        with _one_thread_each():
+        with one_thread_each():
             self.process.start()
         theirs.close()
 
@@ -139,16 +138,3 @@ def _serve(job: Job, pipe: Connection[Any, Any]) -> None:
         except EOFError:
             return
         pipe.send(bench.work(name))
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let a new process keep to one thread for linear algebra: the processes are the parallelism."""
-    before = {name: os.environ.get(name) for name in _SINGLE}
-    os.environ.update({name: "1" for name, value in before.items() if value is None})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)

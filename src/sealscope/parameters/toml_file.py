@@ -1,0 +1,33 @@
+"""Read a TOML file from outside: bounded, and with one line for whatever is wrong with it."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from sealscope.errors import InputError
+
+#: Largest file read [bytes]; what is larger is no file of settings.
+LARGEST = 1_000_000
+
+
+def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
+    """The tables of the TOML file `path`; `what` it is ("a rig file") and its `place` stand in the errors.
+
+    Raises InputError where it cannot be read, is larger than `LARGEST`, is not UTF-8 or not TOML.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(LARGEST + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{what} must be readable, got: {reason} ({place})") from None
+    if len(data) > LARGEST:
+        raise InputError(f"{what} must be at most {LARGEST} bytes, got more ({place})")
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{what} must be UTF-8 text, got byte {data[error.start]:#04x} ({place})") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"{what} must be TOML: {str(error).splitlines()[0]} ({place})") from None
