@@ -337,9 +337,7 @@ def parse_quantity(
             f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {text[:60]!r}{where}"
         )
     rest = match["rest"].strip()
-    unit = si_unit
-    if rest:
-        unit = rest[1:-1] if rest.startswith("[") and rest.endswith("]") else rest
+    unit = (rest[1:-1] if rest.startswith("[") and rest.endswith("]") else rest) if rest else si_unit
     number = float(match["number"])
     if not math.isfinite(number) or number == 0:  # exact arithmetic is for finite numbers; 1e-999999 is 0
         result = to_si(number, unit, si_unit, name=name, place=place)

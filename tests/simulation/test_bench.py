@@ -1,0 +1,249 @@
+"""Machines drawn from a profile: the packaged bench, and profiles of one's own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.errors import InputError
+from sealscope.parameters import load_rig
+from sealscope.physics.rig import rig_numbers
+from sealscope.simulation.bench import centred_start, draw
+from sealscope.simulation.changes import LONGEST_BLOCK, Schedule
+from sealscope.simulation.drifts import RESOLUTION
+from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.profile import Profile, load_profile
+from sealscope.simulation.simulate import run
+
+PSI = 6894.757293168361
+
+
+# -- the bench ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bench() -> Profile:
+    return load_profile("bench")
+
+
+@pytest.fixture(scope="module")
+def machines(bench):
+    return [draw(bench, seed) for seed in range(400)]
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("fluid.K_oil", 550e6, 800e6),
+        ("pump.G_pump", 1.2e-13, 3.6e-13),
+        ("fluid.p_charge", 0.22e6, 0.34e6),
+        ("sensors.p_A.noise", 1.125 * PSI, 1.375 * PSI),
+        ("sensors.p_B.offset", -2 * PSI, 2 * PSI),
+        ("sensors.p_1.hum", 0.0, 0.5 * PSI),
+        ("sensors.p_2.delay", 0.0, 0.2e-3),
+        ("sensors.x.scale_error", -1e-3, 1e-3),
+    ],
+)
+def test_what_differs_between_machines_fills_its_range_evenly(machines, name, low, high):
+    drawn = (np.array([machine.values[name] for machine in machines]) - low) / (high - low)
+    assert drawn.min() >= -1e-12
+    assert drawn.max() <= 1 + 1e-12
+    counts, _ = np.histogram(drawn, 5, (0, 1))
+    assert counts.min() > 50  # 80 expected, deviation 8
+    assert counts.max() < 112
+
+
+def test_what_does_not_differ_is_the_same_on_every_machine(machines):
+    for machine in machines[:20]:
+        assert machine.values["daq.bits"] == 14
+        assert machine.values["sensors.x.resolution"] == pytest.approx(20e-6)
+        assert machine.values["sensors.theta.counts"] == 20_000
+        assert machine.values["sensors.common_noise"] == 0.0
+
+
+def test_friction_differs_and_drifts_as_one(machines):
+    rig, names = load_rig(), ("friction.F_pr", "friction.F_cfr", "friction.F_v")
+    factors = np.array([[m.values[name] / rig[name] for name in names] for m in machines])
+    np.testing.assert_allclose(factors, np.broadcast_to(factors[:, :1], factors.shape), rtol=1e-12)
+    assert factors.min() >= 0.9 - 1e-12
+    assert factors.max() <= 1.1 + 1e-12
+    assert factors.max() - factors.min() > 0.19
+    for machine in machines[:20]:
+        shapes = {drift.parameter: drift.shape for drift in machine.drifts}
+        assert shapes["friction.F_pr"] == shapes["friction.F_v"] == shapes["friction.F_cfr"]
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("friction.F_v", 0.04, 0.08),
+        ("fluid.K_oil", 0.03, 0.03),
+        ("pump.G_pump", 0.08, 0.08),
+        ("sensors.p_A.noise", 0.04, 0.04),
+        ("sensors.p_A.offset", 0.0, 0.5 * PSI),
+    ],
+)
+def test_what_drifts_within_a_record_stays_within_its_size(machines, name, low, high):
+    t = np.linspace(0.0, 180.0, 1001)
+    spans = [np.ptp(d.shape.at(t)) for m in machines for d in m.drifts if d.parameter == name]
+    assert len(spans) == len(machines)
+    assert min(spans) >= low * (1 - 1e-9)
+    assert max(spans) <= high * (1 + 1e-9)
+    assert max(spans) - min(spans) >= 0.9 * (high - low)
+
+
+def test_warmer_oil_moves_friction_and_modulus_down_and_pump_leakage_up(machines):
+    t = np.linspace(0.0, 180.0, 200)
+    names = ("friction.F_v", "fluid.K_oil", "pump.G_pump", "sensors.p_A.noise")
+    paths = np.array([[d.shape.at(t) for n in names for d in m.drifts if d.parameter == n] for m in machines])
+    ends = paths[:, :, -1] / np.ptp(paths, axis=2)
+    together = ends.T @ ends / len(machines)  # warming is the rule, so the mean belongs to it
+    assert together[0, 1] > 0.2
+    assert together[0, 2] < -0.2
+    assert together[1, 2] < -0.2
+    assert np.abs(together[3, :3]).max() < 0.1
+    assert np.mean(ends, axis=0)[2] > 0.25 > -0.25 > np.mean(ends, axis=0)[0]
+
+
+def test_every_duty_is_drawn(machines):
+    duties = {(str(machine.command), machine.closed) for machine in machines}
+    assert len(duties) == 16
+    assert {str(machine.command) for machine in machines} == {"3 sin(4t)", "5 sin(2t)", "7 sin(4t)", "8 sin(1t)"}
+
+
+def test_a_drift_of_the_bench_moves_less_than_its_resolution_from_block_to_block(machines):
+    for machine in machines[:12]:
+        experiment = machine.experiment()
+        found = Schedule(experiment.effects(), rig_numbers(experiment.rig), 360_000, 2000.0)
+        assert np.diff(found.bounds).max() <= LONGEST_BLOCK * 2000
+        for field in ("K_oil", "F_v", "G_pump"):
+            values = np.array([getattr(one, field) for one in found.numbers])
+            assert np.ptp(values) > 0.02 * values[0]
+            assert np.abs(np.diff(values) / values[1:]).max() <= 1.05 * RESOLUTION
+
+
+def test_the_same_seed_is_the_same_machine_and_the_same_bytes(bench):
+    assert draw(bench, 7) == draw("bench", 7)
+    assert draw(bench, 7) != draw(bench, 8)
+    one, again = (run(draw("bench", 7, duration=4.0).experiment(leak="G = 6e-13 from 2 s")) for _ in range(2))
+    for name in one.recording.channels:
+        assert one.recording[name].tobytes() == again.recording[name].tobytes()
+    other = run(draw("bench", 8, duration=4.0).experiment()).recording
+    assert not np.array_equal(one.recording["p_A"], other["p_A"])
+    assert "drift" not in str(dict(one.recording.provenance)["experiment"]).replace(".drift", "")
+    assert len(one.truth.drifts) == len(draw("bench", 7).drifts)
+
+
+def test_one_nuisance_less_leaves_the_others_as_they_were(bench):
+    fewer = replace(bench, nuisances=tuple(n for n in bench.nuisances if n.name not in ("bulk modulus", "bias")))
+    whole, part = draw(bench, 5), draw(fewer, 5)
+    assert "fluid.K_oil" not in part.values
+    assert all(whole.values[name] == value for name, value in part.values.items())
+    assert set(part.drifts) < set(whole.drifts)
+    assert (part.command, part.closed) == (whole.command, whole.closed)
+
+
+def test_a_machine_applies_to_another_rig_and_duty():
+    rig = load_rig().with_values({"F_v": "400[N s/m]"})
+    built = draw("bench", 3, rig=rig, duration=2.0).experiment(command="2 sin(3t)", seed=99)
+    assert built.rig["F_v"] == pytest.approx(draw("bench", 3).values["friction.F_v"] * 400.0 / 300.0)
+    assert built.rig["fluid.K_oil"] == draw("bench", 3).values["fluid.K_oil"]
+    assert str(built.command) == "2 sin(3t)"
+    assert built.seed == 99
+    assert built.rig.entry("K_oil").source == "drawn from profile bench, seed 3"
+
+
+@pytest.mark.parametrize("command", ["8 sin(t)", "5 sin(2t)", "ramp 3 from 1 s to 2 s"])
+def test_strokes_lie_about_the_middle(command):
+    rig = load_rig().with_values({"omega_per_volt": 26.7})
+    duration = 6.0 if "ramp" in command else 40.0
+    x_0 = centred_start(rig, command, duration)
+    x = run(make_experiment(rig=rig, command=command, duration=duration, x_0=x_0)).truth.outputs["x"]
+    assert abs(x.max() + x.min()) < 0.02 * np.ptp(x) + 1e-3
+    assert np.ptp(x) > 0.05
+
+
+# -- profiles of one's own ------------------------------------------------------------------------------------------
+
+SMALL = """
+[profile]
+name = "mine"
+title = "two nuisances"
+[duty]
+commands = ["2 sin(3t)"]
+closed = [50]
+amplitude = [0.5, 1.0]
+why = "ours"
+[[nuisance]]
+name = "oil"
+parameters = ["K_oil"]
+range = [6000, 7000]
+unit = "bar"
+drift = { size = [1, 2], unit = "%" }
+why = "measured"
+"""
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_profile_of_one_s_own(tmp_path):
+    machine = draw(load_profile(write(tmp_path, SMALL)), 1, duration=30.0)
+    assert 6e8 <= machine.values["fluid.K_oil"] <= 7e8
+    assert machine.closed == 0.5
+    assert 1.0 <= machine.command.amplitude <= 2.0
+    assert [drift.parameter for drift in machine.drifts] == ["fluid.K_oil"]
+    assert draw(str(write(tmp_path, SMALL)), 1, duration=30.0) == machine
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "rule"),
+    [
+        ('unit = "bar"', 'unit = "mm"', "mm"),
+        ('unit = "bar"', "", "unit of oil must be a text, got None"),
+        ("range = [6000, 7000]", "range = [7000, 6000]", "must be .low, high. with low <= high"),
+        ("range = [6000, 7000]", "", "must have a range with its unit or a scale without one"),
+        ("range = [6000, 7000]", "scale = [0.5, 2]", "must have a range with its unit or a scale without one"),
+        ('parameters = ["K_oil"]', 'parameters = ["K_ol"]', "'K_ol' is not a parameter; did you mean K_oil"),
+        ('parameters = ["K_oil"]', 'parameters = ["volumes"]', "is a choice"),
+        ('parameters = ["K_oil"]', 'parameters = ["K_oil", "F_v"]', "must have one unit"),
+        ('parameters = ["K_oil"]', 'parameters = ["p_charge"]', "p_charge cannot drift"),
+        ('parameters = ["K_oil"]', "parameters = []", "must be a list of names"),
+        ('why = "measured"', "", "why of oil must be a text, got None"),
+        ("size = [1, 2]", "size = [-1, 2]", "must be >= 0"),
+        ('unit = "%" }', 'unit = "%", oil = 2 }', "weight in -1..1, got 2"),
+        ('unit = "%" }', 'unit = "%", shapes = ["zigzag"] }', "must be of linear, wander"),
+        ('unit = "%" }', 'unit = "%", shapes = ["linear"], oil = 1 }', "must have shapes or oil, got both"),
+        ('unit = "%" }', 'unit = "%", speed = 1 }', "speed is not known in the drift of oil"),
+        ('["2 sin(3t)"]', '["2 cos(3t)"]', "command must be like"),
+        ('["2 sin(3t)"]', '["step 2"]', "'step 2' has no amplitude"),
+        ("closed = [50]", "closed = [100]", "per cent, 0 to 99"),
+        ('title = "two nuisances"', "", "title of .profile. must be a text"),
+        ("[profile]", "[profile", "a profile must be TOML"),
+    ],
+)
+def test_a_profile_with_a_slip_is_refused_in_one_line_with_its_place(tmp_path, old, new, rule):
+    assert SMALL.count(old) == 1
+    path = write(tmp_path, SMALL.replace(old, new))
+    with pytest.raises(InputError, match=rule) as caught:
+        load_profile(path)
+    assert "\n" not in str(caught.value)
+    assert "mine.toml" in str(caught.value)
+
+
+def test_an_unknown_or_unreadable_profile_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"'banch' is no packaged profile \(bench\)"):
+        load_profile("banch")
+    with pytest.raises(InputError, match="profile must be readable, got: No such file"):
+        load_profile(tmp_path / "none.toml")
+    twice = SMALL + SMALL[SMALL.index("[[nuisance]]") :].replace('name = "oil"', 'name = "oil again"')
+    with pytest.raises(InputError, match=r"fluid.K_oil must be in one nuisance, got oil and oil again"):
+        load_profile(write(tmp_path, twice))
+    with pytest.raises(InputError, match="seed must be >= 0, got -1"):
+        draw("bench", -1)
