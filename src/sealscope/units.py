@@ -263,7 +263,7 @@ def _look_up(unit: str, si_unit: str, name: str, place: str | None) -> _Conversi
         return _conversion(unit, si_unit)
     except InputError as error:
         where = f" ({place})" if place else ""
-        raise InputError(f"{name} must have {_expected(si_unit)}, {error}{where}") from None
+        raise InputError(" ".join(f"{name} must have {_expected(si_unit)}, {error}{where}".split())) from None
 
 
 def _convert_one(value: Fraction, conversion: _Conversion) -> float:

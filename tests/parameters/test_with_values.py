@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError
@@ -200,6 +200,7 @@ def test_every_word_of_a_choice_is_accepted(name: str) -> None:
         assert RIG.with_values({name: f" {word} "})[name] == word
 
 
+@example("", "0:\n0")
 @settings(deadline=None, max_examples=200)
 @given(st.text(max_size=20), st.one_of(st.text(max_size=20), st.integers(), st.none(), st.lists(st.floats())))
 def test_anything_else_is_an_input_error(name: str, value: Any) -> None:
