@@ -11,6 +11,7 @@ import pytest
 from sealscope.diagnosis.contract import DETECTORS
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict import Evidence
+from sealscope.parameters import load_rig
 from sealscope.recordings.recording import COUNTS, Recording
 
 P = 0.01
@@ -74,7 +75,7 @@ HOPELESS: dict[str, tuple[Change, str]] = {
 
 @pytest.fixture(params=DETECTORS)
 def detector(request: pytest.FixtureRequest):  # type: ignore[no-untyped-def]
-    return DETECTORS[request.param]()
+    return DETECTORS[request.param](load_rig("thesis"))
 
 
 def examined(detector, recording: Recording, probability: float = P) -> Evidence:  # type: ignore[no-untyped-def]

@@ -4,10 +4,13 @@ states its evidence."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from sealscope.diagnosis.verdict import Evidence
 from sealscope.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
 
 
 class Detector(Protocol):
@@ -26,11 +29,12 @@ class Detector(Protocol):
         ...
 
 
-def _rms_change() -> Detector:
+def _rms_change(rig: Rig) -> Detector:
     from sealscope.diagnosis.rms_change import RmsChange
 
     return RmsChange()
 
 
-#: Every detector by name; `diagnose` runs those that the channels allow, and one contract test runs them all.
-DETECTORS: dict[str, Callable[[], Detector]] = {"rms change": _rms_change}
+#: Every detector by name, made for what it may assume of the machine; `diagnose` runs those that the channels allow,
+#: and one contract test runs them all.
+DETECTORS: dict[str, Callable[[Rig], Detector]] = {"rms change": _rms_change}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from sealscope.diagnosis.verdict import Diagnosis, Evidence, MethodResult
 from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding, inspect, uniform_segments
 from sealscope.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
 
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
 FALSE_ALARM_PROBABILITY = 0.01
@@ -57,16 +61,21 @@ def diagnose(
     *,
     false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
     file: str | None = None,
+    rig: Rig | None = None,
 ) -> Diagnosis:
     """Say whether oil bypasses the piston in this recording.
 
     `baseline`: leak-free recordings of the same machine; without any, the recording's own beginning is the baseline
     and the onset is looked for. Baseline recordings that cannot be compared (other direction, command, pressure
-    level) are left out. The verdict is `cannot tell` where the data do not allow one.
+    level) are left out. `rig`: what the detectors may assume of the machine, the thesis's by default. The verdict is
+    `cannot tell` where the data do not allow one.
 
     Raises InputError for a false-alarm probability outside 1e-4 to 0.2.
     """
+    from sealscope.parameters import load_rig
+
     check_probability(false_alarm_probability)
+    assumed = load_rig("thesis") if rig is None else rig
     quality = list(inspect(recording))
     part, cut_down = analysable(recording)
     if cut_down is not None:
@@ -77,7 +86,7 @@ def diagnose(
     whole = [analysable(one)[0] for one in baseline]
     evidence = [
         (detector.name, _examine(detector, part, whole, false_alarm_probability, spoilt))
-        for detector in (make() for make in DETECTORS.values())
+        for detector in (make(assumed) for make in DETECTORS.values())
     ]
     name, chosen = evidence[0]
     methods = [MethodResult(name, chosen.score, chosen.threshold, chosen.verdict, chosen.reason), *chosen.methods]

@@ -8,8 +8,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from sealscope.recordings.quality import Finding
+from sealscope.recordings.recording import Array
 
 Verdict = Literal["leak", "no leak", "cannot tell"]
+#: What a change can come from; only the first is a leak past the piston.
+Cause = Literal[
+    "piston leak", "pump leak", "external leak", "friction change", "air in the oil", "sensor fault", "changed duty"
+]
 
 
 @dataclass(frozen=True)
@@ -24,9 +29,25 @@ class MethodResult:
     reason: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class LeakCourse:
+    """The leak over a recording: estimates `lpm` (k,) [L/min] at the instants `t` (k,) [s], each with its 95 %
+    interval `low`, `high` (k,)."""
+
+    t: Array
+    lpm: Array
+    low: Array
+    high: Array
+
+
 @dataclass(frozen=True)
 class Evidence:
-    """What a detector found in one recording; `methods` are its parts, each with a threshold of its own."""
+    """What a detector found in one recording; `methods` are its parts, each with a threshold of its own.
+
+    `cause`: what the detector takes the change for, None where it cannot tell one cause from another or found no
+    change; a detector that is sure that a change is no piston leak says `no leak` or `cannot tell`, and the cause.
+    `course`: the leak over the recording, where the detector follows it.
+    """
 
     verdict: Verdict
     reason: str
@@ -37,6 +58,8 @@ class Evidence:
     leak_lpm: float | None = None
     leak_interval_lpm: tuple[float, float] | None = None
     methods: tuple[MethodResult, ...] = ()
+    cause: Cause | None = None
+    course: LeakCourse | None = None
 
 
 @dataclass(frozen=True)
