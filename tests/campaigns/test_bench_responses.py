@@ -10,14 +10,14 @@ import pytest
 
 from sealscope.campaigns import bench_responses as room
 from sealscope.campaigns.bench_responses import bench_responses, stated
-from sealscope.campaigns.planning import experiment_for, instrument_noise, noise_scatter
+from sealscope.campaigns.noise_responses import instrument_noise, responses
+from sealscope.campaigns.planning import experiment_for
 from sealscope.campaigns.prediction import ChangeDetector, Responses
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.bench import Machine
 from sealscope.simulation.commands import Sine
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.sensitivity import clean_channels
 
 DETECTORS = (ChangeDetector("d3", "p_A", "fell"), ChangeDetector("d4", "p_B", "changed"))
 
@@ -106,8 +106,7 @@ def test_too_few_machines_and_machines_that_cannot_run_are_refused(
 
 def test_the_packaged_bench_adds_drift_to_the_scatter(experiment: Experiment) -> None:
     """Same rig, same command: the changes of machines that drift within the record scatter more than noise alone."""
-    clean = clean_channels(experiment)
-    alone, _ = noise_scatter(clean, instrument_noise(experiment, 8, 0), experiment.rate, DETECTORS)
+    alone = responses(experiment, (0.01,), DETECTORS, instrument_noise(experiment, 8, 0))[0].scatter[0]
     found = bench_responses(experiment, "bench", 10, 0, 0.01, DETECTORS, serially, sizes=(0.01,))
     assert found.records == 10
     assert np.all(np.isfinite(found.mean))

@@ -13,18 +13,10 @@ from typer.testing import CliRunner
 
 from sealscope.campaigns.cases import cases_of
 from sealscope.campaigns.judge import calibration_of, judge
+from sealscope.campaigns.noise_responses import instrument_noise, responses
 from sealscope.campaigns.outlook import Outlook
 from sealscope.campaigns.plan import Plan, Records
-from sealscope.campaigns.planning import (
-    Noise,
-    Wish,
-    closing_words,
-    experiment_for,
-    instrument_noise,
-    outlook,
-    responses,
-    with_closing,
-)
+from sealscope.campaigns.planning import Wish, closing_words, experiment_for, outlook, with_closing
 from sealscope.campaigns.prediction import (
     THESIS_DETECTORS,
     ChangeDetector,
@@ -35,7 +27,6 @@ from sealscope.diagnosis.scorers import Look
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
-from sealscope.simulation.sensitivity import clean_channels
 from sealscope.simulation.simulate import run
 
 FELL, ROSE, CHANGED = (ChangeDetector("d3", "p_A", side) for side in ("fell", "rose", "changed"))
@@ -108,14 +99,11 @@ def test_noise_holds_what_the_instruments_add_and_loses_no_sample(rig: Rig) -> N
     flaky = rig.with_values({"sensors.p_A.drop_rate": 5.0, "sensors.p_B.stuck_rate": 1.0, "sensors.p_A.offset": 1e3})
     experiment = experiment_for(flaky, "3 sin(4t)", 20.0)
     noise = instrument_noise(experiment, 3, 2)
-    assert isinstance(noise, Noise)
-    assert noise.values.shape == (3, 2, 10_000)
-    assert np.all(np.isfinite(noise.values))
-    assert noise.values[:, 0].mean() == pytest.approx(1e3, abs=250)
+    assert noise.shape == (3, 2, 10_000)
+    assert np.all(np.isfinite(noise))
+    assert noise[:, 0].mean() == pytest.approx(1e3, abs=250)
     step = flaky.daq.step / 10.0 * 3000 * 6894.757
-    assert noise.values.std(axis=2)[:, 0] == pytest.approx(math.sqrt(3e3**2 + 1e3**2 + step**2 / 12), rel=0.03)
-    over = noise.over(clean_channels(experiment), 1, experiment.rate)
-    assert set(over.channels) == {"p_A", "p_B"}
+    assert noise.std(axis=2)[:, 0] == pytest.approx(math.sqrt(3e3**2 + 1e3**2 + step**2 / 12), rel=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -263,6 +251,8 @@ def test_prediction_agrees_with_a_campaigns_a90(rig: Rig) -> None:
     calibration = calibration_of(rows, campaign.detectors, rate=0.02)
     (found,) = judge(rows, campaign.detectors, calibration).pods
     assert found.curve is not None
-    a90 = found.curve.size_at(0.9)
-    assert predicted.low / 1.2 < a90 < 1.2 * (predicted.high or predicted.smallest * 2)
-    assert a90 == pytest.approx(predicted.smallest, rel=0.5)
+    low, high = found.curve.size_interval(0.9, 0.95)
+    assert predicted.high is not None
+    assert low < 1.1 * predicted.high  # a tenth either way for the threshold's own chance: 300 records at 2 %
+    assert high > predicted.low / 1.1
+    assert found.curve.a90 == pytest.approx(predicted.smallest, rel=0.3)

@@ -56,6 +56,40 @@ def test_the_challenger_s_o_rings():
     assert 1 - fit.detection(31.0)[0] == pytest.approx(0.9996, abs=5e-5)
 
 
+def test_an_interval_has_the_bounds_of_half_its_doubt_for_ends():
+    """Both ends drop the profile log-likelihood by as much; an interval of 90 % ends at a90/95."""
+    fit = fit_hit_miss(CHALLENGER_F, 1 - CHALLENGER_DISTRESS, "linear")
+    slopes = np.linspace(0.001, 1.0, 20001)
+    low, high = fit.size_interval(0.9, 0.90)
+    assert high == fit.a90_95
+    assert low < fit.a90 < high
+    for end in (low, high):
+        best = log_likelihood(fit, math.log(9) - slopes * end, slopes).max()
+        assert fit.log_likelihood - best == pytest.approx(1.6448536**2 / 2, abs=1e-6)
+    for bounds in ("likelihood ratio", "wald"):
+        narrow, wide = (fit.size_interval(0.9, c, bounds) for c in (0.5, 0.9))
+        assert wide[0] < narrow[0] < fit.a90 < narrow[1] < wide[1]
+
+
+def test_an_interval_without_a_rise_is_everything():
+    size, hit = np.repeat([1.0, 2.0, 3.0], 4), np.array([0, 1, 1, 0] * 3)
+    hit[0] = 1
+    assert fit_hit_miss(size, hit).size_interval() == (0.0, math.inf)
+    assert fit_hit_miss(size, hit, "linear").size_interval() == (-math.inf, math.inf)
+    weak = fit_hit_miss(size, 1 - hit)
+    assert weak.slope > 0
+    for bounds in ("likelihood ratio", "wald"):
+        assert weak.size_interval(bounds=bounds) == (0.0, math.inf)
+
+
+def test_intervals_cover():
+    """a90 of the truth is 0.009; 90 % intervals hold it in about 90 % of the campaigns, and miss it on both sides."""
+    ends = np.array([fit_hit_miss(*drawn(seed, n=25)).size_interval(0.9, 0.9) for seed in range(200)])
+    below, above = np.mean(ends[:, 1] < 0.009), np.mean(ends[:, 0] > 0.009)
+    assert 0.01 <= below <= 0.10
+    assert 0.01 <= above <= 0.10
+
+
 def log_likelihood(fit, intercept, slope) -> np.ndarray:
     x = np.log(fit.size) if fit.scale == "log" else fit.size
     eta = np.add.outer(intercept, 0 * x) + np.multiply.outer(slope, x)

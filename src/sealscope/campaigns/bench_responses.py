@@ -19,7 +19,7 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
 
 #: Sizes of leaks that each machine is run with [L/min].
-BENCH_SIZES = (0.002, 0.008, 0.032)
+BENCH_SIZES = (0.002, 0.008, 0.032, 0.128)
 #: Fewest machines for a scatter, and the largest share of them that may fail.
 FEWEST, MOST_FAILED = 8, 0.25
 

@@ -19,23 +19,16 @@ from typing import TypeVar
 import numpy as np
 
 from sealscope.campaigns.bound import UNKNOWN, LeakBound, in_lpm, leak_bound, noise_covariance, smallest_found
+from sealscope.campaigns.noise_responses import instrument_noise, responses
 from sealscope.campaigns.outlook import BoundFigures, CommandRow, Outlook
 from sealscope.campaigns.prediction import THESIS_DETECTORS, ChangeDetector, Responses, predict
-from sealscope.diagnosis.blocks import QUANTITIES, mean_squares
-from sealscope.diagnosis.scorers import Look
 from sealscope.errors import InputError, SealscopeError
 from sealscope.parameters import Rig
-from sealscope.physics.rig import OUTPUTS
-from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import details, edge_samples
+from sealscope.recordings.recording import Array
 from sealscope.simulation.bench import centred_start
 from sealscope.simulation.commands import Command, parse_command
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
-from sealscope.simulation.instruments import PRESSURES, decimate, record
-from sealscope.simulation.integrate import Trajectory
-from sealscope.simulation.sensitivity import CHAMBERS, clean_channels
-from sealscope.simulation.simulate import oversampling, trajectory
+from sealscope.simulation.sensitivity import CHAMBERS
 
 Progress = Callable[[str, float], None]
 _T = TypeVar("_T")
@@ -44,20 +37,16 @@ _T = TypeVar("_T")
 STANDARD_COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)", "8 sin(t)")
 STANDARD_CLOSINGS = (None, 0.25, 0.50, 0.75)
 #: Sizes of leaks that are simulated [L/min]; a prediction never goes beyond the largest.
-SIZES = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
+SIZES = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)
 TABLE_SIZES = (0.001, 0.004, 0.012, 0.032)
 #: Shortest record planned for [s]: each half must hold whole cycles of the slowest standard command.
 SHORTEST = 20.0
 #: How much of a command is looked at to centre its sweep [s].
 LONGEST_LOOK = 1000.0
 #: Noise records laid over the run: for the rig's own command, and for each row of the table.
-NOISES, TABLE_NOISES = 24, 8
+NOISES, TABLE_NOISES = 48, 8
 #: Most values of noise kept in memory (8 bytes each).
 MOST_NOISE = 3e7
-#: Blocks of a half over which the noise is taken as independent.
-BLOCKS = 16
-#: Records that each mean change is averaged over; those with a leak carry the noise of the leak-free ones.
-_PAIRED = 3
 
 
 def with_closing(rig: Rig, closing: float | None) -> Rig:
@@ -74,100 +63,6 @@ def closing_words(rig: Rig) -> str:
         return "none"
     a, b = (100.0 * closed for closed in (rig.line.closed_A, rig.line.closed_B))
     return f"{a:g} %" if a == b else f"{a:g} % at A, {b:g} % at B"
-
-
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """What the instruments add to the chamber pressures: (r, c, n) [Pa] of r records."""
-
-    values: Array
-
-    def over(self, clean: Array, record: int, rate: float) -> Recording:
-        """A record of the clean pressures (c, n) under one of the noises."""
-        n = clean.shape[1]
-        channels = dict(zip(CHAMBERS, clean + self.values[record, :, :n], strict=True))
-        return Recording(np.arange(n) / rate, channels, dict.fromkeys(CHAMBERS, "Pa"), rate)
-
-
-def filtered(experiment: Experiment) -> Trajectory:
-    """The leak-free trajectory at the recording's samples, pressures behind the anti-alias filter: what many records
-    of one run have in common."""
-    path, factor = trajectory(experiment, ()), oversampling(experiment)
-    n = round(experiment.duration * experiment.rate)
-    rows = path.rows[: n * factor : factor].copy()
-    for name in PRESSURES:
-        rows[:, OUTPUTS.index(name)] = decimate(path[name], factor, n)
-    return Trajectory(path.t[: n * factor : factor], rows, path.method, path.step)
-
-
-def instrument_noise(experiment: Experiment, records: int, seed: int) -> Noise:
-    """Readings less the truth of `records` leak-free records, by the rig's own instruments; samples that would be
-    lost or stuck are not."""
-    whole = {f"sensors.{name}.{rate}": 0.0 for name in CHAMBERS for rate in ("stuck_rate", "drop_rate")}
-    rig = experiment.rig.with_values(whole, source="varied for a plan")
-    times = experiment.sample_times()
-    path, u = filtered(experiment), experiment.command.volts(times)
-    clean = np.stack([path[name] for name in CHAMBERS])
-    made = []
-    for one in np.random.SeedSequence(seed).generate_state(records, np.uint32):
-        read = record(rig, path, u, 1, int(one))
-        made.append(np.stack([read[name] for name in CHAMBERS]) - clean)
-    return Noise(np.stack(made))
-
-
-def noise_scatter(clean: Array, noise: Noise, rate: float, detectors: Sequence[ChangeDetector]) -> tuple[Array, int]:
-    """Standard deviation (d,) of the detectors' changes under noise alone, without a leak, and its degrees of freedom.
-
-    A half's mean square is the mean of its blocks', whose noise is independent (the filters reach over a thousandth of
-    a block), so ``Var(change) = 1/4 sum_halves Var(mean square) / (mean square)^2`` with the variance of each block
-    taken over the records: `BLOCKS` times the freedom that the records' changes alone would give.
-    """
-    n = clean.shape[1]
-    before, after = (int(samples) for samples in edge_samples()[-1])
-    halves = ((before, n // 2 - after), (n // 2 + before, n - after))
-    bounds = [np.linspace(first, last, BLOCKS + 1).astype(np.int64) for first, last in halves]
-    squares = np.empty((len(noise.values), len(CHAMBERS), 2, BLOCKS, len(QUANTITIES)))
-    for k in range(len(noise.values)):
-        read = noise.over(clean, k, rate)
-        for c, name in enumerate(CHAMBERS):
-            found = details(read[name])
-            squares[k, c] = [mean_squares(found, half) for half in bounds]
-    variance = squares.var(axis=0, ddof=1).mean(axis=2) / BLOCKS
-    relative = 0.25 * (variance / squares.mean(axis=(0, 3)) ** 2).sum(axis=1)
-    chosen = [relative[CHAMBERS.index(one.chamber), QUANTITIES.index(one.quantity)] for one in detectors]
-    return np.sqrt(np.array(chosen)), 2 * BLOCKS * (len(noise.values) - 1)
-
-
-def _changes(recording: Recording, detectors: Sequence[ChangeDetector]) -> Array:
-    look = Look(recording)
-    return np.array([detector.change(look) for detector in detectors])
-
-
-def responses(
-    experiment: Experiment,
-    sizes: Sequence[float],
-    detectors: Sequence[ChangeDetector],
-    noise: Noise,
-    told: Callable[[float], None] = lambda share: None,
-) -> tuple[Responses, float]:
-    """How the detectors' changes answer to leaks of about these `sizes` [L/min] from the middle on, under noise alone;
-    and the mean pressure difference [Pa] that drives them."""
-    middle, rate = experiment.duration / 2.0, experiment.rate
-    clean = clean_channels(experiment)
-    later = slice(clean.shape[1] // 2, None)
-    dp = float(np.mean(np.abs(clean[0, later] - clean[1, later])))
-    scatter, freedom = noise_scatter(clean, noise, rate, detectors)
-    free = np.stack([_changes(noise.over(clean, k, rate), detectors) for k in range(_PAIRED)])
-    got, mean = [], [free.mean(axis=0)]
-    for number, size in enumerate(sizes, start=1):
-        told(number / (len(sizes) + 1))
-        G = size * LITRE_PER_MINUTE / dp
-        leaky = clean_channels(experiment, (Leak("laminar", coefficient=G, opening=From(middle)),))
-        got.append(in_lpm(G, float(np.mean(np.abs(leaky[0, later] - leaky[1, later])))))
-        mean.append(np.mean([_changes(noise.over(leaky, k, rate), detectors) for k in range(_PAIRED)], axis=0))
-    table = np.stack(mean)
-    spread = np.broadcast_to(scatter, table.shape)
-    return Responses(np.array(got), table, spread, len(noise.values), freedom), dp
 
 
 def _in_parallel(jobs: Sequence[Callable[[], _T]], words: str, progress: Progress) -> list[_T]:
@@ -238,7 +133,7 @@ def experiment_for(rig: Rig, command: Command | str, duration: float, x_0: float
     return Experiment(rig=rig, command=parsed, duration=duration, x_0=start)
 
 
-def command_row(rig: Rig, command: str, duration: float, noise: Noise, wish: Wish) -> CommandRow:
+def command_row(rig: Rig, command: str, duration: float, noise: Array, wish: Wish) -> CommandRow:
     """One line of the comparison: every detector's smallest leak, and the bound's with all else known.
 
     What cannot be simulated (a command over the converter's range, a stop, vacuum) is told in the row's note.
@@ -290,7 +185,7 @@ def outlook(
     found = measured or found
     bound = leak_bound(half_of(experiment), unknown=UNKNOWN, progress=lambda share: told(0.5 + 0.5 * share))
     told(1.0)
-    some = Noise(noise.values[:TABLE_NOISES])
+    some = noise[:TABLE_NOISES]
     places = [(command, with_closing(rig, closing)) for command in commands for closing in closings]
     jobs = [partial(command_row, where, command, experiment.duration, some, wish) for command, where in places]
     rows = _in_parallel(jobs, "commands compared", progress) if jobs else []

@@ -27,8 +27,8 @@ from sealscope.recordings.recording import Array
 Side = Literal["fell", "rose", "changed"]
 #: The confidence of a prediction's interval.
 CONFIDENCE = 0.9
-_FINE = 400
-_RESAMPLED, _QUANTILES = 200, 41
+_FINE = 1000
+_RESAMPLED = 200
 #: Sizes [L/min] at which a prediction gives its probability of detection.
 CURVE_SIZES = (0.0005, 0.001, 0.0042, 0.0075, 0.015)
 
@@ -79,7 +79,8 @@ class Responses:
     row 0 without a leak; `records`: leak-free records behind the scatter, of `freedom` degrees of freedom.
 
     `samples`: the changes (n, d) themselves of each row, where they were counted; `paired`: whether sample k of every
-    row is the same machine.
+    row is the same machine; `error` (m + 1, d): where they were not, standard errors of the means' shifts from row 0,
+    common to all sizes.
     """
 
     sizes: Array
@@ -89,6 +90,7 @@ class Responses:
     freedom: int
     samples: tuple[Array, ...] = ()
     paired: bool = False
+    error: Array | None = None
 
     def __post_init__(self) -> None:
         if self.sizes.size == 0 or np.any(np.diff(self.sizes) <= 0) or not self.sizes[0] > 0:
@@ -214,15 +216,16 @@ def predict(
 
 def _again(responses: Responses) -> list[Responses]:
     """Responses as chance might have given them: the samples drawn again, or, where only a scatter is known, the
-    scatter at even quantiles of its own distribution (chi squared)."""
+    scatter as chi squared spreads it and the means shifted by their errors."""
+    random = np.random.default_rng(0)
     if responses.samples:
-        random = np.random.default_rng(0)
         return [responses.resampled(random) for _ in range(_RESAMPLED)]
-    from scipy.stats import chi2
-
-    shares = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    factors = np.sqrt(responses.freedom / chi2.ppf(shares, responses.freedom))
-    return [replace(responses, scatter=factor * responses.scatter) for factor in factors]
+    factors = np.sqrt(responses.freedom / random.chisquare(responses.freedom, _RESAMPLED))
+    error = np.zeros_like(responses.mean) if responses.error is None else responses.error
+    return [
+        replace(responses, scatter=factor * responses.scatter, mean=responses.mean + shift * error)
+        for factor, shift in zip(factors, random.standard_normal(_RESAMPLED), strict=True)
+    ]
 
 
 def _interval(sizes: Sequence[float | None]) -> tuple[float | None, float | None]:

@@ -140,14 +140,33 @@ class HitMiss:
         share(detection, "the probability of detection")
         if not 0.5 <= confidence < 1.0:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
-        if not self.slope > 0.0:
-            return math.inf
-        z = float(ndtri(confidence))
-        if bounds == "wald":
-            return unscaled(self._fieller(_log_odds(detection), z), self.scale)
-        if bounds == "likelihood ratio":
-            return unscaled(self._profile_bound(_log_odds(detection), 0.5 * z * z), self.scale)
-        raise InputError(f"the bounds must be 'likelihood ratio' or 'wald', got {bounds!r}")
+        return self._end(detection, float(ndtri(confidence)), bounds, 1.0)
+
+    def size_interval(
+        self, detection: float = 0.9, confidence: float = 0.95, bounds: Bounds = "likelihood ratio"
+    ) -> tuple[float, float]:
+        """Two-sided confidence interval of `size_at(detection)`, of the same kinds as `size_bound`.
+
+        It is that of chance in these hits and misses; a threshold counts as given. The lower end is 0 on the `log`
+        scale (-infinite on the `linear` one), the upper one infinite, where the data set none; with no rise over the
+        size (0, inf) or (-inf, inf). By `wald` it is the fiducial interval of a logit analysis. Source: Finney, Probit
+        Analysis (3rd ed., 1971); Venzon and Moolgavkar, Appl. Stat. 37 (1988) 87-94, doi 10.2307/2347496.
+        """
+        from scipy.special import ndtri
+
+        share(detection, "the probability of detection")
+        z = float(ndtri(0.5 + share(confidence, "confidence") / 2.0))
+        return self._end(detection, z, bounds, -1.0), self._end(detection, z, bounds, 1.0)
+
+    def _end(self, detection: float, z: float, bounds: Bounds, side: float) -> float:
+        """The upper (`side` 1) or lower (-1) end of an interval of `z` standard deviations either way."""
+        if bounds not in ("likelihood ratio", "wald"):
+            raise InputError(f"the bounds must be 'likelihood ratio' or 'wald', got {bounds!r}")
+        odds = _log_odds(detection)
+        end = side * math.inf
+        if self.slope > 0.0:
+            end = self._fieller(odds, z, side) if bounds == "wald" else self._profile_bound(odds, 0.5 * z * z, side)
+        return unscaled(end, self.scale)
 
     @property
     def a50(self) -> float:
@@ -164,12 +183,12 @@ class HitMiss:
         """The size found nine times in ten, with 95 % confidence (likelihood ratio)."""
         return self.size_bound()
 
-    def _fieller(self, odds: float, z: float) -> float:
+    def _fieller(self, odds: float, z: float, side: float) -> float:
         v, d, b = self.covariance, self.intercept - odds, self.slope
         a2, a1, a0 = b * b - z * z * v[1, 1], b * d - z * z * v[0, 1], d * d - z * z * v[0, 0]
         if a2 <= 0.0:
-            return math.inf
-        return float((-a1 + math.sqrt(max(0.0, a1 * a1 - a2 * a0))) / a2)
+            return side * math.inf
+        return float((-a1 + side * math.sqrt(max(0.0, a1 * a1 - a2 * a0))) / a2)
 
     def _profile(self) -> Callable[[float, float], float]:
         """Log-likelihood at log odds `odds` in the point x, maximised over the slope."""
@@ -189,25 +208,25 @@ class HitMiss:
 
         return profile
 
-    def _profile_bound(self, odds: float, drop: float) -> float:
+    def _profile_bound(self, odds: float, drop: float, side: float) -> float:
         from scipy.optimize import brentq
 
         if self.log_likelihood - self.null <= drop:
-            return math.inf
+            return side * math.inf
         profile = self._profile()
         x = scaled(self.size, self.scale, "sizes")
-        best, step = (odds - self.intercept) / self.slope, float(np.ptp(x)) / 8.0
+        best, step = (odds - self.intercept) / self.slope, side * float(np.ptp(x)) / 8.0
 
         def short(at: float) -> float:
             return self.log_likelihood - profile(odds, at) - drop
 
-        low, high = best, best + step
-        while short(high) < 0.0:
-            low, step = high, 2.0 * step
-            high += step
-            if step > _FARTHEST * float(np.ptp(x)):
-                return math.inf
-        return float(brentq(short, low, high, xtol=1e-10 * max(1.0, abs(high))))
+        near, far = best, best + step
+        while short(far) < 0.0:
+            near, step = far, 2.0 * step
+            far += step
+            if abs(step) > _FARTHEST * float(np.ptp(x)):
+                return side * math.inf
+        return float(brentq(short, near, far, xtol=1e-10 * max(1.0, abs(far))))
 
 
 def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike, scale: Scale = "log") -> HitMiss:
