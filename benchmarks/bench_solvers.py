@@ -1,18 +1,23 @@
 """Work and precision of the solvers against a C++ Runge-Kutta program and SUNDIALS CVODE, in turn and in one run.
 
-    python benchmarks/bench_solvers.py [--rounds 5] [--duration 180] [--case NAME ...] [--json FILE]
+    python benchmarks/bench_solvers.py [--rounds 5] [--duration 180] [--case NAME ...] [--json FILE] [--plot FILE]
 
 Builds the programs of `benchmarks/peers` (g++, gcc; CVODE needs the SUNDIALS headers, Debian's libsundials-dev, and is
 left out with a word where they are absent), checks that all of them give the same trajectory of the same rig, and
 prints for each solver and step or tolerance the rms error in p_A against a converged run and the time of the
-integration: median and middle half (25 % to 75 %) over the rounds, and as a ratio to our default in the same round.
-Compilation is not timed. A step that `integrate` refuses unless told otherwise is marked "refused".
+integration, all our own Python included: median and middle half (25 % to 75 %) over the rounds, and as a ratio to our
+default (the step chosen by error, 100 Pa) in the same round; then the ratios that the project promises. Times are
+processor seconds of one thread, so that other work on the machine disturbs them less. Compilation is not timed. A step
+that `integrate` refuses unless told otherwise is marked "refused". `--plot` draws error against time (needs
+matplotlib).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -26,7 +31,9 @@ from typing import Any
 import numpy as np
 
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.integrate import DEFAULT_STEP, integrate
+from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.inputs import RunInputs
+from sealscope.simulation.integrate import integrate
 
 PEERS = Path(__file__).parent / "peers"
 RATE = 500.0
@@ -35,8 +42,21 @@ FREQUENCY = 4.0
 CHECK_RIG = {"omega_per_volt": 26.7, "p_charge": 0.25e6, "V_1": 50e-6, "V_2": 50e-6}
 CONVERGED = {"rk4": 1e-5, "imex": 2.5e-5}
 REFUSED = 2e-3
+OURS = "ours, step chosen by error"
+#: What one run may cost: at most this share of a peer's time.
+PROMISED = {"C++ RK4, h = 0.0001 s": 0.25, "CVODE BDF, rtol = 1e-06": 0.2}
 #: Programs that integrate one rig to convergence must agree to this rms [Pa] over the first seconds.
 SAME = 2.0
+
+#: Solvers of the plot by the beginning of their names, and their marks.
+FAMILIES = {
+    OURS: "k*",
+    "ours, rk4, h": "C0o:",
+    "ours, imex, h": "C1o:",
+    "C++ RK4, h": "C2s:",
+    "C++ IMEX, h": "C4D:",
+    "CVODE BDF": "C3^:",
+}
 
 Rows = np.ndarray
 Solve = Callable[[], tuple[float, Rows]]
@@ -70,17 +90,17 @@ CASES = (
 )
 
 
-def ours(case: Case, method: str, step: float, duration: float) -> Solve:
-    """Our solver: seconds and (n, 3) x [m], p_A, p_B [Pa]."""
+def ours(case: Case, method: str, step: float | None, duration: float) -> Solve:
+    """Our solver, at a step or (None) at the one it chooses: seconds and (n, 3) x [m], p_A, p_B [Pa]."""
     rig = case.rig()
-
-    def inputs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return case.amplitude * np.sin(FREQUENCY * t), np.zeros_like(t), np.zeros_like(t)
+    experiment = make_experiment(rig=rig, command=f"{case.amplitude} sin({FREQUENCY}t)", duration=duration)
+    refused = step is not None and step >= REFUSED
 
     def solve() -> tuple[float, Rows]:
-        start = time.perf_counter()
-        run = integrate(rig, inputs, duration, RATE, method=method, step=step, allow_unresolved=step >= REFUSED)  # type: ignore[arg-type]
-        took = time.perf_counter() - start
+        start = time.process_time()
+        inputs = RunInputs(experiment, ())
+        run = integrate(rig, inputs, duration, RATE, method=method, step=step, allow_unresolved=refused)  # type: ignore[arg-type]
+        took = time.process_time() - start
         return took, np.column_stack([run["x"], run["p_A"], run["p_B"]])
 
     return solve
@@ -103,6 +123,7 @@ def build(folder: Path) -> dict[str, Path]:
     libraries = ("cvode", "nvecserial", "sunmatrixdense", "sunlinsoldense")
     recipes = {
         "C++ RK4": ("rk4", ["g++", "-O3", "-march=native", "-std=c++17", str(PEERS / "rk4.cpp")], ["-lm"]),
+        "C++ IMEX": ("imex", ["g++", "-O3", "-march=native", "-std=c++17", str(PEERS / "imex.cpp")], ["-lm"]),
         "CVODE BDF": (
             "cvode",
             ["gcc", "-O3", "-march=native", str(PEERS / "cvode.c")],
@@ -134,7 +155,9 @@ def same_trajectory(case: Case, peers: dict[str, Path]) -> dict[str, float]:
     converged = ours(case, method, CONVERGED[method], 5.0)()[1]
     found = {}
     for name, program in peers.items():
-        tight = 1e-10 if name == "CVODE BDF" else (1e-5 if case.closed is None else 1e-6)
+        if name == "C++ IMEX" and case.closed is None:
+            continue
+        tight = 1e-10 if name == "CVODE BDF" else {"C++ IMEX": 2.5e-5}.get(name, 1e-5 if case.closed is None else 1e-6)
         found[name] = rms(theirs(program, case, tight, 5.0)()[1][:, 1] - converged[:, 1])
         if not found[name] <= SAME:
             raise SystemExit(
@@ -146,13 +169,15 @@ def same_trajectory(case: Case, peers: dict[str, Path]) -> dict[str, float]:
 def contenders(case: Case, peers: dict[str, Path], duration: float) -> dict[str, Solve]:
     """Every solver and setting that is timed for the case; the first is our default."""
     method = "rk4" if case.closed is None else "imex"
-    found = {f"ours, {method}, h = {DEFAULT_STEP[method]:g} s": ours(case, method, DEFAULT_STEP[method], duration)}
-    for h in (1e-3, 2e-4, 1e-4) if method == "rk4" else (5e-4, 2e-4):
+    found = {OURS: ours(case, "auto", None, duration)}
+    for h in (1e-3, 5e-4, 2e-4, 1e-4) if method == "rk4" else (1e-3, 5e-4, 2e-4):
         found[f"ours, {method}, h = {h:g} s"] = ours(case, method, h, duration)
     found[f"ours, {method}, h = {REFUSED:g} s, refused"] = ours(case, method, REFUSED, duration)
     if "C++ RK4" in peers:
         for h in (1e-3, 5e-4, 1e-4) if case.closed is None else (1e-4, 2e-5, 1e-5, 5e-6):
             found[f"C++ RK4, h = {h:g} s"] = theirs(peers["C++ RK4"], case, h, duration)
+    if "C++ IMEX" in peers and case.closed is not None:
+        found["C++ IMEX, h = 0.001 s"] = theirs(peers["C++ IMEX"], case, 1e-3, duration)
     if "CVODE BDF" in peers:
         for rtol in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
             found[f"CVODE BDF, rtol = {rtol:g}"] = theirs(peers["CVODE BDF"], case, rtol, duration)
@@ -176,11 +201,20 @@ def measure(case: Case, peers: dict[str, Path], duration: float, rounds: int) ->
     times = np.array([[solve()[0] for solve in solvers.values()] for _ in range(rounds)])
     return {
         "agreement_p_A_rms": agreement,
+        "promised": promised(case, dict(zip(solvers, times.T, strict=True))),
         "solvers": {
             name: {**errors[name], "seconds": quartiles(times[:, k]), "ratio": quartiles(times[:, k] / times[:, 0])}
             for k, name in enumerate(solvers)
         },
     }
+
+
+def promised(case: Case, times: dict[str, np.ndarray]) -> dict[str, list[float]]:
+    """Our time over that of the peer that the case is measured against: median, quartiles and promise."""
+    name = next(iter(PROMISED)) if case.closed is None else list(PROMISED)[1]
+    if name not in times:
+        return {}
+    return {name: [*quartiles(times[OURS] / times[name]), PROMISED[name]]}
 
 
 def show(case: Case, figures: dict[str, Any]) -> None:
@@ -190,6 +224,8 @@ def show(case: Case, figures: dict[str, Any]) -> None:
     for name, one in figures["solvers"].items():
         spread = [f"{m:.3f} ({a:.3f} .. {b:.3f})" for m, a, b in (one["seconds"], one["ratio"])]
         print(f"{name:<36}{one['p_A_rms']:>20.3g}{one['x_rms']:>18.2g}{spread[0]:>26}{spread[1]:>26}", flush=True)
+    for name, (m, a, b, most) in figures["promised"].items():
+        print(f"ours / {name}: {m:.3f} ({a:.3f} .. {b:.3f}), promised at most {most:g}")
 
 
 def main() -> None:
@@ -198,6 +234,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=180.0, help="simulated seconds")
     parser.add_argument("--case", action="append", choices=[case.name for case in CASES], help="only this case")
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
+    parser.add_argument("--plot", type=Path, help="draw error against time into this file (.svg, .png)")
     chosen = parser.parse_args()
     figures = {}
     print(f"{chosen.duration:g} s simulated, outputs at {RATE:g} Hz, {chosen.rounds} rounds; median (25 % .. 75 %)")
@@ -208,9 +245,46 @@ def main() -> None:
                 figures[case.name] = measure(case, peers, chosen.duration, chosen.rounds)
                 show(case, figures[case.name])
     if chosen.json:
-        partial = chosen.json.with_name(chosen.json.name + ".partial")
-        partial.write_text(json.dumps(figures, indent=2) + "\n")
-        partial.replace(chosen.json)
+        write(chosen.json, figures)
+    if chosen.plot:
+        draw(figures, chosen.plot)
+
+
+def write(path: Path, figures: dict[str, Any]) -> None:
+    """Write figures as JSON with the day and the kind of machine, whole or not at all."""
+    cores = f"{os.cpu_count()} cores, {platform.machine()}"
+    figures = {"measured": time.strftime("%Y-%m-%d"), "machine": cores, "figures": figures}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(figures, indent=2) + "\n")
+    partial.replace(path)
+
+
+def draw(figures: dict[str, Any], path: Path) -> None:
+    """The work-precision plot: rms error in p_A against processor seconds, a panel for each case."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    chosen, axes = plt.subplots(1, len(figures), figsize=(4.2 * len(figures), 4.0), sharey=True, squeeze=False)
+    for ax, (case, found) in zip(axes[0], figures.items(), strict=True):
+        for family, style in FAMILIES.items():
+            points = [
+                (one["seconds"][0], one["p_A_rms"]) for name, one in found["solvers"].items() if name.startswith(family)
+            ]
+            if points:
+                seconds, error = np.array(sorted(points)).T
+                ax.loglog(seconds, error, style, markersize=14 if "*" in style else 6, label=family.rstrip(", h="))
+        ax.legend(fontsize=8)
+        ax.axhline(100.0, color="0.6", linewidth=0.8)
+        ax.set_title(case, fontsize=10)
+        ax.set_xlabel("processor time [s]")
+        ax.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("rms error in p_A [Pa]")
+    chosen.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    chosen.savefig(path)
 
 
 if __name__ == "__main__":

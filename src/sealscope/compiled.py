@@ -105,4 +105,10 @@ def kernel(function: _F) -> _F:
 
 def law(function: _F) -> _F:
     """Compile a small law that only other compiled functions call: inlined there, cached with them, never alone."""
-    return numba.njit(nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)  # type: ignore[no-any-return]
+
+
+def contracted(function: _F) -> _F:
+    """A law whose products and sums may be contracted to fused multiply-adds and whose divisions by what does not
+    change may become products: last digits depend on the processor, never on the block or the lane."""
+    return numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "arcp"}, forceinline=True)(function)  # type: ignore[no-any-return]

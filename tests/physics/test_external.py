@@ -110,7 +110,7 @@ def test_a_tight_circuit_needs_no_make_up_once_it_is_filled(check_rig, drive):
 def test_air_keeps_the_oil_in_the_circuit(check_rig, drive):
     """V dp/dt = K(p) Q: the sum of V F(p), dF/dp = 1/K(p), stays."""
     rig = check_rig(air="1 %")
-    run = drive(rig, 3.0)
+    run = drive(rig, 3.0, step=5e-4)
 
     def compressed(p: float) -> float:
         return 1.0 / effective_bulk_modulus(p, rig.fluid.K_oil, rig.fluid.air, rig.fluid.n_air)

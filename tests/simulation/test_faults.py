@@ -120,7 +120,7 @@ def test_until_its_onset_a_fault_changes_nothing_and_then_it_does():
         first, second = halves(healthy)
         np.testing.assert_array_equal(healthy.recording["p_A"][first][:-20], faulty.recording["p_A"][first][:-20])
         difference = np.abs(healthy.truth.outputs["p_A"] - faulty.truth.outputs["p_A"])
-        assert difference[first].max() == 0.0, fault
+        assert difference[first].max() < 1e-6, fault  # Pa; a faulty duty is another command, equal to rounding
         assert difference[second].max() > 500.0, fault
 
 

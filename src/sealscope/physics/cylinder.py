@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from sealscope.compiled import law
+import math
+
+from sealscope.compiled import contracted
+from sealscope.physics.lanes import select
 
 
-@law
+@contracted
 def chamber_volumes(x: float, V: float, A_A: float, A_B: float, position_dependent: bool) -> tuple[float, float]:
     """Oil volumes (V_A, V_B) [m^3] at piston position x [m] from mid-stroke: V on both sides (Table 4.1), or V + A_A
     x and V - A_B x."""
@@ -14,27 +17,25 @@ def chamber_volumes(x: float, V: float, A_A: float, A_B: float, position_depende
     return V, V
 
 
-@law
+@contracted
 def pressure_rate(inflow: float, volume: float, K_oil: float) -> float:
     """dp/dt [Pa/s] = K_oil/V (net inflow - volume growth), eqs. (4.16)-(4.19); `inflow` [m^3/s] is already net of
     both."""
     return K_oil / volume * inflow
 
 
-@law
+@contracted
 def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) -> float:
     """Force [N] of the cap on the piston, against +x at x = +L/2 and against -x at x = -L/2.
 
     A stiff spring k_stop [N/m] with a damper d_stop [N s/m] that acts in contact only and never pulls.
     """
-    if x > 0.5 * L:
-        return -max(0.0, k_stop * (x - 0.5 * L) + d_stop * v)
-    if x < -0.5 * L:
-        return -min(0.0, k_stop * (x + 0.5 * L) + d_stop * v)
-    return 0.0
+    side = math.copysign(1.0, x)
+    depth = abs(x) - 0.5 * L
+    return select(depth > 0.0, -side * max(k_stop * depth + d_stop * (side * v), 0.0), 0.0)  # type: ignore[no-any-return]
 
 
-@law
+@contracted
 def piston_acceleration(
     p_A: float, p_B: float, friction: float, load: float, stop: float, A_A: float, A_B: float, M_eq: float
 ) -> float:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from sealscope.compiled import law
+from sealscope.compiled import contracted
+from sealscope.physics.lanes import anywhere
 
 #: Atmospheric pressure [Pa]; every pressure of the rig is counted from it.
 P_ATM = 101325.0
@@ -12,7 +13,7 @@ P_ATM = 101325.0
 _LEAST = 100.0
 
 
-@law
+@contracted
 def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> float:
     """Bulk modulus [Pa] of oil with free air at the pressure `p` [Pa gauge].
 
@@ -22,8 +23,8 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
     Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
     liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its friction.
     """
-    if air == 0.0:
-        return K_oil
+    if not anywhere(air > 0.0):
+        return K_oil + 0.0 * p
     p_abs = max(p + P_ATM, _LEAST)
     r = air * math.pow(P_ATM / p_abs, 1.0 / n_air)
     return K_oil * (1.0 + r) / (1.0 + r * K_oil / (n_air * p_abs))

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 
-from sealscope.compiled import law
+from sealscope.compiled import contracted
+from sealscope.physics.lanes import exponential, select
 
 
-@law
+@contracted
 def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, of_difference: bool) -> float:
     """Coulomb force F_C [N] = F_pr + F_cfr (p_A + p_B), eq. (4.20); `of_difference` takes p_A - p_B, the literal
     reading."""
     return F_pr + F_cfr * ((p_A - p_B) if of_difference else (p_A + p_B))
 
 
-@law
+@contracted
 def stribeck_friction(
     v: float, F_C: float, K_brk: float, C_c: float, F_v: float, v_th: float, literal_bracket: bool
 ) -> float:
@@ -27,8 +28,9 @@ def stribeck_friction(
     - 1) exp(-C_c |v|) + F_v v_th] / v_th.
     """
     speed = abs(v)
-    if speed > v_th:
-        return math.copysign(F_C * (1.0 + (K_brk - 1.0) * math.exp(-C_c * speed)), v) + F_v * v
     if literal_bracket:
-        return v * F_C * (1.0 + (K_brk - 1.0) * math.exp(-C_c * speed) + F_v * v_th) / v_th
-    return v * (F_C * (1.0 + (K_brk - 1.0) * math.exp(-C_c * v_th)) + F_v * v_th) / v_th
+        stribeck = 1.0 + (K_brk - 1.0) * exponential(-C_c * speed)
+        slow = v * F_C * (stribeck + F_v * v_th) / v_th
+        return select(speed > v_th, math.copysign(F_C * stribeck, v) + F_v * v, slow)  # type: ignore[no-any-return]
+    stribeck = 1.0 + (K_brk - 1.0) * exponential(-C_c * max(speed, v_th))
+    return F_C * stribeck * min(max(v / v_th, -1.0), 1.0) + F_v * v  # type: ignore[no-any-return]

@@ -13,73 +13,114 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.compiled import kernel
+from sealscope.compiled import contracted, kernel
 from sealscope.physics.cylinder import chamber_volumes, pressure_rate
-from sealscope.physics.restrictors import implicit_orifice_drop
+from sealscope.physics.lanes import anywhere
+from sealscope.physics.restrictors import implicit_orifice_flow
 from sealscope.physics.rig import (
-    CURRENT,
-    P_1,
-    P_2,
-    P_A,
-    P_B,
-    POSITION,
     RigNumbers,
     bulk_modulus,
     observe,
     rates_without_throttles,
-    throttle_flow_A,
-    throttle_flow_B,
+    throttle_flows,
+    throttle_rates,
+    within_limits,
 )
+from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, Pressures, State, moved, pressures_moved, state_of
 
 #: Nodes of the step at which the inputs are needed.
 IMEX_NODES = (0.0, 1 / 2, 83 / 250, 31 / 50, 17 / 20, 1.0)
 GAMMA = 1 / 4
+Nodes = tuple[float, float, float, float, float, float]
 #: With air in the oil an implicit stage is solved anew with the bulk moduli of the pressures that it found, until these
 #: move by less than this [Pa], or this many times (each brings them nearer by about a factor of ten).
 AIR_SETTLED = 1e-2
 AIR_TURNS = 12
 
-EXPLICIT = np.array(
-    [
-        [0.0, 0.0, 0.0, 0.0, 0.0],
-        [1 / 2, 0.0, 0.0, 0.0, 0.0],
-        [13861 / 62500, 6889 / 62500, 0.0, 0.0, 0.0],
-        [
-            -116923316275 / 2393684061468,
-            -2731218467317 / 15368042101831,
-            9408046702089 / 11113171139209,
-            0.0,
-            0.0,
-        ],
-        [
-            -451086348788 / 2902428689909,
-            -2682348792572 / 7519795681897,
-            12662868775082 / 11960479115383,
-            3355817975965 / 11060851509271,
-            0.0,
-        ],
-        [
-            647845179188 / 3216320057751,
-            73281519250 / 8382639484533,
-            552539513391 / 3454668386233,
-            3354512671639 / 8306763924573,
-            4040 / 17871,
-        ],
-    ]
+#: Explicit tableau, row by row below the diagonal.
+E_2 = (1 / 2,)
+E_3 = (13861 / 62500, 6889 / 62500)
+E_4 = (-116923316275 / 2393684061468, -2731218467317 / 15368042101831, 9408046702089 / 11113171139209)
+E_5 = (
+    -451086348788 / 2902428689909,
+    -2682348792572 / 7519795681897,
+    12662868775082 / 11960479115383,
+    3355817975965 / 11060851509271,
+)
+E_6 = (
+    647845179188 / 3216320057751,
+    73281519250 / 8382639484533,
+    552539513391 / 3454668386233,
+    3354512671639 / 8306763924573,
+    4040 / 17871,
 )
 #: Implicit tableau below the diagonal, which is GAMMA but for the explicit first stage.
-IMPLICIT = np.array(
-    [
-        [0.0, 0.0, 0.0, 0.0, 0.0],
-        [1 / 4, 0.0, 0.0, 0.0, 0.0],
-        [8611 / 62500, -1743 / 31250, 0.0, 0.0, 0.0],
-        [5012029 / 34652500, -654441 / 2922500, 174375 / 388108, 0.0, 0.0],
-        [15267082809 / 155376265600, -71443401 / 120774400, 730878875 / 902184768, 2285395 / 8070912, 0.0],
-        [82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211],
-    ]
-)
-#: Weights of both parts: the last implicit stage (stiffly accurate).
-WEIGHTS = np.array([82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, 1 / 4])
+I_2 = (1 / 4,)
+I_3 = (8611 / 62500, -1743 / 31250)
+I_4 = (5012029 / 34652500, -654441 / 2922500, 174375 / 388108)
+I_5 = (15267082809 / 155376265600, -71443401 / 120774400, 730878875 / 902184768, 2285395 / 8070912)
+#: Weights of both parts: the last implicit stage (stiffly accurate), in which the second stage has none.
+W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
+
+
+@contracted
+def _after(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
+    """The state with a stage's explicit and implicit rates added, each with its weight."""
+    return pressures_moved(moved(z, h * e, f), h * i, s)
+
+
+@contracted
+def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
+    """An implicit stage: the state with the pressures that the throttles' flows leave, and what these flows add to the
+    rates."""
+    V_A, V_B = chamber_volumes(z[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
+    step = GAMMA * h
+    total_A, total_B = z[P_1] - z[P_A], z[P_B] - z[P_2]
+    found = z
+    s = (z[P_A], z[P_B], z[P_1], z[P_2])
+    for _ in range(1 if len(p.aerated) == 0 else AIR_TURNS):
+        K_A, K_B = bulk_modulus(found[P_A], p), bulk_modulus(found[P_B], p)
+        K_1, K_2 = bulk_modulus(found[P_1], p), bulk_modulus(found[P_2], p)
+        g_A = step * (pressure_rate(1.0, V_A, K_A) + pressure_rate(1.0, p.V_1, K_1))
+        g_B = step * (pressure_rate(1.0, V_B, K_B) + pressure_rate(1.0, p.V_2, K_2))
+        Q_A = implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
+        Q_B = implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
+        s = throttle_rates(found, Q_A, Q_B, p)
+        before = found
+        found = pressures_moved(z, step, s)
+        if len(p.aerated) > 0:
+            settled_A = max(abs(found[P_A] - before[P_A]), abs(found[P_1] - before[P_1]))
+            settled_B = max(abs(found[P_B] - before[P_B]), abs(found[P_2] - before[P_2]))
+            if not anywhere(max(settled_A, settled_B) >= AIR_SETTLED):
+                break
+    return found, s
+
+
+@contracted
+def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, p: RigNumbers) -> State:
+    """The state a step of h [s] later; `u`, `G`, `C` at the nodes of the step."""
+    Q_A, Q_B = throttle_flows(y, p)
+    s1 = throttle_rates(y, Q_A, Q_B, p)
+    f1 = rates_without_throttles(y, u[0], G[0], C[0], p)
+    z, s2 = _solved(_after(y, h, E_2[0], f1, I_2[0], s1), h, p)
+    f2 = rates_without_throttles(z, u[1], G[1], C[1], p)
+    z = _after(_after(y, h, E_3[0], f1, I_3[0], s1), h, E_3[1], f2, I_3[1], s2)
+    z, s3 = _solved(z, h, p)
+    f3 = rates_without_throttles(z, u[2], G[2], C[2], p)
+    z = _after(_after(y, h, E_4[0], f1, I_4[0], s1), h, E_4[1], f2, I_4[1], s2)
+    z, s4 = _solved(_after(z, h, E_4[2], f3, I_4[2], s3), h, p)
+    f4 = rates_without_throttles(z, u[3], G[3], C[3], p)
+    z = _after(_after(y, h, E_5[0], f1, I_5[0], s1), h, E_5[1], f2, I_5[1], s2)
+    z = _after(_after(z, h, E_5[2], f3, I_5[2], s3), h, E_5[3], f4, I_5[3], s4)
+    z, s5 = _solved(z, h, p)
+    f5 = rates_without_throttles(z, u[4], G[4], C[4], p)
+    z = _after(_after(y, h, E_6[0], f1, W[0], s1), h, E_6[2], f3, W[2], s3)
+    z = _after(_after(moved(z, h * E_6[1], f2), h, E_6[3], f4, W[3], s4), h, E_6[4], f5, W[4], s5)
+    z, s6 = _solved(z, h, p)
+    f6 = rates_without_throttles(z, u[5], G[5], C[5], p)
+    z = _after(_after(y, h, W[0], f1, W[0], s1), h, W[2], f3, W[2], s3)
+    z = _after(_after(_after(z, h, W[3], f4, W[3], s4), h, W[4], f5, W[4], s5), h, W[5], f6, W[5], s6)
+    return within_limits(z, p)
 
 
 @kernel
@@ -97,59 +138,13 @@ def advance_imex(
 
     `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 17).
     """
-    n, stages = u.shape
-    size = y.size
-    f = np.zeros((stages, size))  # explicit rates
-    s = np.zeros((stages, 4))  # implicit rates of p_A, p_B, p_1, p_2
-    z = np.empty(size)
-    known = np.empty(4)  # a stage's pressures without its own implicit rates
-    turns = 1 if len(p.aerated) == 0 else AIR_TURNS
-    for step in range(n):
+    z = state_of(y)
+    for step in range(u.shape[0]):
         if step % every == 0:
-            observe(y, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
-        for k in range(stages):
-            for m in range(size):
-                z[m] = y[m]
-            for j in range(k):
-                a = h * EXPLICIT[k, j]
-                for m in range(size):
-                    z[m] += a * f[j, m]
-                b = h * IMPLICIT[k, j]
-                for m in range(4):
-                    z[P_A + m] += b * s[j, m]
-            V_A, V_B = chamber_volumes(z[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
-            for m in range(4):
-                known[m] = z[P_A + m]
-            for _ in range(1 if k == 0 else turns):
-                K_A, K_B = bulk_modulus(z[P_A], p), bulk_modulus(z[P_B], p)
-                K_1, K_2 = bulk_modulus(z[P_1], p), bulk_modulus(z[P_2], p)
-                if k == 0:
-                    Q_A = throttle_flow_A(z, p)
-                    Q_B = throttle_flow_B(z, p)
-                else:
-                    g_A = GAMMA * h * (pressure_rate(1.0, V_A, K_A) + pressure_rate(1.0, p.V_1, K_1))
-                    g_B = GAMMA * h * (pressure_rate(1.0, V_B, K_B) + pressure_rate(1.0, p.V_2, K_2))
-                    total_A = known[2] - known[0]
-                    total_B = known[1] - known[3]
-                    Q_A = (total_A - implicit_orifice_drop(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)) / g_A
-                    Q_B = (total_B - implicit_orifice_drop(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)) / g_B
-                s[k, 0] = pressure_rate(Q_A, V_A, K_A)
-                s[k, 1] = pressure_rate(-Q_B, V_B, K_B)
-                s[k, 2] = pressure_rate(-Q_A, p.V_1, K_1)
-                s[k, 3] = pressure_rate(Q_B, p.V_2, K_2)
-                moved = 0.0
-                if k > 0:
-                    for m in range(4):
-                        found = known[m] + GAMMA * h * s[k, m]
-                        moved = max(moved, abs(found - z[P_A + m]))
-                        z[P_A + m] = found
-                if moved < AIR_SETTLED:
-                    break
-            rates_without_throttles(z, u[step, k], G[step, k], C[step, k], p, f[k])
-        for k in range(stages):
-            b = h * WEIGHTS[k]
-            for m in range(size):
-                y[m] += b * f[k, m]
-            for m in range(4):
-                y[P_A + m] += b * s[k, m]
-        y[CURRENT] = min(max(y[CURRENT], -p.i_max), p.i_max)
+            observe(z, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
+        volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
+        laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])
+        orifice = (C[step, 0], C[step, 1], C[step, 2], C[step, 3], C[step, 4], C[step, 5])
+        z = imex_step(z, h, volts, laminar, orifice, p)
+    for m in range(len(z)):
+        y[m] = z[m]

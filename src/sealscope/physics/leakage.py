@@ -8,21 +8,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.compiled import kernel, law
+from sealscope.compiled import contracted, kernel
+from sealscope.physics.lanes import anywhere
 from sealscope.physics.restrictors import orifice_flow
 
 
-@law
+@contracted
 def laminar_leakage(dp: float, G: float) -> float:
     """Q_L = G (p_A - p_B) [m^3/s]: laminar gap of leakage conductance G [m^3/(s Pa)] (Merritt, Hydraulic Control
     Systems, 1967, leakage of an actuator)."""
     return G * dp
 
 
-@law
+@contracted
 def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
     """Q_L [m^3/s] from chamber A to B: a laminar gap G [m^3/(s Pa)] beside an orifice C [m^3/(s Pa^0.5)]."""
-    if C == 0.0:
+    if not anywhere(C > 0.0):
         return laminar_leakage(dp, G)
     return laminar_leakage(dp, G) + orifice_flow(dp, C, dp_0)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from sealscope.compiled import law
+from sealscope.compiled import contracted
 
 
-@law
+@contracted
 def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
     """Flow [m^3/s] that the pump delivers into port 1: Q_1 = q_b omega / (2 pi) - G_pump (p_1 - p_2), eq. (4.1) with
     internal leakage.
@@ -17,7 +17,7 @@ def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
     return q_b / (2.0 * math.pi) * omega - G_pump * dp
 
 
-@law
+@contracted
 def pump_torque(dp: float, q_b: float) -> float:
     """Load torque [N m] of the pressure difference on the shaft: q_b (p_1 - p_2) / (2 pi), eqs. (4.5)-(4.6)."""
     return q_b / (2.0 * math.pi) * dp

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from sealscope.compiled import law
+from sealscope.compiled import contracted
+from sealscope.physics.lanes import anywhere, select
 
 
 def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
@@ -12,7 +13,7 @@ def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
     return C_d * area * math.sqrt(2.0 / rho)
 
 
-@law
+@contracted
 def orifice_flow(dp: float, c: float, dp_0: float) -> float:
     """Flow [m^3/s] through an orifice under the pressure difference `dp` [Pa].
 
@@ -23,33 +24,56 @@ def orifice_flow(dp: float, c: float, dp_0: float) -> float:
     return c * dp / math.sqrt(math.sqrt(dp * dp + dp_0 * dp_0))
 
 
-@law
+@contracted
 def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
     """Coefficient that is in force in a one-way throttle: one for each direction of the pressure difference."""
-    return c_forward if dp > 0.0 else c_reverse
+    return select(dp > 0.0, c_forward, c_reverse)  # type: ignore[no-any-return]
 
 
-@law
-def implicit_orifice_drop(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
-    """Pressure difference d [Pa] that solves d + g Q(d) = total for a one-way throttle, g >= 0 [Pa s/m^3].
+@contracted
+def _implicit_share(b: float, a: float) -> float:
+    """The share w with w r(w) + a w = b for b >= 0, a >= 0, where r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1.
 
-    This scalar equation is all that an implicit stage has to solve for one line volume against one chamber. The left
-    side grows with d, so the root is unique, has the sign of `total`, and Newton's method started below it climbs to
-    it without overshoot (for d > 0 the left side is concave but for a neighbourhood of zero, where the second bound
-    below is sharp). Both bounds used as the start solve a simpler law that lets more flow pass: the bare
-    square root (a quadratic), and the laminar tangent at zero.
+    w = Q/(c sqrt(dp_0)) is the flow through an orifice and w r its pressure difference over dp_0 (`orifice_flow` solved
+    for the difference). The left side grows and is convex, so the root is unique; Halley's method finds it, in one turn
+    where the volumes are stiff (a >> 1: r hardly matters), and ends where its rest is below 1e-12 of w.
+    """
+    w = b / (a + 1.0)
+    w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))
+    for _ in range(50):
+        square = w * w
+        r = math.sqrt(0.5 * (square + math.sqrt(square * square + 4.0)))
+        r_2 = r * r
+        r_4 = r_2 * r_2
+        over = w * (r + a) - b
+        d = 1.0 + r_4
+        slope = 2.0 * r * r_4 + a * d  # of the left side, times d
+        bend = w * (r * r_2 * r_4) * (10.0 + 2.0 * r_4)  # its second derivative, times d^3
+        step = 2.0 * over * d * d * slope / (2.0 * d * slope * slope - over * bend)
+        w = w - step
+        if not anywhere(abs(step * step * step) * r_2 > 1e-12 * square * w * (a + r) * (a + r)):
+            break
+    return w  # type: ignore[no-any-return]
+
+
+@contracted
+def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
+    """Flow Q [m^3/s] of a one-way throttle between two volumes in an implicit stage: d + g Q(d) = total, g >= 0 [Pa
+    s/m^3].
+
+    This scalar equation is all that an implicit stage has to solve for one line volume against one chamber; the root
+    is unique and has the sign of `total`.
     """
     c = one_way_coefficient(total, c_forward, c_reverse)
-    gc = g * c
-    magnitude = abs(total)
-    root = 0.5 * (math.sqrt(gc * gc + 4.0 * magnitude) - gc)
-    d = max(root * root, magnitude / (1.0 + gc / math.sqrt(dp_0)))
-    for _ in range(20):
-        square = d * d + dp_0 * dp_0
-        fourth = 1.0 / math.sqrt(math.sqrt(square))
-        residual = d + gc * d * fourth - magnitude
-        step = residual / (1.0 + gc * fourth * (1.0 - 0.5 * d * d / square))
-        d -= step
-        if abs(step) <= 1e-10 * d + 1e-12:
-            break
-    return math.copysign(d, total)
+    root = math.sqrt(dp_0)
+    w = _implicit_share(abs(total) / dp_0, g * c / root)
+    return math.copysign(c * root * w, total)
+
+
+@contracted
+def implicit_orifice_drop(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
+    """Pressure difference d [Pa] of `implicit_orifice_flow`."""
+    c = one_way_coefficient(total, c_forward, c_reverse)
+    w = _implicit_share(abs(total) / dp_0, g * c / math.sqrt(dp_0))
+    square = w * w
+    return math.copysign(dp_0 * w * math.sqrt(0.5 * (square + math.sqrt(square * square + 4.0))), total)

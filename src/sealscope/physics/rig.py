@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.compiled import law
+from sealscope.compiled import contracted
 from sealscope.parameters import Rig
 from sealscope.physics.cylinder import chamber_volumes, hard_stop_force, piston_acceleration, pressure_rate
 from sealscope.physics.external import accumulator_pressure, check_valve_flow, external_leakage
@@ -24,12 +24,23 @@ from sealscope.physics.leakage import piston_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
 from sealscope.physics.restrictors import one_way_coefficient, orifice_coefficient, orifice_flow
-
-STATES = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "V_up")
-INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP = range(len(STATES))
-
-#: What a run reports at each output instant: the states and the quantities that follow from them.
-OUTPUTS = (*STATES, "Q_1", "Q_A", "Q_B", "q_leak", "V", "q_ext", "q_up")
+from sealscope.physics.state import (
+    CURRENT,
+    INTEGRAL,
+    MADE_UP,
+    OMEGA,
+    P_1,
+    P_2,
+    P_A,
+    P_B,
+    POSITION,
+    STATES,
+    VELOCITY,
+    Pressures,
+    State,
+    pressures_moved,
+)
+from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
 
 
 class RigNumbers(NamedTuple):
@@ -173,34 +184,37 @@ def initial_state(rig: Rig, x_0: float) -> np.ndarray:
     return y
 
 
-@law
-def speed_error(y: np.ndarray, u: float, p: RigNumbers) -> float:
+@contracted
+def within_limits(y: State, p: RigNumbers) -> State:
+    """The state after a step: the drive's current is held within its limits; without lines p_1 = p_A and p_2 = p_B."""
+    current = min(max(y[CURRENT], -p.i_max), p.i_max)
+    p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
+    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, y[10]
+
+
+@contracted
+def speed_error(y: State, u: float, p: RigNumbers) -> float:
     """Commanded less actual motor speed [rad/s]."""
-    return p.omega_per_volt * u - float(y[OMEGA])
+    return p.omega_per_volt * u - y[OMEGA]
 
 
-@law
-def friction_force(y: np.ndarray, p: RigNumbers) -> float:
+@contracted
+def friction_force(y: State, p: RigNumbers) -> float:
     """Friction [N] on the piston, eqs. (4.20)-(4.22)."""
     F_C = coulomb_friction(y[P_A], y[P_B], p.F_pr, p.F_cfr, p.coulomb_of_difference)
     return stribeck_friction(y[VELOCITY], F_C, p.K_brk, p.C_c, p.F_v, p.v_th, p.literal_bracket)
 
 
-@law
-def throttle_flow_A(y: np.ndarray, p: RigNumbers) -> float:
-    """Q_A [m^3/s] from line 1 into chamber A, eqs. (4.9)-(4.10)."""
-    dp = y[P_1] - y[P_A]
-    return orifice_flow(dp, one_way_coefficient(dp, p.c_A_in, p.c_A_out), p.dp_0)
+@contracted
+def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
+    """Q_A [m^3/s] from line 1 into chamber A, eqs. (4.9)-(4.10), and Q_B from chamber B into line 2, eqs.
+    (4.11)-(4.12)."""
+    dp_A, dp_B = y[P_1] - y[P_A], y[P_B] - y[P_2]
+    Q_A = orifice_flow(dp_A, one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
+    return Q_A, orifice_flow(dp_B, one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
 
 
-@law
-def throttle_flow_B(y: np.ndarray, p: RigNumbers) -> float:
-    """Q_B [m^3/s] from chamber B into line 2, eqs. (4.11)-(4.12)."""
-    dp = y[P_B] - y[P_2]
-    return orifice_flow(dp, one_way_coefficient(dp, p.c_B_out, p.c_B_in), p.dp_0)
-
-
-@law
+@contracted
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     """Bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
     if len(p.aerated) == 0:
@@ -208,97 +222,102 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     return effective_bulk_modulus(pressure, p.K_oil, p.air, p.n_air)
 
 
-@law
-def make_up_flows(y: np.ndarray, p: RigNumbers) -> tuple[float, float]:
+@contracted
+def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
+    """What the throttles' flows add to the rates of p_A, p_B, p_1, p_2 [Pa/s], eqs. (4.16)-(4.19)."""
+    V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
+    return (
+        pressure_rate(Q_A, V_A, bulk_modulus(y[P_A], p)),  # eq. (4.18)
+        pressure_rate(-Q_B, V_B, bulk_modulus(y[P_B], p)),  # eq. (4.19)
+        pressure_rate(-Q_A, p.V_1, bulk_modulus(y[P_1], p)),  # eq. (4.16)
+        pressure_rate(Q_B, p.V_2, bulk_modulus(y[P_2], p)),  # eq. (4.17)
+    )
+
+
+@contracted
+def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Flows [m^3/s] of the make-up into side 1 (A) and side 2 (B): at the pump's ports, or at the chambers without
     lines."""
-    if not p.made_up:
-        return 0.0, 0.0
     supply = accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
     one, two = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
-    return check_valve_flow(supply - one, p.p_crack, p.G_check), check_valve_flow(supply - two, p.p_crack, p.G_check)
+    G_check = p.G_check if p.made_up else 0.0 * p.G_check
+    return check_valve_flow(supply - one, p.p_crack, G_check), check_valve_flow(supply - two, p.p_crack, G_check)
 
 
-@law
-def add_outer_flows(y: np.ndarray, p: RigNumbers, dy: np.ndarray) -> None:
-    """Add to `dy` what leaves at the rod seals and what the make-up feeds."""
+@contracted
+def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
+    """What leaves at the rod seals and what the make-up feeds: rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed
+    [m^3/s]."""
     V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     up_1, up_2 = make_up_flows(y, p)
-    dy[MADE_UP] = up_1 + up_2
-    dy[P_A] -= pressure_rate(external_leakage(y[P_A], p.G_ext_A), V_A, K_A)
-    dy[P_B] -= pressure_rate(external_leakage(y[P_B], p.G_ext_B), V_B, K_B)
+    out_A, out_B = external_leakage(y[P_A], p.G_ext_A), external_leakage(y[P_B], p.G_ext_B)
     if p.throttled:
-        dy[P_1] += pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
-        dy[P_2] += pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
-    else:
-        dy[P_A] += pressure_rate(up_1, V_A, K_A)
-        dy[P_B] += pressure_rate(up_2, V_B, K_B)
+        one = pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
+        two = pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
+        return (-pressure_rate(out_A, V_A, K_A), -pressure_rate(out_B, V_B, K_B), one, two), up_1 + up_2
+    one, two = pressure_rate(up_1 - out_A, V_A, K_A), pressure_rate(up_2 - out_B, V_B, K_B)
+    return (one, two, one, two), up_1 + up_2
 
 
-@law
-def rates_without_throttles(y: np.ndarray, u: float, G: float, C: float, p: RigNumbers, dy: np.ndarray) -> None:
-    """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients; written into
-    `dy`."""
-    p_A, p_B = y[P_A], y[P_B]
+@contracted
+def rates_without_throttles(y: State, u: float, G: float, C: float, p: RigNumbers) -> State:
+    """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients."""
+    p_A, p_B, x, v = y[P_A], y[P_B], y[POSITION], y[VELOCITY]
     dp_pump = (y[P_1] - y[P_2]) if p.throttled else (p_A - p_B)
-    error = speed_error(y, u, p)
+    error = speed_error(y, u, p)  # eq. (4.2) as a state
     voltage = controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
-    dy[INTEGRAL] = error  # eq. (4.2) as a state
-    dy[CURRENT] = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
-    dy[OMEGA] = shaft_acceleration(y[CURRENT], y[OMEGA], pump_torque(dp_pump, p.q_b), p.C_m, p.B_M, p.J_M)
-    dy[THETA] = y[OMEGA]
-    x, v = y[POSITION], y[VELOCITY]
+    current = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
+    spin = shaft_acceleration(y[CURRENT], y[OMEGA], pump_torque(dp_pump, p.q_b), p.C_m, p.B_M, p.J_M)
     stop = hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
-    dy[POSITION] = v  # eq. (4.13)
-    dy[VELOCITY] = piston_acceleration(p_A, p_B, friction_force(y, p), p.F_l, stop, p.A_A, p.A_B, p.M_eq)
+    push = piston_acceleration(p_A, p_B, friction_force(y, p), p.F_l, stop, p.A_A, p.A_B, p.M_eq)
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
     V_A, V_B = chamber_volumes(x, p.V, p.A_A, p.A_B, p.position_dependent)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
     if p.throttled:
-        dy[P_A] = pressure_rate(-p.A_A * v - Q_L, V_A, K_A)
-        dy[P_B] = pressure_rate(p.A_B * v + Q_L, V_B, K_B)
-        dy[P_1] = pressure_rate(Q_1, p.V_1, bulk_modulus(y[P_1], p))
-        dy[P_2] = pressure_rate(-Q_1, p.V_2, bulk_modulus(y[P_2], p))
+        rate_A = pressure_rate(-p.A_A * v - Q_L, V_A, K_A)
+        rate_B = pressure_rate(p.A_B * v + Q_L, V_B, K_B)
+        rate_1 = pressure_rate(Q_1, p.V_1, bulk_modulus(y[P_1], p))
+        rate_2 = pressure_rate(-Q_1, p.V_2, bulk_modulus(y[P_2], p))
     else:
-        dy[P_A] = pressure_rate(Q_1 - p.A_A * v - Q_L, V_A, K_A)
-        dy[P_B] = pressure_rate(-Q_1 + p.A_B * v + Q_L, V_B, K_B)
-    dy[MADE_UP] = 0.0
+        rate_A = pressure_rate(Q_1 - p.A_A * v - Q_L, V_A, K_A)
+        rate_B = pressure_rate(-Q_1 + p.A_B * v + Q_L, V_B, K_B)
+        rate_1, rate_2 = rate_A, rate_B
+    dy = (error, current, spin, y[OMEGA], v, push, rate_A, rate_B, rate_1, rate_2, 0.0 * v)  # eq. (4.13)
     if len(p.open_circuit) > 0:
-        add_outer_flows(y, p, dy)
-    if not p.throttled:
-        dy[P_1] = dy[P_A]
-        dy[P_2] = dy[P_B]
+        outer, fed = outer_rates(y, p)
+        dy = pressures_moved(dy, 1.0, outer)
+        return dy[0], dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], fed
+    return dy
 
 
-@law
-def rates(y: np.ndarray, u: float, G: float, C: float, p: RigNumbers, dy: np.ndarray) -> None:
-    """dy/dt of the whole rig, written into `dy`."""
-    rates_without_throttles(y, u, G, C, p, dy)
+@contracted
+def rates(y: State, u: float, G: float, C: float, p: RigNumbers) -> State:
+    """dy/dt of the whole rig."""
+    dy = rates_without_throttles(y, u, G, C, p)
     if p.throttled:
-        Q_A = throttle_flow_A(y, p)
-        Q_B = throttle_flow_B(y, p)
-        V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
-        dy[P_A] += pressure_rate(Q_A, V_A, bulk_modulus(y[P_A], p))  # eq. (4.18)
-        dy[P_B] += pressure_rate(-Q_B, V_B, bulk_modulus(y[P_B], p))  # eq. (4.19)
-        dy[P_1] += pressure_rate(-Q_A, p.V_1, bulk_modulus(y[P_1], p))  # eq. (4.16)
-        dy[P_2] += pressure_rate(Q_B, p.V_2, bulk_modulus(y[P_2], p))  # eq. (4.17)
+        Q_A, Q_B = throttle_flows(y, p)
+        dy = pressures_moved(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))
+    return dy
 
 
-@law
-def observe(y: np.ndarray, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
+@contracted
+def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
     """Write the states and the derived quantities of `OUTPUTS` into `row`."""
-    row[: y.size] = y
+    for m in range(len(y)):
+        row[m] = y[m]
+    n = len(y)
     dp_pump = (y[P_1] - y[P_2]) if p.throttled else (y[P_A] - y[P_B])
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
-    row[y.size] = Q_1
-    row[y.size + 1] = throttle_flow_A(y, p) if p.throttled else Q_1
-    row[y.size + 2] = throttle_flow_B(y, p) if p.throttled else Q_1
-    row[y.size + 3] = piston_leakage(y[P_A] - y[P_B], G, C, p.dp_0)
-    row[y.size + 4] = controller_voltage(speed_error(y, u, p), y[INTEGRAL], p.k_p, p.K_i, p.V_max)
-    row[y.size + 5 :] = 0.0
+    Q_A, Q_B = throttle_flows(y, p) if p.throttled else (Q_1, Q_1)
+    row[n] = Q_1
+    row[n + 1] = Q_A
+    row[n + 2] = Q_B
+    row[n + 3] = piston_leakage(y[P_A] - y[P_B], G, C, p.dp_0)
+    row[n + 4] = controller_voltage(speed_error(y, u, p), y[INTEGRAL], p.k_p, p.K_i, p.V_max)
+    row[n + 5] = row[n + 6] = 0.0
     if len(p.open_circuit) > 0:
-        row[y.size + 5] = external_leakage(y[P_A], p.G_ext_A) + external_leakage(y[P_B], p.G_ext_B)
+        row[n + 5] = external_leakage(y[P_A], p.G_ext_A) + external_leakage(y[P_B], p.G_ext_B)
         up_1, up_2 = make_up_flows(y, p)
-        row[y.size + 6] = up_1 + up_2
+        row[n + 6] = up_1 + up_2

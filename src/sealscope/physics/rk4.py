@@ -5,11 +5,34 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.compiled import kernel
-from sealscope.physics.rig import CURRENT, INTEGRAL, OMEGA, RigNumbers, observe, rates
+from sealscope.compiled import contracted, kernel
+from sealscope.physics.rig import RigNumbers, observe, rates, within_limits
+from sealscope.physics.state import State, moved, state_of
 
 #: Nodes of the step at which the inputs are needed.
 RK4_NODES = (0.0, 0.5, 1.0)
+Nodes = tuple[float, float, float]
+
+
+@contracted
+def held_integral(dy: State, euler_integral: bool) -> State:
+    """The rates with the controller's integral standing still where eq. (4.2) is taken literally."""
+    still = 0.0 * dy[0] if euler_integral else dy[0]
+    return still, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10]
+
+
+@contracted
+def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, p: RigNumbers, euler_integral: bool) -> State:
+    """The state a step of h [s] later; `u`, `G`, `C` at the nodes of the step."""
+    first = rates(y, u[0], G[0], C[0], p)
+    k1 = held_integral(first, euler_integral)
+    k2 = held_integral(rates(moved(y, 0.5 * h, k1), u[1], G[1], C[1], p), euler_integral)
+    k3 = held_integral(rates(moved(y, 0.5 * h, k2), u[1], G[1], C[1], p), euler_integral)
+    k4 = held_integral(rates(moved(y, h, k3), u[2], G[2], C[2], p), euler_integral)
+    total = moved(moved(moved(k1, 2.0, k2), 2.0, k3), 1.0, k4)
+    z = within_limits(moved(y, h / 6.0, total), p)
+    integral = y[0] + h * first[0] if euler_integral else z[0]  # eq. (4.2)
+    return integral, z[1], z[2], z[3], z[4], z[5], z[6], z[7], z[8], z[9], z[10]
 
 
 @kernel
@@ -31,32 +54,12 @@ def advance_rk4(
     once after it.
     """
     n = u.shape[0]
-    size = y.size
-    k1, k2, k3, k4, z = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    z = state_of(y)
     for step in range(n):
         if step % every == 0:
-            observe(y, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
-        error = p.omega_per_volt * u[step, 0] - y[OMEGA]
-        rates(y, u[step, 0], G[step, 0], C[step, 0], p, k1)
-        if euler_integral:
-            k1[INTEGRAL] = 0.0
-        for m in range(size):
-            z[m] = y[m] + 0.5 * h * k1[m]
-        rates(z, u[step, 1], G[step, 1], C[step, 1], p, k2)
-        if euler_integral:
-            k2[INTEGRAL] = 0.0
-        for m in range(size):
-            z[m] = y[m] + 0.5 * h * k2[m]
-        rates(z, u[step, 1], G[step, 1], C[step, 1], p, k3)
-        if euler_integral:
-            k3[INTEGRAL] = 0.0
-        for m in range(size):
-            z[m] = y[m] + h * k3[m]
-        rates(z, u[step, 2], G[step, 2], C[step, 2], p, k4)
-        if euler_integral:
-            k4[INTEGRAL] = 0.0
-        for m in range(size):
-            y[m] += h / 6.0 * (k1[m] + 2.0 * k2[m] + 2.0 * k3[m] + k4[m])
-        if euler_integral:
-            y[INTEGRAL] += h * error  # eq. (4.2)
-        y[CURRENT] = min(max(y[CURRENT], -p.i_max), p.i_max)
+            observe(z, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
+        volts = (u[step, 0], u[step, 1], u[step, 2])
+        laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])
+        z = rk4_step(z, h, volts, laminar, orifice, p, euler_integral)
+    for m in range(len(z)):
+        y[m] = z[m]

@@ -52,7 +52,7 @@ class Schedule:
         self.bounds = np.unique(np.r_[np.arange(0, n_out, cell), n_out, jumps.astype(np.int64)])
         self.bounds = self._refined(effects, rate)
         middles: Array = np.asarray(0.5 * (self.bounds[:-1] + self.bounds[1:]) / rate, dtype=np.float64)
-        values = _values(effects, base, middles)
+        values = values_of(effects, base, middles)
         table = np.array(list(values.values()))
         new = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]
         self.bounds = np.r_[self.bounds[:-1][new], n_out]
@@ -88,7 +88,8 @@ class Schedule:
             first, k = stop, k + 1
 
 
-def _values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
+def values_of(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
+    """The numbers of `base` that change, by name, at times t [s]."""
     values: dict[str, Array] = {}
     for effect in sorted(effects, key=lambda one: not one.added):  # sums before products
         own = values.get(effect.field)

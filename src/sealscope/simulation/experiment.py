@@ -124,19 +124,19 @@ class Experiment:
     def key(self) -> str:
         """A short name that is the same for equal experiments only."""
         values = {row.name: repr(row.value) for row in self.rig.table()}
-        inputs = [_exact(self.command), *(_exact(leak) for leak in self.leaks)]
-        inputs += [_exact(one) for one in (*self.faults, *self.drifts)]
+        inputs = [exact(self.command), *(exact(leak) for leak in self.leaks)]
+        inputs += [exact(one) for one in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _exact(value: Any) -> Any:
+def exact(value: Any) -> Any:
     """A command or a leak as plain values that differ wherever its numbers do, in the last digit or deep in a table."""
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
     if is_dataclass(value):
-        return [type(value).__name__, *(_exact(getattr(value, one.name)) for one in fields(value))]
+        return [type(value).__name__, *(exact(getattr(value, one.name)) for one in fields(value))]
     return repr(value)
 
 

@@ -22,6 +22,18 @@ _KAISER_BETA = 8.0
 _PASS = 0.9  # cut-off (-6 dB) as a share of the Nyquist frequency
 
 
+def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
+    """Taps of the zero-phase anti-alias filter at `factor` times the recording's rate, (2 FILTER_REACH factor + 1,):
+    a Kaiser-windowed sinc of gain 1, late by `delay` < 1 taps; a single 1 where there is nothing to filter."""
+    if factor == 1 and delay == 0.0:
+        return np.ones(1)
+    reach = FILTER_REACH * factor
+    off = np.arange(-reach, reach + 1) + delay
+    window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (off / reach) ** 2))) / np.i0(_KAISER_BETA)
+    taps = np.sinc((_PASS / factor if factor > 1 else 1.0) * off) * window
+    return np.asarray(taps / taps.sum())
+
+
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     """`n` samples out of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc (-6 dB at 0.9 of the new
     Nyquist frequency).
@@ -34,12 +46,12 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
         return np.array(values[:n])
     reach = FILTER_REACH * factor
     whole = math.floor(delay)
-    off = np.arange(-reach, reach + 1) + (delay - whole)
-    window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (off / reach) ** 2))) / np.i0(_KAISER_BETA)
-    taps = np.sinc((_PASS / factor if factor > 1 else 1.0) * off) * window
+    taps = anti_alias_taps(factor, delay - whole)
+    if taps.size == 1:  # a whole delay of an unfiltered signal
+        taps = np.r_[np.zeros(reach), 1.0, np.zeros(reach)]
     padded = np.concatenate([np.full(reach + whole, values[0]), values])
     windows = np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::factor]
-    return np.asarray(windows[:n] @ (taps / taps.sum()))
+    return np.asarray(windows[:n] @ taps)
 
 
 def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:

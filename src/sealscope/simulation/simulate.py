@@ -14,10 +14,10 @@ import numpy as np
 
 from sealscope.recordings.recording import Array, Recording
 from sealscope.recordings.whole import whole_file
-from sealscope.simulation.commands import check_command
 from sealscope.simulation.drifts import Drift
 from sealscope.simulation.experiment import Experiment, make_experiment
 from sealscope.simulation.faults import LITRE_PER_MINUTE, Fault, Leak
+from sealscope.simulation.inputs import RunInputs
 from sealscope.simulation.instruments import FILTER_REACH, record
 from sealscope.simulation.integrate import DEFAULT_STEP, Trajectory, choose_method, integrate
 from sealscope.simulation.sizing import leak_flow, mean_while_open, sized
@@ -54,24 +54,12 @@ class Run:
 def oversampling(experiment: Experiment) -> int:
     """Outputs per sample: enough for the anti-alias filter, no more than the solver has steps."""
     longest = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
-    return max(1, min(_OVERSAMPLING, math.ceil(1.0 / (experiment.rate * longest) * (1.0 - 1e-9))))
+    return oversampling_of(experiment.rate, longest)
 
 
-def _inputs(experiment: Experiment, leaks: tuple[Leak, ...]) -> Callable[[Array], tuple[Array, Array, Array]]:
-    limit = experiment.rig.daq.u_max
-    command = experiment.commanded
-
-    def inputs(t: Array) -> tuple[Array, Array, Array]:
-        G, C = np.zeros_like(t), np.zeros_like(t)
-        for leak in leaks:
-            (G if leak.law == "laminar" else C)[...] += (leak.coefficient or 0.0) * leak.opening.share(t)
-        u = command.volts(t)
-        if not np.abs(u).max(initial=0.0) <= limit:  # between samples, or beyond the end, where the filter still looks
-            check_command(command, t[t <= experiment.duration], limit)
-            u = np.clip(u, -limit, limit)
-        return u, G, C
-
-    return inputs
+def oversampling_of(rate: float, step: float) -> int:
+    """Outputs per sample of a recording at `rate` [Hz] where the solver has a step about every `step` [s]."""
+    return max(1, min(_OVERSAMPLING, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9))))
 
 
 def trajectory(
@@ -85,7 +73,7 @@ def trajectory(
     factor = oversampling(experiment)
     return integrate(
         experiment.rig,
-        _inputs(experiment, leaks),
+        RunInputs(experiment, leaks),
         (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate,
         experiment.rate * factor,
         x_0=experiment.x_0,

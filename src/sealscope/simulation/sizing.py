@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from sealscope.simulation.integrate import Trajectory
 
 #: Relative distance from the mean asked for at which the search ends.
 TOLERANCE = 1e-3
-_MOST_RUNS = 20
+MOST_RUNS = 20
 _LEAST_SLOPE = 0.1
 
 Integrate = Callable[[tuple[Leak, ...]], Trajectory]
@@ -56,6 +56,24 @@ def _slope(before: tuple[float, float], now: tuple[float, float]) -> float:
     return min(max(math.log(q_1 / q_0) / math.log(c_1 / c_0), _LEAST_SLOPE), 1.0)
 
 
+def scaled_size(asked: float, before: tuple[float, float], now: tuple[float, float]) -> float:
+    """The coefficient to try next for a mean flow `asked` [m^3/s], from (coefficient, mean flow) of the run before and
+    of this run; with a coefficient of 0, the flow is that of a coefficient of 1."""
+    size, flow = now
+    if size == 0.0:
+        return asked / flow
+    return float(size * (asked / flow) ** (1.0 / _slope(before, now)))
+
+
+def refuse_unsettled(leaks: Sequence[Leak]) -> SimulationFailed:
+    """The error of a search that does not end."""
+    return SimulationFailed(
+        f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: "
+        f"{', '.join(str(leak) for leak in leaks)} is more than this "
+        "rig's pressures can drive; ask for a smaller leak"
+    )
+
+
 def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[Leak, ...]:
     """The leaks with a coefficient each, found so that each one's mean is what was asked for.
 
@@ -68,7 +86,7 @@ def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[L
     """
     current = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
     before: list[tuple[float, float]] = [(0.0, 0.0)] * len(leaks)  # coefficient and mean flow of the run before
-    for attempt in range(_MOST_RUNS):
+    for attempt in range(MOST_RUNS):
         run = integrate(current)
         if attempt == 0:
             _refuse_impossible(leaks, float(np.mean(np.abs(run["Q_1"]))))
@@ -85,18 +103,10 @@ def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[L
                 raise InputError(f"a leak with a mean flow must be open within the run, got {asked}")
             got = unit * size
             worst = max(worst, abs(got / asked.mean - 1.0))
-            scaled = (
-                asked.mean / unit
-                if size == 0.0
-                else size * (asked.mean / got) ** (1.0 / _slope(before[k], (size, got)))
-            )
+            scaled = scaled_size(asked.mean, before[k], (size, got if size > 0.0 else unit))
             before[k] = (size, got)
             following.append(replace(now, coefficient=scaled))
         if worst <= TOLERANCE:
             return current
         current = tuple(following)
-    raise SimulationFailed(
-        f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: "
-        f"{', '.join(str(leak) for leak in leaks)} is more than this "
-        "rig's pressures can drive; ask for a smaller leak"
-    )
+    raise refuse_unsettled(leaks)

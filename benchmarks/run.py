@@ -1,0 +1,44 @@
+"""All speed benchmarks with one command: peers built, trajectories compared, ratios printed, figures kept.
+
+    python benchmarks/run.py [--quick] [--into FOLDER]
+
+Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib) and batch.json into `benchmarks/results` or the
+folder that is given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+
+
+def main() -> None:
+    """Run the scripts in turn, each in a process of its own, on one thread but for the batches."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="two rounds, two rigs, few runs: to see that all works")
+    parser.add_argument("--into", type=Path, default=HERE / "results", help="folder of the figures")
+    chosen = parser.parse_args()
+    results = chosen.into
+    solvers = ["bench_solvers.py", "--json", str(results / "solvers.json")]
+    if importlib.util.find_spec("matplotlib"):
+        solvers += ["--plot", str(results / "solvers.svg")]
+    else:
+        print("no work-precision plot: matplotlib is not installed (pip install 'sealscope[report]')", file=sys.stderr)
+    batch = ["bench_batch.py", "--json", str(results / "batch.json")]
+    if chosen.quick:
+        solvers += ["--rounds", "2", "--duration", "20", "--case", "no throttles, 3 sin 4t"]
+        solvers += ["--case", "50 % closed, 3 sin 4t"]
+        batch += ["--rounds", "2", "--runs", "32", "--duration", "20"]
+    print(f"{platform.machine()}, {platform.python_implementation()} {platform.python_version()}", flush=True)
+    for words in (solvers, batch):
+        subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=True)
+
+
+if __name__ == "__main__":
+    main()

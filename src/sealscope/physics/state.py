@@ -1,0 +1,69 @@
+"""The state of the rig: its order, its names, and the tuple of numbers (or of lanes) that the laws take."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sealscope.compiled import contracted, kernel
+
+STATES = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "V_up")
+INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP = range(len(STATES))
+
+#: What a run reports at each output instant: the states and the quantities that follow from them.
+OUTPUTS = (*STATES, "Q_1", "Q_A", "Q_B", "q_leak", "V", "q_ext", "q_up")
+
+#: A state or its rate as the laws take it, in the order of `STATES`; p_A, p_B, p_1, p_2 or their rates.
+State = tuple[float, float, float, float, float, float, float, float, float, float, float]
+Pressures = tuple[float, float, float, float]
+
+
+@contracted
+def state_of(y: np.ndarray) -> State:
+    """The state (11,) as the tuple of numbers that the laws take."""
+    return y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10]
+
+
+@contracted
+def moved(y: State, h: float, dy: State) -> State:
+    """y + h dy."""
+    return (
+        y[0] + h * dy[0],
+        y[1] + h * dy[1],
+        y[2] + h * dy[2],
+        y[3] + h * dy[3],
+        y[4] + h * dy[4],
+        y[5] + h * dy[5],
+        y[6] + h * dy[6],
+        y[7] + h * dy[7],
+        y[8] + h * dy[8],
+        y[9] + h * dy[9],
+        y[10] + h * dy[10],
+    )
+
+
+@contracted
+def with_pressures(y: State, pressures: Pressures) -> State:
+    """The state with other p_A, p_B, p_1, p_2."""
+    p_A, p_B, p_1, p_2 = pressures
+    return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10]
+
+
+@contracted
+def pressures_moved(y: State, h: float, s: Pressures) -> State:
+    """The state with h s added to its pressures."""
+    return with_pressures(y, (y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]))
+
+
+@kernel
+def survey(rows: np.ndarray) -> tuple[bool, float, float]:
+    """Of rows of outputs (n, 17): whether all are finite, the largest |x| [m], and the lowest pressure [Pa]."""
+    reach, least, total = 0.0, math.inf, 0.0
+    for k in range(rows.shape[0]):
+        row = rows[k]
+        reach = max(reach, abs(row[POSITION]))
+        least = min(least, row[P_A], row[P_B], row[P_1], row[P_2])
+        for value in row:
+            total += 0.0 * value  # NaN from any value that is not finite
+    return total == 0.0, reach, least

@@ -1,0 +1,225 @@
+"""What instruments and wavelets make of runs side by side, block by block: pressures in, sums of squares out.
+
+The laws are those of `instruments.record` (filter, gain and offset, noise, hum, saturation, conversion) and of
+`signals.details` (stationary db8), on lanes; memory is a few filter lengths for each group of runs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sealscope.compiled import contracted, kernel
+from sealscope.physics.lane_runs import TOLD
+from sealscope.physics.lanes import anywhere, load, spread, store
+from sealscope.simulation.lane_noise import half_turn_sine, normals
+
+LEVELS = 4
+#: d1, d2, d3, d4 and d3 d4.
+QUANTITIES = LEVELS + 1
+#: Samples that pass through the filters at a time, and the taps of db8.
+BLOCK, TAPS = 64, 16
+#: Rows of a channel's instrument: gain, offset, own noise, common noise and what each grows by a sample; walk a sample,
+#: hum, hum's turns a sample and at the start; least and largest pressure; volts at the least, volts per pascal, volts
+#: per count, counts at most.
+GAIN, OFFSET, NOISE, COMMON, GAIN_RISE, OFFSET_RISE, NOISE_RISE, COMMON_RISE = range(8)
+WALK, HUM, HUM_TURNS, HUM_PHASE = range(8, 12)
+LEAST, LARGEST, VOLTS, PER_PASCAL, COUNT, TOP = range(12, 18)
+INSTRUMENT_ROWS = 18
+#: Rows of a channel's filters: the history and a block of a_0 .. a_3, d_3 late by 64 samples, details of a block.
+HISTORIES = tuple((TAPS - 1) * 2**level for level in range(LEVELS))
+STARTS = tuple(sum(HISTORIES[:level]) + level * BLOCK for level in range(LEVELS + 1))
+LATE = TAPS // 2 * 2 ** (LEVELS - 1)
+FILTER_ROWS = STARTS[LEVELS] + LATE + BLOCK + BLOCK
+_ROUND = 6755399441055744.0  # 1.5 * 2^52: adding it rounds to the nearest whole number
+
+
+@contracted
+def converted(pressure: Any, sensor: np.ndarray, at: int) -> Any:
+    """Pressure [Pa] as read back from the converter (`instruments.convert`)."""
+    least = load(sensor, at + LEAST)
+    held = min(max(pressure, least), load(sensor, at + LARGEST))
+    volts = load(sensor, at + VOLTS) + (held - least) * load(sensor, at + PER_PASCAL)
+    top = load(sensor, at + TOP)
+    codes = (volts / load(sensor, at + COUNT) + _ROUND) - _ROUND
+    codes = min(max(codes, -top), top - 1.0)
+    return least + (codes * load(sensor, at + COUNT) - load(sensor, at + VOLTS)) / load(sensor, at + PER_PASCAL)
+
+
+@contracted
+def _hum(sensor: np.ndarray, at: int, sample: int) -> Any:
+    turns = load(sensor, at + HUM_PHASE) + load(sensor, at + HUM_TURNS) * sample
+    turns = turns - ((turns + _ROUND) - _ROUND)  # -1/2 .. 1/2 of a turn
+    half = half_turn_sine(turns)
+    other = half_turn_sine(0.5 - abs(turns))  # cos(pi turns)
+    return load(sensor, at + HUM) * (2.0 * half * other)
+
+
+@contracted
+def _read(true: Any, sensor: np.ndarray, at: int, own: Any, common: Any, walk: Any, sample: int, since: float) -> Any:
+    gain = load(sensor, at + GAIN) + since * load(sensor, at + GAIN_RISE)
+    offset = load(sensor, at + OFFSET) + since * load(sensor, at + OFFSET_RISE)
+    noise = load(sensor, at + NOISE) + since * load(sensor, at + NOISE_RISE)
+    shared = load(sensor, at + COMMON) + since * load(sensor, at + COMMON_RISE)
+    seen = gain * true + offset + walk + noise * own + shared * common
+    if anywhere(load(sensor, at + HUM) > 0.0):
+        seen = seen + _hum(sensor, at, sample)
+    return converted(seen, sensor, at)
+
+
+@contracted
+def _filtered(told: np.ndarray, at: int, taps: np.ndarray) -> Any:
+    """The anti-alias filter at one sample; `at`: row of its first tap."""
+    total = spread(0.0)
+    for k in range(taps.size):
+        total = total + taps[k] * load(told, at + TOLD * k)
+    return total
+
+
+@contracted
+def _filtered_late(told: np.ndarray, at: int, taps: np.ndarray, row: int, count: int) -> Any:
+    """The same with taps of each lane's own, from row `row` of `taps` on."""
+    total = spread(0.0)
+    for k in range(count):
+        total = total + load(taps, row + k) * load(told, at + TOLD * k)
+    return total
+
+
+@contracted
+def _split(rows: np.ndarray, source: int, hole: int, low: np.ndarray, high: np.ndarray, m: int, a: int, d: int) -> None:
+    """Causal low- and high-pass of m samples from row `source` on, into rows from `a` and `d` on."""
+    for i in range(m):
+        smooth, detail = spread(0.0), spread(0.0)
+        for k in range(TAPS):
+            x = load(rows, source + i - hole * k)
+            smooth = smooth + low[k] * x
+            detail = detail + high[k] * x
+        store(rows, a + i, smooth)
+        store(rows, d + i, detail)
+
+
+@contracted
+def _summed(
+    rows: np.ndarray,
+    d: int,
+    other: int,
+    product: bool,
+    m: int,
+    first: int,
+    bounds: np.ndarray,
+    sums: np.ndarray,
+    at: int,
+) -> None:
+    """Add the squares of m details (or of their products with `other`) to the segments that they fall into.
+
+    The details are those of samples first, first + 1, ..; `sums` rows at, at + QUANTITIES, .. are the segments'.
+    """
+    segments = bounds.size - 1
+    segment = int(np.searchsorted(bounds, first, side="right")) - 1
+    i = 0 if segment >= 0 else bounds[0] - first
+    segment = max(segment, 0)
+    while i < m and segment < segments:
+        stop = min(m, bounds[segment + 1] - first)
+        total = load(sums, at + segment * QUANTITIES)
+        for k in range(i, stop):
+            x = load(rows, d + k)
+            if product:
+                x = x * load(rows, other + k)
+            total = total + x * x
+        store(sums, at + segment * QUANTITIES, total)
+        i = stop
+        segment += 1
+
+
+@contracted
+def _transform(
+    rows: np.ndarray,
+    at: int,
+    m: int,
+    sample: int,
+    low: np.ndarray,
+    high: np.ndarray,
+    bounds: np.ndarray,
+    sums: np.ndarray,
+    to: int,
+) -> None:
+    """Take m new samples, the first of them number `sample`, through all levels, and keep the filters' history."""
+    late = at + STARTS[LEVELS]
+    scratch = late + LATE + BLOCK
+    delay = 0
+    for level in range(LEVELS):
+        hole = 1 << level
+        delay += TAPS // 2 * hole
+        source = at + STARTS[level] + HISTORIES[level]
+        below = at + STARTS[level + 1] + HISTORIES[level + 1] if level + 1 < LEVELS else scratch
+        detail = late + LATE if level == LEVELS - 2 else scratch
+        _split(rows, source, hole, low, high, m, below, detail)
+        _summed(rows, detail, 0, False, m, sample - delay, bounds, sums, to + level)
+    _summed(rows, scratch, late, True, m, sample - delay, bounds, sums, to + LEVELS)
+    for level in range(LEVELS):
+        for i in range(HISTORIES[level]):
+            store(rows, at + STARTS[level] + i, load(rows, at + STARTS[level] + m + i))
+    for i in range(LATE):
+        store(rows, late + i, load(rows, late + m + i))
+
+
+@kernel
+def sense_lanes(
+    groups: tuple[int, int],
+    told: np.ndarray,
+    begin: int,
+    factor: int,
+    taps: np.ndarray,
+    own_taps: np.ndarray,
+    first: int,
+    last: int,
+    sensors: np.ndarray,
+    keys: np.ndarray,
+    walks: np.ndarray,
+    filters: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    bounds: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """Read samples first <= s < last of the groups' runs and add the squares of their details to `sums`.
+
+    `told`: (groups, outputs, TOLD, WIDTH), the first tap of sample `first` on output `begin`, `factor` outputs a
+    sample; `taps` of the anti-alias filter, or `own_taps` (groups, TOLD, taps, WIDTH) where channels are late;
+    `sensors`: (groups, TOLD, INSTRUMENT_ROWS, WIDTH), as at sample `first`; `keys`: (groups, WIDTH) of the noise;
+    `walks`: (groups, TOLD, WIDTH) zero drift so far [Pa]; `filters`: (groups, TOLD, FILTER_ROWS, WIDTH); `bounds`:
+    (segments + 1,) samples; `sums`: (groups, TOLD, segments, QUANTITIES, WIDTH).
+    """
+    segments = bounds.size - 1
+    late = own_taps.shape[2]
+    head = STARTS[0] + HISTORIES[0]
+    for g in range(groups[0], groups[1]):
+        key = load(keys, g)
+        walk_A, walk_B = load(walks, TOLD * g), load(walks, TOLD * g + 1)
+        one, two = TOLD * g * INSTRUMENT_ROWS, (TOLD * g + 1) * INSTRUMENT_ROWS
+        a, b = TOLD * g * FILTER_ROWS, (TOLD * g + 1) * FILTER_ROWS
+        for start in range(first, last, BLOCK):
+            m = min(BLOCK, last - start)
+            for i in range(m):
+                s = start + i
+                at = (g * told.shape[1] + begin + (s - first) * factor) * TOLD
+                own_A, own_B = normals(key, 3 * s)
+                common, step_A = normals(key, 3 * s + 1)
+                step_B, _ = normals(key, 3 * s + 2)
+                walk_A = walk_A + load(sensors, one + WALK) * step_A
+                walk_B = walk_B + load(sensors, two + WALK) * step_B
+                since = float(s - first)
+                if late > 0:
+                    true_A = _filtered_late(told, at, own_taps, TOLD * g * late, late)
+                    true_B = _filtered_late(told, at + 1, own_taps, (TOLD * g + 1) * late, late)
+                else:
+                    true_A, true_B = _filtered(told, at, taps), _filtered(told, at + 1, taps)
+                read_A = _read(true_A, sensors, one, own_A, common, walk_A, s, since)
+                read_B = _read(true_B, sensors, two, own_B, common, walk_B, s, since)
+                store(filters, a + head + i, read_A)
+                store(filters, b + head + i, read_B)
+            _transform(filters, a, m, start, low, high, bounds, sums, TOLD * g * segments * QUANTITIES)
+            _transform(filters, b, m, start, low, high, bounds, sums, (TOLD * g + 1) * segments * QUANTITIES)
+        store(walks, TOLD * g, walk_A)
+        store(walks, TOLD * g + 1, walk_B)

@@ -1,0 +1,116 @@
+"""White noise for runs side by side: normal numbers from a counter and a key for each lane.
+
+The generator is SplitMix64 at a stated place of its sequence (Steele, Lea, Flood, Fast splittable pseudorandom number
+generators, OOPSLA 2014): the number of a sample depends on the run's key and the sample's place alone, never on the
+lane, the group or the block. It is another stream than that of a run by itself (`instruments.record`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import types
+from numba.core.typing.templates import signature
+from numba.extending import intrinsic
+
+from sealscope.compiled import contracted
+from sealscope.physics.lanes import LANES, WIDTH, Lanes, select
+from sealscope.recordings.recording import Array
+
+_LONG = ir.VectorType(ir.IntType(64), WIDTH)
+_DOUBLE = ir.VectorType(ir.DoubleType(), WIDTH)
+_ONE_BITS, _MANTISSA = 0x3FF0000000000000, 0x000FFFFFFFFFFFFF
+
+
+def _constant(value: int) -> Any:
+    return ir.Constant(_LONG, [value] * WIDTH)
+
+
+def keys(seeds: list[int]) -> Array:
+    """A key for each run's noise, as the bits of doubles: (runs,)."""
+    states = [np.random.SeedSequence(seed).generate_state(1, np.uint64) for seed in seeds]
+    return np.concatenate(states).view(np.float64)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def uniform(typingctx: Any, key: Any, place: Any) -> Any:
+    """Numbers evenly spread over (0, 1], one a lane: those at `place` >= 0 of the keys' sequences."""
+    if not (isinstance(key, Lanes) and isinstance(place, types.Integer)):
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        count = context.cast(builder, args[1], sig.args[1], types.int64)
+        count = builder.mul(builder.add(count, ir.Constant(count.type, 1)), ir.Constant(count.type, 0x9E3779B97F4A7C15))
+        one = builder.insert_element(ir.Constant(_LONG, ir.Undefined), count, ir.Constant(ir.IntType(32), 0))
+        step = builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
+        z = builder.add(builder.bitcast(args[0], _LONG), step)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+            z = builder.mul(builder.xor(z, builder.lshr(z, _constant(shift))), _constant(factor))
+        z = builder.xor(z, builder.lshr(z, _constant(31)))
+        bits = builder.or_(builder.lshr(z, _constant(12)), _constant(_ONE_BITS))
+        return builder.fsub(ir.Constant(_DOUBLE, [2.0] * WIDTH), builder.bitcast(bits, _DOUBLE))
+
+    return signature(LANES, key, place), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _exponent(typingctx: Any, x: Any) -> Any:
+    """The exponent of positive normal doubles, as doubles."""
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        raised = builder.lshr(builder.bitcast(args[0], _LONG), _constant(52))
+        return builder.sitofp(builder.sub(raised, _constant(1023)), _DOUBLE)
+
+    return signature(x, x), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _fraction(typingctx: Any, x: Any) -> Any:
+    """The fraction of positive normal doubles, 1 <= m < 2."""
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.and_(builder.bitcast(args[0], _LONG), _constant(_MANTISSA))
+        return builder.bitcast(builder.or_(bits, _constant(_ONE_BITS)), _DOUBLE)
+
+    return signature(x, x), build
+
+
+@contracted
+def logarithm(x: Any) -> Any:
+    """ln x for lanes of normal numbers x > 0, within 2e-15 (absolute near 1, relative elsewhere).
+
+    ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)), m in sqrt(1/2)..sqrt(2), by the artanh's series.
+    """
+    e, m = _exponent(x), _fraction(x)
+    high = m > 1.4142135623730951
+    e, m = select(high, e + 1.0, e), select(high, 0.5 * m, m)
+    f = (m - 1.0) / (m + 1.0)
+    s = f * f
+    q = s * s
+    series = (1.0 + s * (1.0 / 3.0)) + q * ((1.0 / 5.0 + s * (1.0 / 7.0)) + q * (1.0 / 9.0 + s * (1.0 / 11.0)))
+    series = series + q * q * q * ((1.0 / 13.0 + s * (1.0 / 15.0)) + q * (1.0 / 17.0))
+    return e * 0.6931471805599453 + 2.0 * f * series
+
+
+@contracted
+def half_turn_sine(v: Any) -> Any:
+    """sin(pi v) for -1/2 <= v <= 1/2, within 5e-14: Taylor's polynomial to the 17th power."""
+    x = v * math.pi
+    s = x * x
+    q = s * s
+    low = (1.0 - s * (1.0 / 6.0)) + q * (1.0 / 120.0 - s * (1.0 / 5040.0))
+    high = (1.0 / 362880.0 - s * (1.0 / 39916800.0)) + q * (1.0 / 6227020800.0 - s * (1.0 / 1307674368000.0))
+    return x * (low + q * q * (high + q * q * (1.0 / 355687428096000.0)))
+
+
+@contracted
+def normals(key: Any, place: int) -> tuple[Any, Any]:
+    """Two independent standard normal numbers a lane, from places 2 k and 2 k + 1 of the keys' sequences (Box and
+    Muller, Annals of Mathematical Statistics 29 (1958) 610-611)."""
+    radius = math.sqrt(-2.0 * logarithm(uniform(key, 2 * place)))
+    s = half_turn_sine(uniform(key, 2 * place + 1) - 0.5)
+    c = math.sqrt(max(1.0 - s * s, 0.0))
+    return radius * (2.0 * s * c), radius * (1.0 - 2.0 * s * s)

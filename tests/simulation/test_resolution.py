@@ -1,0 +1,100 @@
+"""The step that is chosen by error: what is asked for is what comes out, and no step is finer than it need be."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from sealscope.errors import InputError
+from sealscope.signals.details import details
+from sealscope.signals.windows import rms
+from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.inputs import RunInputs
+from sealscope.simulation.integrate import integrate
+from sealscope.simulation.resolution import windows
+
+PRESSURES = ("p_A", "p_B", "p_1", "p_2")
+
+
+def off(run, truth) -> float:
+    return max(float(np.sqrt(np.mean((run[name] - truth[name]) ** 2))) for name in PRESSURES)
+
+
+@pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
+@pytest.mark.parametrize("command", ["3 sin(4t)", "5 sin(t)", "prbs 1 every 0.5 s seed 1"])
+def test_the_error_that_is_asked_for_comes_out(check_rig, throttled, command):
+    experiment = make_experiment(rig=check_rig(throttled), command=command, leak="G = 6e-13 from 10 s", duration=20.0)
+    inputs = RunInputs(experiment, experiment.leaks)
+    truth = integrate(experiment.rig, inputs, 20.0, 500.0, step=5e-5)
+    steps = []
+    for error in (1000.0, 100.0, 10.0):
+        run = integrate(experiment.rig, inputs, 20.0, 500.0, error=error)
+        assert off(run, truth) <= 1.25 * error, (error, run.step)
+        assert run.error <= error
+        steps.append(run.step)
+        for name in ("p_A", "p_B"):
+            noise = experiment.rig.sensors.p_A.noise
+            one, other = (details(found[name]) for found in (run, truth))
+            for level in range(1, 5):
+                a, b = (np.hypot(rms(x[level][x.inside(level)]), noise) for x in (one, other))
+                assert abs(a / b - 1.0) < 1.5e-3, (error, name, level)
+    assert steps == sorted(steps, reverse=True)
+    assert steps[-1] < steps[0] or throttled  # the throttled rig is within 10 Pa at the longest step
+
+
+def test_a_quick_command_gets_a_finer_step_than_a_slow_one(check_rig):
+    def step(command: str) -> float:
+        experiment = make_experiment(rig=check_rig(), command=command, duration=4.0)
+        return integrate(experiment.rig, RunInputs(experiment, ()), 4.0, 500.0).step
+
+    assert step("prbs 1 every 0.5 s seed 1") < step("1 sin(2t)")
+
+
+def test_a_change_late_in_the_run_is_seen(check_rig):
+    """The first half is gentle, and the second half is not: the step is that of the second."""
+    rig = check_rig()
+
+    def inputs(t):
+        return np.where(t < 9.0, 0.1 * np.sin(t), np.where(np.floor(4.0 * t) % 2 > 0, 1.0, -1.0)), 0.0 * t, 0.0 * t
+
+    run = integrate(rig, inputs, 20.0, 500.0)
+    gentle = integrate(rig, inputs, 8.0, 500.0)
+    assert gentle.step == 1e-3
+    assert run.step < 0.5 * gentle.step
+    assert off(run, integrate(rig, inputs, 20.0, 500.0, step=2e-5)) < 150.0
+
+
+def test_the_windows_lie_within_the_run_and_apart():
+    for n, rate in ((1, 500.0), (40, 10.0), (1000, 500.0), (2600, 500.0), (90_000, 500.0), (360_000, 2000.0)):
+        found = windows(n, rate)
+        assert found[0][0] == 0
+        assert all(0 <= start < stop <= n for start, stop in found)
+        assert all(a[1] <= b[0] for a, b in itertools.pairwise(found))
+    assert windows(90_000, 500.0)[-1][0] >= 0.85 * 90_000
+
+
+def test_an_error_must_be_a_pressure(check_rig, drive):
+    for error in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="error must be > 0 Pa"):
+            drive(check_rig(), 1.0, error=error)
+
+
+def test_the_inputs_at_the_nodes_are_those_at_the_times(check_rig):
+    offsets = np.array([1e-12, 5e-4, 1e-3])
+    start = np.arange(5000) * 1e-3
+    for command in ("3 sin(4t + 0.3) + 0.2", "9.9 sin(4t) + 3", "chirp 3 from 0.1 Hz to 5 Hz over 60 s"):
+        experiment = make_experiment(rig=check_rig(), leak="C = 1e-10 from 2 s", duration=1.0, command="1 sin(t)")
+        object.__setattr__(experiment, "command", make_experiment(rig=check_rig(u_max=20.0), command=command).command)
+        inputs = RunInputs(experiment, experiment.leaks)
+        if "9.9" in command:
+            inputs._experiment = make_experiment(rig=check_rig(), duration=0.01)
+        t = start[:, None] + offsets
+        for one, other in zip(inputs.at_nodes(start, offsets), inputs(t), strict=True):
+            np.testing.assert_allclose(one, other, rtol=0, atol=2e-14)
+            assert one.shape == t.shape
+        later = start[:2000] + 173.0  # the sines of the first block, turned
+        for one, other in zip(inputs.at_nodes(later, offsets), inputs(later[:, None] + offsets), strict=True):
+            np.testing.assert_allclose(one, other, rtol=0, atol=3e-12)
+    assert inputs.largest(start) == (0.0, 1e-10)
