@@ -1,0 +1,172 @@
+"""The pressure difference that a machine should show under its command: the rig reduced to what p_A - p_B depends on.
+
+Where both pistons' areas are alike, p_A and p_B move against each other and their sum stands still, so the rig of
+eqs. (4.1)-(4.22) leaves five states: the difference dp, the piston's velocity v, the motor's speed omega, its current i
+and the integral I of its speed loop. Throttles and lines are left out: at the piston they act as more volume (a softer
+oil) and a little more damping, which the fit finds. The laws are those of `sealscope.physics`; the numbers are the
+detector's own, from a rig it may assume, and none of them is the recorded machine's.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.compiled import contracted, kernel
+from sealscope.parameters import Rig
+from sealscope.physics.cylinder import piston_acceleration, pressure_rate
+from sealscope.physics.friction import coulomb_friction, stribeck_friction
+from sealscope.physics.lanes import WIDTH, load, spread, store
+from sealscope.physics.leakage import laminar_leakage
+from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
+from sealscope.physics.pump import pump_flow, pump_torque
+from sealscope.recordings.recording import Array
+
+#: What is estimated: speed per volt of the command [rad/(s V)], lead of the command [s], what the speed has beyond it
+#: [rad/s], stiffness of the oil [Pa], conductance past the piston and the pump [m^3/(s Pa)], Coulomb friction [N],
+#: viscous friction [N s/m], breakaway over Coulomb friction [1], decay of the breakaway [s/m].
+PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c")
+GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C = range(len(PARAMETERS))
+#: Runs that one call makes side by side.
+RUNS = WIDTH
+STATES = 5
+State = tuple[float, float, float, float, float]
+Parameters = tuple[float, float, float, float, float, float, float, float, float]
+#: Longest step of the solver [s]: a tenth of a radian at the ringing of the thesis's rig would be 2e-4 s; RK4 at 1e-3 s
+#: is within 100 Pa, far under the transducers' noise.
+LONGEST_STEP = 1.01e-3
+
+
+class Machine(NamedTuple):
+    """What the detector takes as known of the machine, SI."""
+
+    k_p: float
+    K_i: float
+    V_max: float
+    i_max: float
+    R_c: float
+    L_c: float
+    C_e: float
+    C_m: float
+    J_M: float
+    B_M: float
+    q_b: float
+    A: float
+    V: float
+    M_eq: float
+    v_th: float
+
+
+def machine_of(rig: Rig) -> Machine:
+    """What a rig says of the machine; the piston's area is the mean of both sides'."""
+    motor, cylinder = rig.motor, rig.cylinder
+    return Machine(
+        motor.k_p,
+        motor.K_i,
+        motor.V_max,
+        motor.i_max,
+        motor.R_c,
+        motor.L_c,
+        motor.C_e,
+        motor.C_m,
+        motor.J_M,
+        motor.B_M,
+        rig.pump.q_b,
+        0.5 * (cylinder.A_A + cylinder.A_B),
+        cylinder.V,
+        cylinder.M_eq,
+        rig.friction.v_th,
+    )
+
+
+def nominal(rig: Rig) -> Array:
+    """The parameters (9,) that a rig has about its charge pressure with no leak past the piston."""
+    friction = rig.friction
+    coulomb = coulomb_friction(
+        rig.fluid.p_charge,
+        rig.fluid.p_charge,
+        friction.F_pr,
+        friction.F_cfr,
+        friction.coulomb_pressure == "difference",
+    )
+    return np.array(
+        [
+            rig.motor.omega_per_volt,
+            0.0,
+            0.0,
+            rig.fluid.K_oil,
+            rig.pump.G_pump,
+            coulomb,
+            friction.F_v,
+            friction.K_brk,
+            friction.C_c,
+        ]
+    )
+
+
+@contracted
+def reduced_rates(y: State, u: float, theta: Parameters, m: Machine) -> State:
+    """dy/dt of y = (dp, v, omega, i, I) under the command u [V]."""
+    dp, v, omega, i, integral = y
+    error = theta[GAIN] * u + theta[BIAS] - omega
+    voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
+    friction = stribeck_friction(v, theta[F_C], theta[K_BRK], theta[C_C], theta[F_V], m.v_th, False)
+    flow = pump_flow(omega, dp, m.q_b, 0.0) - m.A * v - laminar_leakage(dp, theta[G])
+    return (
+        2.0 * pressure_rate(flow, m.V, theta[K]),
+        piston_acceleration(0.5 * dp, -0.5 * dp, friction, 0.0, 0.0, m.A, m.A, m.M_eq),
+        shaft_acceleration(i, omega, pump_torque(dp, m.q_b), m.C_m, m.B_M, m.J_M),
+        winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
+        error,
+    )
+
+
+@contracted
+def _moved(y: State, h: float, k: State) -> State:
+    return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4]
+
+
+@kernel
+def pressure_differences(
+    u: np.ndarray,
+    slope: np.ndarray,
+    h: float,
+    every: int,
+    theta: np.ndarray,
+    segment: np.ndarray,
+    m: Machine,
+    state: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Write dp [Pa] of RUNS runs at each sample into `out` (n, RUNS), by RK4 in steps of h [s], `every` to a sample.
+
+    `u`, `slope`: (2 every n + 1,) command [V] and its derivative [V/s] at every half step; `theta`: (segments, 9, RUNS)
+    parameters, `segment` (n,) which of them holds at a sample; `state`: (5, RUNS) at the first sample, in place.
+    """
+    y = (load(state, 0), load(state, 1), load(state, 2), load(state, 3), load(state, 4))
+    for sample in range(segment.size):
+        store(out, sample, y[0])
+        row = 9 * segment[sample]
+        lead = load(theta, row + LEAD)
+        now = (
+            load(theta, row + GAIN),
+            lead,
+            load(theta, row + BIAS),
+            load(theta, row + K),
+            load(theta, row + G),
+            load(theta, row + F_C),
+            load(theta, row + F_V),
+            load(theta, row + K_BRK),
+            load(theta, row + C_C),
+        )
+        for step in range(every):
+            at = 2 * (sample * every + step)
+            u_0, u_1, u_2 = u[at] + lead * slope[at], u[at + 1] + lead * slope[at + 1], u[at + 2] + lead * slope[at + 2]
+            k_1 = reduced_rates(y, u_0, now, m)
+            k_2 = reduced_rates(_moved(y, 0.5 * h, k_1), u_1, now, m)
+            k_3 = reduced_rates(_moved(y, 0.5 * h, k_2), u_1, now, m)
+            k_4 = reduced_rates(_moved(y, h, k_3), u_2, now, m)
+            y = _moved(_moved(_moved(_moved(y, h / 6.0, k_1), h / 3.0, k_2), h / 3.0, k_3), h / 6.0, k_4)
+    for state_row in range(5):
+        store(state, state_row, y[state_row] + spread(0.0))

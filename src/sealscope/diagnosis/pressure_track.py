@@ -1,0 +1,257 @@
+"""The fitted parameters followed through a record, block by block, and a step of the leak's conductance in them.
+
+In every block the model is linear about the block's own parameters: its information matrix N_b and right side r_b come
+from the slopes of dp. The parameters theta_b wander from block to block (a random walk, each with a strength that
+machines have), so that the whole record is one normal model with precision matrix Lambda (block tridiagonal). A step d
+of G after block k adds N_b e_G d to the right sides of all later blocks; with everything else eliminated its estimate
+is s_k / I_k with variance 1 / I_k, and z_k = s_k / sqrt(I_k) is standard normal where nothing steps, with a known
+correlation between any two instants.
+Source: A. C. Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, ch. 4; P. de Jong,
+J. Penzer, Diagnosing shocks in time series, JASA 93 (1998) 796-806.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.pressure_fit import Duty, differences, steps_of
+from sealscope.diagnosis.pressure_laws import BIAS, C_C, F_C, F_V, GAIN, K_BRK, LEAD, PARAMETERS, G, K, Machine
+from sealscope.recordings.recording import Array
+
+#: How far each parameter may wander in 90 s (standard deviation): shares of its value, lead in s, G in m^3/(s Pa).
+WANDER = {GAIN: 2e-3, K: 0.03, F_C: 0.06, F_V: 0.06, K_BRK: 0.02, C_C: 0.02}
+WANDER_LEAD, WANDER_G = 1e-4, 3e-14
+_WANDER_SECONDS = 90.0
+#: The bias of the speed settles within a minute of a start: this share of the command's speed in 6 s.
+_WANDER_BIAS = 0.003
+#: Where the record's mean parameters may be, around the first fit (standard deviations as above).
+ANCHOR = {GAIN: 0.02, K: 0.1, F_C: 0.1, F_V: 0.15, K_BRK: 0.1, C_C: 0.15}
+ANCHOR_LEAD, ANCHOR_G = 5e-4, 1.5e-12
+#: Wandering that is tried, times the usual one: the likelihood chooses.
+SCALES = (1.0, 2.0, 4.0)
+_PASSES = 10
+#: Shares of a Gauss-Newton step that are tried side by side, and the fall of the cost to go on for.
+_SHARES = np.array([1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 1.4])
+_ENOUGH = 1.0
+#: How far the parameters may wander in the first passes, times the usual: the record's mean comes first, so that what
+#: is left to find in a block is small and the model is linear over it.
+_LEASHES = (0.1, 0.3, 1.0)
+_CONSTANT = len(PARAMETERS)
+_SIZE = _CONSTANT + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A record followed: blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 9) about which the model is
+    linear; `N` (b, p, p), `r` (b, p) information in units of `units` (p,), the last a constant of dp; `variance`
+    [Pa^2] of the residual and of each block's (b,)."""
+
+    edges: NDArray[np.int64]
+    path: Array
+    N: Array
+    r: Array
+    units: Array
+    variance: float
+    block_variance: Array
+    anchor: Array
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """A step of G after each block: `size`, `deviation` (b - 1,) [m^3/(s Pa)], `z` and their `correlation`; `level`
+    (b,) the wandering G with no step, and its `level_deviation`; `scale` of the wandering that was chosen; `excess`:
+    chi square of the blocks against the wandering, and its degrees of freedom."""
+
+    size: Array
+    deviation: Array
+    z: Array
+    correlation: Array
+    level: Array
+    level_deviation: Array
+    scale: float
+    excess: tuple[float, float]
+
+
+def _shares(theta: Array, shares: dict[int, float]) -> Array:
+    return np.array([shares.get(k, 0.0) * abs(theta[k]) for k in range(len(PARAMETERS))])
+
+
+def _wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
+    """Standard deviation (p,) of the walk from block to block, in `units`."""
+    walk = _shares(theta, WANDER)
+    walk[LEAD], walk[G] = WANDER_LEAD, WANDER_G
+    walk *= np.sqrt(seconds / _WANDER_SECONDS)
+    walk[BIAS] = _WANDER_BIAS * speed * np.sqrt(seconds / 6.0)
+    return np.append(walk, 1500.0 * np.sqrt(seconds / _WANDER_SECONDS)) / units
+
+
+def _anchor(theta: Array, units: Array) -> Array:
+    """Weight (p,) of the first fit on the record's mean parameters."""
+    deviation = _shares(theta, ANCHOR)
+    deviation[LEAD], deviation[G] = ANCHOR_LEAD, ANCHOR_G
+    weight = np.zeros(_SIZE)
+    known = deviation > 0
+    weight[:_CONSTANT][known] = (units[:_CONSTANT][known] / deviation[known]) ** 2
+    return weight
+
+
+def _precision(N: Array, walk: Array, anchor: Array) -> Array:
+    """Lambda (b p, b p) of all blocks' parameters."""
+    blocks, p, _ = N.shape
+    found = np.zeros((blocks, p, blocks, p))
+    steps = np.diag(1.0 / walk**2)
+    for b in range(blocks):
+        found[b, :, b] += N[b]
+        if b:
+            found[b, :, b] += steps
+            found[b - 1, :, b - 1] += steps
+            found[b - 1, :, b] -= steps
+            found[b, :, b - 1] -= steps
+    for k in np.flatnonzero(anchor > 0):
+        found[:, k, :, k] += anchor[k] / blocks**2
+    found[0, range(p), 0, range(p)] += 1e-10 * np.diagonal(N[0])
+    return found.reshape(blocks * p, blocks * p)
+
+
+def _right(r: Array, anchor: Array, centre: Array) -> Array:
+    return r + anchor * centre / len(r)
+
+
+def track(
+    duty: Duty,
+    dp: Array,
+    edges: NDArray[np.int64],
+    theta: Array,
+    machine: Machine,
+    start: Array,
+    skip: int,
+    rate: float,
+) -> Track:
+    """Follow the parameters from the first fit `theta` (9,) through blocks between `edges` of the whole record.
+
+    `start` (5,): the model's state at the first sample. Blocks are linearised about their own parameters, until these
+    stand still; the trend of the speed's bias within a block is eliminated.
+    """
+    blocks = edges.size - 1
+    n = dp.size
+    segment = np.clip(np.searchsorted(edges, np.arange(n), side="right") - 1, 0, blocks - 1).astype(np.int64)
+    h = steps_of(theta)
+    units = np.append(h, 1.0)
+    seconds = float(np.median(np.diff(edges))) / rate
+    speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(duty.u))
+    walk, anchor = _wander(theta, units, seconds, speed), _anchor(theta, units)
+    centre = np.append(theta / h, 0.0)
+    path = np.tile(theta, (blocks, 1))
+    limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
+
+    def cost(shown: Array, at: Array, variance: float, walk: Array) -> float:
+        misfit = sum(float(here.size * np.var(here)) for here in (dp[one] - shown[one] for one in limits))
+        steps = np.diff(at, axis=0) / h / walk[:-1]
+        off = at.mean(axis=0) / h - centre[:-1]
+        return misfit / variance + float(np.sum(steps**2)) + float(anchor[:-1] @ off**2)
+
+    for number in range(_PASSES):
+        sets = np.tile(path, (_CONSTANT + 1, 1, 1))
+        for k in range(_CONSTANT):
+            sets[k + 1, :, k] += h[k]
+        shown = differences(duty, sets, machine, segment, np.tile(start, (_CONSTANT + 1, 1)))
+        N, r = np.empty((blocks, _SIZE, _SIZE)), np.empty((blocks, _SIZE))
+        squares, counts = np.empty(blocks), np.empty(blocks)
+        for b, here in enumerate(limits):
+            slopes = shown[1:, here] - shown[0, here]
+            count = slopes.shape[1]
+            ramp = slopes[BIAS] * np.linspace(-1.0, 1.0, count)
+            X = np.vstack([slopes, np.ones(count), ramp])
+            rest = dp[here] - shown[0, here]
+            H, g = X @ X.T, X @ rest
+            lost = H[:-1, -1] / H[-1, -1]
+            H, g, gone = H[:-1, :-1] - np.outer(lost, H[:-1, -1]), g[:-1] - lost * g[-1], g[-1] ** 2 / H[-1, -1]
+            squares[b] = float(rest @ rest - gone - g @ np.linalg.lstsq(H, g, rcond=1e-12)[0])
+            counts[b] = count - _SIZE - 1
+            N[b], r[b] = H, g + H @ np.append(path[b] / h, 0.0)
+        variance = float(squares.sum() / counts.sum())
+        found = Track(
+            edges,
+            path,
+            N / variance,
+            r / variance,
+            units,
+            variance,
+            squares / counts,
+            np.concatenate([anchor, centre]),
+            seconds,
+        )
+        if number == _PASSES - 1:
+            break
+        allowed = _LEASHES[min(number, len(_LEASHES) - 1)] * walk
+        solved = np.linalg.solve(_precision(found.N, allowed, anchor), _right(found.r, anchor, centre).reshape(-1))
+        fresh = _held(solved.reshape(blocks, _SIZE)[:, :_CONSTANT] * h, theta)
+        tries = path + _SHARES[:, None, None] * (fresh - path)
+        seen = differences(duty, tries, machine, segment, np.tile(start, (_SHARES.size, 1)))
+        costs = [cost(one, at, variance, allowed) for one, at in zip(seen, tries, strict=True)]
+        best = int(np.nanargmin(costs))
+        gained = cost(shown[0], path, variance, allowed) - costs[best]
+        if gained > 0.0:
+            path = tries[best]
+        if not gained > _ENOUGH and number >= len(_LEASHES) - 1:
+            break
+    return found
+
+
+def _held(path: Array, theta: Array) -> Array:
+    """The path within what the laws can be evaluated for."""
+    for k in (GAIN, K, F_C, C_C):
+        path[:, k] = np.clip(path[:, k], 0.3 * theta[k], 3.0 * theta[k])
+    path[:, K_BRK] = np.maximum(path[:, K_BRK], 1.05)
+    return path
+
+
+def steps_in(followed: Track, theta: Array, speed: float, scales: Sequence[float] = SCALES) -> Steps:
+    """A step of G after each block, everything else free to wander; how much it wanders, the likelihood chooses."""
+    anchor, centre = np.split(followed.anchor, 2)
+    walk = _wander(theta, followed.units, followed.seconds, speed)
+    right = _right(followed.r, anchor, centre).reshape(-1)
+    blocks = len(followed.N)
+    best: tuple[float, float, Array, float] | None = None
+    for scale in scales:
+        L = np.asarray(np.linalg.cholesky(_precision(followed.N, scale * walk, anchor)), dtype=np.float64)
+        half = np.linalg.solve(L, right)
+        fit = float(half @ half)
+        likelihood = fit - 2.0 * np.sum(np.log(np.diagonal(L)))
+        likelihood -= 2.0 * (blocks - 1) * np.sum(np.log(scale * walk))
+        if best is None or likelihood > best[0] + 2.0:
+            best = (float(likelihood), scale, L, fit)
+    assert best is not None
+    _, scale, L, fit = best
+    free = sum(float(r @ np.linalg.lstsq(N, r, rcond=1e-12)[0]) for N, r in zip(followed.N, followed.r, strict=True))
+    free += float(np.sum(anchor * centre**2))
+    later_blocks = np.zeros((blocks, _SIZE, blocks - 1))
+    for k in range(1, blocks):
+        later_blocks[k:, :, k - 1] = followed.N[k:, :, G]
+    inner = later_blocks.reshape(blocks * _SIZE, blocks - 1)
+    level_rows = np.zeros((blocks * _SIZE, blocks))
+    level_rows[np.arange(blocks) * _SIZE + G, np.arange(blocks)] = 1.0
+    solved = np.linalg.solve(L, np.column_stack([inner, right, level_rows]))
+    steps, half, levels = solved[:, : blocks - 1], solved[:, blocks - 1], solved[:, blocks:]
+    later = np.cumsum(followed.N[::-1, G, G])[::-1]
+    at = np.arange(1, blocks)
+    information = later[np.maximum(at[:, None], at[None, :])] - steps.T @ steps
+    right_sum = np.cumsum(followed.r[::-1, G])[::-1][1:]
+    score = right_sum - steps.T @ half
+    own = np.sqrt(np.diagonal(information))
+    unit = followed.units[G]
+    return Steps(
+        score / own**2 * unit,
+        unit / own,
+        score / own,
+        information / np.outer(own, own),
+        levels.T @ half * unit,
+        np.sqrt(np.sum(levels**2, axis=0)) * unit,
+        scale,
+        (free - fit, float(_SIZE * (blocks - 1))),
+    )
