@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from sealscope.diagnosis import contract
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import make_experiment
 from sealscope.simulation.instruments import record
@@ -15,6 +16,12 @@ from sealscope.simulation.simulate import oversampling, sized_leaks, trajectory
 
 THROTTLED = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
 Records = Callable[..., Recording]
+
+
+@pytest.fixture
+def rms_change_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `diagnose` run the detector `rms change` and no other."""
+    monkeypatch.setattr(contract, "DETECTORS", {"rms change": contract.DETECTORS["rms change"]})
 
 
 @pytest.fixture(scope="session")

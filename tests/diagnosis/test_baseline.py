@@ -12,6 +12,8 @@ from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.rms_results import excess
 from sealscope.recordings.recording import Recording
 
+pytestmark = pytest.mark.usefixtures("rms_change_alone")
+
 #: Rocket propellant data: age [weeks] and shear strength [psi]; Montgomery, Peck & Vining, Introduction to Linear
 #: Regression Analysis, Table 2.1.
 AGE = np.array(

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import json
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sealscope.diagnosis.contract import detectors
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict import Diagnosis
+from sealscope.diagnosis.verdict import Cause, Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 
 KEYS = [
     "file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm",
-    "false_alarm_probability", "score", "threshold", "methods", "quality",
+    "false_alarm_probability", "score", "threshold", "methods", "quality", "cause", "next_check",
 ]  # fmt: skip
 VERDICTS = ("leak", "no leak", "cannot tell")
+CAUSES = get_args(Cause)
 
 
 def is_number(value: object) -> bool:
@@ -61,12 +64,17 @@ def check(found: Diagnosis) -> None:
         assert type(finding["count"]) is int
         assert finding["severity"] in ("note", "warning", "fatal")
         assert is_number(finding["first_t"])
+    assert told["cause"] is None or told["cause"] in CAUSES
+    assert told["next_check"]
+    assert "\n" not in told["next_check"]
+    assert told["methods"][0]["verdict"] == told["verdict"]
     if told["onset_s"] is not None:
         first, last = told["onset_interval_s"]
         assert told["verdict"] == "leak"
         assert first <= told["onset_s"] <= last
 
 
+@pytest.mark.usefixtures("rms_change_alone")
 def test_contract_of_a_leak(leaky: Recording) -> None:
     found = diagnose(leaky, file="rig.csv")
     assert (found.verdict, found.file) == ("leak", "rig.csv")
@@ -85,6 +93,16 @@ def test_contract_of_a_leak(leaky: Recording) -> None:
     assert [one["name"] for one in told["methods"][1:]] == [
         f"RMS of {quantity} of {chamber}" for chamber in ("p_A", "p_B") for quantity in ("d1", "d2", "d3", "d4", "d3d4")
     ]
+
+
+def test_contract_of_a_leak_that_every_detector_looked_for(leaky: Recording) -> None:
+    found = diagnose(leaky)
+    assert found.verdict == "leak"
+    check(found)
+    told = found.as_dict()
+    assert (told["score"], told["threshold"]) == (told["methods"][0]["score"], told["methods"][0]["threshold"])
+    assert told["reason"].startswith(told["methods"][0]["reason"])
+    assert set(detectors()) <= {one["name"] for one in told["methods"]}
 
 
 def test_contract_of_the_other_verdicts(sound: Recording) -> None:

@@ -1,4 +1,5 @@
-"""The thesis's own tests in simulation: small leaks found at their onset, and what looks like one not called so."""
+"""The thesis's own tests in simulation, by its own method: small leaks found at their onset, and what looks like one
+not called so."""
 
 from __future__ import annotations
 
@@ -10,6 +11,8 @@ import pytest
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.simulate import simulate
+
+pytestmark = pytest.mark.usefixtures("rms_change_alone")
 
 
 def altered(recording: Recording, p_A: np.ndarray, p_B: np.ndarray) -> Recording:

@@ -52,6 +52,9 @@ def _diagnosis(**changed):
         "threshold": 3.21875,
         "quality": (finding,),
         "methods": (method,),
+        "cause": None,
+        "next_check": "repeat the recording",
+        "course": None,
     }
     return SimpleNamespace(**(values | changed))
 

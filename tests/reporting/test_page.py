@@ -266,3 +266,31 @@ def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path, recording, make_
 def test_a_mark_must_stand_at_a_time():
     with pytest.raises(InputError, match="'oil change' must be finite, got nan"):
         Mark(float("nan"), "oil change")
+
+
+def course(**changed):
+    values = {"t": np.linspace(2.0, 38.0, 19), "lpm": np.linspace(0.0, 0.004, 19)}
+    values |= {"low": values["lpm"] - 0.001, "high": values["lpm"] + 0.001}
+    return SimpleNamespace(**(values | changed))
+
+
+def test_the_leak_is_drawn_over_time_with_its_band(recording, make_diagnosis):
+    found = course()
+    page = render_page(recording, make_diagnosis(course=found))
+    chart = next(one for one in chart_data(Reader(page))["charts"] if one["key"] == "course")
+    assert (chart["unit"], chart["band"]) == ("L/min", True)
+    for series, values in zip(chart["series"], (found.lpm, found.low, found.high), strict=True):
+        assert drawn(series) == pytest.approx(values, abs=1e-6)
+    (band,) = re.findall(r'<path class="interval" d="([^"]*)"', page)
+    assert len(re.findall("[ML]", band)) == 2 * found.t.size
+    assert band.endswith("Z")
+
+
+def test_a_course_without_ends_or_without_anything(recording, make_diagnosis):
+    endless = course(low=np.full(19, -np.inf), high=np.full(19, np.inf))
+    page = render_page(recording, make_diagnosis(course=endless))
+    assert not re.search(r' d="[^"]*(nan|inf)', page)
+    assert 'data-chart="course"' in page
+    empty = render_page(recording, make_diagnosis(course=course(lpm=np.full(19, np.nan))))
+    assert 'data-chart="course"' not in empty
+    assert "How large the leak is over time" not in empty

@@ -53,6 +53,36 @@ def test_no_leak_claims_no_onset_and_no_flow(make_diagnosis):
     assert "not over the threshold" in text and "baseline" in text
 
 
+def test_no_leak_says_how_large_one_could_be(make_diagnosis):
+    bound = {"verdict": "no leak", "score": 1.5, "onset_s": None, "leak_lpm": 1e-5, "leak_interval_lpm": (-8e-5, 1e-4)}
+    assert words.how_much(make_diagnosis(**bound)) == "none found; at most 0.0001 L/min (95 % interval)"
+
+
+def test_another_cause_is_told_with_what_to_check(make_diagnosis):
+    check = "look at rod, guides and load"
+    found = make_diagnosis(
+        verdict="no leak", score=1.5, onset_s=None, leak_lpm=None, cause="friction change", next_check=check, quality=()
+    )
+    text = " ".join(diagnosis_text(found).split())
+    assert "cause friction change" in text
+    assert f"next {check}" in text
+    assert words.headline(found) == "No leak found across the piston, but something changed: friction change"
+    leak = make_diagnosis(cause="piston leak", next_check="hold the piston against a load", quality=())
+    assert words.headline(leak) == "Leak: oil bypasses the piston"
+    assert words.next_steps(leak)[0] == "hold the piston against a load"
+    assert words.next_steps(make_diagnosis(cause="friction change", next_check=check, quality=()))[0] != check
+
+
+def test_a_method_without_a_score_says_why(no_verdict, make_diagnosis):
+    from types import SimpleNamespace
+
+    balance = SimpleNamespace(
+        name="volume balance", score=None, threshold=None, verdict="cannot tell", reason="needs theta"
+    )
+    text = diagnosis_text(make_diagnosis(methods=(balance,)))
+    assert "volume balance: cannot tell (needs theta)" in text
+
+
 def test_a_leak_since_before_the_recording_and_of_unknown_size(make_diagnosis):
     text = diagnosis_text(make_diagnosis(onset_s=None, onset_interval_s=None, leak_lpm=None, leak_interval_lpm=None))
     assert "not within this recording" in text and "the channels do not allow it" in text

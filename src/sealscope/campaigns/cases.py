@@ -99,7 +99,7 @@ def code_key() -> str:
     """A hash of the sources that a row depends on: rows of other sources must not stand in the same table."""
     root = Path(__file__).resolve().parents[1]
     found = hashlib.sha256()
-    own = [root / "campaigns" / name for name in ("cases.py", "machines.py", "work.py")]
+    own = [root / "campaigns" / name for name in ("cases.py", "machines.py", "work.py", "entries.py", "statement.py")]
     rooms = [path for room in _ROOMS for path in sorted((root / room).rglob("*")) if path.suffix in (".py", ".toml")]
     for path in (*own, *rooms):
         found.update(path.relative_to(root).as_posix().encode() + b"\0")

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from sealscope.campaigns.entries import Views, entry
+from sealscope.campaigns.estimates import Estimate, Named, Onset, estimates_of, named_of, onsets_of
 from sealscope.campaigns.work import Row
 from sealscope.diagnosis.calibration import Calibration, Place, calibrate
 from sealscope.diagnosis.operating_point import OperatingPoint
@@ -20,7 +22,6 @@ from sealscope.evaluation.binomial import Rate, rate_of
 from sealscope.evaluation.confusion import CANNOT_TELL
 from sealscope.evaluation.hit_miss import HitMiss, fit_hit_miss
 from sealscope.evaluation.pod import SizeRate, by_size, proven_size
-from sealscope.evaluation.rates import OnsetErrors, onset_errors
 from sealscope.evaluation.roc import Roc, roc_curve
 from sealscope.evaluation.table import ALWAYS, NEVER, Outcome, SummaryRow, summary
 
@@ -48,15 +49,6 @@ class SizeRoc:
 
 
 @dataclass(frozen=True)
-class Onset:
-    """Errors [s] of the onsets that one detector found in its alarms at one size of leak."""
-
-    detector: str
-    leak_lpm: float
-    errors: OnsetErrors
-
-
-@dataclass(frozen=True)
 class Cell:
     """Alarms of one detector at one size of leak (0: none) in one cell of the factors."""
 
@@ -80,10 +72,10 @@ class FaultAlarms:
 class Judgement:
     """What a campaign shows.
 
-    `table` by size, `overall` with all leaks together; `calibration`: None where every detector has a threshold of its
-    own; `calibrated_on`, `judged`: records that had a
-    result; `failed`: rows that had none (they are `cannot
-    tell` for every detector); `realised`: size -> mean and standard deviation of the flow the leaks really had [L/min].
+    `table` by size, `overall` with all leaks together; `estimates` of the flow, `named` causes: of detectors that state
+    them; `calibration`: None where every detector has a threshold of its own; `calibrated_on`, `judged`: records that
+    had a result; `failed`: rows that had none (they are `cannot tell` for every detector); `realised`: size -> mean and
+    standard deviation of the flow the leaks really had [L/min].
     """
 
     calibration: Calibration | None
@@ -93,6 +85,8 @@ class Judgement:
     table: tuple[SummaryRow, ...]
     overall: tuple[SummaryRow, ...]
     onsets: tuple[Onset, ...]
+    estimates: tuple[Estimate, ...]
+    named: tuple[Named, ...]
     pods: tuple[Pod, ...]
     rocs: tuple[SizeRoc, ...]
     cells: tuple[Cell, ...]
@@ -118,10 +112,11 @@ def calibration_of(
     confidence: float = 0.95,
     split_share: float = 0.5,
     made_from: Mapping[str, Any] | None = None,
+    views: Views | None = None,
 ) -> Calibration | None:
     """Thresholds of the detectors that need them, from the rows that are there to calibrate; None where none needs
     any."""
-    wanted = [name for name in detectors if scorer(name).threshold is None]
+    wanted = [name for name in detectors if entry(name).needs_calibration]
     known = [row for row in rows if row.use == "calibrate" and row.error is None]
     if not wanted:
         return None
@@ -133,13 +128,23 @@ def calibration_of(
         confidence=confidence,
         split_share=split_share,
         made_from={**(made_from or {}), "records": len(known)},
+        views=views,
     )
 
 
+def own_threshold(name: str) -> float | None:
+    """The threshold that a scorer has of its own; None where records must set it, or a detector's verdict counts."""
+    found = entry(name)
+    return None if found.detector else scorer(found.of).threshold
+
+
 def verdict_on(row: Row, detector: str, calibration: Calibration | None, own: float | None) -> str:
-    """What a detector says of a row: by its own threshold, else by the calibration's at the row's operating point."""
+    """What a detector says of a row: its own verdict, or by its own threshold, else by the calibration's at the row's
+    operating point."""
     if row.error is not None:
         return CANNOT_TELL
+    if row.statements and entry(detector).own:
+        return row.statements[entry(detector).key].verdict
     value = row.scores[detector][0]
     threshold = own
     if threshold is None and calibration is not None:
@@ -168,7 +173,7 @@ def judge(
     `hours`: operating time of a record; without them no delays or hourly rates are given. Raises InputError where
     there is no row to judge.
     """
-    own = {name: scorer(name).threshold for name in detectors} if thresholds is None else thresholds
+    own = {name: own_threshold(name) for name in detectors} if thresholds is None else thresholds
     mine = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not mine:
         raise InputError("a campaign needs at least one record to judge, got none")
@@ -182,7 +187,9 @@ def judge(
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
         table=tuple(summary(outcomes, confidence)) if plain else (),
         overall=tuple(_any_size(outcomes, confidence)) if plain else (),
-        onsets=tuple(_onsets(plain, detectors, said, onset_s, confidence)),
+        onsets=tuple(onsets_of(plain, detectors, said, onset_s, confidence)),
+        estimates=tuple(estimates_of(plain, detectors, confidence)),
+        named=tuple(named_of(mine, detectors, confidence)),
         pods=tuple(_pods(plain, detectors, said, confidence)),
         rocs=tuple(_rocs(plain, detectors, confidence)),
         cells=tuple(_cells(plain, detectors, said, confidence)),
@@ -201,24 +208,6 @@ def _any_size(outcomes: Sequence[Outcome], confidence: float) -> list[SummaryRow
     """The table with all leaks in one row."""
     found = summary([replace(one, leak_lpm=1.0 if one.leak_lpm else 0.0) for one in outcomes], confidence)
     return [replace(row, leak_lpm=math.nan) for row in found]
-
-
-def _onsets(
-    rows: Sequence[Row],
-    detectors: Sequence[str],
-    said: Mapping[tuple[str, str], str],
-    onset_s: float | None,
-    confidence: float,
-) -> list[Onset]:
-    """For detectors that search for the onset: its error over the alarms."""
-    found = []
-    for name in detectors if onset_s is not None else ():
-        for size in sorted({row.leak_lpm for row in rows if row.leak_lpm > 0}):
-            alarmed = [row for row in rows if row.leak_lpm == size and said[name, row.id] == "leak"]
-            times = [at for row in alarmed if (at := row.scores[name][1]) is not None]
-            if times and onset_s is not None:
-                found.append(Onset(name, size, onset_errors(times, [onset_s] * len(times), confidence=confidence)))
-    return found
 
 
 def _pods(

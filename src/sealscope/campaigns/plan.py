@@ -48,7 +48,8 @@ class Plan:
 
     `profile`: the bench whose nuisances each record draws, "" for the rig as it stands; `factors`: name -> levels,
     every combination is a cell; `command` and `closed` are the duty, other names parameters of the rig; `seed`: the
-    base of every case's seed.
+    base of every case's seed; `views`: sets of channels that detectors see (`entries`); `assumed`: what detectors may
+    assume of the machine, None for the plan's rig.
     """
 
     name: str
@@ -68,6 +69,8 @@ class Plan:
     place: str = ""
     unit: str = "L/min"
     note: str = ""
+    views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    assumed: Rig | None = None
 
     @property
     def size(self) -> int:
@@ -112,9 +115,9 @@ class _Reader:
 
     def plan(self, tree: Mapping[str, Any]) -> Plan:
         for key in tree:
-            if key not in ("campaign", "factors", "records"):
+            if key not in ("campaign", "factors", "records", "views"):
                 raise InputError(
-                    f"[{key}] is not known; a plan has [campaign], [factors] and [[records]] ({self.place})"
+                    f"[{key}] is not known; a plan has [campaign], [factors], [views] and [[records]] ({self.place})"
                 )
         head = Table(tree.get("campaign", {}), "campaign", self.place)
         name = head.text("name")
@@ -126,6 +129,7 @@ class _Reader:
             raise head.fail(f"onset must be within the duration, 0 s to {duration:g} s, got {onset:g}")
         rig = self._rig(head)
         factors = self._factors(tree.get("factors", {}), rig)
+        views = head.views(tree.get("views", {}))
         plan = Plan(
             name=name,
             title=head.text("title", name),
@@ -137,12 +141,14 @@ class _Reader:
             promise=head.choice("promise", get_args(Promise), "average"),  # type: ignore[arg-type]
             confidence=head.share("confidence", 0.95),
             seed=head.whole("seed", 0),
-            detectors=head.detectors(),
+            detectors=head.detectors(views),
             keep_recordings=self._keep(head),
             records=self._records(tree.get("records", ()), onset),
             factors=factors,
             place=self.place,
             note=head.text("note", ""),
+            views=views,
+            assumed=head.assumed(rig),
         )
         head.end()
         if plan.size > MOST_RECORDS:
@@ -250,12 +256,12 @@ class _Reader:
 
     def _whole(self, plan: Plan) -> None:
         """What only the plan as a whole can break."""
-        from sealscope.diagnosis.scorers import scorer
+        from sealscope.campaigns.entries import entry
         from sealscope.evaluation.thresholds import records_needed
 
         if not any(one.use == "judge" for one in plan.records):
             raise InputError(f"a plan must have records to judge, got none ({self.place})")
-        if all(scorer(name).threshold is not None for name in plan.detectors):
+        if not any(entry(name).needs_calibration for name in plan.detectors):
             return
         known = sum(one.count for one in plan.records if one.use == "calibrate")
         needed = records_needed(plan.false_alarm, plan.confidence if plan.promise == "bound" else None)

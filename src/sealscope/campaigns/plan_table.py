@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sealscope.errors import InputError
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
 
 
 class Table:
@@ -72,21 +77,68 @@ class Table:
             raise self.fail(f"{key} must be between 0 and 1, got {value:g}")
         return value
 
-    def detectors(self) -> tuple[str, ...]:
-        """The entry `detectors`: names of scorers, each once."""
-        from sealscope.diagnosis.scorers import scorer
+    def detectors(self, views: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+        """The entry `detectors`: what `entries.entry` knows, each once."""
+        from sealscope.campaigns.entries import check_entry
 
         given = self.take("detectors")
         if not isinstance(given, list) or not given:
             raise self.fail(f"detectors must be a list of names, got {given!r}")
         for name in given:
+            if not isinstance(name, str):
+                raise self.fail(f"detectors must be names, got {name!r}")
             try:
-                scorer(name)
+                check_entry(name, views)
             except InputError as error:
                 raise self.fail(f"detectors: {error}") from None
         if len(set(given)) < len(given):
             raise self.fail("detectors must be named once each")
         return tuple(given)
+
+    def views(self, given: Any) -> dict[str, tuple[str, ...]]:
+        """The plan's table [views], name -> channels, and under "" the entry `channels` where there is one."""
+        table = Table(given, "views", self.place)
+        found = {}
+        if "channels" in self.left:
+            found[""] = self._channels("channels", self.left.pop("channels"))
+        for name, channels in table.left.items():
+            if not name.strip() or name != name.strip() or "@" in name:
+                raise table.fail(f"{name} must be a plain name without '@'")
+            found[name] = table._channels(name, channels)
+        return found
+
+    def _channels(self, key: str, given: Any) -> tuple[str, ...]:
+        from sealscope.recordings.recording import CHANNEL_UNITS
+
+        if not isinstance(given, list) or not given or len({repr(one) for one in given}) < len(given):
+            raise self.fail(f"{key} must be a list of channels, each once, got {given!r}")
+        for one in given:
+            if one not in CHANNEL_UNITS:
+                raise self.fail(f"{key} must be channels such as 'p_A', got {one!r}")
+            if one == "q_leak":
+                raise self.fail(f"{key} must not hold q_leak: it measures what detectors are to find")
+        return tuple(given)
+
+    def assumed(self, rig: Rig | None) -> Rig | None:
+        """What the detectors may assume: the entries `assume`, a rig's name or file, and `assume_set`, values of its
+        parameters; `rig` where there are none."""
+        from sealscope.parameters import load_rig
+
+        try:
+            if "assume" in self.left:
+                name = self.text("assume")
+                beside = os.fspath(Path(self.place).parent / name) if name.endswith(".toml") else name
+                rig = load_rig(beside)
+            given = self.left.pop("assume_set", None)
+            if given is None:
+                return rig
+            if not isinstance(given, Mapping):
+                raise self.fail(f"assume_set must be a table of parameters, got {given!r}")
+            return (rig or load_rig("thesis")).with_values(given, source="assumed by the plan")
+        except InputError as error:
+            if self.place in str(error):
+                raise
+            raise InputError(f"{self.name}.assume: {error} ({self.place})") from None
 
     def end(self) -> None:
         """Refuse what is left over."""

@@ -5,15 +5,18 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from sealscope.campaigns.plan import Promise, Use
 from sealscope.campaigns.plan_table import Table
 from sealscope.campaigns.work import Row
 from sealscope.errors import InputError, SealscopeError
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
 
 #: Told how many recordings have their row and how many there are.
 Progress = Callable[[int, int, int], None]
@@ -34,7 +37,8 @@ class RecordingSet:
 
 @dataclass(frozen=True)
 class RecordedPlan:
-    """A campaign over recordings in a folder that the caller has; `unit` of the sets' sizes."""
+    """A campaign over recordings in a folder that the caller has; `unit` of the sets' sizes; `views` and `assumed` as
+    in `plan.Plan`, the thesis's rig being assumed where nothing is said."""
 
     name: str
     title: str
@@ -48,13 +52,17 @@ class RecordedPlan:
     detectors: tuple[str, ...]
     place: str = ""
     note: str = ""
+    views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    assumed: Rig | None = None
 
 
 def read_recorded(tree: Mapping[str, Any], place: str) -> RecordedPlan:
     """The plan in a TOML file's tables; raises InputError with the place for whatever breaks a rule."""
     for key in tree:
-        if key not in ("campaign", "recordings"):
-            raise InputError(f"[{key}] is not known; a plan over recordings has [campaign] and [recordings] ({place})")
+        if key not in ("campaign", "recordings", "views"):
+            raise InputError(
+                f"[{key}] is not known; a plan over recordings has [campaign], [views] and [recordings] ({place})"
+            )
     head = Table(tree.get("campaign", {}), "campaign", place)
     part = Table(tree["recordings"], "recordings", place)
     channel_map = part.take("map", {})
@@ -64,6 +72,7 @@ def read_recorded(tree: Mapping[str, Any], place: str) -> RecordedPlan:
     if not isinstance(given, list) or not given:
         raise part.fail(f"sets must be a list of tables, got {given!r}")
     name = head.text("name")
+    views = head.views(tree.get("views", {}))
     plan = RecordedPlan(
         name=name,
         title=head.text("title", name),
@@ -74,9 +83,11 @@ def read_recorded(tree: Mapping[str, Any], place: str) -> RecordedPlan:
         false_alarm=head.share("false_alarm", 0.01),
         promise=head.choice("promise", get_args(Promise), "average"),  # type: ignore[arg-type]
         confidence=head.share("confidence", 0.95),
-        detectors=head.detectors(),
+        detectors=head.detectors(views),
         place=place,
         note=head.text("note", ""),
+        views=views,
+        assumed=head.assumed(None),
     )
     head.end()
     part.end()
@@ -140,8 +151,8 @@ def _row(plan: RecordedPlan, of: RecordingSet, path: Path, name: str) -> Row:
         levels={"set": of.label or of.files},
         replicate=0,
     )
+    from sealscope.campaigns.entries import stated
     from sealscope.diagnosis.calibrated import look_at, looked_at, place_of
-    from sealscope.diagnosis.scorers import scorer
     from sealscope.recordings import read
 
     try:
@@ -149,9 +160,8 @@ def _row(plan: RecordedPlan, of: RecordingSet, path: Path, name: str) -> Row:
         part, _, reason = looked_at(recording)
         if reason is not None:
             return base(error=f"{name}: {reason}")
-        look = look_at(part, 0.5, plan.false_alarm)
-        found = {one: scorer(one).score(look) for one in plan.detectors}
-        scores = {one: (score.value, score.onset_s) for one, score in found.items()}
-        return base(place=asdict(place_of(part)), scores=scores)
+        look = look_at(part, 0.5, plan.false_alarm, plan.assumed)
+        scores, statements = stated(look, plan.detectors, plan.views)
+        return base(place=asdict(place_of(part)), scores=scores, statements=statements)
     except SealscopeError as error:
         return base(error=str(error))

@@ -44,6 +44,7 @@ def simulated_result(plan: Plan, folder: Path) -> Result:
         confidence=plan.confidence,
         split_share=plan.onset_s / plan.duration_s,
         made_from={"campaign": store.head(folder) or made_from(plan)},
+        views=plan.views,
     )
     judgement = judge(
         list(rows.values()),
@@ -74,6 +75,7 @@ def recorded_result(plan: RecordedPlan, folder: Path, progress: Progress | None 
         promise=plan.promise,
         confidence=plan.confidence,
         made_from={"campaign": {"name": plan.name, "title": plan.title, "recordings": len(rows)}},
+        views=plan.views,
     )
     return Result(plan, tuple(rows), 0, judge(rows, plan.detectors, calibration, confidence=plan.confidence))
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.campaigns import crew, store
-from sealscope.campaigns.cases import Case, cases_of, code_key, world
+from sealscope.campaigns.cases import Case, cases_of, code_key, digest, world
+from sealscope.campaigns.entries import entry, plug_ins_of
 from sealscope.campaigns.plan import Plan
 from sealscope.campaigns.work import Row, work
 from sealscope.diagnosis.scorers import scorer
@@ -40,13 +41,19 @@ class Standing:
 def made_from(plan: Plan) -> dict[str, Any]:
     """What a campaign's rows depend on, as plain values."""
     # a detector that searches within the record sets its own threshold for the rate, and its score may follow
-    searching = any(scorer(name).timing == "search" for name in plan.detectors)
+    entries = [entry(name) for name in plan.detectors]
+    searching = any(one.detector or scorer(one.of).timing == "search" for one in entries)
+    assumed = plan.assumed or plan.rig
     return {
+        "format": store.FORMAT,
         "name": plan.name,
         "title": plan.title,
         "world": world(plan),
         "code": code_key(),
         "rate_within": plan.false_alarm if searching else None,
+        "assumed": digest({row.name: repr(row.value) for row in assumed.table()}) if searching else None,
+        "plug_ins": plug_ins_of(entries),
+        "views": {view: list(plan.views.get(view, ())) for view in sorted({one.view for one in entries})},
         "version": _version(),
     }
 

@@ -16,11 +16,17 @@ from sealscope.recordings.whole import whole_file
 
 #: What rows of one folder must share, and how it is called.
 _SAME = {
+    "format": "form of rows",
     "name": "campaign",
     "world": "rig, bench, length, onset or seed",
     "code": "program code",
     "rate_within": "false-alarm rate, at which its detectors search within a record",
+    "assumed": "rig that its detectors assume",
+    "plug_ins": "detectors of other distributions",
+    "views": "channels that its detectors see",
 }
+#: The form of a row: 2 since rows keep what each detector stated.
+FORMAT = 2
 ROWS, HEAD, LOCK = "rows.jsonl", "campaign.json", ".lock"
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sealscope.campaigns.judge import Judgement
+from sealscope.campaigns.statement import Statement
 from sealscope.campaigns.work import Row
 from sealscope.evaluation.binomial import Rate
 from sealscope.recordings.whole import whole_file
@@ -39,8 +40,8 @@ def _size(leak_lpm: float) -> Cell:
 
 def sheets(judgement: Judgement, unit: str = "L/min") -> list[Sheet]:
     """Every table of a judgement; sizes of leaks in `unit`, rates as shares with their intervals."""
-    by_size = [make(judgement, unit) for make in (_table, _pod, _roc, _cells, _onsets)]
-    return [*by_size, _thresholds(judgement), _faults(judgement)]
+    by_size = [make(judgement, unit) for make in (_table, _pod, _roc, _cells, _onsets, _estimates)]
+    return [*by_size, _thresholds(judgement), _faults(judgement), _named(judgement)]
 
 
 def _table(judgement: Judgement, unit: str) -> Sheet:
@@ -108,13 +109,48 @@ def _cells(judgement: Judgement, unit: str) -> Sheet:
 
 
 def _onsets(judgement: Judgement, unit: str) -> Sheet:
-    columns = ("detector", f"leak [{unit}]", "alarms", "median error [s]", "median size [s]", "90 % size [s]")
-    rows = tuple(
-        (one.detector, one.leak_lpm, one.errors.n, one.errors.median.value, one.errors.median_size.value,
-         one.errors.ninety_size.value)
-        for one in judgement.onsets
+    columns = (
+        "detector", f"leak [{unit}]", "alarms", "median error [s]", "median size [s]", "median size: low",
+        "median size: high", "90 % size [s]", *_rate_columns("interval holds the onset"),
     )  # fmt: skip
-    return Sheet("onsets", columns, rows)
+    rows: list[tuple[Cell, ...]] = []
+    for one in judgement.onsets:
+        errors = one.errors
+        size = errors.median_size
+        stated = _rate(errors.coverage if errors.coverage.n else None)
+        sizes = (size.value, size.low, size.high, errors.ninety_size.value)
+        rows.append((one.detector, one.leak_lpm, errors.n, errors.median.value, *sizes, *stated))
+    return Sheet("onsets", columns, tuple(rows))
+
+
+def _estimates(judgement: Judgement, unit: str) -> Sheet:
+    """Errors of the flow that detectors state, leak-free records (size 0) among them."""
+    columns = (
+        "detector", f"leak [{unit}]", "with an estimate", "without", f"bias [{unit}]", "bias: low", "bias: high",
+        f"median error [{unit}]", f"median size of the error [{unit}]", f"rms error [{unit}]",
+        *_rate_columns("interval holds the flow"),
+    )  # fmt: skip
+    rows: list[tuple[Cell, ...]] = []
+    for one in judgement.estimates:
+        errors = one.errors
+        bias = errors.bias
+        sizes = (bias.value, bias.low, bias.high, one.median.value, one.median_size.value, errors.rmse.value)
+        stated = _rate(errors.coverage if errors.coverage.n else None)
+        rows.append((one.detector, one.leak_lpm, bias.n, errors.without, *sizes, *stated))
+    return Sheet("estimates", columns, tuple(rows))
+
+
+def _named(judgement: Judgement) -> Sheet:
+    """Which cause each detector names for which there is; one line for each pair."""
+    columns = ("detector", "there is", "named", *_rate_columns("records"))
+    rows = tuple(
+        (one.detector, true, said, *_rate(one.confusion.rates[i][j]))
+        for one in judgement.named
+        for i, true in enumerate(one.confusion.rows)
+        for j, said in enumerate(one.confusion.columns)
+        if one.confusion.counts[i].any()
+    )
+    return Sheet("causes", columns, rows)
 
 
 def _faults(judgement: Judgement) -> Sheet:
@@ -123,15 +159,33 @@ def _faults(judgement: Judgement) -> Sheet:
     return Sheet("faults", columns, rows)
 
 
+_STATED = (
+    "verdict", "threshold", "onset [s]", "onset: low", "onset: high", "flow", "flow: low", "flow: high", "cause",
+)  # fmt: skip
+
+
+def _stated(statement: Statement | None) -> tuple[Cell, ...]:
+    if statement is None:
+        return (None,) * len(_STATED)
+    onset, flow = statement.onset_interval_s or (None, None), statement.leak_interval_lpm or (None, None)
+    timed = (statement.onset_s, *onset)
+    return (statement.verdict, statement.threshold, *timed, statement.leak_lpm, *flow, statement.cause)
+
+
 def rows_sheet(rows: Iterable[Row], detectors: Sequence[str], unit: str = "L/min") -> Sheet:
     """Every record of a campaign in the order of its id, without what differs from run to run."""
     found = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in found for name in sorted(row.levels)))
-    columns = ("id", "use", f"leak [{unit}]", "fault", *factors, "replicate", f"flow [{unit}]", *detectors, "error")
+    keys = sorted({key for row in found for key in row.statements})
+    columns = (
+        "id", "use", f"leak [{unit}]", "fault", *factors, "replicate", f"flow [{unit}]", *detectors,
+        *(f"{key}: {part}" for key in keys for part in _STATED), "error",
+    )  # fmt: skip
     body = tuple(
         (
             row.id, row.use, row.leak_lpm, row.fault, *(row.levels.get(name) for name in factors), row.replicate,
-            row.flow_lpm, *(row.scores[name][0] if name in row.scores else None for name in detectors), row.error,
+            row.flow_lpm, *(row.scores[name][0] if name in row.scores else None for name in detectors),
+            *(cell for key in keys for cell in _stated(row.statements.get(key))), row.error,
         )
         for row in found
     )  # fmt: skip

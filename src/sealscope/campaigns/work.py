@@ -10,10 +10,11 @@ from typing import Any
 
 from sealscope.campaigns.cases import Case
 from sealscope.campaigns.plan import Plan
+from sealscope.campaigns.statement import Statement
 from sealscope.errors import InputError, SealscopeError
 
-#: Channels that a scorer or the operating point reads; looking through the others for findings would cost a third more.
-_LOOKED_AT = ("u", "x", "p_A", "p_B")
+#: Channels that are looked through for findings: those that can spoil a verdict.
+INSPECTED = ("u", "x", "p_A", "p_B")
 #: detector -> (score, None where it cannot tell; onset [s], None where it finds none)
 Scores = Mapping[str, tuple[float | None, float | None]]
 
@@ -23,7 +24,8 @@ class Row:
     """What is kept of a case: its inputs, where the record was made, the scores; or the `error` it failed with.
 
     `flow_lpm`: mean leak [L/min] while open, as the run really had it; `place`: operating point and length of the
-    record, plain values; `seconds`: processor time, of no account to the result and not in the final table.
+    record, plain values; `scores` by the plan's name of a detector, `statements` by `Entry.key`; `seconds`: processor
+    time, of no account to the result and not in the final table.
     """
 
     id: str
@@ -37,6 +39,7 @@ class Row:
     scores: Scores = field(default_factory=dict)
     error: str | None = None
     seconds: float = 0.0
+    statements: Mapping[str, Statement] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The row as plain JSON values."""
@@ -46,7 +49,8 @@ class Row:
     def from_dict(cls, tree: Mapping[str, Any]) -> Row:
         """The row of such values; raises TypeError, KeyError or ValueError where they are none."""
         scores = {str(name): (_number(pair[0]), _number(pair[1])) for name, pair in tree["scores"].items()}
-        return cls(**{**tree, "scores": scores})
+        statements = {str(name): Statement.from_dict(one) for name, one in tree.get("statements", {}).items()}
+        return cls(**{**tree, "scores": scores, "statements": statements})
 
 
 def _number(value: Any) -> float | None:
@@ -73,9 +77,10 @@ def work(plan: Plan, case: Case, keep: Path | None = None) -> Row:
 
 
 def _work(plan: Plan, case: Case, keep: Path | None) -> Row:
+    from sealscope.campaigns.entries import stated
     from sealscope.campaigns.machines import experiment_of
     from sealscope.diagnosis.calibrated import looked_at, place_of
-    from sealscope.diagnosis.scorers import Look, scorer
+    from sealscope.diagnosis.scorers import Look
     from sealscope.simulation.simulate import run
 
     made = run(experiment_of(plan, case))
@@ -83,15 +88,11 @@ def _work(plan: Plan, case: Case, keep: Path | None) -> Row:
         from sealscope.recordings import write
 
         write(made.recording, keep / f"{case.id}.nc")
-    part, _, reason = looked_at(made.recording.only(name for name in _LOOKED_AT if name in made.recording))
+    part, _, reason = looked_at(made.recording, INSPECTED)
     if reason is not None:
         raise InputError(f"the record cannot be judged: {reason}")
-    place = place_of(part)
-    look = Look(part, plan.onset_s, plan.false_alarm)
-    scores = {}
-    for name in plan.detectors:
-        found = scorer(name).score(look)
-        scores[name] = (found.value, found.onset_s)
+    look = Look(part, plan.onset_s, plan.false_alarm, plan.assumed or plan.rig)
+    scores, statements = stated(look, plan.detectors, plan.views)
     return Row(
         id=case.id,
         use=case.use,
@@ -100,6 +101,7 @@ def _work(plan: Plan, case: Case, keep: Path | None) -> Row:
         levels=case.levels,
         replicate=case.replicate,
         flow_lpm=made.truth.mean_leak_lpm if case.leak_lpm else 0.0,
-        place=asdict(place),
+        place=asdict(place_of(part)),
         scores=scores,
+        statements=statements,
     )

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sealscope.cli.options import (
+    AssumeOption,
     FalseAlarmOption,
     MapOption,
     RateOption,
+    assumed_rig,
     channel_map_of,
     check_folder,
     complain,
@@ -41,10 +43,12 @@ def complete_plans(incomplete: str) -> list[str]:
 
 
 def complete_detectors(incomplete: str) -> list[str]:
-    """Names of scorers that begin so."""
-    from sealscope.diagnosis.scorers import SCORERS
+    """Names of scorers, and of detectors with a calibrated threshold, that begin so."""
+    from sealscope.diagnosis.contract import detectors
+    from sealscope.diagnosis.scorers import CALIBRATED, SCORERS
 
-    return [name for name in SCORERS if name.startswith(incomplete)]
+    names = [*SCORERS, *(f"{name}{CALIBRATED}" for name in detectors())]
+    return [name for name in names if name.startswith(incomplete)]
 
 
 PlanArgument = Annotated[
@@ -224,6 +228,7 @@ def calibrate(
     ] = 0.5,
     maps: MapOption = None,
     rate: RateOption = None,
+    rig: AssumeOption = None,
 ) -> None:
     """Set thresholds from leak-free recordings of your own machine, for `diagnose --calibration`."""
     from hashlib import sha256
@@ -240,6 +245,7 @@ def calibrate(
         raise InputError(f"a calibration must not replace a recording, got {output}")
     if promise not in ("average", "bound"):
         raise InputError(f"--promise must be average or bound, got {promise}")
+    assumed = assumed_rig(rig)
     channel_map = channel_map_of(maps)
     recordings = {str(path): read(path, channel_map=channel_map or None, rate=rate) for path in baseline}
     files = [{"file": path.name, "sha256": sha256(path.read_bytes()).hexdigest()} for path in baseline]
@@ -248,9 +254,15 @@ def calibrate(
         tuple(detectors or DEFAULT_DETECTORS),
         false_alarm_probability=false_alarm,
         split_share=split,
+        rig=assumed,
         promise=promise,
         confidence=confidence,
-        made_from={"recordings": files, "channel_map": dict(channel_map), "version": str(__version__)},
+        made_from={
+            "recordings": files,
+            "channel_map": dict(channel_map),
+            "version": str(__version__),
+            "assumed_rig": rig or "thesis",
+        },
     )
     save(found, output)
     for group in found.groups:

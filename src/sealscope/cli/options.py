@@ -36,6 +36,15 @@ def complete_settings(incomplete: str) -> list[str]:
 RigOption = Annotated[
     str, typer.Option("--rig", help="Rig by name, or the path of a rig's TOML file.", autocompletion=complete_rigs)
 ]
+AssumeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        metavar="NAME|FILE",
+        help="What the detectors may assume of the machine: a rig by name, or a TOML file; by default the thesis's.",
+        autocompletion=complete_rigs,
+    ),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -83,6 +92,13 @@ def progress() -> Iterator[Progress]:
             bar.update(tasks[words], completed=share)
 
         yield told
+
+
+def assumed_rig(name: str | None) -> Rig | None:
+    """The rig of `--rig` that detectors may assume; None where none is given."""
+    from sealscope.parameters import load_rig
+
+    return None if name is None else load_rig(name)
 
 
 def rig_with(name: str, settings: Sequence[str] | None) -> Rig:

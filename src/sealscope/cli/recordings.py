@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sealscope.cli.options import (
+    AssumeOption,
     BaselineOption,
     CalibrationOption,
     FalseAlarmOption,
     MapOption,
     RateOption,
+    assumed_rig,
     channel_map_of,
     check_folder,
     complain,
@@ -25,6 +27,7 @@ from sealscope.errors import InputError, MissingExtra, UnreadableFile
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.verdict import Diagnosis
+    from sealscope.parameters import Rig
     from sealscope.recordings import Recording
 
 
@@ -56,6 +59,7 @@ def _diagnoses(
     rate: float | None,
     false_alarm: float,
     calibration: Path | None,
+    rig: Rig | None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
     """Recording and diagnosis of each file, None for one that cannot be read; a file is never its own baseline."""
     from sealscope.diagnosis.diagnose import check_probability, diagnose
@@ -63,7 +67,7 @@ def _diagnoses(
     check_probability(false_alarm)
     channel_map = channel_map_of(maps)
     if calibration is not None:
-        yield from _calibrated(files, baseline, channel_map, rate, calibration)
+        yield from _calibrated(files, baseline, channel_map, rate, calibration, rig)
         return
     for file in files if baseline else ():
         if all(path.resolve() == file.resolve() for path in baseline):
@@ -82,11 +86,16 @@ def _diagnoses(
             complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
             continue
-        yield recording, diagnose(recording, others, false_alarm_probability=false_alarm, file=str(file))
+        yield recording, diagnose(recording, others, false_alarm_probability=false_alarm, file=str(file), rig=rig)
 
 
 def _calibrated(
-    files: Sequence[Path], baseline: Sequence[Path], channel_map: dict[str, str], rate: float | None, calibration: Path
+    files: Sequence[Path],
+    baseline: Sequence[Path],
+    channel_map: dict[str, str],
+    rate: float | None,
+    calibration: Path,
+    rig: Rig | None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
     """Recording and diagnosis of each file by the thresholds of a calibration, at its false-alarm rate."""
     from sealscope.diagnosis.calibrated import diagnose_calibrated
@@ -96,7 +105,7 @@ def _calibrated(
         raise InputError("--calibration must stand without --baseline: its leak-free recordings are in it")
     known = load(calibration)
     for file, recording in _read_all(files, channel_map, rate):
-        yield None if recording is None else (recording, diagnose_calibrated(recording, known, file=str(file)))
+        yield None if recording is None else (recording, diagnose_calibrated(recording, known, file=str(file), rig=rig))
 
 
 def diagnose(
@@ -109,12 +118,13 @@ def diagnose(
     rate: RateOption = None,
     false_alarm: FalseAlarmOption = 0.01,
     calibration: CalibrationOption = None,
+    rig: AssumeOption = None,
 ) -> None:
     """Say for each file whether oil bypasses the piston. Exit status 1 where a file could not be read."""
     from sealscope.reporting import diagnosis_text
 
     complete = True
-    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration):
+    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed_rig(rig)):
         if found is None:
             complete = False
         elif output is TextFormat.jsonl:
@@ -133,6 +143,7 @@ def report(
     rate: RateOption = None,
     false_alarm: FalseAlarmOption = 0.01,
     calibration: CalibrationOption = None,
+    rig: AssumeOption = None,
 ) -> None:
     """Diagnose each file and write a self-contained HTML page of it."""
     from sealscope.reporting import write_page
@@ -152,13 +163,14 @@ def report(
     else:
         check_folder(output)
     complete = True
-    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration):
+    assumed = assumed_rig(rig)
+    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed):
         if found is None:
             complete = False
             continue
         recording, diagnosis = found
         page = output / f"{Path(diagnosis.file).stem}.html" if several else output
-        write_page(page, recording, diagnosis)
+        write_page(page, recording, diagnosis, rig=assumed)
         typer.echo(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
     if not complete:
         raise typer.Exit(1)

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Container, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from sealscope.diagnosis.blocks import chambers_of
 from sealscope.diagnosis.calibration import Calibration, Group, Place, calibrate
-from sealscope.diagnosis.diagnose import analysable, spoils
+from sealscope.diagnosis.diagnose import analysable, why_untrusted
+from sealscope.diagnosis.next_check import next_check
 from sealscope.diagnosis.operating_point import operating_point
-from sealscope.diagnosis.scorers import Look, Score, scorer
+from sealscope.diagnosis.scorers import Look, Score, scorer, split_view
 from sealscope.diagnosis.verdict import Diagnosis, MethodResult, Verdict
 from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding, inspect
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import shortest
 
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
 #: Detectors that a calibration holds unless others are named; the first makes the verdict.
 DEFAULT_DETECTORS = ("rms change", "d3 of p_A changed", "d4 of p_A changed", "d3 of p_B changed", "d4 of p_B changed")
 
 
-def looked_at(recording: Recording) -> tuple[Recording, tuple[Finding, ...], str | None]:
-    """What of a recording can be judged, the findings on it, and why it cannot be trusted (None where it can)."""
-    quality = list(inspect(recording))
+def looked_at(
+    recording: Recording, inspected: Container[str] | None = None
+) -> tuple[Recording, tuple[Finding, ...], str | None]:
+    """What of a recording can be judged, the findings on it, and why it cannot be trusted (None where it can).
+
+    `inspected`: channels to look at for findings, by default all.
+    """
+    looked = recording
+    if inspected is not None:
+        looked = recording.only(name for name in recording.channels if name in inspected)
+    quality = list(inspect(looked))
     if not chambers_of(recording):
         return recording, tuple(quality), "needs the pressure of a chamber (p_A or p_B)"
     part, cut_down = analysable(recording)
@@ -31,9 +43,7 @@ def looked_at(recording: Recording) -> tuple[Recording, tuple[Finding, ...], str
         quality.append(cut_down)
     if len(part) < shortest():
         return part, tuple(quality), f"needs {shortest()} samples or more without a gap, got {len(part)}"
-    spoilt = [one for one in quality if one.channel in chambers_of(recording) and spoils(one, len(part))]
-    reason = f"the pressures cannot be trusted: {spoilt[0].text}" if spoilt else None
-    return part, tuple(quality), reason
+    return part, tuple(quality), why_untrusted(part, quality)
 
 
 def place_of(part: Recording) -> Place:
@@ -41,9 +51,9 @@ def place_of(part: Recording) -> Place:
     return Place(operating_point(part), part.duration)
 
 
-def look_at(part: Recording, split_share: float, rate: float) -> Look:
-    """The recording as scorers see it, split at that share of its length."""
-    return Look(part, float(part.t[0]) + split_share * part.duration, rate)
+def look_at(part: Recording, split_share: float, rate: float, rig: Rig | None = None) -> Look:
+    """The recording as scorers see it, split at that share of its length; `rig`: what detectors may assume."""
+    return Look(part, float(part.t[0]) + split_share * part.duration, rate, rig)
 
 
 def calibrate_on(
@@ -52,12 +62,14 @@ def calibrate_on(
     *,
     false_alarm_probability: float,
     split_share: float = 0.5,
+    rig: Rig | None = None,
     **options: Any,
 ) -> Calibration:
     """Calibrate detectors on leak-free recordings of one machine.
 
     `recordings`: name -> recording; one that cannot be judged raises InputError with its name and the reason: what is
-    not leak-free data of the machine in good order has no place in a calibration. `options` as for `calibrate`.
+    not leak-free data of the machine in good order has no place in a calibration. `rig`: what detectors may assume of
+    the machine; `options` as for `calibrate`.
     """
     if not 0.0 < split_share < 1.0:
         raise InputError(f"the split must be a share of the length between 0 and 1, got {split_share}")
@@ -69,29 +81,32 @@ def calibrate_on(
         if reason is not None:
             raise InputError(f"a leak-free recording must be in good order, got: {reason} ({name})")
         places.append(place_of(part))
-        look = look_at(part, split_share, false_alarm_probability)
+        look = look_at(part, split_share, false_alarm_probability, rig)
         for one in chosen:
             scores[one.name].append(one.score(look).value)
     return calibrate(places, scores, rate=false_alarm_probability, split_share=split_share, **options)
 
 
-def diagnose_calibrated(recording: Recording, calibration: Calibration, *, file: str | None = None) -> Diagnosis:
+def diagnose_calibrated(
+    recording: Recording, calibration: Calibration, *, file: str | None = None, rig: Rig | None = None
+) -> Diagnosis:
     """Say whether oil bypasses the piston, by the thresholds of a calibration.
 
     The first of the calibration's detectors makes the verdict, at its false-alarm rate; the others are told as
     methods. A recording outside the calibrated operating points, or one the data of which cannot be trusted, is
-    `cannot tell`, with the reason.
+    `cannot tell`, with the reason. `rig`: what detectors may assume of the machine, the same as for the calibration.
     """
     part, quality, reason = looked_at(recording)
     found: Group | str = reason if reason is not None else calibration.find(place_of(part))
-    look = look_at(part, calibration.split_share, calibration.rate) if isinstance(found, Group) else None
+    look = look_at(part, calibration.split_share, calibration.rate, rig) if isinstance(found, Group) else None
     methods = []
     onset = None
     for name in calibration.detectors:
         if look is None or not isinstance(found, Group):
             methods.append(MethodResult(name, None, None, "cannot tell", str(found)))
             continue
-        score = scorer(name).score(look)
+        detector, view = split_view(name)
+        score = scorer(detector).score(look.through(calibration.views[view]) if view else look)
         methods.append(_result(name, score, found, calibration))
         if len(methods) == 1 and methods[0].verdict == "leak":
             onset = score.onset_s
@@ -109,6 +124,7 @@ def diagnose_calibrated(recording: Recording, calibration: Calibration, *, file:
         threshold=judge.threshold,
         methods=tuple(methods),
         quality=quality,
+        next_check=next_check(judge.verdict, None),
     )
 
 

@@ -7,12 +7,12 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from sealscope.diagnosis.operating_point import LEVEL_RATIO, OperatingPoint, difference
-from sealscope.diagnosis.scorers import scorer
+from sealscope.diagnosis.scorers import scorer, split_view
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 from sealscope.recordings.whole import whole_file
@@ -67,7 +67,8 @@ class Calibration:
 
     The first detector makes the verdict, so that the rate is the verdict's own; the others are told beside it.
     `split_share`: where detectors that compare two sides of a moment split a recording, as a share of its length.
-    `made_from`: plain values that say which recordings or which campaign it was made from.
+    `made_from`: plain values that say which recordings or which campaign it was made from; `views`: name -> channels,
+    for detectors that saw no other (`rms change @ pressures`).
     """
 
     rate: float
@@ -77,6 +78,7 @@ class Calibration:
     split_share: float
     groups: tuple[Group, ...]
     made_from: Mapping[str, Any]
+    views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def find(self, place: Place) -> Group | str:
         """The calibrated operating point of a recording, or why it is outside of all, in words."""
@@ -121,6 +123,7 @@ def calibrate(
     confidence: float = 0.95,
     split_share: float = 0.5,
     made_from: Mapping[str, Any] | None = None,
+    views: Mapping[str, Sequence[str]] | None = None,
 ) -> Calibration:
     """Thresholds from the scores of leak-free recordings.
 
@@ -133,8 +136,9 @@ def calibrate(
         raise InputError("a calibration needs leak-free recordings, got none")
     if not scores:
         raise InputError("a calibration needs at least one detector, got none")
+    seen = {name: tuple(channels) for name, channels in (views or {}).items()}
     for name, values in scores.items():
-        scorer(name)
+        _check(name, seen)
         if len(values) != len(places):
             raise InputError(
                 f"scores of {name!r} must be as many as the recordings, got {len(values)} for {len(places)}"
@@ -144,7 +148,7 @@ def calibrate(
     for members in grouped(places):
         thresholds: dict[str, Threshold] = {}
         for name, values in scores.items():
-            own = scorer(name).threshold
+            own = scorer(split_view(name)[0]).threshold
             if own is not None:
                 raise InputError(f"{name!r} has a threshold of its own and cannot be calibrated")
             known = [values[k] for k in members]
@@ -172,7 +176,18 @@ def calibrate(
             f"leak-free recordings must be at least {needed} at an operating point for a false-alarm rate of {rate:g}, "
             f"got at most {most}"
         )
-    return Calibration(rate, promise, confidence, tuple(scores), split_share, tuple(groups), dict(made_from or {}))
+    used = {view: seen[view] for name in scores if (view := split_view(name)[1])}
+    return Calibration(
+        rate, promise, confidence, tuple(scores), split_share, tuple(groups), dict(made_from or {}), used
+    )
+
+
+def _check(name: str, views: Mapping[str, tuple[str, ...]]) -> None:
+    """Raise InputError for a detector that is not known, or sees a set of channels that is not."""
+    detector, view = split_view(name)
+    scorer(detector)
+    if view and not views.get(view):
+        raise InputError(f"the channels that {name!r} sees must be known, got none for {view!r}")
 
 
 def as_dict(calibration: Calibration) -> dict[str, Any]:
@@ -195,6 +210,7 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
         "detectors": list(calibration.detectors),
         "split_share": calibration.split_share,
         "made_from": dict(calibration.made_from),
+        **({"views": {k: list(v) for k, v in calibration.views.items()}} if calibration.views else {}),
         "groups": groups,
     }
 
@@ -246,14 +262,17 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
         low, high = (float(value) for value in one["levels"])
         short, long = (float(value) for value in one["durations_s"])
         groups.append(Group(OperatingPoint(**point), int(one["records"]), (low, high), (short, long), thresholds))
+    views = {str(name): tuple(str(one) for one in channels) for name, channels in tree.get("views", {}).items()}
     for name in detectors:
-        scorer(name)
+        _check(name, views)
     if not detectors or not groups:
         raise InputError("a calibration must have detectors and operating points")
     rate, confidence, split = (float(tree[name]) for name in ("false_alarm_rate", "confidence", "split_share"))
     if not (0.0 < rate < 1.0 and 0.0 < confidence < 1.0 and 0.0 < split < 1.0):
         raise InputError("false_alarm_rate, confidence and split_share must be between 0 and 1")
-    return Calibration(rate, tree["promise"], confidence, detectors, split, tuple(groups), dict(tree["made_from"]))
+    return Calibration(
+        rate, tree["promise"], confidence, detectors, split, tuple(groups), dict(tree["made_from"]), views
+    )
 
 
 def with_judge(calibration: Calibration, name: str) -> Calibration:

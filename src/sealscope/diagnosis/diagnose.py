@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.blocks import chambers_of
-from sealscope.diagnosis.contract import DETECTORS, Detector
-from sealscope.diagnosis.verdict import Diagnosis, Evidence, MethodResult
+from sealscope.diagnosis.examination import Examination
+from sealscope.diagnosis.fusion import Fused
+from sealscope.diagnosis.next_check import next_check
+from sealscope.diagnosis.verdict import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding, inspect, uniform_segments
 from sealscope.recordings.recording import Recording
@@ -67,64 +69,60 @@ def diagnose(
 
     `baseline`: leak-free recordings of the same machine; without any, the recording's own beginning is the baseline
     and the onset is looked for. Baseline recordings that cannot be compared (other direction, command, pressure
-    level) are left out. `rig`: what the detectors may assume of the machine, the thesis's by default. The verdict is
-    `cannot tell` where the data do not allow one.
+    level) are left out. `rig`: what the detectors may assume of the machine, the thesis's by default. Every detector
+    that the channels allow is run, the most specific of them judges (`fusion.ORDER`), the others are told beside it.
+    The verdict is `cannot tell` where the data do not allow one.
 
     Raises InputError for a false-alarm probability outside 1e-4 to 0.2.
     """
-    from sealscope.parameters import load_rig
-
     check_probability(false_alarm_probability)
-    assumed = load_rig("thesis") if rig is None else rig
     quality = list(inspect(recording))
     part, cut_down = analysable(recording)
     if cut_down is not None:
         quality.append(cut_down)
-    spoilt = [
-        finding for finding in quality if finding.channel in chambers_of(recording) and spoils(finding, len(part))
-    ]
     whole = [analysable(one)[0] for one in baseline]
-    evidence = [
-        (detector.name, _examine(detector, part, whole, false_alarm_probability, spoilt))
-        for detector in (make(assumed) for make in DETECTORS.values())
-    ]
-    name, chosen = evidence[0]
-    methods = [MethodResult(name, chosen.score, chosen.threshold, chosen.verdict, chosen.reason), *chosen.methods]
-    return Diagnosis(
-        file=file or str(recording.provenance.get("file", "recording")),
-        verdict=chosen.verdict,
-        reason=chosen.reason,
-        onset_s=chosen.onset_s,
-        onset_interval_s=chosen.onset_interval_s,
-        leak_lpm=chosen.leak_lpm,
-        leak_interval_lpm=chosen.leak_interval_lpm,
+    found = Examination(
+        part,
+        whole,
         false_alarm_probability=false_alarm_probability,
-        score=chosen.score,
-        threshold=chosen.threshold,
-        methods=tuple(methods),
-        quality=tuple(quality),
+        rig=rig,
+        untrusted=why_untrusted(part, quality),
+    ).fused()
+    return diagnosis_of(
+        found, file or str(recording.provenance.get("file", "recording")), false_alarm_probability, quality
     )
+
+
+def diagnosis_of(found: Fused, file: str, false_alarm_probability: float, quality: Sequence[Finding]) -> Diagnosis:
+    """The diagnosis that a fused verdict makes."""
+    own = found.evidence
+    return Diagnosis(
+        file=file,
+        verdict=own.verdict,
+        reason=own.reason,
+        onset_s=own.onset_s,
+        onset_interval_s=own.onset_interval_s,
+        leak_lpm=own.leak_lpm,
+        leak_interval_lpm=own.leak_interval_lpm,
+        false_alarm_probability=false_alarm_probability,
+        score=own.score,
+        threshold=own.threshold,
+        methods=found.methods,
+        quality=tuple(quality),
+        cause=own.cause,
+        next_check=next_check(own.verdict, own.cause),
+        course=own.course,
+    )
+
+
+def why_untrusted(part: Recording, quality: Sequence[Finding]) -> str | None:
+    """Why the chamber pressures of a recording with these findings cannot be trusted; None where they can."""
+    for finding in quality:
+        if finding.channel in chambers_of(part) and spoils(finding, len(part)):
+            return f"the pressures cannot be trusted: {finding.text}"
+    return None
 
 
 def spoils(finding: Finding, samples: int) -> bool:
     """Whether a finding on a chamber pressure of so many samples leaves no trust in its details."""
     return finding.code in _SPOILING or (finding.code == "clipped" and finding.count > _MOST_CLIPPED * samples)
-
-
-def _examine(
-    detector: Detector,
-    recording: Recording,
-    baseline: Sequence[Recording],
-    probability: float,
-    spoilt: Sequence[Finding],
-) -> Evidence:
-    unusable = detector.usable(recording)
-    if unusable is not None:
-        return Evidence("cannot tell", unusable)
-    if spoilt:
-        return Evidence("cannot tell", f"the pressures cannot be trusted: {spoilt[0].text}")
-    usable = [one for one in baseline if detector.usable(one) is None]
-    if baseline and not usable:
-        return Evidence("cannot tell", f"no baseline recording can be used: {detector.usable(baseline[0])}")
-    with np.errstate(all="ignore"):
-        return detector.examine(recording, usable, probability)

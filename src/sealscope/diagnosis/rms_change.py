@@ -29,6 +29,7 @@ class RmsChange:
     """Change of the details' RMS, within a recording or against leak-free ones."""
 
     name = "rms change"
+    reads = ("u", "p_A", "p_B")
 
     def usable(self, recording: Recording) -> str | None:
         chambers = chambers_of(recording)

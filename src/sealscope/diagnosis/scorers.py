@@ -8,18 +8,23 @@ detector with a threshold from within the recording) states it as `threshold`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from sealscope.diagnosis.blocks import CHAMBERS, QUANTITIES, mean_squares
+from sealscope.diagnosis.contract import detectors
+from sealscope.diagnosis.examination import Examination
 from sealscope.diagnosis.verdict import Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array, Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
 
 Sided = Literal["one-sided", "two-sided"]
 #: What is left out at the beginning of a recording: this long, but no more than this share of the first part, so that
@@ -40,17 +45,28 @@ class Look:
     """A recording as all scorers see it, each transform computed once.
 
     `split_s` [s]: the moment on the recording's time axis before and after which it is compared, half-way by default;
-    `false_alarm_probability`: what a scorer with a threshold of its own sets it for. The recording is uniformly
-    sampled without missing samples (`diagnose.analysable`).
+    `false_alarm_probability`: what a detector with a threshold of its own sets it for; `rig`: what detectors may
+    assume of the machine. The recording is uniformly sampled without missing samples (`diagnose.analysable`).
     """
 
     def __init__(
-        self, recording: Recording, split_s: float | None = None, false_alarm_probability: float = 0.01
+        self,
+        recording: Recording,
+        split_s: float | None = None,
+        false_alarm_probability: float = 0.01,
+        rig: Rig | None = None,
     ) -> None:
         self.recording = recording
         start = float(recording.t[0]) if len(recording) else 0.0
         self.split_s = start + recording.duration / 2 if split_s is None else float(split_s)
-        self.false_alarm_probability = false_alarm_probability
+        self.examination = Examination(recording, false_alarm_probability=false_alarm_probability, rig=rig)
+
+    def through(self, channels: Iterable[str]) -> Look:
+        """The same recording with these of its channels alone; a detector that reads no other is not run again."""
+        examination = self.examination.through(channels)
+        seen = Look(examination.recording, self.split_s, examination.false_alarm_probability)
+        seen.examination = examination
+        return seen
 
     @cached_property
     def log_rms(self) -> Mapping[str, tuple[Array, Array, Array]]:
@@ -78,17 +94,9 @@ class Look:
                 found[chamber] = tuple(0.5 * np.log(one) for one in (*parts, both))
         return found
 
-    @cached_property
-    def rms_change(self) -> Evidence:
-        """The evidence of the detector `rms change`, with no baseline."""
-        from sealscope.diagnosis.rms_change import RmsChange
-
-        detector = RmsChange()
-        unusable = detector.usable(self.recording)
-        if unusable is not None:
-            return Evidence("cannot tell", unusable)
-        with np.errstate(all="ignore"):
-            return detector.examine(self.recording, (), self.false_alarm_probability)
+    def evidence(self, detector: str) -> Evidence:
+        """The evidence of a registered detector, with no baseline."""
+        return self.examination.evidence(detector)
 
     def of(self, chamber: str, quantity: str, what: Literal["change", "level"]) -> float | None:
         """Change of a quantity's log RMS over the split, or its level; None where it has none."""
@@ -171,12 +179,12 @@ def _both_products(look: Look) -> Score:
 
 
 def _scan(look: Look) -> Score:
-    found = look.rms_change
+    found = look.evidence("rms change")
     return Score(found.score, found.onset_s, found.reason)
 
 
 def _own_scan(look: Look) -> Score:
-    found = look.rms_change
+    found = look.evidence("rms change")
     if found.verdict == "cannot tell" or found.score is None or found.threshold is None:
         return Score(None, reason=found.reason)
     return Score(found.score - found.threshold, found.onset_s, found.reason)
@@ -205,18 +213,45 @@ def _all() -> Iterator[Scorer]:
     )
 
 
-#: Every scorer by name.
+#: What follows a detector's name where leak-free recordings are to set its threshold, and what stands before the name
+#: of a set of channels where it sees those alone.
+CALIBRATED, VIEW = ", calibrated", " @ "
+
+
+def _calibrated(detector: str) -> Scorer:
+    """A registered detector's score, for a threshold from leak-free recordings; none where it takes the change for
+    something else than a piston leak."""
+
+    def score(look: Look) -> Score:
+        found = look.evidence(detector)
+        if found.score is None or not math.isfinite(found.score) or found.cause not in (None, "piston leak"):
+            return Score(None, reason=found.reason)
+        return Score(found.score, found.onset_s, found.reason)
+
+    about = f"the score of the detector {detector!r}, against a threshold from leak-free recordings"
+    return Scorer(f"{detector}{CALIBRATED}", "two-sided", "search", about, score)
+
+
+#: Every scorer by name, but for the calibrated form of the registered detectors.
 SCORERS: Mapping[str, Scorer] = MappingProxyType({one.name: one for one in _all()})
 
 
 def scorer(name: str) -> Scorer:
-    """The scorer of that name; raises InputError for a name it does not know."""
-    if name not in SCORERS:
-        import difflib
+    """The scorer of that name, or a registered detector's with `, calibrated` behind it; raises InputError for a name
+    it does not know."""
+    if name in SCORERS:
+        return SCORERS[name]
+    known = detectors()
+    if name.endswith(CALIBRATED) and name.removesuffix(CALIBRATED) in known:
+        return _calibrated(name.removesuffix(CALIBRATED))
+    import difflib
 
-        near = difflib.get_close_matches(str(name), SCORERS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(
-            f"a detector must be a scorer's name such as 'd3 of p_A fell' or 'rms change', got {name!r}{hint}"
-        )
-    return SCORERS[name]
+    near = difflib.get_close_matches(str(name), [*SCORERS, *(f"{one}{CALIBRATED}" for one in known)], n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise InputError(f"a detector must be a scorer's name such as 'd3 of p_A fell' or 'rms change', got {name!r}{hint}")
+
+
+def split_view(name: str) -> tuple[str, str]:
+    """A detector's name, and the name of the set of channels it sees, "" for all: `rms change @ pressures`."""
+    detector, _, view = name.partition(VIEW)
+    return detector, view

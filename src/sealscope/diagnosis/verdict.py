@@ -11,10 +11,20 @@ from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Array
 
 Verdict = Literal["leak", "no leak", "cannot tell"]
-#: What a change can come from; only the first is a leak past the piston.
+#: What a change can come from.
 Cause = Literal[
-    "piston leak", "pump leak", "external leak", "friction change", "air in the oil", "sensor fault", "changed duty"
+    "piston leak",
+    "piston or pump leak",
+    "pump leak",
+    "external leak",
+    "friction change",
+    "air in the oil",
+    "sensor fault",
+    "changed duty",
 ]
+#: The causes for which the verdict is `leak`: piston and pump lie in parallel, and often no channel tells them apart.
+LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak")
+LITRE_PER_MINUTE = 1e-3 / 60.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +78,10 @@ class Diagnosis:
 
     `onset_s`, `onset_interval_s` [s] on the recording's time axis; `leak_lpm`, `leak_interval_lpm` [L/min], None
     where the channels do not allow it; `false_alarm_probability`: the probability of `leak` on a leak-free recording
-    for which `threshold` was set; `quality`: findings on the data.
+    for which `threshold` was set; `methods`: every detector's own evidence, each followed by its parts, the one that
+    judged first; `quality`: findings on the data; `cause`: what the change is taken for, None where there is none or
+    it cannot be told; `next_check`: what to check next, in words; `course`: the leak over the recording, where a
+    detector follows it (not among the plain values).
     """
 
     file: str
@@ -83,6 +96,9 @@ class Diagnosis:
     threshold: float | None
     methods: tuple[MethodResult, ...]
     quality: tuple[Finding, ...]
+    cause: Cause | None = None
+    next_check: str = ""
+    course: LeakCourse | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The diagnosis as plain JSON values, keys in the order of the output contract; a number that is not finite
@@ -119,6 +135,8 @@ class Diagnosis:
                 }
                 for finding in self.quality
             ],
+            "cause": self.cause,
+            "next_check": self.next_check,
         }
 
     def __str__(self) -> str:

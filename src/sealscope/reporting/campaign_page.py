@@ -10,15 +10,18 @@ from typing import Literal
 
 import numpy as np
 
+from sealscope.campaigns.entries import DIAGNOSE, entry
 from sealscope.campaigns.held_out_plan import HeldOutPlan
 from sealscope.campaigns.judge import Judgement, Pod, SizeRoc
 from sealscope.campaigns.plan import Plan
 from sealscope.campaigns.recorded import RecordedPlan
-from sealscope.campaigns.results import Result
-from sealscope.evaluation.binomial import Rate
+from sealscope.campaigns.results import Result, detectors_of
+from sealscope.diagnosis.contract import detectors
+from sealscope.diagnosis.scorers import SCORERS
 from sealscope.evaluation.table import SummaryRow
 from sealscope.recordings.whole import whole_file
 from sealscope.reporting.campaign_curves import Curve, Drawing, draw
+from sealscope.reporting.campaign_tables import cause_tables, flow_lines, onset_lines, percent
 from sealscope.reporting.page import _packaged, _version
 
 PAGE = "report.html"
@@ -50,20 +53,6 @@ class Section:
     areas: tuple[tuple[str, str], ...]
     cells: tuple[tuple[str, ...], ...]
     cell_columns: tuple[str, ...]
-
-
-def percent(rate: Rate | None) -> str:
-    """A rate with its interval in per cent, a dash where nothing is known."""
-    if rate is None or rate.n == 0:
-        return "–"
-    return f"{_p(rate.rate)} % ({_p(rate.low)}–{_p(rate.high)})"
-
-
-def _p(share: float) -> str:
-    value = 100.0 * share
-    return (
-        f"{value:.2f}" if value < 9.95 else f"{value:.0f}" if value > 99.95 or value == round(value) else f"{value:.1f}"
-    )
 
 
 def _within(size: float, largest: float) -> str:
@@ -158,6 +147,12 @@ def _notes(result: Result) -> list[str]:
         )
     elif isinstance(plan, HeldOutPlan):
         notes.append(f"Each {plan.leave_out} was held out whole in turn; an alarm is a probability over 50 %.")
+    own = [one for one in detectors_of(plan) if entry(one).own] if not isinstance(plan, HeldOutPlan) else []
+    if own and not isinstance(plan, HeldOutPlan):
+        notes.append(
+            f"By thresholds of their own, set for {100 * plan.false_alarm:g} % false alarms: {', '.join(own)}. What "
+            "they state of flow, onset and cause is in estimates.csv, onsets.csv and causes.csv."
+        )
     if plan.note:
         notes.append(plan.note)
     if result.missing:
@@ -201,6 +196,9 @@ def render_campaign_page(result: Result, files: Sequence[str] = ()) -> str:
             for name in dict.fromkeys(pod.detector for pod in judgement.pods)
         ],
         faults=[(one.detector, one.fault, percent(one.alarms), percent(one.cannot_tell)) for one in judgement.faults],
+        flows=flow_lines(judgement),
+        onsets=onset_lines(judgement),
+        causes=cause_tables(judgement),
         failed=[
             (row.id, ", ".join(f"{k} {v}" for k, v in row.levels.items()), row.error) for row in judgement.failed[:200]
         ],
@@ -229,7 +227,10 @@ def _facts(result: Result) -> list[tuple[str, str]]:
         ("records", f"{plan.duration_s:g} s at {plan.rig.daq.sample_rate:g} Hz, leaks open at {plan.onset_s:g} s"),
         *((name, ", ".join(str(level) for level in levels)) for name, levels in plan.factors.items()),
         ("base seed", str(plan.seed)),
+        *((f"seen by @ {name}" if name else "seen", ", ".join(channels)) for name, channels in plan.views.items()),
     ]
+    if any(entry(one).detector for one in plan.detectors):
+        facts.append(("assumed by detectors", _assumed(plan)))
     for size, (mean, spread) in judgement.realised.items():
         told = "" if math.isnan(spread) else f" ± {spread:.2g}"
         facts.append(
@@ -238,10 +239,18 @@ def _facts(result: Result) -> list[tuple[str, str]]:
     return facts
 
 
-def _section(name: str, judgement: Judgement, unit: str) -> Section:
-    from sealscope.diagnosis.scorers import SCORERS
+def _assumed(plan: Plan) -> str:
+    """What the detectors assume of the machine, in words."""
+    if plan.assumed is None or plan.assumed == plan.rig:
+        return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
+    true = {row.name: row.value for row in plan.rig.table()}
+    other = [f"{row.name} {row.value:g}" if isinstance(row.value, float) else f"{row.name} {row.value}"
+             for row in plan.assumed.table() if true.get(row.name) != row.value]  # fmt: skip
+    more = f" and {len(other) - 6} more" if len(other) > 6 else ""
+    return f"{plan.assumed.name}, which differs from the rig: {', '.join(other[:6])}{more}"
 
-    known = SCORERS.get(name)
+
+def _section(name: str, judgement: Judgement, unit: str) -> Section:
     pod = next(one for one in judgement.pods if one.detector == name)
     rocs = [one for one in judgement.rocs if one.detector == name]
     shown = [one for one in rocs if not math.isnan(one.leak_lpm)]
@@ -264,7 +273,20 @@ def _section(name: str, judgement: Judgement, unit: str) -> Section:
          f"{one.area.value:.3f} ({one.area.low:.3f}–{one.area.high:.3f})")
         for one in shown
     )  # fmt: skip
-    return Section(name, known.about if known else "", drawings, areas, tuple(table), heads)
+    return Section(name, _about(name), drawings, areas, tuple(table), heads)
+
+
+def _about(name: str) -> str:
+    """What a detector's score is, "" for one that is known here by its name alone."""
+    one = entry(name)
+    through = f", given the channels of {one.view} alone" if one.view else ""
+    if one.of in SCORERS and not one.detector:
+        return SCORERS[one.of].about + through
+    if one.of not in (DIAGNOSE, *detectors()):
+        return ""
+    how = "by its own threshold" if one.own else "against a threshold from leak-free records"
+    what = "score over threshold of the judge" if one.of == DIAGNOSE else f"the score of the detector {one.of!r} {how}"
+    return what + through
 
 
 def _pod_drawing(pod: Pod, unit: str) -> Drawing | None:

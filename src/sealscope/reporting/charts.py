@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Recording
-from sealscope.reporting.contract import DiagnosisLike, Mark
+from sealscope.reporting.contract import CourseLike, DiagnosisLike, Mark
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
 from sealscope.reporting.series import Base, coded, coded_times, time_base
 
@@ -48,7 +48,9 @@ class Series:
 
 @dataclass(frozen=True)
 class Chart:
-    """One chart; `base` names the time axis its series share (all samples, or the centres of the RMS windows)."""
+    """One chart; `base` names the time axis its series share (all samples, the centres of the RMS windows, or the
+    instants of the leak's course); `band`: whether the second and third series are the ends of the first one's
+    interval."""
 
     key: str
     group: str
@@ -57,6 +59,7 @@ class Chart:
     series: tuple[Series, ...]
     base: str = SAMPLES
     height: int = 150
+    band: bool = False
 
 
 def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
@@ -121,6 +124,18 @@ def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart
     return charts
 
 
+COURSE = "course"
+
+
+def course_charts(course: CourseLike | None) -> list[Chart]:
+    """The leak over the recording with its interval, where a detector follows it."""
+    if course is None or not np.isfinite(course.lpm).any():
+        return []
+    ends = [np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high)]
+    lines = (Series("leak", "a", course.lpm), Series("95 %: low", "d1", ends[0]), Series("95 %: high", "d1", ends[1]))
+    return [Chart(COURSE, COURSE, "Leak past the piston", "L/min", lines, COURSE, 190, band=True)]
+
+
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """The details themselves, one chart each, the chambers side by side."""
     charts = []
@@ -162,6 +177,8 @@ def draw(
     few = time_base(recording.t, recording.rate, STILL_POINTS)
     span = (float(base.t[0]), float(base.t[-1]))
     axes: dict[str, Array] = {SAMPLES: base.t} | {_axis(c.channel): c.window_t for c in chambers}
+    if diagnosis.course is not None:
+        axes[COURSE] = diagnosis.course.t
     onset, interval = onset_within(diagnosis, span)
     low, high = interval or (None, None)
     data: dict[str, Any] = {
@@ -182,6 +199,7 @@ def draw(
                 "title": chart.title,
                 "unit": chart.unit,
                 "height": chart.height,
+                "band": chart.band,
                 "series": [
                     {"label": s.label, "style": s.style} | coded(line)
                     for s, line in zip(chart.series, lines, strict=True)
@@ -228,8 +246,16 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
         points = zip(pen[drawn], across(t)[drawn], height * (high - line[drawn]) / (high - low), strict=True)
         steps = [f"{'M' if begins else 'L'}{x:.0f} {y:.0f}" for begins, x, y in points]
         paths.append({"label": series.label, "style": series.style, "d": "".join(steps)})
+    band = ""
+    if chart.band:
+        there = np.isfinite(lines[1]) & np.isfinite(lines[2])
+        x = across(t)[there]
+        ends = [height * (high - line[there]) / (high - low) for line in lines[1:3]]
+        corners = [*zip(x, ends[1], strict=True), *zip(x[::-1], ends[0][::-1], strict=True)]
+        band = "".join(f"{'L' if k else 'M'}{a:.1f} {b:.1f}" for k, (a, b) in enumerate(corners)) + "Z" * bool(corners)
     return {
         "paths": paths,
+        "band": band,
         "width": width,
         "height": height,
         "x_ticks": [(float(across(np.asarray(v))), f"{v:g}") for v in ticks(start, stop, 8)],

@@ -8,6 +8,7 @@ from math import isfinite
 from typing import Protocol
 
 from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
 
 
 class FindingLike(Protocol):
@@ -42,6 +43,19 @@ class MethodLike(Protocol):
     def reason(self) -> str: ...
 
 
+class CourseLike(Protocol):
+    """The leak over a recording [L/min] at instants `t` [s], with the ends of its 95 % interval."""
+
+    @property
+    def t(self) -> Array: ...
+    @property
+    def lpm(self) -> Array: ...
+    @property
+    def low(self) -> Array: ...
+    @property
+    def high(self) -> Array: ...
+
+
 class DiagnosisLike(Protocol):
     """The verdict on one recording, with everything that a program reading `diagnose --format jsonl` gets."""
 
@@ -69,6 +83,12 @@ class DiagnosisLike(Protocol):
     def quality(self) -> Sequence[FindingLike]: ...
     @property
     def methods(self) -> Sequence[MethodLike]: ...
+    @property
+    def cause(self) -> str | None: ...
+    @property
+    def next_check(self) -> str: ...
+    @property
+    def course(self) -> CourseLike | None: ...
 
 
 @dataclass(frozen=True)

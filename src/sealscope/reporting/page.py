@@ -53,6 +53,7 @@ def render_page(
     found = [features.chamber_details(recording, name) for name in features.CHAMBERS]
     chambers = [chamber for chamber, _ in found if chamber is not None]
     shown = [
+        *charts.course_charts(diagnosis.course),
         *charts.rms_charts(chambers, pressure_unit),
         *charts.channel_charts(recording, pressure_unit),
         *charts.detail_charts(chambers, pressure_unit),
@@ -181,6 +182,7 @@ def _verdict(
         "headline": words.headline(diagnosis),
         "since": words.since(diagnosis),
         "how_much": words.how_much(diagnosis),
+        "cause": words.cause(diagnosis),
         "how_sure": words.how_sure(diagnosis),
         "threshold_note": words.false_alarms(diagnosis),
         "quality_summary": f"{count} finding{'s' if count != 1 else ''}{f' ({worst[0]})' if worst else ''},",
@@ -229,7 +231,7 @@ def _evidence(
 
     close = (base_t(fine.start), base_t(fine.stop - 1)) if base.width > 1 else around(2.0)
 
-    groups = {group: [c for c in shown if c.group == group] for group in ("rms", "channels", "details")}
+    groups = {group: [c for c in shown if c.group == group] for group in (charts.COURSE, "rms", "channels", "details")}
     line_key = ["p_A, p_1 dark and p_B, p_2 light"] if any(len(c.series) == 2 for c in shown) else []
     if groups["rms"]:
         line_key.append("d1 thin light, d2 dashed, d3 thick, d4 dotted")

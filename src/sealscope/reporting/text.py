@@ -28,12 +28,15 @@ def diagnosis_text(diagnosis: DiagnosisLike, *, width: int = 100) -> str:
     rows = [
         ("since", words.since(diagnosis)),
         ("how much", words.how_much(diagnosis)),
+        ("cause", words.cause(diagnosis)),
         ("how sure", words.how_sure(diagnosis)),
         ("reason", diagnosis.reason or None),
     ]
     lines += [_row(label, text, width) for label, text in rows if text]
     for method in diagnosis.methods:
         figures = f"{method.verdict} (score {words.number(method.score)}, threshold {words.number(method.threshold)})"
+        if method.score is None and method.reason:
+            figures = f"{method.verdict} ({method.reason})"
         lines.append(_row("method", f"{method.name}: {figures}", width))
     lines += [_row(finding.severity, finding.text, width) for finding in diagnosis.quality]
     lines += [_row("next" if i == 0 else "", step, width) for i, step in enumerate(words.next_steps(diagnosis)[:2])]

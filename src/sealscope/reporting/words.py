@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import floor, isfinite, isnan, log10
 
+from sealscope.diagnosis.verdict import LEAKS
 from sealscope.reporting.contract import DiagnosisLike, FindingLike
 
 ABSENT = "–"
@@ -43,11 +44,22 @@ def subject(diagnosis: DiagnosisLike) -> str:
 
 def headline(diagnosis: DiagnosisLike) -> str:
     """What was found, in one line."""
-    return {
+    said = {
         "leak": "Leak: oil bypasses the piston",
         "no leak": "No leak found across the piston",
         "cannot tell": "Cannot tell whether oil bypasses the piston",
     }.get(diagnosis.verdict, diagnosis.verdict)
+    other = cause(diagnosis)
+    if diagnosis.verdict == "leak" and other == "piston or pump leak":
+        return f"{said}, or the pump"
+    return f"{said}, but something changed: {other}" if other and diagnosis.verdict != "leak" else said
+
+
+def cause(diagnosis: DiagnosisLike) -> str | None:
+    """What the change is taken for; None where there is none, or it cannot be told."""
+    if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
+        return None
+    return diagnosis.cause
 
 
 def since(diagnosis: DiagnosisLike) -> str | None:
@@ -64,15 +76,17 @@ def since(diagnosis: DiagnosisLike) -> str | None:
 
 
 def how_much(diagnosis: DiagnosisLike) -> str | None:
-    """How much oil in L/min; None where there is no leak to measure."""
+    """How much oil in L/min; where no leak was found, how much there can be at most. None where nothing is known."""
+    interval = diagnosis.leak_interval_lpm
+    if diagnosis.verdict == "no leak" and diagnosis.leak_lpm is not None and interval is not None and interval[1] > 0:
+        return f"none found; at most {number(interval[1], 2)} L/min (95 % interval)"
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.leak_lpm is None:
         return "not stated: the channels do not allow it"
     text = f"{number(diagnosis.leak_lpm)} L/min"
-    if diagnosis.leak_interval_lpm is not None:
-        low, high = diagnosis.leak_interval_lpm
-        text += f", between {number(low)} and {number(high)} L/min"
+    if interval is not None:
+        text += f", between {number(interval[0])} and {number(interval[1])} L/min"
     return text
 
 
@@ -82,7 +96,9 @@ def how_sure(diagnosis: DiagnosisLike) -> str:
         return "no score was formed"
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     text = f"score {number(diagnosis.score)}, {relation} the threshold of {number(diagnosis.threshold)}"
-    return f"{text}; {false_alarms(diagnosis)}"
+    judge = diagnosis.methods[0].name if diagnosis.methods else ""
+    by = f" of {judge}" if judge else ""
+    return f"{text}{by}; {false_alarms(diagnosis)}"
 
 
 def false_alarms(diagnosis: DiagnosisLike) -> str:
@@ -107,7 +123,19 @@ def next_steps(diagnosis: DiagnosisLike) -> tuple[str, ...]:
     """What to check next, most useful first."""
     trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
     faults = ", ".join(dict.fromkeys(_fault(finding) for finding in trouble))
-    if diagnosis.verdict == "leak":
+    if diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS):
+        steps = [diagnosis.next_check]
+        if diagnosis.verdict == "leak":
+            steps += [
+                "Repeat the recording with the same command and oil temperature: a worn seal shows again.",
+                "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until "
+                "then.",
+            ]
+        else:
+            steps.append("Record again under the same command when that is settled: a leak may hide behind it.")
+        if trouble:
+            steps.insert(0, f"Rule out a fault of the data first: {faults}.")
+    elif diagnosis.verdict == "leak":
         steps = [
             "Repeat the recording with the same command and oil temperature: a worn seal shows again.",
             "Make sure that the bypass needle valve is shut. The pressures cannot tell it from the piston seal.",

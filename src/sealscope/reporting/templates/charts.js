@@ -73,6 +73,7 @@
         scales: {x: {time: false}, y: {range: (u, min, max) => min == null ? [0, 1] : uPlot.rangeNum(min, max, 0.06, true)}},
         axes: [Object.assign({size: 30, values: (u, list) => list.map((v) => v + " s")}, axis), Object.assign({size: 66, space: 22, values: (u, list) => list.map((v) => (v == null ? "" : (Math.abs(v) >= 1e5 ? v.toExponential().replace("e+", "e") : String(+v.toPrecision(6))).replace("-", "−")))}, axis)],
         series: [{label: "t", value: (u, v) => (v == null ? "–" : v.toFixed(2) + " s")}].concat(c.series.map(pen)),
+        bands: c.band ? [{series: [3, 2], fill: color("--fill-a")}] : [],
         legend: {markers: {width: 1, fill: (u, i) => u.series[i]._stroke || color("--" + c.series[i - 1].style)}},
         cursor: {sync: {key: "t", scales: ["x", null]}, drag: {x: true, y: false}},
         hooks: {draw: [(u) => marksOver(u, color)], setScale: [(u, key) => {if (key === "x" && u.status) link(u, u.scales.x.min, u.scales.x.max);}]},

@@ -1,0 +1,107 @@
+"""A recording as every detector sees it: each is run once, however many ask for its evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sealscope.diagnosis.contract import Detector, detectors
+from sealscope.diagnosis.fusion import Fused, Said, fuse
+from sealscope.diagnosis.trust import does_not_move
+from sealscope.diagnosis.verdict import Evidence
+from sealscope.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+
+@cache
+def assumed_rig() -> Rig:
+    """What detectors assume of a machine of which nothing was said: the thesis's rig."""
+    from sealscope.parameters import load_rig
+
+    return load_rig("thesis")
+
+
+class Examination:
+    """One recording without gaps and missing samples (`diagnose.analysable`), its leak-free `baseline`, and what the
+    detectors may assume of the machine.
+
+    `untrusted`: why the pressures cannot be trusted, None where they can; then no detector is run. A recording that is
+    to be its own baseline needs pressures that move throughout (`trust`).
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        baseline: Sequence[Recording] = (),
+        *,
+        false_alarm_probability: float,
+        rig: Rig | None = None,
+        untrusted: str | None = None,
+    ) -> None:
+        self.recording, self.baseline = recording, tuple(baseline)
+        self.untrusted = untrusted
+        if untrusted is None and not self.baseline:
+            self.untrusted = does_not_move(recording)
+        self.false_alarm_probability = false_alarm_probability
+        self._rig = rig
+        self._made: dict[str, Detector] = {}
+        self._known: dict[tuple[str, frozenset[str]], Said] = {}
+
+    def through(self, channels: Iterable[str]) -> Examination:
+        """The same recording with these of its channels alone; a detector that reads no other is not run again."""
+        wanted = set(channels)
+        seen = Examination(
+            self.recording.only(name for name in self.recording.channels if name in wanted),
+            [one.only(name for name in one.channels if name in wanted) for one in self.baseline],
+            false_alarm_probability=self.false_alarm_probability,
+            rig=self._rig,
+            untrusted=self.untrusted,
+        )
+        seen._made, seen._known = self._made, self._known
+        return seen
+
+    def _detector(self, name: str) -> Detector:
+        if name not in self._made:
+            self._made[name] = detectors()[name](assumed_rig() if self._rig is None else self._rig)
+        return self._made[name]
+
+    def said(self, name: str) -> Said:
+        """What that detector says; raises KeyError for one that is not registered."""
+        detector = self._detector(name)
+        # a detector may state the channels that it `reads` where there is no baseline: another view differs in no other
+        visible = frozenset(self.recording.channels)
+        reads = visible if self.baseline else frozenset(getattr(detector, "reads", visible))
+        key = (name, visible & reads)
+        if key not in self._known:
+            self._known[key] = self._examined(detector)
+        return self._known[key]
+
+    def evidence(self, name: str) -> Evidence:
+        """That detector's evidence, `cannot tell` where the recording lacks what it needs."""
+        return self.said(name).evidence
+
+    def fused(self) -> Fused:
+        """One verdict from all registered detectors."""
+        return fuse([self.said(name) for name in detectors()])
+
+    def _examined(self, detector: Detector) -> Said:
+        def not_usable(reason: str) -> Said:
+            return Said(detector.name, Evidence("cannot tell", reason), usable=False)
+
+        with np.errstate(all="ignore"):
+            unusable = detector.usable(self.recording)
+            if unusable is not None:
+                return not_usable(unusable)
+            if self.untrusted is not None:
+                return not_usable(self.untrusted)
+            reasons = [detector.usable(one) for one in self.baseline]
+            usable = [one for one, reason in zip(self.baseline, reasons, strict=True) if reason is None]
+            if self.baseline and not usable:
+                return not_usable(f"no baseline recording can be used: {reasons[0]}")
+            found = detector.examine(self.recording, usable, self.false_alarm_probability)
+        return Said(detector.name, found)

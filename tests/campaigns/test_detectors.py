@@ -1,0 +1,336 @@
+"""Campaigns judge detectors by what they state - verdict, onset, flow, cause - each through its channels, run once."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sealscope.campaigns import run as campaign
+from sealscope.campaigns.entries import check_entry, entry
+from sealscope.campaigns.judge import calibration_of, judge
+from sealscope.campaigns.plan import load_plan
+from sealscope.campaigns.results import simulated_result, write_result
+from sealscope.campaigns.statement import Statement, cause_of
+from sealscope.campaigns.store import read_rows
+from sealscope.campaigns.work import Row
+from sealscope.diagnosis import contract, plugins
+from sealscope.diagnosis.calibrated import diagnose_calibrated
+from sealscope.diagnosis.calibration import load
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.verdict import Evidence
+from sealscope.errors import InputError
+from sealscope.recordings import read
+from sealscope.reporting.campaign_page import campaign_text, render_campaign_page
+
+PLAN = """
+[campaign]
+name = "seen"
+duration = "40 s"
+onset = "20 s"
+rate = "500 Hz"
+false_alarm = 0.2
+seed = 3
+keep_recordings = true
+detectors = ["watcher", "watcher @ pressures", "watcher, calibrated @ pressures", "diagnose", "diagnose @ pressures",
+             "rms change, own threshold", "d3 of p_A changed"]
+
+[views]
+pressures = ["u", "p_A", "p_B"]
+
+[[records]]
+use = "calibrate"
+count = 6
+
+[[records]]
+count = 2
+
+[[records]]
+leak = "0.02 L/min"
+count = 3
+
+[[records]]
+fault = "friction +20 %"
+count = 2
+"""
+examined: list[tuple[str, ...]] = []
+
+
+class Watcher:
+    """Says of a record what its channels and the assumed rig are, as numbers."""
+
+    name = "watcher"
+
+    def __init__(self, rig) -> None:
+        self.rig = rig
+
+    def usable(self, recording):
+        return None
+
+    def examine(self, recording, baseline, p):
+        examined.append(tuple(recording.channels))
+        moved = float(recording["p_A"][len(recording) // 2 :].std() / recording["p_A"][: len(recording) // 2].std())
+        leak = "leak" if "x" in recording else "no leak"
+        return Evidence(
+            leak, f"at {p}", 2.0 + abs(math.log(moved)), 2.0, 21.0, (19.0, 23.0), self.rig.pump.q_b, (0.0, 1.0),
+            cause=None if "x" in recording else "friction change",
+        )  # fmt: skip
+
+
+@pytest.fixture
+def plan(tmp_path, monkeypatch):
+    monkeypatch.setattr(contract, "DETECTORS", {**contract.DETECTORS, "watcher": Watcher})
+    monkeypatch.setattr(plugins, "_found", lambda: ())
+    plugins.plug_ins.cache_clear()
+    entry.cache_clear()
+    examined.clear()
+    path = tmp_path / "seen.toml"
+    path.write_text(PLAN, encoding="utf-8")
+    return load_plan(path)
+
+
+@pytest.fixture
+def done(plan, tmp_path):
+    assert campaign.run(plan, tmp_path / "seen", jobs=1).failed == 0
+    return tmp_path / "seen"
+
+
+def test_every_detector_sees_its_channels_and_is_run_once(plan, done):
+    assert len(examined) == 2 * plan.size  # once for each set of channels, although three entries ask for one of them
+    assert examined.count(("u", "p_A", "p_B")) == plan.size
+    whole = next(one for one in examined if "x" in one)
+    assert {"theta", "omega", "p_1", "p_2"} <= set(whole)
+    assert not any("q_leak" in one for one in examined)
+
+
+def test_rows_keep_what_was_stated_and_come_back_from_disk(plan, done):
+    rows = read_rows(done)
+    row = next(iter(rows.values()))
+    assert set(row.scores) == set(plan.detectors)
+    assert set(row.statements) == {
+        "watcher", "watcher @ pressures", "diagnose", "diagnose @ pressures", "rms change"
+    }  # fmt: skip
+    said = row.statements["watcher"]
+    assert (said.verdict, said.threshold, said.onset_s, said.onset_interval_s) == ("leak", 2.0, 21.0, (19.0, 23.0))
+    assert (said.leak_lpm, said.leak_interval_lpm) == (plan.rig.pump.q_b, (0.0, 1.0))
+    assert row.statements["watcher @ pressures"].cause == "friction change"
+    assert row.scores["watcher @ pressures"] == (None, 21.0)  # another cause: the lowest of scores
+    assert Row.from_dict(json.loads(json.dumps(row.as_dict(), allow_nan=False))) == row
+    line = json.loads((done / "rows.jsonl").read_text().splitlines()[0])
+    del line["statements"]
+    assert Row.from_dict(line).statements == {}
+
+
+def test_the_fused_verdict_is_that_of_diagnose(plan, done):
+    for row in read_rows(done).values():
+        recording = read(done / "recordings" / f"{row.id}.nc")
+        seen = recording.only(name for name in recording.channels if name != "q_leak")
+        for key, one in (("diagnose", seen), ("diagnose @ pressures", seen.only(["u", "p_A", "p_B"]))):
+            found = diagnose(one, false_alarm_probability=plan.false_alarm, rig=plan.rig)
+            said = row.statements[key]
+            assert (said.verdict, said.cause, said.onset_s) == (found.verdict, found.cause, found.onset_s)
+            assert said.score == pytest.approx(found.score)
+            if said.rank is not None:
+                assert row.scores[key][0] == pytest.approx(found.score / found.threshold)
+
+
+def test_what_it_adds_up_to(plan, done):
+    result = simulated_result(plan, done)
+    table = {(one.detector, one.leak_lpm): one for one in result.judgement.table}
+    assert table["watcher", 0.02].detection.rate == table["watcher", 0.02].false_alarm.rate == 1.0
+    assert table["watcher @ pressures", 0.02].detection.count == 0
+    flows = {(one.detector, one.leak_lpm): one for one in result.judgement.estimates}
+    assert flows["watcher", 0.0].errors.bias.value == pytest.approx(plan.rig.pump.q_b)
+    assert flows["watcher", 0.02].errors.bias.value == pytest.approx(-0.02, rel=0.1)
+    assert flows["watcher", 0.02].errors.coverage.rate == 1.0
+    onsets = {(one.detector, one.leak_lpm): one.errors for one in result.judgement.onsets}
+    assert onsets["watcher", 0.02].median_size.value == 1.0
+    assert onsets["watcher", 0.02].coverage.count == 3
+    named = {one.detector: one.confusion for one in result.judgement.named}
+    assert named["watcher @ pressures"].recall("friction change").rate == 1.0
+    assert named["watcher"].recall("piston leak").rate == 1.0
+    assert named["watcher"].recall("friction change").rate == 0.0
+    assert "watcher, calibrated @ pressures" not in named
+    files = {path.name: path for path in write_result(result, done)}
+    assert {"estimates.csv", "causes.csv", "onsets.csv", "records.csv"} <= set(files)
+    with files["records.csv"].open(encoding="utf-8") as file:
+        (first, *_) = csv.DictReader(file)
+    assert first["watcher @ pressures: cause"] == "friction change"
+    page = render_campaign_page(result, list(files))
+    for heading in ("How much", "Since when", "Which cause is named"):
+        assert heading in page
+    assert "watcher @ pressures" in campaign_text(result)
+
+
+def test_a_calibration_of_a_view_is_used_through_it(plan, done, tmp_path):
+    """The watcher calls it friction when it sees pressures alone, so it has no score to calibrate; d3 has."""
+    text = PLAN.replace('"watcher, calibrated @ pressures"', '"rms change, calibrated @ pressures"')
+    (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
+    other = load_plan(tmp_path / "seen.toml")
+    campaign.run(other, done, jobs=1)
+    write_result(simulated_result(other, done), done)
+    known = load(done / "calibration.json")
+    assert known.views == {"pressures": ("u", "p_A", "p_B")}
+    recording = read(next(iter((done / "recordings").glob("*.nc"))))
+    found = diagnose_calibrated(recording, known)
+    assert found.methods[0].name == "rms change, calibrated @ pressures"
+    assert found.score is not None
+    assert found.threshold is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (('assume_set = { "pump.q_b" = 1e-7 }', ""), "rig that its detectors assume"),
+        (("", ('pressures = ["u", "p_A", "p_B"]', 'pressures = ["p_A", "p_B"]')), "channels that its detectors see"),
+        (("", ("false_alarm = 0.2", "false_alarm = 0.19")), "false-alarm rate"),
+    ],
+)
+def test_rows_of_other_assumptions_are_not_mixed_in(plan, done, tmp_path, change, told):
+    text = PLAN.replace("seed = 3", f"seed = 3\n{change[0]}")
+    if change[1]:
+        assert change[1][0] in text
+        text = text.replace(*change[1])
+    (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        campaign.run(load_plan(tmp_path / "seen.toml"), done, jobs=1)
+
+
+def test_rows_of_an_older_form_are_refused(plan, done):
+    head = json.loads((done / "campaign.json").read_text())
+    del head["format"]
+    (done / "campaign.json").write_text(json.dumps(head))
+    with pytest.raises(InputError, match="form of rows"):
+        campaign.run(plan, done, jobs=1)
+
+
+def test_detectors_may_assume_another_rig(plan, done, tmp_path):
+    text = PLAN.replace("seed = 3", 'seed = 3\nassume_set = { "pump.q_b" = 1e-7 }').replace("count = 6", "count = 4")
+    (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
+    other = load_plan(tmp_path / "seen.toml")
+    assert other.rig == plan.rig
+    assert other.assumed.pump.q_b == 1e-7
+    campaign.run(other, tmp_path / "other", jobs=1)
+    rows, before = read_rows(tmp_path / "other"), read_rows(done)
+    assert set(rows) < set(before)  # the records are the same
+    assert {row.statements["watcher"].leak_lpm for row in rows.values()} == {1e-7}
+    assert "differs from the rig" in render_campaign_page(simulated_result(other, tmp_path / "other"))
+
+
+def test_what_names_stand_for(plan):
+    assert entry("watcher, calibrated @ pressures").key == entry("watcher @ pressures").key == "watcher @ pressures"
+    assert entry("watcher").own
+    assert entry("watcher, own threshold").key == "watcher"
+    assert not entry("rms change").own  # the scorer of that name, as ever
+    assert entry("rms change").needs_calibration
+    assert entry("rms change, own threshold").own
+    assert not entry("sign rule: d3 of p_A fell").needs_calibration
+    for name, told in (
+        ("watchr", "did you mean 'watcher'"),
+        ("watchr, calibrated", "did you mean 'watcher, calibrated'"),
+        ("diagnose, calibrated", "cannot be calibrated"),
+        ("watcher @ nowhere", "must be one of"),
+    ):
+        with pytest.raises(InputError, match=told):
+            check_entry(name, plan.views)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ('pressures = ["u"', 'pressures = ["q_leak"', "must not hold q_leak"),
+        ('pressures = ["u"', 'pressures = ["v"', "must be channels such as"),
+        ('pressures = ["u", "p_A", "p_B"]', "pressures = []", "must be a list of channels"),
+        ("[views]", '[views]\n"a @ b" = ["u"]', "plain name"),
+        ("seed = 3", 'seed = 3\nassume = "nowhere"', "campaign.assume"),
+        ("seed = 3", "seed = 3\nassume_set = 3", "assume_set must be a table"),
+        ("seed = 3", 'seed = 3\nassume_set = { "V_9" = 1.0 }', "campaign.assume"),
+        ('"watcher",', '"watcher", 3,', "must be names"),
+    ],
+)
+def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, told):
+    assert before in PLAN
+    (tmp_path / "seen.toml").write_text(PLAN.replace(before, after, 1), encoding="utf-8")
+    with pytest.raises(InputError, match=told) as error:
+        load_plan(tmp_path / "seen.toml")
+    assert "seen.toml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
+    text = PLAN.replace("seed = 3", 'seed = 3\nchannels = ["p_A", "p_B"]').replace("count = 6", "count = 4")
+    (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
+    campaign.run(load_plan(tmp_path / "seen.toml"), tmp_path / "few", jobs=1)
+    assert set(examined) == {("p_A", "p_B"), ("u", "p_A", "p_B")}
+
+
+def row(number, verdict, leak=0.0, fault="", cause=None, use="judge", **stated):
+    said = Statement(verdict, 4.0 if verdict == "leak" else 1.0, 3.0, cause=cause, **stated)
+    scores = {"watcher": (said.rank, said.onset_s)}
+    return Row(f"{number:04x}", use, leak, fault, {}, number, leak, scores=scores, statements={"watcher": said})
+
+
+def test_flows_onsets_and_causes_by_hand():
+    rows = [
+        row(1, "leak", 1.0, onset_s=92.0, onset_interval_s=(91.0, 95.0), leak_lpm=1.5, leak_interval_lpm=(1.2, 2.0)),
+        row(2, "leak", 1.0, onset_s=84.0, onset_interval_s=(80.0, 91.0), leak_lpm=0.9, leak_interval_lpm=(0.8, 1.1)),
+        row(3, "no leak", 1.0, leak_lpm=0.3),
+        row(4, "cannot tell", 1.0),
+        row(5, "no leak", 0.0, leak_lpm=0.1, leak_interval_lpm=(-0.1, 0.3)),
+        row(6, "no leak", 0.0, cause="friction change"),
+        row(7, "no leak", fault="friction +20 %", cause="friction change"),
+        row(8, "leak", fault="friction +20 %"),
+        row(9, "cannot tell", fault="air 1 %"),
+        replace(row(10, "leak", fault="air 1 %"), error="it failed"),
+    ]
+    found = judge(rows, ["watcher"], calibration_of(rows, ["watcher"], rate=0.1), onset_s=90.0)
+    (onset,) = found.onsets
+    assert (onset.errors.n, onset.errors.median.value, onset.errors.median_size.value) == (2, -6.0, 2.0)
+    assert (onset.errors.coverage.count, onset.errors.coverage.n) == (1, 2)
+    free, leaky = found.estimates
+    assert (free.leak_lpm, free.errors.bias.value, free.errors.without, free.errors.coverage.rate) == (0.0, 0.1, 1, 1)
+    assert leaky.errors.bias.value == pytest.approx((0.5 - 0.1 - 0.7) / 3)
+    assert (leaky.errors.without, leaky.errors.coverage.count, leaky.errors.coverage.n) == (1, 1, 2)
+    assert (leaky.median.value, leaky.median_size.value) == pytest.approx((-0.1, 0.5))
+    (named,) = found.named
+    said = {
+        (true, name): int(named.confusion.counts[i][j])
+        for i, true in enumerate(named.confusion.rows)
+        for j, name in enumerate(named.confusion.columns)
+        if named.confusion.counts[i][j]
+    }
+    assert said == {
+        ("none", "none"): 1, ("none", "friction change"): 1,
+        ("piston leak", "piston leak"): 2, ("piston leak", "none"): 1, ("piston leak", "cannot tell"): 1,
+        ("friction change", "friction change"): 1, ("friction change", "piston leak"): 1,
+        ("air in the oil", "cannot tell"): 2,
+    }  # fmt: skip
+    assert found.calibration is None
+
+
+def test_every_fault_of_the_simulator_has_a_cause():
+    for words, cause in (
+        ("pump leak x3", "pump leak"),
+        ("rod seal A 0.01 L/min", "external leak"),
+        ("friction +20 %", "friction change"),
+        ("air 1 %", "air in the oil"),
+        ("sensor p_A gain 2 %", "sensor fault"),
+        ("duty amplitude x1.1", "changed duty"),
+    ):
+        assert cause_of(words) == cause
+
+
+def test_the_documented_plan_is_sound_where_the_example_is_installed(monkeypatch):
+    example = Path(__file__).resolve().parents[2] / "docs" / "examples" / "ringing-energy"
+    made = runpy.run_path(str(example / "ringing_energy.py"))["RingingEnergy"]
+    with pytest.raises(InputError, match="ringing energy"):
+        load_plan(example / "judge.toml")
+    monkeypatch.setattr(contract, "DETECTORS", {**contract.DETECTORS, "ringing energy": made})
+    plan = load_plan(example / "judge.toml")
+    assert [name for name in plan.detectors if entry(name).needs_calibration] == ["ringing energy, calibrated"]
+    assert plan.views == {"pressures": ("u", "p_A", "p_B")}

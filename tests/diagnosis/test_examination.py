@@ -1,0 +1,125 @@
+"""Each detector looks once, through the channels it was given, and only where it can."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis import contract
+from sealscope.diagnosis.examination import Examination, assumed_rig
+from sealscope.diagnosis.scorers import Look, scorer
+from sealscope.diagnosis.trust import does_not_move
+from sealscope.diagnosis.verdict import Evidence
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Recording
+
+seen: list[tuple[tuple[str, ...], int]] = []
+
+
+class Looker:
+    """Notes what it was given; divides by zero, as detectors on strange data do."""
+
+    name = "looker"
+
+    def __init__(self, rig: object) -> None:
+        self.rig = rig
+
+    def usable(self, recording: Recording) -> str | None:
+        return None if "p_A" in recording else "needs p_A"
+
+    def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
+        seen.append((tuple(recording.channels), len(list(baseline))))  # type: ignore[call-overload]
+        assert np.isinf(np.array([1.0]) / 0.0).all()
+        return Evidence("no leak", "looked", probability, 1.0)
+
+
+class Reader(Looker):
+    """Reads pressures alone."""
+
+    name = "reader"
+    reads = ("p_A", "p_B")
+
+
+@pytest.fixture
+def recording(monkeypatch: pytest.MonkeyPatch) -> Recording:
+    monkeypatch.setattr(contract, "DETECTORS", {"looker": Looker, "reader": Reader})
+    seen.clear()
+    channels = {name: np.sin(np.arange(100.0)) for name in ("u", "x", "p_A", "p_B", "q_leak")}
+    return Recording(np.arange(100.0), channels, dict.fromkeys(channels, "count"), 1.0)
+
+
+def test_once_and_again_only_where_it_reads_something_else(recording: Recording) -> None:
+    whole = Examination(recording, false_alarm_probability=0.05)
+    for _ in range(3):
+        assert whole.evidence("looker").score == 0.05
+    assert len(seen) == 1
+    few = whole.through(["u", "p_A", "p_B", "omega"])
+    assert few.evidence("looker") == few.evidence("looker")
+    assert [channels for channels, _ in seen] == [("u", "x", "p_A", "p_B", "q_leak"), ("u", "p_A", "p_B")]
+    seen.clear()
+    whole.evidence("reader")
+    few.evidence("reader")
+    assert len(seen) == 1
+    few.through(["p_A"]).evidence("reader")
+    assert [channels for channels, _ in seen][1:] == [("p_A",)]
+
+
+def test_with_a_baseline_every_view_is_another(recording: Recording) -> None:
+    whole = Examination(recording, [recording, recording.only(["u"])], false_alarm_probability=0.05)
+    whole.evidence("reader")
+    whole.through(["u", "p_A", "p_B"]).evidence("reader")
+    assert seen == [(("u", "x", "p_A", "p_B", "q_leak"), 1), (("u", "p_A", "p_B"), 1)]
+
+
+def test_who_cannot_look_does_not(recording: Recording) -> None:
+    def said(examination: Examination) -> tuple[str, bool]:
+        found = examination.said("looker")
+        return found.evidence.reason, found.usable
+
+    assert said(Examination(recording.only(["u"]), false_alarm_probability=0.05)) == ("needs p_A", False)
+    assert said(Examination(recording, false_alarm_probability=0.05, untrusted="stuck")) == ("stuck", False)
+    alone = Examination(recording, [recording.only(["u"])], false_alarm_probability=0.05)
+    assert said(alone) == ("no baseline recording can be used: needs p_A", False)
+    assert seen == []
+
+
+def test_a_pressure_that_rests_cannot_be_its_own_baseline() -> None:
+    random = np.random.default_rng(1)
+    noise = {name: random.standard_normal(20000) for name in ("p_A", "p_B")}
+    t = np.arange(20000) / 500.0
+
+    def found(**changed: np.ndarray) -> str | None:
+        channels = {**noise, **changed}
+        return does_not_move(Recording(t, channels, dict.fromkeys(channels, "Pa"), 500.0))
+
+    def holding(samples: int, value: float = 0.3) -> np.ndarray:
+        held = np.array(noise["p_B"])
+        held[5000 : 5000 + samples] = value
+        return held
+
+    assert found() is None
+    assert found(x=np.zeros(20000)) is None
+    assert found(p_B=holding(750)) is None
+    assert found(p_B=holding(752)) == "the pressures cannot be trusted: p_B does not move from 10 s to 11.5 s"
+    assert found(p_B=holding(15000)) == "the pressures cannot be trusted: p_B does not move from 10 s to 40 s"
+    assert "straight line" in str(found(p_A=3.0 * t - 5.0))
+    assert found(p_A=np.rint(2.0 * noise["p_A"])) is None  # whole numbers of a converter
+    with_rest = Recording(t, {**noise, "p_B": holding(1000)}, {"p_A": "Pa", "p_B": "Pa"}, 500.0)
+    plain = Recording(t, noise, {"p_A": "Pa", "p_B": "Pa"}, 500.0)
+    assert Examination(with_rest, false_alarm_probability=0.05).untrusted is not None
+    assert Examination(with_rest, [plain], false_alarm_probability=0.05).untrusted is None
+
+
+def test_it_is_made_for_the_rig_given_or_the_thesis_s(recording: Recording) -> None:
+    other = assumed_rig().with_values({"q_b": 1e-6})
+    for rig, expected in ((other, other), (None, assumed_rig())):
+        examination = Examination(recording, false_alarm_probability=0.05, rig=rig)
+        assert examination._detector("looker").rig == expected  # type: ignore[attr-defined]
+
+
+def test_a_detector_s_score_may_be_calibrated(recording: Recording) -> None:
+    look = Look(recording, false_alarm_probability=0.05)
+    assert scorer("looker, calibrated").score(look).value == 0.05
+    assert len(seen) == 1
+    with pytest.raises(InputError, match="did you mean 'looker, calibrated'"):
+        scorer("looker, calibratd")

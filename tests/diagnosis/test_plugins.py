@@ -1,0 +1,153 @@
+"""A detector of one's own: found by entry point, judged by the same contract, and harmless where it is broken."""
+
+from __future__ import annotations
+
+import logging
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from sealscope.diagnosis import plugins
+from sealscope.diagnosis.contract import DETECTORS, detectors
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.recordings.recording import Recording
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "ringing-energy"
+GOOD = """
+from sealscope.diagnosis.verdict import Evidence
+class Good:
+    name = "good"
+    def __init__(self, rig): self.rig = rig.name
+    def usable(self, recording): return None
+    def examine(self, recording, baseline, p): return Evidence("no leak", f"assumed {self.rig}", 0.0, 1.0)
+"""
+Install = Callable[..., None]
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Install a distribution of that name with its source and entry points, as pip would leave it."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def made(distribution: str, source: str, points: dict[str, str]) -> None:
+        (tmp_path / f"{distribution}.py").write_text(source, encoding="utf-8")
+        info = tmp_path / f"{distribution}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n", encoding="utf-8")
+        lines = [f"[{plugins.GROUP}]", *(f"{name} = {value}" for name, value in points.items())]
+        (info / "entry_points.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        forget()
+
+    def forget() -> None:
+        plugins.plug_ins.cache_clear()
+        plugins._told.cache_clear()
+
+    before = set(sys.modules)
+    yield made
+    forget()
+    for name in set(sys.modules) - before:
+        if getattr(sys.modules[name], "__file__", None) and str(tmp_path) in str(sys.modules[name].__file__):
+            del sys.modules[name]
+
+
+def told(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [one.getMessage() for one in caplog.records if one.name == "sealscope"]
+
+
+def test_the_documented_example_is_found_and_heard(install: Install, leaky: Recording) -> None:
+    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))
+    points = project["project"]["entry-points"][plugins.GROUP]
+    assert points == {"ringing energy": "ringing_energy:RingingEnergy"}
+    install("ringing_energy", (EXAMPLE / "ringing_energy.py").read_text(encoding="utf-8"), points)
+    assert list(detectors()) == [*DETECTORS, "ringing energy"]
+    found = {one.name: one for one in diagnose(leaky).methods}
+    own = found["ringing energy"]
+    assert own.verdict == "leak"
+    assert own.score is not None
+    assert own.threshold is not None
+    assert own.score > own.threshold
+    assert {"ringing of p_A", "ringing of p_B"} <= set(found)
+
+
+def test_it_is_made_for_the_rig_that_is_assumed(install: Install, sound: Recording) -> None:
+    from sealscope.parameters import load_rig
+
+    install("fine", GOOD, {"good": "fine:Good"})
+    for name in ("thesis", "thesis-calibrated"):
+        rig = load_rig(name)
+        methods = {one.name: one for one in diagnose(sound, rig=rig).methods}
+        assert methods["good"].reason == f"assumed {rig.name}"
+
+
+BROKEN = {
+    "no such module": ("", {"bad": "nowhere_at_all:Bad"}, "ModuleNotFoundError"),
+    "no such class": ("x = 1", {"bad": "broken:Bad"}, "AttributeError"),
+    "source with an error": ("def f(:", {"bad": "broken:f"}, "SyntaxError"),
+    "no callable": ("Bad = 3", {"bad": "broken:Bad"}, "must be callable with a rig"),
+    "a built-in's name": (GOOD, {"rms change": "broken:Good"}, "taken by Sealscope"),
+    "a reserved word": (GOOD, {"diagnose": "broken:Good"}, "taken by Sealscope"),
+    "cannot be made": ("def Bad(rig): raise OSError('no licence')", {"bad": "broken:Bad"}, "no licence"),
+    "another name": (GOOD, {"bad": "broken:Good"}, "must be that of its entry point, 'bad', got 'good'"),
+    "examines badly": (
+        GOOD.replace('return Evidence("no leak"', 'raise ZeroDivisionError("so\\nit is"); return Evidence("no leak"'),
+        {"good": "broken:Good"},
+        "so it is",
+    ),
+    "no evidence": (
+        re.sub(r"return Evidence\(.*", 'return "no leak"', GOOD),
+        {"good": "broken:Good"},
+        "must give Evidence, got str",
+    ),
+    "a verdict of its own": (GOOD.replace('"no leak"', '"perhaps"'), {"good": "broken:Good"}, "got 'perhaps'"),
+    "a verdict without a score": (GOOD.replace(", 0.0, 1.0", ""), {"good": "broken:Good"}, "score and threshold"),
+    "usable that fails": (GOOD.replace("return None", "return 1 / 0"), {"good": "broken:Good"}, "ZeroDivisionError"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_one_costs_one_line_that_names_the_distribution(
+    case: str, install: Install, sound: Recording, caplog: pytest.LogCaptureFixture
+) -> None:
+    source, points, words = BROKEN[case]
+    expected = diagnose(sound)
+    install("broken", source, points)
+    with caplog.at_level(logging.WARNING, "sealscope"):
+        found = [diagnose(sound), diagnose(sound)]
+    (line,) = told(caplog)  # once, however often it fails
+    assert "\n" not in line
+    assert "of broken is left out" in line
+    assert words in line
+    for one in found:
+        assert (one.verdict, one.score, one.reason) == (expected.verdict, expected.score, expected.reason)
+
+
+def test_two_of_one_name(install: Install, sound: Recording, caplog: pytest.LogCaptureFixture) -> None:
+    install("first", GOOD, {"good": "first:Good"})
+    install("second", GOOD, {"good": "second:Good"})
+    with caplog.at_level(logging.WARNING, "sealscope"):
+        assert list(detectors()) == [*DETECTORS, "good"]
+    (line,) = told(caplog)
+    assert line == "detector 'good' of second is left out: ValueError: its name is that of a detector of first"
+
+
+def test_another_source_is_another_fingerprint(install: Install) -> None:
+    install("first", GOOD, {"good": "first:Good"})
+    install("second", GOOD + "\n# changed\n", {"fine": "second:Good"})
+    prints = [one.fingerprint for one in plugins.plug_ins(frozenset())]
+    assert len(set(prints)) == 2
+    assert "unknown" not in prints
+
+
+def test_the_guide_shows_the_example_as_it_stands() -> None:
+    guide = (EXAMPLE.parents[1] / "detectors.md").read_text(encoding="utf-8")
+    source = (EXAMPLE / "ringing_energy.py").read_text(encoding="utf-8")
+    assert source[source.index("class RingingEnergy") :].rstrip() in guide
+    project = (EXAMPLE / "pyproject.toml").read_text(encoding="utf-8")
+    assert all(line in project for line in guide.split("```toml\n")[1].split("```")[0].splitlines())
+    plan = (EXAMPLE / "judge.toml").read_text(encoding="utf-8")
+    for line in guide.split("```toml\n")[2].split("```")[0].splitlines():
+        assert line in plan
