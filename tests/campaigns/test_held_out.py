@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from sealscope.campaigns.held_out import Samples, fit_logistic, held_out_scores
-from sealscope.campaigns.held_out_plan import Logistic
+from sealscope.campaigns.held_out import Samples, chosen_candidates, fit_logistic, fold_log_odds, held_out_scores
+from sealscope.campaigns.held_out_checks import checks_of, clustered_area, swapped_areas
+from sealscope.campaigns.held_out_plan import Chosen, HeldOutPlan, Logistic
 from sealscope.campaigns.plan import load_plan
 from sealscope.cli import campaign as words
 from sealscope.errors import InputError
+from sealscope.evaluation.auc import auc
 
 
 def cloud(seed, n=200, f=3):
@@ -90,6 +92,108 @@ def test_an_unknown_feature_is_named():
         held_out_scores(samples, Logistic("x", ("b",), 1.0), "test")
 
 
+@pytest.mark.parametrize("ridge", [0.01, 1.0])
+def test_all_folds_at_once_are_the_fits_one_by_one(ridge):
+    x, y = cloud(5)
+    folds = np.random.default_rng(1).random((6, len(x))) < 0.7
+    together = fold_log_odds(x, y, folds, ridge)
+    alone = np.stack([fit_logistic(x[fold], y[fold], ridge).log_odds(x) for fold in folds])
+    assert together == pytest.approx(alone, abs=1e-7)
+    apart = x[:, :1] * 1e3 + 1e4 * y[:, None]  # separable: whole steps alone may not reach it
+    assert fold_log_odds(apart, y, folds, ridge) == pytest.approx(
+        np.stack([fit_logistic(apart[fold], y[fold], ridge).log_odds(apart) for fold in folds]), abs=1e-6
+    )
+    with pytest.raises(InputError, match="larger ridge"):
+        fold_log_odds(apart, y, folds, 0.0)
+    with pytest.raises(InputError, match="both classes"):
+        fold_log_odds(x, y, np.stack([y, ~y]), ridge)
+
+
+def paired(seed, tests=24, effect=1.5):
+    """Tests of two halves, the second with a leak: `good` moves with it, `self` tells the test, `noise` nothing."""
+    random = np.random.default_rng(seed)
+    number = np.repeat(np.arange(tests), 2)
+    leaks = np.tile([0.0, 0.005], tests)
+    own = random.normal(size=tests)[number]
+    features = {
+        "good": random.normal(size=2 * tests) + effect * (leaks > 0),
+        "self": own,
+        "noise": random.normal(size=2 * tests),
+    }
+    return Samples(features, leaks, list(number), [{"condition": int(k % 6)} for k in number])
+
+
+CHOSEN = Chosen("chosen", (("good",), ("self",), ("noise",)), (0.1, 1.0))
+
+
+def test_what_is_held_out_takes_no_part_in_the_choice():
+    """The first test's own values do not change what its fold chooses, nor its other sample's score."""
+    samples = paired(1)
+    picks = chosen_candidates(samples, CHOSEN, "test")
+    assert len(picks) == 24
+    assert all("good" in pick.features for pick in picks)
+    scores = held_out_scores(samples, CHOSEN, "test")
+    wild = {name: values + 1e3 * (np.arange(48) == 0) for name, values in samples.features.items()}
+    other = Samples(wild, samples.leak_lpm, samples.tests, samples.levels)
+    assert chosen_candidates(other, CHOSEN, "test")[0] == picks[0]
+    assert held_out_scores(other, CHOSEN, "test")[1] == pytest.approx(scores[1], abs=1e-12)
+    assert {one.ridge for one in CHOSEN.candidates()} == {0.1, 1.0}
+    assert len(CHOSEN.candidates()) == 14
+
+
+def test_choosing_from_noise_alone_finds_nothing():
+    """Choosing the best of many on the scores themselves would find something; choosing within the training samples
+    does not, on average over data without a leak's effect."""
+    areas = []
+    for seed in range(30):
+        samples = paired(seed, effect=0.0)
+        scores = held_out_scores(samples, CHOSEN, "condition")
+        leaks = samples.leak_lpm > 0
+        areas.append(auc(scores[~leaks], scores[leaks]).value)
+    assert np.mean(areas) < 0.5 + 3.0 * np.std(areas) / np.sqrt(len(areas))
+
+
+def test_swapped_labels_show_what_chance_reaches():
+    samples, detector = paired(2), Logistic("good", ("good", "self"), 1.0)
+    swapped = swapped_areas(samples, detector, "test", 60, seed=5)
+    assert np.array_equal(swapped, swapped_areas(samples, detector, "test", 60, seed=5))
+    assert 0.3 < np.mean(swapped) < 0.55  # held out, what is not there is found less often than by guessing
+    plan = HeldOutPlan("x", "x", "appendix-c", "test", (detector, CHOSEN), 0.95, permutations=60, seed=5)
+    first, second = checks_of(plan, samples)
+    assert (first.reached, first.swaps) == (0, 60)
+    assert first.chance == pytest.approx(np.quantile(swapped, 0.95))
+    assert first.tests[0] > 0.75
+    assert sum(times for _, times in second.picks) == 24
+    assert "0 reach" in first.words()
+    assert "good" in second.words()
+    useless = checks_of(HeldOutPlan("x", "x", "appendix-c", "test", (Logistic("n", ("noise",), 1.0),), 0.95,
+                                    permutations=60), paired(3))  # fmt: skip
+    assert useless[0].reached > 1
+    assert checks_of(HeldOutPlan("x", "x", "appendix-c", "test", (detector,), 0.95), samples) == []
+
+
+def test_the_interval_of_clustered_samples():
+    """Clusters of one sample: DeLong's. Every sample twice: the same as once each, which DeLong does not see. Coverage
+    over many draws with dependent halves."""
+    random = np.random.default_rng(6)
+    scores, leaks = random.normal(size=80), np.tile([False, True], 40)
+    scores += leaks
+    alone = clustered_area(scores, leaks, np.arange(80))
+    plain = auc(scores[~leaks], scores[leaks])
+    assert alone[0] == plain.value
+    assert alone[1:] == pytest.approx((plain.low, plain.high), abs=0.004)
+    twice = clustered_area(np.tile(scores, 2), np.tile(leaks, 2), np.tile(np.arange(80), 2))
+    assert twice == pytest.approx(alone, abs=1e-12)
+
+    truth, held = 0.7602, 0  # Phi(1/sqrt 2): halves of unit variance, 1 apart
+    for _ in range(400):
+        shared = random.normal(size=40)[:, None] * np.sqrt(0.6)
+        halves = (shared + random.normal(size=(40, 2)) * np.sqrt(0.4) + [0.0, 1.0]).ravel()
+        _, low, high = clustered_area(halves, leaks, np.repeat(np.arange(40), 2))
+        held += low <= truth <= high
+    assert 0.91 <= held / 400 <= 0.98
+
+
 def test_appendix_c_with_whole_tests_held_out(sheet_folder, tmp_path, monkeypatch, capsys):
     """The plain logistic baseline without a baseline of the test's own: AUC 0.955, accuracy 0.87, true positives 0.83,
     false positives 0.10."""
@@ -103,7 +207,20 @@ def test_appendix_c_with_whole_tests_held_out(sheet_folder, tmp_path, monkeypatc
     assert float(rates[name]["detected: rate"]) == pytest.approx(34 / 41)
     assert float(rates[name]["false alarms: rate"]) == pytest.approx(4 / 41)
     assert {"always fire", "never fire"} <= set(rates)
-    assert "0.955" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "0.955" in told
+    assert "chosen: d2 d3 d4" in told
+    better = ("logistic on d2, d3, d4 of both chambers", "logistic, details and ridge chosen in the training tests")
+    for other in better:
+        assert float(areas[other]["low"]) > 0.955  # the whole interval lies over the plain baseline's figure
+    with (tmp_path / "held_out.csv").open(encoding="utf-8") as file:
+        checks = {row["detector"]: row for row in csv.DictReader(file)}
+    for other in better:
+        assert float(checks[other]["conditions: low"]) > 0.955
+    assert checks["logistic on d2, d3, d4 of both chambers"]["swaps that reach the true labels' AUC"] == "0"
+    noise = checks["logistic on d1 of both chambers"]
+    assert float(noise["tests: low"]) < 0.5 < float(noise["tests: high"])
+    assert int(noise["swaps that reach the true labels' AUC"]) > 10
     assert (tmp_path / "report.html").read_text(encoding="utf-8").count("<figure>") >= 3
 
 
@@ -122,6 +239,11 @@ def test_without_the_sheet_it_says_what_it_needs(tmp_path, monkeypatch):
         ('leave_out = "half"', "leave_out must be one of test, condition"),
         ("ridge = -1.0", "ridge must be >= 0, got -1"),
         ('features = "d3"', "features must be a list of names"),
+        ("permutations = -1", "permutations must be"),
+        ("choose = []", "choose must be a list of lists of names"),
+        ('choose = ["d3"]', "choose must be a list of lists of names"),
+        ('choose = [["d3"]]\nridges = [0.0]', "ridges must be a list of numbers > 0"),
+        (f"choose = {[['d3']] * 9}\nridges = [1.0]", "choose must have at most 8 groups, got 9"),
         ('colour = "red"', "colour is not known"),
     ],
 )
@@ -134,8 +256,11 @@ def test_a_wrong_plan_is_one_line(tmp_path, entry, told):
     }
     key = entry.split(" ")[0]
     lines[key] = entry
-    table = [line for name, line in lines.items() if name in ("data", "leave_out")]
-    detector = ['name = "x"', *(line for name, line in lines.items() if name not in ("data", "leave_out"))]
+    if key == "choose":
+        del lines["features"], lines["ridge"]
+    plan = ("data", "leave_out", "permutations")
+    table = [line for name, line in lines.items() if name in plan]
+    detector = ['name = "x"', *(line for name, line in lines.items() if name not in plan)]
     text = "\n".join(['[campaign]\nname = "mine"\n[held_out]', *table, "[[held_out.detectors]]", *detector])
     path = tmp_path / "mine.toml"
     path.write_text(text, encoding="utf-8")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sealscope.campaigns.held_out_plan import HeldOutPlan, Logistic
+from sealscope.campaigns.held_out_plan import Chosen, Classifier, HeldOutPlan, Logistic
 from sealscope.campaigns.work import Row
 from sealscope.errors import InputError
 
@@ -17,6 +17,10 @@ Array = npt.NDArray[np.float64]
 _MOST_STEPS = 100
 _SMALL = 1e-15
 _LEAST_SHARE = 1e-8
+#: Newton steps of whole length before a fit is done with shorter ones.
+_PLAIN_STEPS = 15
+#: Parts of the training samples in which features and ridge are chosen.
+_INNER = 5
 
 
 @dataclass(frozen=True)
@@ -95,22 +99,103 @@ def fit_logistic(x: Array, leaks: npt.NDArray[np.bool_], ridge: float) -> Logist
     raise InputError(f"a classifier must reach a maximum, got none with ridge {ridge:g}; give a larger ridge")
 
 
-def held_out_scores(samples: Samples, detector: Logistic, leave_out: str) -> Array:
-    """Log odds of each sample from a fit that saw no sample of its test (`test`) or of its condition (`condition`),
-    (n,)."""
-    x, leaks = samples.matrix(detector.features), samples.leak_lpm > 0
+def fold_log_odds(x: Array, leaks: npt.NDArray[np.bool_], folds: npt.NDArray[np.bool_], ridge: float) -> Array:
+    """Log odds of all samples from one fit for each fold, fitted to the samples of its mask alone, (k, n).
+
+    `x` (n, f), `folds` (k, n). The same fits as `fit_logistic`'s, all folds in one Newton iteration; folds that plain
+    steps do not bring to the maximum are fitted by it one by one, and it raises what it raises.
+    """
+    from scipy.special import expit
+
+    found = np.empty(folds.shape)
+    single = np.ones(len(folds), dtype=bool)
+    weight = folds.astype(np.float64)
+    count = weight.sum(axis=1)
+    centre = weight @ x / np.maximum(count, 1.0)[:, None]
+    off = x[None] - centre[:, None, :]
+    scale = np.sqrt(np.einsum("kn,knf->kf", weight, off**2) / np.maximum(count, 1.0)[:, None])
+    both = np.any(folds & leaks, axis=1) & np.any(folds & ~leaks, axis=1)
+    if ridge > 0 and np.all(scale > 0) and np.all(both):
+        design = np.concatenate([np.ones((*folds.shape, 1)), off / scale[:, None, :]], axis=2)
+        penalty = np.concatenate([[0.0], np.full(x.shape[1], ridge)])
+        beta = np.zeros((len(folds), design.shape[2]))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(_PLAIN_STEPS):
+                p = expit(np.einsum("knf,kf->kn", design, beta))
+                slope = np.einsum("kn,knf->kf", weight * (p - leaks), design) + penalty * beta
+                inner = (design * (weight * p * (1.0 - p))[:, :, None]).transpose(0, 2, 1) @ design + np.diag(penalty)
+                step = np.linalg.solve(inner, slope[:, :, None])[:, :, 0]
+                beta[single] -= step[single]  # a fold that is done waits: no other changes its last bits
+                single &= ~(np.abs(np.sum(slope * step, axis=1)) <= _SMALL)
+                if not single.any() or not np.all(np.isfinite(beta)):
+                    break
+        found = np.einsum("knf,kf->kn", design, beta)
+    for k in np.flatnonzero(single):
+        found[k] = fit_logistic(x[folds[k]], leaks[folds[k]], ridge).log_odds(x)
+    return found
+
+
+def places_of(samples: Samples, leave_out: str) -> npt.NDArray[np.intp]:
+    """Number of the test (`test`) or operating condition (`condition`) of each sample, from 0 on, (n,)."""
     groups: list[Hashable] = (
         list(samples.tests) if leave_out == "test" else [tuple(sorted(one.items())) for one in samples.levels]
     )
     places = {group: number for number, group in enumerate(dict.fromkeys(groups))}
-    of = np.array([places[group] for group in groups])
-    if len(places) < 2:
-        raise InputError(f"tests to leave out in turn must be at least 2, got {len(places)}")
-    found = np.empty(leaks.size)
-    for number in range(len(places)):
-        out = of == number
-        found[out] = fit_logistic(x[~out], leaks[~out], detector.ridge).log_odds(x[out])
-    return found
+    return np.array([places[group] for group in groups])
+
+
+def held_out_scores(
+    samples: Samples, detector: Classifier, leave_out: str, leaks: npt.NDArray[np.bool_] | None = None
+) -> Array:
+    """Log odds of each sample from a fit that saw no sample of its test (`test`) or of its condition (`condition`),
+    (n,); `leaks` (n,): other labels than the samples' own."""
+    leaks = samples.leak_lpm > 0 if leaks is None else leaks
+    of = places_of(samples, leave_out)
+    if of.max() < 1:
+        raise InputError(f"tests to leave out in turn must be at least 2, got {of.max() + 1}")
+    folds = of[None, :] != np.arange(of.max() + 1)[:, None]
+    if isinstance(detector, Logistic):
+        found = fold_log_odds(samples.matrix(detector.features), leaks, folds, detector.ridge)
+    else:
+        candidates = detector.candidates()
+        best = _choices(samples, detector, of, leaks, folds)
+        found = np.empty(folds.shape)
+        for number in dict.fromkeys(best):
+            mine, one = best == number, candidates[number]
+            found[mine] = fold_log_odds(samples.matrix(one.features), leaks, folds[mine], one.ridge)
+    return np.asarray(found[of, np.arange(of.size)])
+
+
+def chosen_candidates(samples: Samples, detector: Chosen, leave_out: str) -> list[Logistic]:
+    """What the training samples of each fold chose, one for each test or condition held out."""
+    of = places_of(samples, leave_out)
+    folds = of[None, :] != np.arange(of.max() + 1)[:, None]
+    candidates = detector.candidates()
+    return [candidates[number] for number in _choices(samples, detector, of, samples.leak_lpm > 0, folds)]
+
+
+def _choices(
+    samples: Samples,
+    detector: Chosen,
+    of: npt.NDArray[np.intp],
+    leaks: npt.NDArray[np.bool_],
+    folds: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.intp]:
+    """Number of the candidate that loses least within each fold's training samples, (k,).
+
+    The loss is the mean of -ln P(label) over `_INNER` parts of the places (tests or conditions) that the fold trains
+    on, each held out once; what the fold leaves out takes no part.
+    """
+    inner = of % _INNER
+    parts = [part for part in range(_INNER) if np.any(inner == part)]
+    masks = np.stack([fold & (inner != part) for fold in folds for part in parts])
+    judged = np.stack([fold & (inner == part) for fold in folds for part in parts])
+    sign = np.where(leaks, 1.0, -1.0)
+    losses = []
+    for one in detector.candidates():
+        odds = fold_log_odds(samples.matrix(one.features), leaks, masks, one.ridge)
+        losses.append((np.logaddexp(0.0, -sign * odds) * judged).reshape(len(folds), -1).sum(axis=1))
+    return np.asarray(np.argmin(np.array(losses), axis=0))
 
 
 def held_out_rows(plan: HeldOutPlan, samples: Samples) -> list[Row]:

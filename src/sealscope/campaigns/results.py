@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sealscope.campaigns import store
 from sealscope.campaigns.held_out import Samples, held_out_rows
+from sealscope.campaigns.held_out_checks import HeldOutCheck, check_sheet, checks_of
 from sealscope.campaigns.held_out_plan import HeldOutPlan
 from sealscope.campaigns.judge import Judgement, calibration_of, judge
 from sealscope.campaigns.plan import AnyPlan, Plan
@@ -23,12 +24,14 @@ CALIBRATION = "calibration.json"
 
 @dataclass(frozen=True)
 class Result:
-    """A campaign and what it shows; `missing`: records of the plan that have no row yet."""
+    """A campaign and what it shows; `missing`: records of the plan that have no row yet; `checks`: of classifiers that
+    were held out."""
 
     plan: AnyPlan
     rows: tuple[Row, ...]
     missing: int
     judgement: Judgement
+    checks: tuple[HeldOutCheck, ...] = ()
 
 
 def simulated_result(plan: Plan, folder: Path) -> Result:
@@ -62,7 +65,7 @@ def held_out_result(plan: HeldOutPlan, samples: Samples) -> Result:
     rows = held_out_rows(plan, samples)
     names = [one.name for one in plan.detectors]
     judgement = judge(rows, names, None, thresholds=dict.fromkeys(names, 0.0), confidence=plan.confidence)
-    return Result(plan, tuple(rows), 0, judgement)
+    return Result(plan, tuple(rows), 0, judgement, tuple(checks_of(plan, samples)))
 
 
 def recorded_result(plan: RecordedPlan, folder: Path, progress: Progress | None = None) -> Result:
@@ -96,6 +99,7 @@ def write_result(result: Result, folder: Path) -> list[Path]:
         [
             *sheets(result.judgement, result.plan.unit),
             rows_sheet(result.rows, detectors_of(result.plan), result.plan.unit),
+            check_sheet(result.checks),
         ],
     )
     if result.judgement.calibration is not None:

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import cache
+from dataclasses import replace
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.contract import Detector, detectors
-from sealscope.diagnosis.fusion import Fused, Said, fuse
+from sealscope.diagnosis.fusion import ORDER, Fused, Said, fuse
 from sealscope.diagnosis.trust import does_not_move
 from sealscope.diagnosis.verdict import Evidence
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
+    from sealscope.diagnosis.isolation import Signatures
     from sealscope.parameters import Rig
+
+#: Detectors that name a cause by the pressures: they say it of nothing that another cause explains, alone either.
+_ISOLATED = ("pressure model", "observer")
 
 
 @cache
@@ -86,8 +91,39 @@ class Examination:
         return self.said(name).evidence
 
     def fused(self) -> Fused:
-        """One verdict from all registered detectors."""
-        return fuse([self.said(name) for name in detectors()])
+        """One verdict from all registered detectors; what sees a change in the pressures and cannot name its cause is
+        believed where nothing else stepped with it (`isolation`)."""
+        said = [self.said(name) for name in detectors()]
+        found = fuse([one if one.name == ORDER[0] else replace(one, evidence=self._isolated(one)) for one in said])
+        return self._named(found)
+
+    def _named(self, found: Fused) -> Fused:
+        """A verdict other than `leak` that names no cause, with that of a step which no detector asked about."""
+        from sealscope.diagnosis.isolation import unasked
+
+        own = found.evidence
+        if own.verdict == "leak" or own.cause is not None or self.untrusted is not None or self._signatures is None:
+            return found
+        with np.errstate(all="ignore"):
+            stepped = unasked(self._signatures)
+        if stepped is None:
+            return found
+        words = f"{own.reason}; near {stepped[0]:.0f} s {stepped[1].words}: {stepped[1].cause}"
+        return replace(found, evidence=replace(own, cause=stepped[1].cause, reason=words))
+
+    def _isolated(self, said: Said) -> Evidence:
+        from sealscope.diagnosis.isolation import isolated
+
+        if said.evidence.verdict != "leak" or self._signatures is None:
+            return said.evidence
+        return isolated(said.evidence, self._signatures)
+
+    @cached_property
+    def _signatures(self) -> Signatures | None:
+        from sealscope.diagnosis.isolation import signatures
+
+        with np.errstate(all="ignore"):
+            return signatures(self.recording)
 
     def _examined(self, detector: Detector) -> Said:
         def not_usable(reason: str) -> Said:
@@ -104,4 +140,5 @@ class Examination:
             if self.baseline and not usable:
                 return not_usable(f"no baseline recording can be used: {reasons[0]}")
             found = detector.examine(self.recording, usable, self.false_alarm_probability)
-        return Said(detector.name, found)
+        said = Said(detector.name, found)
+        return replace(said, evidence=self._isolated(said)) if detector.name in _ISOLATED else said

@@ -19,7 +19,7 @@ import numpy as np
 from sealscope.diagnosis.blocks import CHAMBERS, QUANTITIES, mean_squares
 from sealscope.diagnosis.contract import detectors
 from sealscope.diagnosis.examination import Examination
-from sealscope.diagnosis.verdict import Evidence
+from sealscope.diagnosis.verdict import LEAKS, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array, Recording
 
@@ -224,7 +224,7 @@ def _calibrated(detector: str) -> Scorer:
 
     def score(look: Look) -> Score:
         found = look.evidence(detector)
-        if found.score is None or not math.isfinite(found.score) or found.cause not in (None, "piston leak"):
+        if found.score is None or not math.isfinite(found.score) or found.cause not in (None, *LEAKS):
             return Score(None, reason=found.reason)
         return Score(found.score, found.onset_s, found.reason)
 

@@ -153,6 +153,7 @@ def _notes(result: Result) -> list[str]:
             f"By thresholds of their own, set for {100 * plan.false_alarm:g} % false alarms: {', '.join(own)}. What "
             "they state of flow, onset and cause is in estimates.csv, onsets.csv and causes.csv."
         )
+    notes += [one.words() for one in result.checks]
     if plan.note:
         notes.append(plan.note)
     if result.missing:
