@@ -221,8 +221,9 @@ def _fit(
     return theta, cost
 
 
-def fit(window: Window, short: Window, prior: Prior) -> tuple[Array, float]:
-    """The parameters (9,) of the best fit and its cost per sample; `short`: part of the window, for the many starts."""
+def fit(window: Window, short: Window, prior: Prior) -> tuple[Array, float, list[Array]]:
+    """The parameters (9,) of the best fit, its cost per sample, and other starts for a record that this one does not
+    lead through; `short`: part of the window, for the many starts."""
     centre = prior.centre
     slow = Window(
         short.duty, short.dp, short.settle, short.integral, short.variance, short.machine, _SLOW_WIDTH * _rate(short)
@@ -241,8 +242,18 @@ def fit(window: Window, short: Window, prior: Prior) -> tuple[Array, float]:
         tried.append(_fit(short, start, prior, everything, 8, 1.0))
     tried.sort(key=lambda one: one[1])
     finalists = [_fit(window, start, prior, everything, 4, 1.0) for start, _ in tried[:2]]
-    best = min(finalists, key=lambda one: one[1])[0]
-    theta, cost = _fit(window, best, prior, everything, 20, 0.1)
+    finalists.sort(key=lambda one: one[1])
+    theta, cost = _fit(window, finalists[0][0], prior, everything, 20, 0.1)
+    plain = theta.copy()
+    plain[[LEAD, BIAS]] = 0.0
+    plain[[G, F_C, F_V, K_BRK, C_C]] = centre[[G, F_C, F_V, K_BRK, C_C]]
+    return theta, cost / window.dp.size, [finalists[1][0], plain]
+
+
+def refit(window: Window, start: Array, prior: Prior) -> tuple[Array, float]:
+    """The best fit that is reached from another start, and its cost per sample."""
+    theta, _ = _fit(window, start, prior, (GAIN, K), 6, 1.0)
+    theta, cost = _fit(window, theta, prior, range(len(PARAMETERS)), 20, 0.1)
     return theta, cost / window.dp.size
 
 

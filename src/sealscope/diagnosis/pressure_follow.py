@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,10 @@ from sealscope.diagnosis.pressure_fit import (
     duty_of,
     fit,
     prior_of,
+    refit,
 )
 from sealscope.diagnosis.pressure_laws import F_C, F_V, GAIN, STATES, G, K, Machine, machine_of, nominal
-from sealscope.diagnosis.pressure_track import Steps, steps_in, track
+from sealscope.diagnosis.pressure_track import Steps, Track, excess_of, leap, steps_in, track
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array
 
@@ -30,6 +31,10 @@ BLOCK, FIRST = 6.0, 3.0
 _WINDOW_AT = 0.55
 _INTEGRAL = 4
 _EARLY = 4
+#: A rise of G worth another look.
+_CLEAR = 2.0
+#: A record that the model follows so badly is tried again from other first fits.
+RESTLESS = 1.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,20 +102,23 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
     duty = duty_of(u, rate)
     span = BLOCK if cycle is None else cycle
     long, short = _windows(duty, dp, centre, machine, rate, span)
-    theta, cost = fit(long, short, prior_of(centre))
+    prior = prior_of(centre)
+    theta, cost, anew = fit(long, short, prior)
     if not np.isfinite(cost):
         return None
     length = max(1, int(np.ceil(BLOCK / span - 1e-9))) * span
     edges = np.round(np.arange(FIRST, dp.size / rate, length) * rate).astype(np.int64)
     if edges.size < 4:
         return None
-    skip = int(FIRST * rate)
-    followed = min(
-        (track(duty, dp, edges, theta, machine, start, skip, rate) for start in _starts(duty, theta, machine)),
-        key=lambda one: float(one.block_variance[:_EARLY].mean()),
-    )
     speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(u))
-    steps = steps_in(followed, theta, speed)
+    skip = int(FIRST * rate)
+    followed, steps = _tracked(duty, dp, edges, theta, machine, skip, rate, speed)
+    if excess_of(steps) > RESTLESS:
+        for first in anew:
+            other, _ = refit(long, first, prior)
+            again = _tracked(duty, dp, edges, other, machine, skip, rate, speed)
+            if excess_of(again[1]) < excess_of(steps) - 0.05:
+                theta, (followed, steps) = other, again
     third = max(1, len(followed.path) // 3)
     early, late = followed.path[:third].mean(axis=0), followed.path[-third:].mean(axis=0)
     friction = _friction(late, machine, speed) / _friction(early, machine, speed) - 1.0
@@ -133,6 +141,38 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
 def _same_way(u: Array, dp: Array) -> bool:
     """Whether dp follows the command, as it does where both are counted the same way."""
     return float(np.dot(u - u.mean(), dp - dp.mean())) >= 0.0
+
+
+def _tracked(
+    duty: Duty,
+    dp: Array,
+    edges: NDArray[np.int64],
+    theta: Array,
+    machine: Machine,
+    skip: int,
+    rate: float,
+    speed: float,
+) -> tuple[Track, Steps]:
+    """The record followed from a first fit, and the steps of G in it.
+
+    Where G seems to rise the blocks are linearised once more with that rise allowed: under the usual leash a leak pulls
+    friction and gain off their values, which makes it smaller than it is. Sizes are taken from there; z, which a second
+    look at what was chosen for being large would raise, is not.
+    """
+    followed, start = min(
+        ((track(duty, dp, edges, theta, machine, one, skip, rate), one) for one in _starts(duty, theta, machine)),
+        key=lambda both: float(both[0].block_variance[:_EARLY].mean()),
+    )
+    steps = steps_in(followed, theta, speed)
+    after = int(np.argmax(steps.z))
+    if steps.z[after] < _CLEAR:
+        return followed, steps
+    jumps = leap(edges.size - 1, after, G)
+    anew = track(duty, dp, edges, theta, machine, start, skip, rate, jumps, followed.path)
+    fresh = steps_in(anew, theta, speed)
+    if excess_of(fresh) < max(1.0, excess_of(steps)) + 0.05:
+        steps = replace(steps, size=fresh.size, deviation=fresh.deviation)
+    return followed, steps
 
 
 def _friction(theta: Array, machine: Machine, speed: float) -> float:

@@ -22,7 +22,6 @@ from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.pressure_follow import Followed
-    from sealscope.diagnosis.pressure_track import Steps
     from sealscope.parameters import Rig
 
 #: Shortest record [s], lowest rate [Hz] that shows the ringing, fewest blocks and fewest on either side of a step.
@@ -109,17 +108,26 @@ def threshold_of(correlation: Array, probability: float) -> float:
 
 def _within(followed: Followed, recording: Recording, probability: float) -> Evidence:
     """The evidence on a rise of G within the record."""
+    from sealscope.diagnosis.pressure_track import excess_of
+
     steps, begin = followed.steps, float(recording.t[0])
     inner = slice(LEAST - 1, followed.blocks - LEAST)
     z = steps.z[inner]
     threshold = threshold_of(steps.correlation[inner, inner], probability)
     best = int(np.argmax(z))
-    excess = _excess(steps)
+    excess = excess_of(steps)
+    cause = _other_cause(followed)
     if excess > UNRULY:
+        seen = {
+            None: "",
+            "friction change": f"; the friction changed by {100.0 * followed.friction_change:.0f} %",
+            "air in the oil": f"; the oil's stiffness changed by {100.0 * followed.stiffness_change:.0f} %",
+        }[cause]
         return Evidence(
             "cannot tell",
             f"the model of the rig does not follow this record: its parameters wander {excess:.2f} times as much as "
-            f"those of a sound machine may, {UNRULY:g} are allowed",
+            f"those of a sound machine may, {UNRULY:g} are allowed{seen}",
+            cause=cause,
         )
     scatter = float(np.sqrt(max(1.0, excess)))
     score = float(z[best]) / scatter
@@ -129,7 +137,6 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     figures = f"z {score:.2f}, threshold {threshold:.2f}"
     found = score > threshold
     method = MethodResult("rise of G", score, threshold, "leak" if found else "no leak")
-    cause = _other_cause(followed)
     if not found:
         words = {
             None: f"no rise of the leakage conductance beyond its scatter ({figures}); a leak that was there from the "
@@ -171,12 +178,6 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
         cause="piston or pump leak",
         course=course,
     )
-
-
-def _excess(steps: Steps) -> float:
-    """Chi square of the blocks over its degrees of freedom, beside the best step either way (Birge's ratio)."""
-    chi_square, freedom = steps.excess
-    return float((chi_square - np.max(np.abs(steps.z)) ** 2) / freedom)
 
 
 def _other_cause(followed: Followed) -> Cause | None:

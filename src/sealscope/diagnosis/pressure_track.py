@@ -34,6 +34,8 @@ ANCHOR_LEAD, ANCHOR_G = 5e-4, 1.5e-12
 #: Wandering that is tried, times the usual one: the likelihood chooses.
 SCALES = (1.0, 2.0, 4.0)
 _PASSES = 10
+#: A jump: so many times the wandering from block to block.
+_LEAP = 50.0
 #: Shares of a Gauss-Newton step that are tried side by side, and the fall of the cost to go on for.
 _SHARES = np.array([1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 1.4])
 _ENOUGH = 1.0
@@ -101,13 +103,13 @@ def _anchor(theta: Array, units: Array) -> Array:
 
 
 def _precision(N: Array, walk: Array, anchor: Array) -> Array:
-    """Lambda (b p, b p) of all blocks' parameters."""
+    """Lambda (b p, b p) of all blocks' parameters; `walk` (b - 1, p) from each block to the next."""
     blocks, p, _ = N.shape
     found = np.zeros((blocks, p, blocks, p))
-    steps = np.diag(1.0 / walk**2)
     for b in range(blocks):
         found[b, :, b] += N[b]
         if b:
+            steps = np.diag(1.0 / walk[b - 1] ** 2)
             found[b, :, b] += steps
             found[b - 1, :, b - 1] += steps
             found[b - 1, :, b] -= steps
@@ -131,11 +133,15 @@ def track(
     start: Array,
     skip: int,
     rate: float,
+    jumps: Array | None = None,
+    from_path: Array | None = None,
 ) -> Track:
     """Follow the parameters from the first fit `theta` (9,) through blocks between `edges` of the whole record.
 
-    `start` (5,): the model's state at the first sample. Blocks are linearised about their own parameters, until these
-    stand still; the trend of the speed's bias within a block is eliminated.
+    `start` (5,): the model's state at the first sample; `jumps` (b - 1, p): how many times farther than usual each
+    parameter may go from a block to the next; `from_path` (b, 9): where to begin, the first fit by default. Blocks are
+    linearised about their own parameters, until these stand still; the trend of the speed's bias within a block is
+    eliminated.
     """
     blocks = edges.size - 1
     n = dp.size
@@ -144,17 +150,22 @@ def track(
     units = np.append(h, 1.0)
     seconds = float(np.median(np.diff(edges))) / rate
     speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(duty.u))
-    walk, anchor = _wander(theta, units, seconds, speed), _anchor(theta, units)
+    walk = np.tile(_wander(theta, units, seconds, speed), (blocks - 1, 1))
+    if jumps is not None:
+        walk *= jumps
+    anchor = _anchor(theta, units)
+    leashes = _LEASHES if from_path is None else _LEASHES[-1:]
     centre = np.append(theta / h, 0.0)
-    path = np.tile(theta, (blocks, 1))
+    path = np.tile(theta, (blocks, 1)) if from_path is None else from_path
     limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
 
     def cost(shown: Array, at: Array, variance: float, walk: Array) -> float:
         misfit = sum(float(here.size * np.var(here)) for here in (dp[one] - shown[one] for one in limits))
-        steps = np.diff(at, axis=0) / h / walk[:-1]
+        steps = np.diff(at, axis=0) / h / walk[:, :-1]
         off = at.mean(axis=0) / h - centre[:-1]
         return misfit / variance + float(np.sum(steps**2)) + float(anchor[:-1] @ off**2)
 
+    found: Track | None = None
     for number in range(_PASSES):
         sets = np.tile(path, (_CONSTANT + 1, 1, 1))
         for k in range(_CONSTANT):
@@ -188,7 +199,7 @@ def track(
         )
         if number == _PASSES - 1:
             break
-        allowed = _LEASHES[min(number, len(_LEASHES) - 1)] * walk
+        allowed = leashes[min(number, len(leashes) - 1)] * walk
         solved = np.linalg.solve(_precision(found.N, allowed, anchor), _right(found.r, anchor, centre).reshape(-1))
         fresh = _held(solved.reshape(blocks, _SIZE)[:, :_CONSTANT] * h, theta)
         tries = path + _SHARES[:, None, None] * (fresh - path)
@@ -198,9 +209,23 @@ def track(
         gained = cost(shown[0], path, variance, allowed) - costs[best]
         if gained > 0.0:
             path = tries[best]
-        if not gained > _ENOUGH and number >= len(_LEASHES) - 1:
+        if not gained > _ENOUGH and number >= len(leashes) - 1:
             break
+    assert found is not None
     return found
+
+
+def excess_of(steps: Steps) -> float:
+    """Chi square of the blocks over its degrees of freedom, beside the best step either way (Birge's ratio)."""
+    chi_square, freedom = steps.excess
+    return float((chi_square - np.max(np.abs(steps.z)) ** 2) / freedom)
+
+
+def leap(blocks: int, after: int, *parameters: int) -> Array:
+    """What lets some parameters jump after a block: factors (b - 1, p) on the walk."""
+    factors = np.ones((blocks - 1, _SIZE))
+    factors[after, list(parameters)] = _LEAP
+    return factors
 
 
 def _held(path: Array, theta: Array) -> Array:
@@ -214,7 +239,7 @@ def _held(path: Array, theta: Array) -> Array:
 def steps_in(followed: Track, theta: Array, speed: float, scales: Sequence[float] = SCALES) -> Steps:
     """A step of G after each block, everything else free to wander; how much it wanders, the likelihood chooses."""
     anchor, centre = np.split(followed.anchor, 2)
-    walk = _wander(theta, followed.units, followed.seconds, speed)
+    walk = np.tile(_wander(theta, followed.units, followed.seconds, speed), (len(followed.N) - 1, 1))
     right = _right(followed.r, anchor, centre).reshape(-1)
     blocks = len(followed.N)
     best: tuple[float, float, Array, float] | None = None
@@ -223,7 +248,7 @@ def steps_in(followed: Track, theta: Array, speed: float, scales: Sequence[float
         half = np.linalg.solve(L, right)
         fit = float(half @ half)
         likelihood = fit - 2.0 * np.sum(np.log(np.diagonal(L)))
-        likelihood -= 2.0 * (blocks - 1) * np.sum(np.log(scale * walk))
+        likelihood -= 2.0 * np.sum(np.log(scale * walk))
         if best is None or likelihood > best[0] + 2.0:
             best = (float(likelihood), scale, L, fit)
     assert best is not None
@@ -253,5 +278,5 @@ def steps_in(followed: Track, theta: Array, speed: float, scales: Sequence[float
         levels.T @ half * unit,
         np.sqrt(np.sum(levels**2, axis=0)) * unit,
         scale,
-        (free - fit, float(_SIZE * (blocks - 1))),
+        (free - fit, float(_SIZE * (blocks - 1) + np.count_nonzero(anchor))),
     )
