@@ -1,8 +1,9 @@
-"""Measure the false-alarm rate and the detection rate of `diagnose` on simulated records with fresh noise.
+"""Measure the false-alarm rate and the detection rate of a detector on simulated records with fresh noise.
 
     python benchmarks/false_alarms.py [--records 100] [--leaky 20] [--probability 0.01] [--duration 180] [--seed 0]
-        [--json FILE]
+        [--detector "rms change"] [--json FILE]
 
+`--detector diagnose` is the verdict of all detectors together.
 Each case (command, throttles, leak) is integrated once; its instruments are read once a record, each time with noise
 of a seed of its own, derived from the case. A rate stands with its 95 % Clopper-Pearson interval; `onset` is the share
 of the alarms within 10 s of the truth.
@@ -20,7 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
+from sealscope.diagnosis.contract import DETECTORS
+from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
+from sealscope.diagnosis.examination import Examination
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import make_experiment
 from sealscope.simulation.instruments import record
@@ -78,11 +81,12 @@ def records_of(
         yield record(experiment.rig, path, volts, factor, seed)
 
 
-def judge(records: Iterator[Recording], probability: float, onset: float | None) -> Count:
-    """The verdicts on some records, and how many alarms lie near the onset."""
+def judge(records: Iterator[Recording], detector: str, probability: float, onset: float | None) -> Count:
+    """A detector's verdicts (`diagnose`: of all together) on some records, and how many alarms lie near the onset."""
     count = Count()
     for one in records:
-        found = diagnose(one, false_alarm_probability=probability)
+        seen = Examination(one, false_alarm_probability=probability)
+        found = seen.fused().evidence if detector == "diagnose" else seen.evidence(detector)
         count.records += 1
         count.leak += found.verdict == "leak"
         count.no_leak += found.verdict == "no leak"
@@ -108,13 +112,16 @@ def main() -> None:
     parser.add_argument("--probability", type=float, default=FALSE_ALARM_PROBABILITY)
     parser.add_argument("--duration", type=float, default=180.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--detector", default="rms change", choices=("diagnose", *DETECTORS))
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     if min(chosen.records, chosen.leaky) < 1:
         parser.error("--records and --leaky must be 1 or more")
 
     start = time.perf_counter()
-    print(f"diagnose at a nominal {100 * chosen.probability:g} %, records of {chosen.duration:g} s, no baseline")
+    print(
+        f"{chosen.detector} at a nominal {100 * chosen.probability:g} %, records of {chosen.duration:g} s, no baseline"
+    )
     heads = f"{'records':>8}{'leak':>6}{'no leak':>9}{'cannot tell':>13}{'alarms (95 %)':>27}{'onset':>10}"
     print(f"{'leak [L/min], command, throttles':<34}{heads}")
     totals: dict[str, Count] = {}
@@ -127,7 +134,7 @@ def main() -> None:
                 name = f"{kind}, {command}, {'half closed' if throttled else 'none'}"
                 count = chosen.leaky if leak else chosen.records
                 records = records_of(command, throttled, leak, chosen.duration, chosen.seed, count)
-                rows[name] = judge(records, chosen.probability, chosen.duration / 2 if leak else None)
+                rows[name] = judge(records, chosen.detector, chosen.probability, chosen.duration / 2 if leak else None)
                 totals[total] = totals.get(total, Count()) + rows[name]
                 print(row(name, rows[name]), flush=True)
     print()
@@ -137,7 +144,7 @@ def main() -> None:
     leaky = sum((count for name, count in totals.items() if not name.startswith("none")), Count())
     print(f"\n{'detector':<34}{'false alarms':>20}{'leaks found':>20}")
     for name, false, found in (
-        ("diagnose", clean.leak, leaky.leak),
+        (chosen.detector, clean.leak, leaky.leak),
         ("always fires", clean.records, leaky.records),
         ("never fires", 0, 0),
     ):
