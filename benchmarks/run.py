@@ -2,8 +2,8 @@
 
     python benchmarks/run.py [--quick] [--into FOLDER]
 
-Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib) and batch.json into `benchmarks/results` or the
-folder that is given.
+Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib), batch.json and streams.json into
+`benchmarks/results` or the folder that is given.
 """
 
 from __future__ import annotations
@@ -35,8 +35,11 @@ def main() -> None:
         solvers += ["--rounds", "2", "--duration", "20", "--case", "no throttles, 3 sin 4t"]
         solvers += ["--case", "50 % closed, 3 sin 4t"]
         batch += ["--rounds", "2", "--runs", "32", "--duration", "20"]
+    streams = ["bench_streams.py", "--json", str(results / "streams.json")]
+    if chosen.quick:
+        streams += ["--rounds", "3"]
     print(f"{platform.machine()}, {platform.python_implementation()} {platform.python_version()}", flush=True)
-    for words in (solvers, batch):
+    for words in (solvers, batch, streams):
         subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=True)
 
 
