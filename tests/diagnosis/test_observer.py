@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from sealscope.diagnosis import observer_pressure
 from sealscope.diagnosis.observer import LEAST_SECONDS, Observer, block_length
 from sealscope.diagnosis.observer_model import G_UNIT, PARAMETERS, assume, start_parameters
-from sealscope.diagnosis.observer_step import find_leak_step
 from sealscope.diagnosis.observer_stream import ObserverStream, channels_of, formulation_of
 from sealscope.diagnosis.observer_volume import VolumeFilter
 from sealscope.errors import InputError
@@ -47,9 +46,6 @@ def machine():  # type: ignore[no-untyped-def]
         return made[key]
 
     return of
-
-
-# ---- the kernel's pieces -------------------------------------------------------------------------------------------
 
 
 def _point() -> tuple[np.ndarray, np.ndarray]:
@@ -104,9 +100,6 @@ def test_sensitivities_are_carried_by_the_exponential(thesis: Rig) -> None:
     assert np.all(np.abs(S - whole) <= 1e-5 * scale + 1e-300)
 
 
-# ---- consistency on data of its own model --------------------------------------------------------------------------
-
-
 def test_volume_filter_is_consistent_on_its_own_model(thesis: Rig) -> None:
     """Innovations of mean square 1 (NIS), errors of G of mean square 1 (NEES), and both fail with half the noise."""
     a = assume(thesis)
@@ -156,9 +149,6 @@ def test_own_parameters_not_the_plants(thesis: Rig, machine) -> None:  # type: i
     assert np.array_equal(told.G, Observer(thesis).follow(bare.only(PRESSURES)).G)
     other = Observer(thesis.with_values({"friction.F_v": 330.0}, source="wrong")).follow(recording.only(PRESSURES))
     assert not np.array_equal(told.G, other.G)
-
-
-# ---- verdicts ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("view", [ALL, PRESSURES])
@@ -272,9 +262,6 @@ def test_against_baselines(thesis: Rig, machine) -> None:  # type: ignore[no-unt
     assert Observer(thesis).examine(other, sound, P).verdict == "cannot tell"
 
 
-# ---- what it needs -------------------------------------------------------------------------------------------------
-
-
 def test_says_what_is_missing(thesis: Rig, machine) -> None:  # type: ignore[no-untyped-def]
     observer = Observer(thesis)
     recording = machine(False).recording.only(ALL)
@@ -307,9 +294,6 @@ def test_a_gap_in_the_position_leaves_the_pressures(thesis: Rig, machine) -> Non
 @pytest.mark.parametrize("cycle, length", [(None, 4.0), (12.0, 4.0), (1.5, 3.0), (np.pi / 2, np.pi), (6.3, 6.3)])
 def test_blocks_are_whole_cycles(cycle: float | None, length: float) -> None:
     assert block_length(cycle) == pytest.approx(length)
-
-
-# ---- a stream ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("formulation", VIEWS)
@@ -348,71 +332,6 @@ def test_a_stream_refuses_gaps(thesis: Rig) -> None:
         ObserverStream(thesis, PRESSURES, 500.0, 3.0).update(bad)
     with pytest.raises(InputError, match="> 0"):
         ObserverStream(thesis, PRESSURES, 500.0, 0.0)
-
-
-# ---- the step ------------------------------------------------------------------------------------------------------
-
-
-def _null_rate(make, count: int, probability: float, **options) -> float:  # type: ignore[no-untyped-def]
-    alarms = 0
-    for seed in range(count):
-        random = np.random.default_rng(seed)
-        g = make(random)
-        alarms += find_leak_step(g, np.ones(g.size), probability, seed=seed, **options).found
-    return alarms / count
-
-
-def _walk(share: float):  # type: ignore[no-untyped-def]
-    return lambda random: random.standard_normal(50) + np.cumsum(share * random.standard_normal(50))
-
-
-@pytest.mark.parametrize("expected, true", [(0.03, 0.03), (3.0, 3.0), (3.0, 0.3)])
-def test_false_alarms_are_those_asked_for(expected: float, true: float) -> None:
-    """Walks as strong as expected, or weaker: 5 % of 120 is 6, and 14 or more would come three times in 1000."""
-    rate = _null_rate(_walk(true**0.5), 120, 0.05, expected_walk=expected, wary=expected > 1.0)
-    assert rate < 14 / 120
-
-
-@pytest.mark.parametrize(
-    "name, drift",
-    [
-        ("warm-up", lambda t, r: 8.0 * np.exp(-t / 10.0)),
-        ("cooling", lambda t, r: -8.0 * np.exp(-t / 10.0)),
-        ("even", lambda t, r: 0.2 * t),
-        ("wander of 60 s", lambda t, r: 4.0 * np.sin(2 * np.pi * t / 20.0 + 6.3 * r.random())),
-        ("wander of 150 s", lambda t, r: 4.0 * np.sin(2 * np.pi * t / 50.0 + 6.3 * r.random())),
-    ],
-)
-def test_smooth_drifts_are_no_steps(name: str, drift) -> None:  # type: ignore[no-untyped-def]
-    t = np.arange(50.0)
-    rate = _null_rate(lambda r: r.standard_normal(50) + drift(t, r), 40, 0.01, expected_walk=3.0, wary=True)
-    assert rate <= 0.05, name
-
-
-def test_a_step_is_found_with_its_size_and_onset() -> None:
-    hits, covered, dated = 0, 0, 0
-    for seed in range(60):
-        random = np.random.default_rng(seed)
-        g = _walk(0.17)(random) + 4.0 * np.clip(np.arange(1, 51) - 24.6, 0.0, 1.0)
-        found = find_leak_step(g, np.ones(50), 0.01, 0.03)
-        hits += found.found
-        covered += abs(found.size - 4.0) < 2.0 * found.size_sd
-        dated += found.onset_interval[0] <= 24.6 <= found.onset_interval[1]
-    assert hits >= 57
-    assert covered >= 52
-    assert dated >= 52
-
-
-def test_a_fall_is_no_leak() -> None:
-    g = np.random.default_rng(1).standard_normal(50) - 8.0 * (np.arange(50) > 25)
-    assert not find_leak_step(g, np.ones(50), 0.01, 0.03).found
-
-
-def test_step_needs_blocks_and_finite_values() -> None:
-    with pytest.raises(InputError, match="16 blocks"):
-        find_leak_step(np.zeros(15), np.ones(15), 0.01, 1.0)
-    with pytest.raises(InputError, match="finite"):
-        find_leak_step(np.full(20, np.nan), np.ones(20), 0.01, 1.0)
 
 
 def test_start_parameters_follow_the_rig(thesis: Rig) -> None:

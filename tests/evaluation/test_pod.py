@@ -16,8 +16,7 @@ from sealscope.evaluation.pod import by_size, proven_size
 from sealscope.evaluation.signal_response import fit_signal_response
 from sealscope.evaluation.tobit import fit_tobit
 
-# Dalal, Fowlkes and Hoadley, J. Am. Stat. Assoc. 84 (1989) 945-957: launch temperature [F] and whether an O-ring of
-# the field joints showed thermal distress, 23 flights before the Challenger's last
+# Dalal, Fowlkes, Hoadley, JASA 84 (1989) 945-957: launch temperature [F], O-ring distress, before the Challenger's last
 CHALLENGER_F = np.array([53, 57, 58, 63, 66, 67, 67, 67, 68, 69, 70, 70, 70, 70, 72, 73, 75, 75, 76, 76, 78, 79, 81.0])
 CHALLENGER_DISTRESS = np.array([1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0])
 

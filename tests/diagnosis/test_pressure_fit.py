@@ -1,0 +1,123 @@
+"""The reduced rig against the whole one, and the fit: parameters found from wrong starts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.blocks import find_cycle
+from sealscope.diagnosis.pressure_fit import Duty, differences, duty_of
+from sealscope.diagnosis.pressure_follow import Followed, follow
+from sealscope.diagnosis.pressure_laws import F_C, F_V, GAIN, RUNS, STATES, G, K, machine_of, nominal
+from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.recording import Recording
+
+from .pressure_machine import G_PUMP, P_CHARGE, recorded, true_difference
+
+P = 0.01
+TRUE_LPM = 0.0042
+FRICTION = ("friction.F_pr", "friction.F_cfr", "friction.F_v")
+
+
+@pytest.fixture(scope="module")
+def thesis() -> Rig:
+    return load_rig("thesis")
+
+
+def truth_of(rig: Rig) -> np.ndarray:
+    """The parameters (9,) of the machine of `recorded`, where nothing else is said."""
+    theta = nominal(rig.with_values({"fluid.p_charge": P_CHARGE}))
+    theta[G] = G_PUMP
+    return theta
+
+
+def followed(rig: Rig, recording: Recording) -> Followed:
+    found = follow(rig, *(recording[n] for n in ("u", "p_A", "p_B")), recording.rate, find_cycle(recording))
+    assert found is not None
+    return found
+
+
+# ---- the reduced rig -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["7 sin(4t)", "3 sin(4t)"])
+def test_the_reduced_rig_shows_what_the_whole_rig_shows(command: str, thesis: Rig) -> None:
+    """p_A - p_B of five states against the full simulation: within 200 Pa rms at steps of 1 ms (the noise has 12 kPa),
+    and within 2 Pa at half of that, the simulation's own step: the error is the step's and not the reduction's."""
+    u, true = true_difference(command=command)
+    theta, machine = truth_of(thesis)[None], machine_of(thesis)
+    coarse = differences(duty_of(u, 500.0), theta, machine)[0]
+    assert np.sqrt(np.mean((coarse - true) ** 2)) < 200.0
+    at = np.arange(8 * u.size + 1) / 8.0
+    fine = np.interp(at, np.arange(u.size), u)
+    duty = Duty(fine, np.gradient(fine, 0.25e-3), 0.5e-3, 4)
+    assert np.sqrt(np.mean((differences(duty, theta, machine)[0] - true) ** 2)) < 2.0
+    theta[0, F_V] *= 1.001
+    assert np.sqrt(np.mean((differences(duty, theta, machine)[0] - true) ** 2)) > 4.0
+
+
+def _steady(thesis: Rig, every: int, seconds: float = 1.0) -> np.ndarray:
+    """dp at 100 Hz under 5 + sin(4t) V, on its way from the start: no reversal, so that every law is smooth."""
+    h = 0.01 / every
+    t = np.arange(round(2 * seconds / h) + 1) * 0.5 * h
+    n = round(seconds * 100)
+    duty = Duty(5.0 + np.sin(4.0 * t), 4.0 * np.cos(4.0 * t), h, every)
+    theta, machine = truth_of(thesis), machine_of(thesis)
+    omega = theta[GAIN] * 5.0
+    v = omega * machine.q_b / (2.0 * np.pi) / machine.A
+    return differences(duty, theta[None], machine, start=np.array([[1e5, v, omega, 0.5, 30.0]]))[0][:n]
+
+
+def test_the_solver_is_of_fourth_order(thesis: Rig) -> None:
+    finest = _steady(thesis, 320)
+    errors = [np.sqrt(np.mean((_steady(thesis, every) - finest) ** 2)) for every in (10, 20, 40)]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert orders == pytest.approx(4.0, abs=0.3)
+
+
+def test_lanes_are_runs_of_their_own(thesis: Rig) -> None:
+    """Eleven sets in two calls of eight lanes are what each gives alone, whatever stands in the lanes beside it."""
+    u, _ = true_difference()
+    duty, machine = duty_of(u[:3000], 500.0), machine_of(thesis)
+    random = np.random.default_rng(4)
+    sets = truth_of(thesis) * random.uniform(0.8, 1.2, (RUNS + 3, 9))
+    together = differences(duty, sets, machine)
+    for one, theta in zip(together, sets, strict=True):
+        np.testing.assert_array_equal(one, differences(duty, theta[None], machine)[0])
+    assert np.ptp(together, axis=0).max() > 1e4
+
+
+def test_a_run_goes_on_where_it_stopped(thesis: Rig) -> None:
+    """Two parts with the state handed on, and segments of equal parameters, are the whole run."""
+    u, _ = true_difference()
+    duty, machine, theta = duty_of(u[:4000], 500.0), machine_of(thesis), truth_of(thesis)[None]
+    whole = differences(duty, theta, machine)[0]
+    state = np.zeros((1, STATES))
+    parts = [differences(duty.part(first, n), theta, machine, start=state)[0] for first, n in ((0, 1700), (1700, 2300))]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    segment = (np.arange(4000) > 2500).astype(np.int64)
+    np.testing.assert_array_equal(differences(duty, np.stack([theta, theta], axis=1), machine, segment)[0], whole)
+    other = np.stack([theta, 1.05 * theta], axis=1)
+    shown = differences(duty, other, machine, segment)[0]
+    np.testing.assert_array_equal(shown[:2502], whole[:2502])
+    assert np.abs(shown[2600:] - whole[2600:]).max() > 1e3
+
+
+# ---- the fit -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stiffness, friction, gain", [(1.2, 0.9, 2.5), (0.8, 1.1, 0.5), (1.2, 1.1, 1.0)])
+def test_the_fit_finds_a_machine_far_from_the_rig_that_is_assumed(
+    stiffness: float, friction: float, gain: float, thesis: Rig
+) -> None:
+    truth = {"fluid.K_oil": stiffness, "motor.omega_per_volt": gain, **dict.fromkeys(FRICTION, friction)}
+    values = {name.replace(".", "__"): factor * float(thesis[name]) for name, factor in truth.items()}
+    command = "3 sin(4t)" if gain > 1.0 else "7 sin(4t)"
+    theta = followed(thesis, recorded(3, command=command, **values)).path.mean(axis=0)
+    machine = machine_of(thesis)
+    v = machine.q_b / (2.0 * np.pi) / machine.A * theta[GAIN] * 4.0
+    assert theta[GAIN] == pytest.approx(values["motor__omega_per_volt"], rel=0.01)
+    assert theta[K] == pytest.approx(values["fluid__K_oil"], rel=0.01)
+    coulomb = values["friction__F_pr"] + 2.0 * P_CHARGE * values["friction__F_cfr"]
+    assert theta[F_C] + theta[F_V] * v == pytest.approx(coulomb + values["friction__F_v"] * v, rel=0.04)
+    assert theta[G] == pytest.approx(G_PUMP, abs=3e-13)
