@@ -129,7 +129,10 @@ class Examination:
         def not_usable(reason: str) -> Said:
             return Said(detector.name, Evidence("cannot tell", reason), usable=False)
 
-        with np.errstate(all="ignore"):
+        from threadpoolctl import threadpool_limits
+
+        # small matrices: threads would cost more than they give, and how they share the work may not repeat to the bit
+        with np.errstate(all="ignore"), threadpool_limits(limits=1):
             unusable = detector.usable(self.recording)
             if unusable is not None:
                 return not_usable(unusable)
