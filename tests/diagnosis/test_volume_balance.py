@@ -190,7 +190,7 @@ def test_throttles_tell_the_pump_from_the_piston(detector: VolumeBalance) -> Non
     assert (pump.verdict, pump.cause) == ("no leak", "pump leak")
     assert pump.score is not None and pump.threshold is not None and pump.score > pump.threshold
     blind = detector.examine(machine(5, G=step(0.0, 1.0e-12)).only(["x", "theta", "p_A", "p_B"]), [], P)
-    assert (blind.verdict, blind.cause) == ("leak", None)
+    assert (blind.verdict, blind.cause) == ("leak", "piston or pump leak")
 
 
 def test_throttles_give_both_conductances(detector: VolumeBalance) -> None:
