@@ -32,6 +32,7 @@ Install = Callable[..., None]
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Install a distribution of that name with its source and entry points, as pip would leave it."""
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr("sealscope.diagnosis.contract.DETECTORS", {"rms change": DETECTORS["rms change"]})
 
     def made(distribution: str, source: str, points: dict[str, str]) -> None:
         (tmp_path / f"{distribution}.py").write_text(source, encoding="utf-8")
@@ -63,7 +64,7 @@ def test_the_documented_example_is_found_and_heard(install: Install, leaky: Reco
     points = project["project"]["entry-points"][plugins.GROUP]
     assert points == {"ringing energy": "ringing_energy:RingingEnergy"}
     install("ringing_energy", (EXAMPLE / "ringing_energy.py").read_text(encoding="utf-8"), points)
-    assert list(detectors()) == [*DETECTORS, "ringing energy"]
+    assert list(detectors()) == ["rms change", "ringing energy"]
     found = {one.name: one for one in diagnose(leaky).methods}
     own = found["ringing energy"]
     assert own.verdict == "leak"
@@ -129,7 +130,7 @@ def test_two_of_one_name(install: Install, sound: Recording, caplog: pytest.LogC
     install("first", GOOD, {"good": "first:Good"})
     install("second", GOOD, {"good": "second:Good"})
     with caplog.at_level(logging.WARNING, "sealscope"):
-        assert list(detectors()) == [*DETECTORS, "good"]
+        assert list(detectors()) == ["rms change", "good"]
     (line,) = told(caplog)
     assert line == "detector 'good' of second is left out: ValueError: its name is that of a detector of first"
 
