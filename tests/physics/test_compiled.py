@@ -89,7 +89,7 @@ def test_an_edited_law_in_another_file_is_seen_and_the_old_code_comes_back_with_
 def test_the_solver_sees_an_edit_of_friction(copy, tmp_path):
     before, _, _ = ask(copy, WHOLE, tmp_path / "cache")
     assert ask(copy, WHOLE, tmp_path / "cache")[:2] == (before, 1)
-    edit(copy, "friction.py", "+ F_v * v\n    if", "+ 2.0 * F_v * v\n    if")
+    edit(copy, "friction.py", "-1.0), 1.0) + F_v * v", "-1.0), 1.0) + 2.0 * F_v * v")
     after, hits, _ = ask(copy, WHOLE, tmp_path / "cache")
     assert hits == 0
     assert abs(after - before) > 100.0
