@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -17,27 +14,11 @@ from .balance_machine import machine, step
 
 P = 0.01
 LPM = 6.0e4
-Records = Callable[..., Recording]
 
 
 @pytest.fixture(scope="module")
 def detector() -> VolumeBalance:
     return VolumeBalance(load_rig("thesis"))
-
-
-@pytest.fixture(scope="module")
-def worn() -> Recording:
-    """2 mL/min past the piston from second 60 on."""
-    return machine(1, G=step(0.0, 3.0e-13))
-
-
-@pytest.fixture(scope="module")
-def tight() -> Recording:
-    return machine(2)
-
-
-def with_channels(recording: Recording, **channels: np.ndarray) -> Recording:
-    return replace(recording, channels={**recording.channels, **channels})
 
 
 def flow_of(recording: Recording, G: float, start: float = 60.0) -> float:
