@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig, load_rig
     from sealscope.recordings import Recording, inspect, read, write
     from sealscope.reporting import write_page
+    from sealscope.simulation.batch import simulate_batch
     from sealscope.simulation.experiment import Experiment, make_experiment
     from sealscope.simulation.proof import prove
     from sealscope.simulation.simulate import run, simulate
@@ -33,6 +34,7 @@ _HOMES = {
     "read": "recordings",
     "run": "simulation.simulate",
     "simulate": "simulation.simulate",
+    "simulate_batch": "simulation.batch",
     "write": "recordings",
     "write_page": "reporting",
 }
@@ -51,6 +53,7 @@ __all__ = [
     "read",
     "run",
     "simulate",
+    "simulate_batch",
     "write",
     "write_page",
 ]

@@ -47,6 +47,32 @@ def test_run_status_and_report(call, tiny, tmp_path):
     assert json.loads((folder / "calibration.json").read_text())["made_from"]["campaign"]["name"] == "tiny"
 
 
+def test_in_batches_it_says_so_and_goes_on(call, tiny, tmp_path):
+    folder = tmp_path / "mine"
+    status, out, err = call("campaign", "run", tiny, "-o", folder, "--batch", "-j", "2")
+    assert status == 0, err
+    assert "records: 26 of 26 done" in out
+    assert "Simulated in batches on the cpu: " in out
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "<dt>simulated</dt><dd>in batches on the cpu</dd>" in re.sub(r"\s*\n\s*", "", page)
+    made_from = json.loads((folder / "calibration.json").read_text())["made_from"]["campaign"]
+    assert made_from["way"] == "in batches on the cpu"
+    rows = (folder / "rows.jsonl").read_bytes()
+    assert call("campaign", "run", tiny, "-o", folder, "--device", "cpu", "--batch")[0] == 0
+    assert (folder / "rows.jsonl").read_bytes() == rows
+    status, _, err = call("campaign", "run", tiny, "-o", folder)
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "the same way of making rows" in err
+
+
+def test_without_a_device_it_is_one_line(call, tiny, tmp_path):
+    status, _, err = call("campaign", "run", tiny, "-o", tmp_path / "mine", "--device", "gpu")
+    if status == 0:
+        pytest.skip("there is a GPU")
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert not (tmp_path / "mine").exists()
+
+
 def test_the_page_is_whole_and_asks_nothing_of_a_network(call, tiny, tmp_path):
     call("campaign", "run", tiny, "-o", tmp_path / "mine", "-j", "1")
     page = (tmp_path / "mine" / "report.html").read_text(encoding="utf-8")
@@ -78,6 +104,9 @@ def test_an_incomplete_campaign_says_so(call, tiny, tmp_path):
         (("campaign", "run", "no-such-plan"), "no packaged plan"),
         (("campaign", "report", "TINY", "-o", "nowhere"), "must have rows to report on"),
         (("campaign", "run", "TINY", "-o", "nowhere", "-j", "0"), "--jobs must be >= 1"),
+        (("campaign", "run", "TINY", "-o", "nowhere", "--device", "tpu"), "--device must be cpu or gpu, got tpu"),
+        (("campaign", "run", "bench-volume", "--batch"), "got 'volume balance', which needs whole recordings"),
+        (("campaign", "run", "appendix-c", "--batch"), "must simulate its records; run it without --batch"),
         (("calibrate", "--baseline", "none.csv", "-o", "c.json"), "none.csv"),
         (("calibrate", "--baseline", "-o", "c.json"), "--baseline must be followed by one file or more"),
     ],

@@ -83,6 +83,19 @@ def test_a_command_from_a_file(call, tmp_path):
     assert run["u"][1500] == pytest.approx(-2.0, abs=0.01)
 
 
+def test_a_stated_error_reaches_the_solver(call, tmp_path):
+    for name, words in (("plain.nc", ()), ("fine.nc", ("--error", "0.002[kPa]"))):
+        assert call("simulate", "-o", tmp_path / name, "--duration", "4", *words).status == 0
+    plain, fine = (sealscope.read(tmp_path / name).provenance["solver"] for name in ("plain.nc", "fine.nc"))
+    assert (plain["error_pa"], fine["error_pa"]) == (100.0, 2.0)
+    assert fine["step_s"] < plain["step_s"]
+    both = call("simulate", "-o", tmp_path / "none.nc", "--error", "20[Pa]", "--step", "1e-3")
+    assert (both.status, len(both.err.splitlines())) == (2, 1)
+    assert "a stated step or a stated error, not both" in both.err
+    assert "--error must have a unit of pressure" in call("simulate", "-o", tmp_path / "none.nc", "--error", "1[V]").err
+    assert not (tmp_path / "none.nc").exists()
+
+
 def test_prove_prints_what_halving_the_step_moves(call, tmp_path):
     done = call("simulate", "-o", tmp_path / "run.nc", "--duration", 6, "--prove")
     assert (done.status, done.err) == (0, "")

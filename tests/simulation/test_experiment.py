@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from sealscope.simulation.commands import Recorded, Sine
 from sealscope.simulation.experiment import make_experiment
 from sealscope.simulation.faults import Leak, Tabulated
 from sealscope.simulation.proof import prove
-from sealscope.simulation.simulate import run
+from sealscope.simulation.simulate import run, trajectory
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 
@@ -51,6 +53,7 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
         make_experiment(**common, leak=["G = 1e-13", "C = 1e-10"]),
         make_experiment(**common, seed=1),
         make_experiment(**common, step=1e-4),
+        make_experiment(**common, error=1e-4),
         make_experiment(**common, method="rk4"),
         make_experiment(**common, allow_unresolved=True),
         make_experiment(**common, values={"R_c": 0.73 + 1e-12}),
@@ -66,9 +69,40 @@ def test_a_run_is_told_in_its_provenance():
     found = run(make_experiment(duration=1.0, values={"V": "200[cm^3]"}, seed=9)).recording
     told = found.provenance
     assert told["origin"] == "simulation"
-    assert told["solver"] == {"method": "rk4", "step_s": 5e-4, "allow_unresolved": False}
+    found_error = told["solver"].pop("error_found_pa")
+    assert 0.0 < found_error < 100.0
+    assert told["solver"] == {"method": "rk4", "step_s": 5e-4, "allow_unresolved": False, "error_pa": 100.0}
     assert told["experiment"]["seed"] == 9
     assert "cylinder.V" in told["experiment"]["parameters_set"]
+
+
+@pytest.mark.parametrize("values", [{}, THROTTLED], ids=["free", "throttled"])
+def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
+    experiment = make_experiment(duration=4.0, values=values)
+    converged = trajectory(replace(experiment, step=2e-5), ())
+
+    def error(path):
+        every = round((path.t[1] - path.t[0]) * 1e6) // round((converged.t[1] - converged.t[0]) * 1e6)
+        return float(np.sqrt(np.mean((path["p_A"] - converged["p_A"][::every][: path.t.size]) ** 2)))
+
+    steps = []
+    for allowed in (None, 3.0, 0.1):
+        path = trajectory(replace(experiment, error=allowed), ())
+        steps.append(path.step)
+        assert error(path) < (100.0 if allowed is None else allowed)
+    assert steps[0] > steps[1] > steps[2]
+    told = run(replace(experiment, duration=1.0, error=3.0)).recording.provenance["solver"]
+    assert told["error_pa"] == 3.0
+    assert told["error_found_pa"] < 3.0
+    assert "error_pa" not in run(replace(experiment, duration=1.0, step=5e-4)).recording.provenance["solver"]
+
+
+def test_an_error_is_positive_and_stands_alone():
+    for wrong in (0.0, -20.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="error must be > 0 Pa, got"):
+            run(make_experiment(duration=1.0, error=wrong))
+    with pytest.raises(InputError, match=r"a stated step or a stated error, not both, got .* 0\.0005 s and error = 20"):
+        make_experiment(duration=1.0, error=20.0, step=5e-4)
 
 
 @pytest.mark.parametrize("values", [{}, THROTTLED], ids=["free", "throttled"])

@@ -14,7 +14,8 @@ import numpy as np
 
 from sealscope.campaigns.plan import Plan, Use
 
-#: Rooms whose sources a record and its scores depend on.
+#: Files of this room, and rooms, whose sources a record and its scores depend on.
+_OWN = ("cases", "machines", "work", "entries", "statement", "batches", "short_runs")
 _ROOMS = ("parameters", "physics", "signals", "simulation", "diagnosis")
 
 
@@ -99,7 +100,7 @@ def code_key() -> str:
     """A hash of the sources that a row depends on: rows of other sources must not stand in the same table."""
     root = Path(__file__).resolve().parents[1]
     found = hashlib.sha256()
-    own = [root / "campaigns" / name for name in ("cases.py", "machines.py", "work.py", "entries.py", "statement.py")]
+    own = [root / "campaigns" / f"{name}.py" for name in _OWN]
     rooms = [path for room in _ROOMS for path in sorted((root / room).rglob("*")) if path.suffix in (".py", ".toml")]
     for path in (*own, *rooms):
         found.update(path.relative_to(root).as_posix().encode() + b"\0")

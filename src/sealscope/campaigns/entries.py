@@ -16,7 +16,7 @@ from functools import cache
 from sealscope.campaigns.statement import Statement, finite
 from sealscope.diagnosis.contract import detectors
 from sealscope.diagnosis.plugins import PlugIn
-from sealscope.diagnosis.scorers import CALIBRATED, SCORERS, VIEW, Look, scorer, split_view
+from sealscope.diagnosis.scorers import CALIBRATED, SCORERS, VIEW, Look, Sides, scorer, split_view
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
 
@@ -123,6 +123,18 @@ def stated(
             found = scorer(split_view(one.name)[0]).score(through)
             scores[one.name] = (finite(found.value), finite(found.onset_s))
     return scores, statements
+
+
+def scored(sides: Sides, names: Sequence[str], views: Views) -> dict[str, tuple[float | None, float | None]]:
+    """The same scores as `stated` gives, of entries that need no more than the RMS on both sides; none has an onset."""
+    scores: dict[str, tuple[float | None, float | None]] = {}
+    for name in names:
+        one = entry(name)
+        of_sides = scorer(one.of).of_sides
+        if one.detector or of_sides is None:
+            raise InputError(f"a detector scored from the RMS on both sides must need no more, got {name!r}")
+        scores[name] = (finite(of_sides(sides.through(views.get(one.view, ALL_CHANNELS))).value), None)
+    return scores
 
 
 def _share(said: Statement) -> float | None:

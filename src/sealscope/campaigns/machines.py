@@ -13,6 +13,7 @@ from sealscope.errors import InputError
 if TYPE_CHECKING:
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.faults import Fault, Leak
+    from sealscope.simulation.profile import Profile
 
 #: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
 SIZING_SECONDS = 13.0
@@ -57,14 +58,14 @@ def leak_of(plan: Plan, case: Case) -> tuple[Leak, ...]:
     return (Leak(law, mean=case.leak_lpm * LITRE_PER_MINUTE, opening=From(plan.onset_s)),)
 
 
-def experiment_of(plan: Plan, case: Case) -> Experiment:
+def unsized(plan: Plan, case: Case, profile: Profile | None = None) -> Experiment:
     """The experiment of a case: the machine that its seed draws from the bench (or the rig as it stands), the case's
-    levels on top, its leak sized on that machine."""
+    levels on top; the size of its leak still a mean flow. `profile`: the plan's bench, where it has been loaded."""
     from sealscope.simulation.bench import Machine, draw
     from sealscope.simulation.commands import Sine, parse_command
 
     if plan.profile:
-        machine = draw(plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s)
+        machine = draw(profile or plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s)
     else:
         machine = Machine("none", case.machine_seed, plan.rig, plan.duration_s, {}, (), Sine(3.0, 4.0), 0.0)
     settings = dict(machine.values)
@@ -77,8 +78,13 @@ def experiment_of(plan: Plan, case: Case) -> Experiment:
             settings[name] = level
     machine = replace(machine, values=_once(settings))
     fault = fault_of(case.fault, plan.onset_s) if case.fault else None
-    experiment = machine.experiment(seed=case.noise_seed, fault=fault)
-    return replace(experiment, leaks=sized_once(experiment, leak_of(plan, case)))
+    return machine.experiment(seed=case.noise_seed, fault=fault, leak=leak_of(plan, case))
+
+
+def experiment_of(plan: Plan, case: Case) -> Experiment:
+    """The experiment of a case (`unsized`) with its leak sized on its machine."""
+    experiment = unsized(plan, case)
+    return replace(experiment, leaks=sized_once(experiment))
 
 
 def _once(settings: Mapping[str, str | float]) -> dict[str, str | float]:
@@ -89,21 +95,26 @@ def _once(settings: Mapping[str, str | float]) -> dict[str, str | float]:
     return {resolve(name, declared_names()): value for name, value in settings.items()}
 
 
-def sized_once(experiment: Experiment, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-    """The leaks with coefficients that give their means on this machine over a short run of its own.
+def sizing_run(experiment: Experiment) -> Experiment:
+    """The short run on which an experiment's leaks are sized, open from its start."""
+    from sealscope.simulation.faults import From
+
+    return replace(
+        experiment,
+        duration=min(experiment.duration, SIZING_SECONDS),
+        leaks=tuple(replace(leak, opening=From(0.0)) for leak in experiment.leaks),
+    )
+
+
+def sized_once(experiment: Experiment) -> tuple[Leak, ...]:
+    """The experiment's leaks with coefficients that give their means on this machine over a short run of its own.
 
     Sizing on the whole record would cost it two or three times over; the mean that the record really had is told in
     its row.
     """
-    from sealscope.simulation.faults import From
     from sealscope.simulation.simulate import sized_leaks
 
-    if not leaks:
+    if not experiment.leaks:
         return ()
-    short = replace(
-        experiment,
-        duration=min(experiment.duration, SIZING_SECONDS),
-        leaks=tuple(replace(leak, opening=From(0.0)) for leak in leaks),
-    )
-    found = sized_leaks(short)
-    return tuple(replace(one, opening=leak.opening) for one, leak in zip(found, leaks, strict=True))
+    found = sized_leaks(sizing_run(experiment))
+    return tuple(replace(one, opening=leak.opening) for one, leak in zip(found, experiment.leaks, strict=True))

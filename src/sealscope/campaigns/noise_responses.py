@@ -10,10 +10,10 @@ import numpy as np
 from sealscope.campaigns.bound import in_lpm
 from sealscope.campaigns.prediction import ChangeDetector, Responses
 from sealscope.diagnosis.blocks import QUANTITIES, mean_squares
-from sealscope.diagnosis.scorers import START_SECONDS, START_SHARE
+from sealscope.diagnosis.scorers import side_bounds
 from sealscope.physics.rig import OUTPUTS
 from sealscope.recordings.recording import Array
-from sealscope.signals.details import Details, details, edge_samples
+from sealscope.signals.details import Details, details
 from sealscope.signals.filters import IntArray
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
@@ -54,10 +54,8 @@ def instrument_noise(experiment: Experiment, records: int, seed: int) -> Array:
 
 def halves(n: int, rate: float) -> tuple[IntArray, IntArray]:
     """Bounds (BLOCKS + 1,) of the blocks before and after the middle, over the samples that the scorers compare."""
-    before, after = (int(samples) for samples in edge_samples()[-1])
-    begin = max(before, int(min(START_SECONDS * rate, START_SHARE * (n // 2))))
-    ends = ((begin, n // 2 - after), (n // 2 + before, n - after))
-    first, second = (np.linspace(*pair, BLOCKS + 1).astype(np.int64) for pair in ends)
+    sides = side_bounds(n, rate, n // 2)
+    first, second = (np.linspace(start, stop, BLOCKS + 1).astype(np.int64) for start, stop in sides)
     return first, second
 
 

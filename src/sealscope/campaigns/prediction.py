@@ -48,7 +48,7 @@ class ChangeDetector:
 
     def change(self, look: Look) -> float:
         """The signed change of the log RMS; NaN where it cannot be computed."""
-        found = look.of(self.chamber, self.quantity, "change")
+        found = look.sides.of(self.chamber, self.quantity, "change")
         return math.nan if found is None else found
 
 

@@ -13,7 +13,7 @@ from sealscope.campaigns.held_out_plan import HeldOutPlan
 from sealscope.campaigns.judge import Judgement, calibration_of, judge
 from sealscope.campaigns.plan import AnyPlan, Plan
 from sealscope.campaigns.recorded import Progress, RecordedPlan, recorded_rows
-from sealscope.campaigns.run import kept_rows, made_from
+from sealscope.campaigns.run import RUN_BY_RUN, kept_rows, made_from
 from sealscope.campaigns.tables import rows_sheet, sheets, write_sheets
 from sealscope.campaigns.work import Row
 from sealscope.diagnosis.calibration import save
@@ -25,13 +25,14 @@ CALIBRATION = "calibration.json"
 @dataclass(frozen=True)
 class Result:
     """A campaign and what it shows; `missing`: records of the plan that have no row yet; `checks`: of classifiers that
-    were held out."""
+    were held out; `way`: how the rows of a simulated one were made, "" for another."""
 
     plan: AnyPlan
     rows: tuple[Row, ...]
     missing: int
     judgement: Judgement
     checks: tuple[HeldOutCheck, ...] = ()
+    way: str = ""
 
 
 def simulated_result(plan: Plan, folder: Path) -> Result:
@@ -39,6 +40,7 @@ def simulated_result(plan: Plan, folder: Path) -> Result:
     rows = kept_rows(plan, folder)
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
+    head = store.head(folder) or made_from(plan)
     calibration = calibration_of(
         list(rows.values()),
         plan.detectors,
@@ -46,7 +48,7 @@ def simulated_result(plan: Plan, folder: Path) -> Result:
         promise=plan.promise,
         confidence=plan.confidence,
         split_share=plan.onset_s / plan.duration_s,
-        made_from={"campaign": store.head(folder) or made_from(plan)},
+        made_from={"campaign": head},
         views=plan.views,
     )
     judgement = judge(
@@ -57,7 +59,7 @@ def simulated_result(plan: Plan, folder: Path) -> Result:
         hours=plan.duration_s / 3600.0,
         confidence=plan.confidence,
     )
-    return Result(plan, tuple(rows.values()), plan.size - len(rows), judgement)
+    return Result(plan, tuple(rows.values()), plan.size - len(rows), judgement, way=str(head.get("way", RUN_BY_RUN)))
 
 
 def held_out_result(plan: HeldOutPlan, samples: Samples) -> Result:

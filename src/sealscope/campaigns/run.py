@@ -20,6 +20,8 @@ from sealscope.errors import InputError
 #: Told how many records have their row, how many there are, and how many of those failed.
 Progress = Callable[[int, int, int], None]
 RECORDINGS = "recordings"
+#: How rows are made unless in batches.
+RUN_BY_RUN = "run by run"
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,8 @@ class Standing:
         return self.done == self.records
 
 
-def made_from(plan: Plan) -> dict[str, Any]:
-    """What a campaign's rows depend on, as plain values."""
+def made_from(plan: Plan, way: str = RUN_BY_RUN) -> dict[str, Any]:
+    """What a campaign's rows depend on, as plain values; `way`: how they are made, `RUN_BY_RUN` or `batches.way`."""
     # a detector that searches within the record sets its own threshold for the rate, and its score may follow
     entries = [entry(name) for name in plan.detectors]
     searching = any(one.detector or scorer(one.of).timing == "search" for one in entries)
@@ -49,6 +51,7 @@ def made_from(plan: Plan) -> dict[str, Any]:
         "name": plan.name,
         "title": plan.title,
         "world": world(plan),
+        "way": way,
         "code": code_key(),
         "rate_within": plan.false_alarm if searching else None,
         "assumed": digest({row.name: repr(row.value) for row in assumed.table()}) if searching else None,
@@ -92,22 +95,37 @@ def run(
     retry: bool = False,
     progress: Progress | None = None,
     task: crew.Task = work,
+    batch: bool = False,
+    device: str = "cpu",
 ) -> Standing:
     """Carry out what is missing of the plan in `folder`, and say how far it is then.
 
     `jobs`: processes of this machine, one a core by default, 1 for this process alone; `cluster`: address of a Dask
-    scheduler instead; `retry`: carry failed cases out again. The rows are the same whoever makes them and in whatever
-    order. Raises InputError where the folder holds another campaign, or another run is at work in it.
+    scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side by side (`batches`) on the
+    `device`, cpu (with `jobs` threads) or gpu, which stands for a batch by itself. The rows are the same whoever makes
+    them and in whatever order, those of batches in any batch. Raises InputError where the folder holds another
+    campaign, another run is at work in it, or a batch cannot do what the plan asks for.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be >= 1, got {jobs}")
+    batch = batch or device != "cpu"
+    cases = cases_of(plan)
+    way = RUN_BY_RUN
+    if batch:
+        from sealscope.campaigns import batches
+
+        if cluster is not None:
+            raise InputError("--cluster must stand without --batch: a batch is made by one machine")
+        batches.check_device(plan, device)
+        batches.check_plan(plan, cases)
+        way = batches.way(device)
     place = Path(folder)
-    store.begin(place, made_from(plan))
+    store.begin(place, made_from(plan, way))
     with store.alone_in(place):
         rows = kept_rows(plan, place)
         if retry:
             rows = {name: row for name, row in rows.items() if row.error is None}
-        waiting = [case for case in cases_of(plan) if case.id not in rows]
+        waiting = [case for case in cases if case.id not in rows]
         failures = sum(row.error is not None for row in rows.values())
         done = len(rows)
         if progress is not None:
@@ -116,7 +134,11 @@ def run(
         if plan.keep_recordings:
             keep = place / RECORDINGS
             keep.mkdir(exist_ok=True)
-        made = _rows(plan, waiting, jobs or _cores(), cluster, keep, task)
+        made = (
+            batches.in_batches(plan, waiting, jobs or _cores(), device)
+            if batch
+            else _rows(plan, waiting, jobs or _cores(), cluster, keep, task)
+        )
         with store.Appender(place) as appender, closing(made):
             for row in made:
                 appender.append(row)

@@ -20,6 +20,7 @@ _SAME = {
     "name": "campaign",
     "world": "rig, bench, length, onset or seed",
     "code": "program code",
+    "way": "way of making rows (run by run, or in batches on which device)",
     "rate_within": "false-alarm rate, at which its detectors search within a record",
     "assumed": "rig that its detectors assume",
     "plug_ins": "detectors of other distributions",

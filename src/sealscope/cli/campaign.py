@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sealscope.cli.campaign_progress import bar, span
 from sealscope.cli.options import (
     AssumeOption,
     FalseAlarmOption,
@@ -26,7 +24,7 @@ if TYPE_CHECKING:
     from sealscope.campaigns.held_out import Samples
     from sealscope.campaigns.plan import AnyPlan
     from sealscope.campaigns.results import Result
-    from sealscope.campaigns.run import Progress, Standing
+    from sealscope.campaigns.run import Standing
 
 campaign = typer.Typer(
     name="campaign",
@@ -81,6 +79,12 @@ def run(
         str | None, typer.Option("--cluster", metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786.")
     ] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Carry failed records out again.")] = False,
+    batch: Annotated[
+        bool, typer.Option("--batch", help="Simulate side by side; for detectors of the details' RMS on both sides.")
+    ] = False,
+    device: Annotated[
+        str, typer.Option("--device", metavar="cpu|gpu", help="What batches run on; gpu stands for --batch.")
+    ] = "cpu",
     sheet: SheetOption = None,
     data: DataOption = None,
 ) -> None:
@@ -91,9 +95,13 @@ def run(
 
     loaded = load_plan(plan)
     place = _folder(loaded, folder)
+    if (batch or device != "cpu") and not isinstance(loaded, Plan):
+        raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
     if isinstance(loaded, Plan):
-        with _progress() as told:
-            standing = carry_out(loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=told)
+        with bar() as told:
+            standing = carry_out(
+                loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=told, batch=batch, device=device
+            )
         typer.echo(_standing(standing))
     _report(loaded, place, sheet, data)
     if isinstance(loaded, Plan) and standing.failed:
@@ -133,18 +141,8 @@ def _standing(standing: Standing) -> str:
     if standing.seconds is not None:
         left = (standing.records - standing.done) * standing.seconds
         words += f"; {standing.seconds:.2f} s of one core each"
-        words += f", about {_span(left)} of one core left" if left else ""
+        words += f", about {span(left)} of one core left" if left else ""
     return words
-
-
-def _span(seconds: float) -> str:
-    return (
-        f"{seconds / 3600:.1f} h"
-        if seconds > 5400
-        else f"{seconds / 60:.0f} min"
-        if seconds > 90
-        else f"{seconds:.0f} s"
-    )
 
 
 def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> None:
@@ -171,7 +169,7 @@ def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
     if isinstance(plan, Plan):
         return simulated_result(plan, folder)
     if isinstance(plan, RecordedPlan):
-        with _progress() as told:
+        with bar() as told:
             return recorded_result(plan, needs_folder(data, "recordings"), told)
     if plan.data == "hydraulic":
         return held_out_result(plan, hydraulic_samples(needs_folder(data, "the hydraulic data set")))
@@ -280,50 +278,3 @@ def calibrate(
                 f"({100 * one.low:.2g} % to {100 * one.high:.2g} %)"
             )
     typer.echo(f"calibration: {output}")
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """One bar on standard error with the records, failures and the time left; without a terminal a line a minute."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _Lines()
-        return
-    columns = (
-        TextColumn("records"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(), TextColumn("{task.description}"),
-    )  # fmt: skip
-    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
-        task = bar.add_task("", total=None)
-
-        def told(done: int, total: int, failures: int) -> None:
-            bar.update(task, completed=done, total=total, description=f"{failures} failed" if failures else "")
-
-        yield told
-
-
-class _Lines:
-    """Progress where nobody watches: a line a minute, for the log."""
-
-    def __init__(self) -> None:
-        self.began, self.last, self.first = time.monotonic(), time.monotonic(), -1
-
-    def __call__(self, done: int, total: int, failures: int) -> None:
-        now = time.monotonic()
-        self.first = done if self.first < 0 else self.first
-        if now - self.last < 60.0 or done == self.first:
-            return
-        self.last = now
-        left = (now - self.began) / (done - self.first) * (total - done)
-        failed = f", {failures} failed" if failures else ""
-        typer.echo(f"{done} of {total} records{failed}, about {_span(left)} left", err=True)

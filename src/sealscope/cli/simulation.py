@@ -56,6 +56,12 @@ def simulate(
     settings: SetOption = None,
     method: Annotated[str, typer.Option("--method", help="auto, rk4 or imex.")] = "auto",
     step: Annotated[str | None, typer.Option("--step", help="Largest step of the solver [s].")] = None,
+    error: Annotated[
+        str | None,
+        typer.Option(
+            "--error", help="Error that a pressure may have, e.g. '20[Pa]', instead of a step. [default: 100]"
+        ),
+    ] = None,
     prove: Annotated[
         bool, typer.Option("--prove", help="Halve the step and report how far everything moves; fail if too far.")
     ] = False,
@@ -89,6 +95,7 @@ def simulate(
         seed=seed,
         method=method,
         step=None if step is None else parse_quantity(step, "s", name="--step"),
+        error=None if error is None else parse_quantity(error, "Pa", name="--error"),
         allow_unresolved=allow_unresolved,
     )
     with progress() as told:

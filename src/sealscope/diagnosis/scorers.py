@@ -22,6 +22,8 @@ from sealscope.diagnosis.examination import Examination
 from sealscope.diagnosis.verdict import LEAKS, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.details import details, edge_samples
+from sealscope.signals.filters import IntArray
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -39,6 +41,47 @@ class Score:
     value: float | None
     onset_s: float | None = None
     reason: str = ""
+
+
+def side_bounds(n: int, rate: float, split: int) -> IntArray:
+    """First and last (exclusive) sample of each side of the sample `split` in a recording of `n` samples at `rate`
+    [Hz], (2, 2): without the start (`START_SECONDS`), and without details that saw the other side or the recording's
+    ends. A side that has no sample left ends before it begins."""
+    before, after = (int(samples) for samples in edge_samples()[-1])
+    begin = max(before, int(min(START_SECONDS * rate, START_SHARE * split)))
+    return np.array([[begin, split - after], [split + before, n - after]])
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Chamber -> log RMS of d1..d4 and d3d4, (5,) each: before the split, after it, over both. All that a scorer needs
+    which compares two sides or judges the level, whether a recording or a batch of runs gave it."""
+
+    log_rms: Mapping[str, tuple[Array, Array, Array]]
+
+    @classmethod
+    def of_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> Sides:
+        """From the mean squares (2, 5) of each chamber's details on the two sides, of `bounds` (2, 2)."""
+        found = {}
+        with np.errstate(divide="ignore"):
+            for chamber, parts in squares.items():
+                both = np.average(parts, axis=0, weights=np.diff(bounds)[:, 0])
+                found[chamber] = (0.5 * np.log(parts[0]), 0.5 * np.log(parts[1]), 0.5 * np.log(both))
+        return cls(found)
+
+    def through(self, channels: Iterable[str]) -> Sides:
+        """The same of these of its chambers alone."""
+        seen = set(channels)
+        return Sides({chamber: values for chamber, values in self.log_rms.items() if chamber in seen})
+
+    def of(self, chamber: str, quantity: str, what: Literal["change", "level"]) -> float | None:
+        """Change of a quantity's log RMS over the split, or its level; None where it has none."""
+        found = self.log_rms.get(chamber)
+        if found is None:
+            return None
+        before, after, both = (float(one[QUANTITIES.index(quantity)]) for one in found)
+        value = after - before if what == "change" else both
+        return value if math.isfinite(value) else None
 
 
 class Look:
@@ -69,43 +112,26 @@ class Look:
         return seen
 
     @cached_property
-    def log_rms(self) -> Mapping[str, tuple[Array, Array, Array]]:
-        """Chamber -> log RMS of d1..d4 and d3d4, (5,) each: before the split, after it, over both.
-
-        Coefficients that saw the other side of the split or the recording's ends are in neither part.
-        """
-        from sealscope.signals.details import details, edge_samples
-
+    def sides(self) -> Sides:
+        """The log RMS before the split, after it and over both, of each chamber whose two sides have details."""
         recording = self.recording
         n, rate = len(recording), recording.rate
-        split = round((self.split_s - float(recording.t[0])) * rate)
-        before, after = (int(samples) for samples in edge_samples()[-1])
-        begin = max(before, int(min(START_SECONDS * rate, START_SHARE * split)))
-        first, second = (begin, split - after), (split + before, n - after)
-        found = {}
-        for chamber in CHAMBERS:
-            if chamber not in recording or min(first[1] - first[0], second[1] - second[0]) < 1:
-                continue
-            transformed = details(recording[chamber])
-            parts = [mean_squares(transformed, np.array(part))[0] for part in (first, second)]
-            sizes = [part[1] - part[0] for part in (first, second)]
-            with np.errstate(divide="ignore"):
-                both = np.average(parts, axis=0, weights=sizes)
-                found[chamber] = tuple(0.5 * np.log(one) for one in (*parts, both))
-        return found
+        bounds = side_bounds(n, rate, round((self.split_s - float(recording.t[0])) * rate))
+        squares = {}
+        for chamber in CHAMBERS if np.diff(bounds).min() > 0 else ():
+            if chamber in recording:
+                transformed = details(recording[chamber])
+                squares[chamber] = np.array([mean_squares(transformed, one)[0] for one in bounds])
+        return Sides.of_squares(squares, bounds)
+
+    @property
+    def log_rms(self) -> Mapping[str, tuple[Array, Array, Array]]:
+        """The log RMS of its sides."""
+        return self.sides.log_rms
 
     def evidence(self, detector: str) -> Evidence:
         """The evidence of a registered detector, with no baseline."""
         return self.examination.evidence(detector)
-
-    def of(self, chamber: str, quantity: str, what: Literal["change", "level"]) -> float | None:
-        """Change of a quantity's log RMS over the split, or its level; None where it has none."""
-        found = self.log_rms.get(chamber)
-        if found is None:
-            return None
-        before, after, both = (float(one[QUANTITIES.index(quantity)]) for one in found)
-        value = after - before if what == "change" else both
-        return value if math.isfinite(value) else None
 
 
 @dataclass(frozen=True)
@@ -113,7 +139,8 @@ class Scorer:
     """One way to score a recording.
 
     `sided`: whether a change either way raises the score; `timing`: whether it compares the two sides of the split,
-    judges the whole, or searches for the onset; `threshold`: its own, None where leak-free recordings must set one.
+    judges the whole, or searches for the onset; `threshold`: its own, None where leak-free recordings must set one;
+    `of_sides`: the score from the RMS on both sides alone, None where it needs the whole recording.
     """
 
     name: str
@@ -122,6 +149,19 @@ class Scorer:
     about: str
     score: Callable[[Look], Score]
     threshold: float | None = None
+    of_sides: Callable[[Sides], Score] | None = None
+
+
+def _on_sides(
+    name: str,
+    sided: Sided,
+    timing: Literal["split", "whole"],
+    about: str,
+    of_sides: Callable[[Sides], Score],
+    threshold: float | None = None,
+) -> Scorer:
+    """A scorer that needs no more of a recording than the RMS on both sides."""
+    return Scorer(name, sided, timing, about, lambda look: of_sides(look.sides), threshold, of_sides)
 
 
 def _number(value: float | None, what: str) -> Score:
@@ -138,43 +178,43 @@ def _of_details() -> Iterator[Scorer]:
         for quantity in QUANTITIES:
             name = f"{quantity} of {chamber}"
 
-            def change(look: Look, sign: float, chamber: str = chamber, quantity: str = quantity) -> Score:
-                found = look.of(chamber, quantity, "change")
+            def change(sides: Sides, sign: float, chamber: str = chamber, quantity: str = quantity) -> Score:
+                found = sides.of(chamber, quantity, "change")
                 value = found if found is None else abs(found) if sign == 0 else sign * found
                 return _number(value, f"the change of {quantity} of {chamber}")
 
-            def level(look: Look, sign: float, chamber: str = chamber, quantity: str = quantity) -> Score:
-                found = look.of(chamber, quantity, "level")
+            def level(sides: Sides, sign: float, chamber: str = chamber, quantity: str = quantity) -> Score:
+                found = sides.of(chamber, quantity, "level")
                 return _number(found if found is None else sign * found, f"the level of {quantity} of {chamber}")
 
             for word, sign in (("fell", -1.0), ("rose", 1.0)):
 
-                def moved(look: Look, sign: float = sign, change: Callable[[Look, float], Score] = change) -> Score:
-                    return change(look, sign)
+                def moved(sides: Sides, sign: float = sign, change: Callable[[Sides, float], Score] = change) -> Score:
+                    return change(sides, sign)
 
                 about = f"the RMS of {name} {word} after the split, as change of its logarithm"
-                yield Scorer(f"{name} {word}", "one-sided", "split", about, moved)
-                yield Scorer(
+                yield _on_sides(f"{name} {word}", "one-sided", "split", about, moved)
+                yield _on_sides(
                     f"sign rule: {name} {word}", "one-sided", "split", f"{about}; any change at all", moved, 0.0
                 )
 
-            def either(look: Look, change: Callable[[Look, float], Score] = change) -> Score:
-                return change(look, 0.0)
+            def either(sides: Sides, change: Callable[[Sides, float], Score] = change) -> Score:
+                return change(sides, 0.0)
 
             about = f"the RMS of {name} changed either way over the split, as size of the change of its logarithm"
-            yield Scorer(f"{name} changed", "two-sided", "split", about, either)
+            yield _on_sides(f"{name} changed", "two-sided", "split", about, either)
             for word, sign in (("low", -1.0), ("high", 1.0)):
 
-                def at(look: Look, sign: float = sign, level: Callable[[Look, float], Score] = level) -> Score:
-                    return level(look, sign)
+                def at(sides: Sides, sign: float = sign, level: Callable[[Sides, float], Score] = level) -> Score:
+                    return level(sides, sign)
 
                 about = f"the RMS of {name} over the whole recording is {word}, as its logarithm"
-                yield Scorer(f"{name} {word}", "one-sided", "whole", about, at)
+                yield _on_sides(f"{name} {word}", "one-sided", "whole", about, at)
 
 
-def _both_products(look: Look) -> Score:
+def _both_products(sides: Sides) -> Score:
     """The thesis's cumulative rule: d3d4 fell in chamber A and rose in chamber B, the lesser of both."""
-    a, b = (look.of(chamber, "d3d4", "change") for chamber in CHAMBERS)
+    a, b = (sides.of(chamber, "d3d4", "change") for chamber in CHAMBERS)
     return _number(None if a is None or b is None else min(-a, b), "the change of d3d4 in both chambers")
 
 
@@ -194,8 +234,8 @@ def _all() -> Iterator[Scorer]:
     yield from _of_details()
     both = "d3d4 of both chambers as the thesis says"
     about = "the RMS of d3d4 fell in p_A and rose in p_B, the lesser of both changes"
-    yield Scorer(both, "one-sided", "split", about, _both_products)
-    yield Scorer(f"sign rule: {both}", "one-sided", "split", f"{about}; any change at all", _both_products, 0.0)
+    yield _on_sides(both, "one-sided", "split", about, _both_products)
+    yield _on_sides(f"sign rule: {both}", "one-sided", "split", f"{about}; any change at all", _both_products, 0.0)
     yield Scorer(
         "rms change",
         "two-sided",

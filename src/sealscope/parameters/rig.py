@@ -232,6 +232,7 @@ def _qualified(full: str, text: str) -> str:
     return text if unique else full + text[len(symbol) :]
 
 
+@cache
 def _shown(full: str) -> str:
     return _qualified(full, full.rpartition(".")[2])
 

@@ -16,6 +16,7 @@ from sealscope.campaigns.judge import Judgement, Pod, SizeRoc
 from sealscope.campaigns.plan import Plan
 from sealscope.campaigns.recorded import RecordedPlan
 from sealscope.campaigns.results import Result, detectors_of
+from sealscope.campaigns.run import RUN_BY_RUN
 from sealscope.diagnosis.contract import detectors
 from sealscope.diagnosis.scorers import SCORERS
 from sealscope.evaluation.table import SummaryRow
@@ -153,6 +154,11 @@ def _notes(result: Result) -> list[str]:
             f"By thresholds of their own, set for {100 * plan.false_alarm:g} % false alarms: {', '.join(own)}. What "
             "they state of flow, onset and cause is in estimates.csv, onsets.csv and causes.csv."
         )
+    if _batched(result):
+        notes.append(
+            f"Simulated {result.way}: of each record only the RMS of the details on both sides of the onset was kept. "
+            "Seeds draw the same machines as run by run, and other noise of the same law."
+        )
     notes += [one.words() for one in result.checks]
     if plan.note:
         notes.append(plan.note)
@@ -161,6 +167,10 @@ def _notes(result: Result) -> list[str]:
     if judgement.failed:
         notes.append(f"{len(judgement.failed)} records failed; those to judge count as cannot tell for every detector.")
     return notes
+
+
+def _batched(result: Result) -> bool:
+    return result.way not in ("", RUN_BY_RUN)
 
 
 def write_campaign_page(result: Result, path: Path, files: Sequence[str] = ()) -> Path:
@@ -228,6 +238,7 @@ def _facts(result: Result) -> list[tuple[str, str]]:
         ("records", f"{plan.duration_s:g} s at {plan.rig.daq.sample_rate:g} Hz, leaks open at {plan.onset_s:g} s"),
         *((name, ", ".join(str(level) for level in levels)) for name, levels in plan.factors.items()),
         ("base seed", str(plan.seed)),
+        *([("simulated", result.way)] if _batched(result) else []),
         *((f"seen by @ {name}" if name else "seen", ", ".join(channels)) for name, channels in plan.views.items()),
     ]
     if any(entry(one).detector for one in plan.detectors):

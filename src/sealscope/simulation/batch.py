@@ -6,6 +6,7 @@ pressures, readings and details exist for a few seconds of each run only.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +26,8 @@ from sealscope.simulation.sizing import scaled_size
 
 #: Told how far the batch is, 0..1.
 Progress = Callable[[float], None]
+#: What a batch runs on.
+DEVICES = ("cpu", "gpu")
 #: Members of a set on which its step is chosen, and for how long [s] each of them runs for that.
 _SCOUTS, _SCOUTED = 4, 2.0 * FIRST_WINDOW
 
@@ -60,19 +63,23 @@ def simulate_batch(
     bounds: Sequence[float] | Array | None = None,
     error: float = PRESSURE_TOLERANCE,
     threads: int | None = None,
+    device: str = "cpu",
     progress: Progress | None = None,
 ) -> Batch:
     """Run experiments side by side, record p_A and p_B as the instruments would, and keep the RMS of the db8 details.
 
     `bounds` [s]: where the segments begin and end (default: both halves); what the transform's edges touch is left out.
     The runs have one duration and one sampling rate; rigs, leaks (one each, opening at once or evenly), drifts and
-    faults of the machine may all differ. A run's step is its own `step`, or one that is chosen by `error` [Pa] for all
+    faults of the machine may all differ. A run's step is its own `step`, or one that is chosen by its own or this `error` [Pa] for all
     runs of its kind and command. Results do not depend on the order of the runs, their number or `threads` (default:
-    the machine's cores); the noise is another stream than that of `simulate.run`.
+    the machine's cores); the noise is another stream than that of `simulate.run`. `device`: cpu, or gpu (extra `gpu`
+    and an NVIDIA GPU), where the same laws run, one thread a run; results agree to rounding, and the beginning of some
+    runs is compared with the processor's.
 
     Raises InputError for runs that cannot be side by side; SimulationFailed, naming the run, where one diverges or
     falls below vacuum.
     """
+    runner = runner_of(device)
     experiments = list(experiments)
     sets = sets_of(experiments)
     first = experiments[0]
@@ -91,33 +98,56 @@ def simulate_batch(
                 if progress is not None:
                     progress(min(1.0, begun + share * size / n))
 
-            _run(part, batch, error, pool, workers, told)
+            own = part.experiment.error
+            _run(part, batch, error if own is None else own, pool, workers, told, runner)
             done += len(part.members) / n
     return batch
 
 
 def _split_by_step(sets: Sequence[LaneSet]) -> list[LaneSet]:
-    """The sets with a step of their own apart from those without."""
+    """The sets with a step or an error of their own apart from those without."""
     found = []
     for one in sets:
-        steps: dict[float | None, list] = {}  # type: ignore[type-arg]
+        kinds: dict[tuple[float | None, float | None], list] = {}  # type: ignore[type-arg]
         for member in one.members:
-            steps.setdefault(member.experiment.step, []).append(member)
-        found += [LaneSet(tuple(members), one.shape) for members in steps.values()]
+            kinds.setdefault((member.experiment.step, member.experiment.error), []).append(member)
+        found += [LaneSet(tuple(members), one.shape) for members in kinds.values()]
     return found
 
 
+def runner_of(device: str) -> type[SetRun]:
+    """What runs a set on a device: cpu, or gpu (extra `gpu`); raises InputError for one that is not there."""
+    if device not in DEVICES:
+        raise InputError(f"device must be one of {', '.join(DEVICES)}, got {device!r}")
+    if device == "cpu":
+        return SetRun
+    from numba.core import config
+
+    if importlib.util.find_spec("numba_cuda") is None and not config.ENABLE_CUDASIM:
+        raise InputError("device gpu needs numba-cuda, which is not installed: pip install 'sealscope[gpu]'")
+    from sealscope.simulation.batch_gpu import DeviceRun, require_device
+
+    require_device()
+    return DeviceRun
+
+
 def _run(
-    part: LaneSet, batch: Batch, error: float, pool: ThreadPoolExecutor, workers: int, progress: Callable[[float], None]
+    part: LaneSet,
+    batch: Batch,
+    error: float,
+    pool: ThreadPoolExecutor,
+    workers: int,
+    progress: Callable[[float], None],
+    runner: type[SetRun],
 ) -> None:
     places = [member.place for member in part.members]
     sizes = np.array([member.leak.coefficient or 0.0 for member in part.members])
     step = part.experiment.step or chosen_step(part, sizes, error)
     asked = np.array([member.leak.mean or 0.0 for member in part.members])
     if np.any(asked > 0):
-        sizes = _sized(part, step, sizes, asked, pool, workers)
+        sizes = _sized(part, step, sizes, asked, pool, workers, runner)
         step = part.experiment.step or min(step, chosen_step(part, sizes, error))
-    run = SetRun(part, step, sizes, sizes, batch.bounds)
+    run = runner(part, step, sizes, sizes, batch.bounds)
     run.all(pool, workers, progress)
     batch.rms[places] = run.rms()
     batch.mean_leak_lpm[places] = run.mean_flow() / LITRE_PER_MINUTE
@@ -163,7 +193,15 @@ def allowed_step(part: LaneSet, sizes: Array) -> float:
     return max(min(limits), LONGEST_STEP / FINEST)
 
 
-def _sized(part: LaneSet, step: float, sizes: Array, asked: Array, pool: ThreadPoolExecutor, workers: int) -> Array:
+def _sized(
+    part: LaneSet,
+    step: float,
+    sizes: Array,
+    asked: Array,
+    pool: ThreadPoolExecutor,
+    workers: int,
+    runner: type[SetRun],
+) -> Array:
     """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members at once."""
     from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, refuse_unsettled
 
@@ -171,7 +209,7 @@ def _sized(part: LaneSet, step: float, sizes: Array, asked: Array, pool: ThreadP
     before = np.zeros((2, len(sizes)))
     for _ in range(MOST_RUNS):
         fine = part.experiment.step or min(step, allowed_step(part, sizes))
-        run = SetRun(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
+        run = runner(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
         run.all(pool, workers, None)
         got = run.mean_flow()
         if np.any(got[wanted] <= 0):

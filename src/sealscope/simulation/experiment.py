@@ -19,6 +19,7 @@ from sealscope.simulation.drifts import Drift
 from sealscope.simulation.faults import Fault, Leak, parse_leak
 from sealscope.simulation.integrate import Method, choose_method
 from sealscope.simulation.readings import Readings
+from sealscope.simulation.resolution import PRESSURE_TOLERANCE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -32,9 +33,10 @@ class Experiment:
     """Everything a run depends on; equal experiments give equal bytes.
 
     `duration` [s]; `seed` of the instruments' noise; `x_0` [m] piston position at the start, from mid-stroke;
-    `method` and `step` [s] of the solver; `allow_unresolved` lets an unstable or under-resolved run through, marked
-    in its provenance; `faults` beside the leaks across the piston, `drifts` within the run. The sampling rate is the
-    rig's `daq.sample_rate`.
+    `method` of the solver, and either its `step` [s] or the rms `error` [Pa] that a pressure may have, by which the
+    step is chosen (`integrate`; None: 100 Pa); `allow_unresolved` lets an unstable or under-resolved run through,
+    marked in its provenance; `faults` beside the leaks across the piston, `drifts` within the run. The sampling rate
+    is the rig's `daq.sample_rate`.
     """
 
     rig: Rig
@@ -48,6 +50,7 @@ class Experiment:
     allow_unresolved: bool = False
     faults: tuple[Fault, ...] = ()
     drifts: tuple[Drift, ...] = ()
+    error: float | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.duration) and self.duration > 0):
@@ -63,8 +66,15 @@ class Experiment:
         half = self.rig.cylinder.L / 2
         if not abs(self.x_0) <= half:
             raise InputError(f"x_0 must be within the stroke, -{half:g} m to {half:g} m, got {self.x_0}")
+        if self.step is not None and self.error is not None:
+            raise InputError(
+                f"a run must have a stated step or a stated error, not both, got step = {self.step:g} s and "
+                f"error = {self.error:g} Pa"
+            )
         choose_method(self.rig, self.method)
-        check_command(self.commanded, self.sample_times(), self.rig.daq.u_max)
+        command, u_max = self.commanded, self.rig.daq.u_max
+        if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
+            check_command(command, self.sample_times(), u_max)
         for drift in self.drifts:
             drift.check(np.linspace(0.0, self.duration, 2001))
         self.effects()
@@ -89,6 +99,11 @@ class Experiment:
             (*drifting, *(one for fault in self.faults for one in fault.adjustments())),
             tuple(hold for fault in self.faults for hold in fault.holds()),
         )
+
+    @property
+    def error_allowed(self) -> float:
+        """Error [Pa] by which a step is chosen: the stated one, else the default."""
+        return PRESSURE_TOLERANCE if self.error is None else self.error
 
     @property
     def rate(self) -> float:
@@ -127,6 +142,7 @@ class Experiment:
         inputs = [exact(self.command), *(exact(leak) for leak in self.leaks)]
         inputs += [exact(one) for one in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
+        solver += [] if self.error is None else [self.error]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -79,6 +79,7 @@ def trajectory(
         x_0=experiment.x_0,
         method=experiment.method,
         step=step or experiment.step,
+        error=experiment.error_allowed,
         allow_unresolved=experiment.allow_unresolved,
         progress=progress,
         effects=experiment.effects(),
@@ -128,7 +129,7 @@ def run(experiment: Experiment, progress: Progress | None = None) -> Run:
         "origin": "simulation",
         "experiment": experiment.describe(),
         "experiment_key": experiment.key(),
-        "solver": {"method": path.method, "step_s": path.step, "allow_unresolved": experiment.allow_unresolved},
+        "solver": _solver(path, experiment),
     }
     history = (f"simulated with {path.method}, h = {path.step:.4g} s; sampled at {experiment.rate:g} Hz",)
     recording = replace(made, provenance=provenance, history=history)
@@ -137,6 +138,15 @@ def run(experiment: Experiment, progress: Progress | None = None) -> Run:
     mean = _mean_leak(leaks, path, experiment)
     truth = Truth(leaks, experiment.onset(), mean, times, outputs, experiment.faults, experiment.drifts)
     return Run(recording, truth)
+
+
+def _solver(path: Trajectory, experiment: Experiment) -> dict[str, Any]:
+    """How the run was integrated, for its provenance; where the step was chosen by error, `error_pa` is what was asked
+    for and `error_found_pa` what was found in the windows that were checked."""
+    told: dict[str, Any] = {"method": path.method, "step_s": path.step, "allow_unresolved": experiment.allow_unresolved}
+    if experiment.step is None:
+        told |= {"error_pa": experiment.error_allowed, "error_found_pa": path.error}
+    return told
 
 
 def _mean_leak(leaks: tuple[Leak, ...], path: Trajectory, experiment: Experiment) -> float:

@@ -1,0 +1,241 @@
+"""Cases many at a time: the scores that each case has by itself, whatever stands beside it, or one clear refusal."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sealscope.campaigns import batches
+from sealscope.campaigns import run as campaign
+from sealscope.campaigns.cases import cases_of
+from sealscope.campaigns.entries import stated
+from sealscope.campaigns.machines import sized_once, unsized
+from sealscope.campaigns.plan import read_plan
+from sealscope.campaigns.results import simulated_result, write_result
+from sealscope.campaigns.short_runs import Steps, place_of_run
+from sealscope.campaigns.work import work
+from sealscope.diagnosis.calibrated import place_of
+from sealscope.diagnosis.scorers import Look
+from sealscope.errors import InputError
+from sealscope.simulation.commands import parse_command
+from sealscope.simulation.simulate import run
+
+QUIET = {f"sensors.{name}.{what}": 0.0 for name in ("p_A", "p_B") for what in ("noise", "drift", "hum")}
+QUIET |= {"sensors.common_noise": 0.0, "daq.bits": 24}
+SCORED = [
+    "d3 of p_A fell", "d1 of p_B changed", "d2 of p_A low", "d4 of p_B rose", "sign rule: d3d4 of p_A fell",
+    "d3d4 of both chambers as the thesis says", "d3 of p_A fell @ side", "d4 of p_B high @ side",
+]  # fmt: skip
+
+
+@pytest.fixture
+def plan_with(text):
+    """The tiny plan with other entries of [campaign], other tables, or other records."""
+
+    def made(records=None, views=None, factors=None, **head):
+        tree = tomllib.loads(text)
+        tree["campaign"] |= head
+        if views:
+            tree["views"] = views
+        if factors:
+            tree["factors"] = factors
+        if records is not None:
+            tree["records"] = [one for one in tree["records"] if one.get("use") == "calibrate"] + records
+        return read_plan(tree, "tiny.toml")
+
+    return made
+
+
+def rows_of(plan, cases, device="cpu"):
+    """The rows by case id, without their processor time."""
+    return {row.id: replace(row, seconds=0.0) for row in batches.in_batches(plan, cases, 2, device)}
+
+
+def alone(plan, case):
+    """Scores and place of a case's whole recording, at the step that it has in a batch."""
+    experiment = unsized(plan, case)
+    experiment = replace(experiment, step=Steps(plan).of(case, experiment))
+    made = run(replace(experiment, leaks=sized_once(experiment)))
+    look = Look(made.recording, plan.onset_s, plan.false_alarm, plan.rig)
+    return stated(look, plan.detectors, plan.views)[0], place_of(made.recording), made.truth
+
+
+def test_without_noise_the_scores_are_those_of_the_recordings(plan_with):
+    records = [
+        {"count": 4},
+        {"leak": "0.015 L/min", "count": 4},
+        {"leak": "0.05 L/min", "law": "orifice", "count": 2},
+        {"fault": "friction x1.3", "count": 2},
+    ]
+    plan = plan_with(records, {"side": ["p_B"]}, set=QUIET, detectors=SCORED, onset="2.6 s")
+    cases = [case for case in cases_of(plan) if case.use == "judge"]
+    rows = rows_of(plan, cases)
+    for case in cases:
+        row = rows[case.id]
+        scores, place, truth = alone(plan, case)
+        assert row.error is None
+        assert row.scores["d3 of p_A fell @ side"] == scores["d3 of p_A fell @ side"] == (None, None)
+        known = [name for name in SCORED if name != "d3 of p_A fell @ side"]
+        found = np.array([row.scores[name][0] for name in known])
+        # a fault's jump falls on the boundary of another block
+        within = 1e-6 if case.fault else 1e-9
+        np.testing.assert_allclose(found, [scores[name][0] for name in known], rtol=0, atol=within)
+        assert row.flow_lpm == pytest.approx(truth.mean_leak_lpm, rel=1e-6)
+        point = row.place["point"]
+        assert point["level"] == pytest.approx(place.point.level, abs=0.02)
+        assert {**point, "level": 0} == {**vars(place.point), "level": 0}
+        assert row.place["duration_s"] == place.duration_s
+        if not case.fault and case.levels["closed"] == "0 %":  # where both choose the same step, down to it
+            by_itself = work(plan, case)
+            np.testing.assert_allclose(found, [by_itself.scores[name][0] for name in known], rtol=0, atol=1e-9)
+    assert np.ptp([row.scores["d3 of p_A fell"][0] for row in rows.values()]) > 0.01
+
+
+def test_with_noise_the_scores_are_of_the_same_law(plan_with):
+    plan = plan_with([{"count": 60}], detectors=["d3 of p_A changed", "d1 of p_A fell", "d4 of p_B rose"])
+    cases = [case for case in cases_of(plan) if case.use == "judge" and case.levels["closed"] == "0 %"]
+    rows, others = rows_of(plan, cases), {case.id: work(plan, case) for case in cases}
+    assert len(cases) == 30
+    for name in plan.detectors:
+        one, other = (np.array([made[case.id].scores[name][0] for case in cases]) for made in (rows, others))
+        assert stats.ks_2samp(one, other).pvalue > 0.01
+        assert not np.any(one == other)  # other noise of the same law
+
+
+def test_a_row_is_the_same_in_any_batch(plan_with, monkeypatch):
+    plan = plan_with(profile="bench", duration="4 s", onset="2 s")
+    cases = cases_of(plan)
+    whole = rows_of(plan, cases)
+    assert not any(row.error for row in whole.values())
+    monkeypatch.setitem(batches.RUNS, "cpu", 7)
+    assert rows_of(plan, cases[::-1]) == whole
+    assert rows_of(plan, cases[3:4]) == {cases[3].id: whole[cases[3].id]}
+
+
+def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, monkeypatch, tmp_path):
+    plan = plan_with()
+    assert campaign.run(plan, tmp_path / "once", batch=True).complete
+    expected = {
+        path.name: path.read_bytes() for path in write_result(simulated_result(plan, tmp_path / "once"), tmp_path)
+    }
+    monkeypatch.setitem(batches.RUNS, "cpu", 8)
+    told = []
+
+    def stop(done, total, failures):
+        told.append(done)
+        if done == 11:  # in the middle of the second batch's rows
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        campaign.run(plan, tmp_path / "twice", batch=True, progress=stop)
+    assert campaign.standing(plan, tmp_path / "twice").done == 11
+    assert campaign.run(plan, tmp_path / "twice", batch=True, progress=lambda done, *_: told.append(done)).complete
+    assert told[12:] == list(range(11, 27))
+    again = {
+        path.name: path.read_bytes() for path in write_result(simulated_result(plan, tmp_path / "twice"), tmp_path)
+    }
+    assert again == expected
+    ids = [json.loads(line)["id"] for line in (tmp_path / "twice" / "rows.jsonl").read_bytes().splitlines()]
+    assert len(ids) == len(set(ids)) == plan.size
+
+
+def test_rows_of_both_ways_are_not_mixed(plan_with, tmp_path):
+    plan = plan_with()
+    campaign.run(plan, tmp_path / "batch", batch=True)
+    with pytest.raises(InputError, match="goes on only with the same way of making rows"):
+        campaign.run(plan, tmp_path / "batch", jobs=1)
+    campaign.run(plan, tmp_path / "runs", jobs=1)
+    with pytest.raises(InputError, match="goes on only with the same way of making rows"):
+        campaign.run(plan, tmp_path / "runs", batch=True)
+    ways = [simulated_result(plan, tmp_path / name).way for name in ("batch", "runs")]
+    assert ways == ["in batches on the cpu", "run by run"]
+
+
+def test_a_case_that_fails_costs_no_other(plan_with):
+    plan = plan_with([{"count": 5}, {"leak": "0.015 L/min", "count": 5}, {"leak": "30 L/min", "count": 2}])
+    cases = [case for case in cases_of(plan) if case.use == "judge"]
+    rows = rows_of(plan, cases)
+    sound = [case for case in cases if case.leak_lpm < 1]
+    assert rows_of(plan, sound) == {case.id: rows[case.id] for case in sound}
+    for case in cases:
+        assert (rows[case.id].error is None) == (case.leak_lpm < 1)
+        if case.leak_lpm > 1:
+            assert rows[case.id].error == work(plan, case).error
+            assert "smaller than the pump's mean flow" in rows[case.id].error
+
+
+def test_a_cell_that_cannot_be_run_costs_no_other(text):
+    """A command that drives the piston into the cap and a pressure below vacuum."""
+    tree = tomllib.loads(text)
+    tree["factors"]["command"].append("9 sin(0.3t)")
+    tree["campaign"] |= {"false_alarm": 0.25, "set": {"omega_per_volt": 26.7}}
+    plan = read_plan(tree, "tiny.toml")
+    cases = [case for case in cases_of(plan) if case.use == "judge"]
+    rows = rows_of(plan, cases)
+    for case in cases:
+        hopeless = case.levels["command"] == "9 sin(0.3t)"
+        assert (rows[case.id].error is not None) == hopeless == (work(plan, case).error is not None)
+        if hopeless:
+            assert "vacuum" in rows[case.id].error
+
+
+def test_a_leak_that_asks_for_a_shorter_step_gets_it(plan_with):
+    plan = plan_with([{"leak": "0.55 L/min", "count": 1}], detectors=["sign rule: d3 of p_A fell"])
+    case = cases_of(plan)[-1]
+    by_itself, row = work(plan, case), rows_of(plan, [case])[case.id]
+    assert (row.error, by_itself.error) == (None, None)
+    assert row.flow_lpm == pytest.approx(by_itself.flow_lpm, rel=1e-2)
+    assert row.scores["sign rule: d3 of p_A fell"][0] == pytest.approx(
+        by_itself.scores["sign rule: d3 of p_A fell"][0], abs=0.1
+    )
+
+
+@pytest.mark.parametrize("command", ["prbs 1 every 0.5 s seed 4", "step 0.5 at 0 s", "2 sin(0.3t) + 0.2"])
+def test_a_place_under_other_commands_is_that_of_the_recording(plan_with, command):
+    plan = plan_with([{"count": 1}], duration="8 s", onset="4 s", detectors=["sign rule: d3 of p_A fell"])
+    case = cases_of(plan)[-1]
+    experiment = replace(unsized(plan, case), command=parse_command(command), step=5e-4)
+    found, expected = place_of_run(experiment), place_of(run(experiment).recording)
+    assert found.point.level == pytest.approx(expected.point.level, abs=0.03)
+    assert replace(found.point, level=0.0) == replace(expected.point, level=0.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "rule"),
+    [
+        ({"detectors": ["d3 of p_A fell", "rms change"]}, r"got 'rms change', which needs whole recordings"),
+        ({"detectors": ["volume balance"]}, r"got 'volume balance', which needs whole recordings"),
+        ({"detectors": ["observer, calibrated"]}, r"got 'observer, calibrated', which needs whole recordings"),
+        ({"detectors": ["diagnose"]}, r"got 'diagnose', which needs whole recordings"),
+        ({"keep_recordings": True}, r"keep_recordings = false, got true"),
+        (
+            {"records": [{"fault": "sensor p_A offset 2 psi", "count": 1}]},
+            r"no fault of a sensor, got 'sensor p_A offset",
+        ),
+        ({"set": {"sensors.p_A.drop_rate": 0.1}}, r"sensors\.p_A\.drop_rate = 0, got 0\.1"),
+        ({"set": {"motor.integrator": "euler"}}, r"motor\.integrator = state, got euler"),
+        ({"factors": {"daq.sample_rate": ["500 Hz", "250 Hz"]}}, r"one sampling rate, 500 Hz, got 250 Hz by a factor"),
+        ({"onset": "5.9 s"}, r"records with details on both sides of the onset, got 6 s with 5\.9 s"),
+    ],
+)
+def test_what_a_batch_cannot_do_is_refused_by_name(plan_with, tmp_path, changed, rule):
+    plan = plan_with(**changed)
+    with pytest.raises(
+        InputError, match=rf"a plan in batches must have .*{rule}.*; run it without --batch \(tiny.toml\)"
+    ):
+        campaign.run(plan, tmp_path / "none", batch=True)
+    assert not (tmp_path / "none").exists()
+
+
+def test_bad_calls_are_refused_before_the_work(plan_with, tmp_path):
+    plan = plan_with()
+    with pytest.raises(InputError, match="--cluster must stand without --batch"):
+        campaign.run(plan, tmp_path / "none", batch=True, cluster="tcp://127.0.0.1:1")
+    with pytest.raises(InputError, match="--device must be cpu or gpu, got tpu"):
+        campaign.run(plan, tmp_path / "none", device="tpu")
+    assert not (tmp_path / "none").exists()
