@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from sealscope.diagnosis.pressure_laws import G
-from sealscope.diagnosis.pressure_track import Track, _wander
+from sealscope.diagnosis.pressure_track import Track, wander
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.commands import Command, Recorded
 from sealscope.simulation.drifts import Drift, Linear
@@ -92,13 +92,19 @@ def recorded(
 def true_difference(**case: object) -> tuple[np.ndarray, np.ndarray]:
     """The command (n,) [V] and p_A - p_B (n,) [Pa] at the samples of a case, as no instrument reads them; `case`: what
     `recorded` takes."""
+    volts, states = true_states(**case)
+    return volts, states["p_A"] - states["p_B"]
+
+
+def true_states(**case: object) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The command (n,) [V], p_A and p_B [Pa] and x [m] (n,) at the samples of a case."""
     chosen = {"command": "7 sin(4t)", "leak": None, "fault": None, "drift": None, "duration": 30.0, **case}
     names = ("command", "leak", "fault", "drift", "duration")
     values = tuple(sorted((name.replace("__", "."), chosen[name]) for name in chosen if name not in names))
     command, leak, fault, drift, duration = (chosen[name] for name in names)
     experiment, path, volts = _case(command, leak, fault, drift, values, duration)
     at = slice(0, volts.size * oversampling(experiment), oversampling(experiment))
-    return volts, (path["p_A"] - path["p_B"])[at]
+    return volts, {name: path[name][at] for name in ("p_A", "p_B", "x")}
 
 
 def of_linear_model(
@@ -107,7 +113,7 @@ def of_linear_model(
     """A track as its own linear model draws it: parameters walk as expected of them from the anchored fit, each block's
     right side has the noise of its information; `step` of G [m^3/(s Pa)] after a block."""
     anchor, centre = np.split(like.anchor, 2)
-    walk = _wander(theta, like.units, like.seconds, speed)
+    walk = wander(theta, like.units, like.seconds, speed)
     blocks, size = like.r.shape
     path = np.cumsum(np.vstack([np.zeros(size), walk * random.standard_normal((blocks - 1, size))]), axis=0)
     known = anchor > 0

@@ -7,21 +7,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.pressure_duty import Duty, differences, duty_of, moving
 from sealscope.diagnosis.pressure_fit import (
     LONG_WINDOW,
     SETTLE,
     SHORT_WINDOW,
     USUAL_G,
-    Duty,
     Window,
-    differences,
-    duty_of,
+    first_guess,
     fit,
     prior_of,
     refit,
 )
 from sealscope.diagnosis.pressure_laws import F_C, F_V, GAIN, STATES, G, K, Machine, machine_of, nominal
-from sealscope.diagnosis.pressure_track import Steps, Track, excess_of, leap, steps_in, track
+from sealscope.diagnosis.pressure_steps import Steps, excess_of, steps_in
+from sealscope.diagnosis.pressure_track import Track, leap, track
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array
 
@@ -35,11 +35,13 @@ _EARLY = 4
 _CLEAR = 2.0
 #: A record that the model follows so badly is tried again from other first fits.
 RESTLESS = 1.15
+#: ... of which one is as good whose cost is higher by no more than this share.
+_AS_GOOD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A record as the model sees it. `theta` (9,): first fit; `path` (b, 9); `steps` of G; `edges` (b + 1,) [samples]
+    """A record as the model sees it. `theta` (12,): first fit; `path` (b, 12); `steps` of G; `edges` (b + 1,) [samples]
     from the first sample; `seconds` of a block; `explained`: share of dp's variance; `level`, `level_deviation`
     [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to the last third, as shares."""
 
@@ -99,11 +101,14 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
     dp = dp * (1.0 if _same_way(u, dp) else -1.0)
     centre = nominal(rig)
     centre[G] = max(centre[G], USUAL_G)
-    duty = duty_of(u, rate)
+    duty = duty_of(u, rate, p_A + p_B)
     span = BLOCK if cycle is None else cycle
-    long, short = _windows(duty, dp, centre, machine, rate, span)
+    _, short = _windows(duty, dp, centre, machine, rate, span)
     prior = prior_of(centre)
-    theta, cost, anew = fit(long, short, prior)
+    guess = first_guess(short, prior)
+    duty = moving(duty, guess, machine)
+    long, short = _windows(duty, dp, guess, machine, rate, span)
+    theta, cost, anew = fit(long, short, prior, guess)
     if not np.isfinite(cost):
         return None
     length = max(1, int(np.ceil(BLOCK / span - 1e-9))) * span
@@ -115,7 +120,9 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
     followed, steps = _tracked(duty, dp, edges, theta, machine, skip, rate, speed)
     if excess_of(steps) > RESTLESS:
         for first in anew:
-            other, _ = refit(long, first, prior)
+            other, dearer = refit(long, first, prior)
+            if dearer > cost * (1.0 + _AS_GOOD):
+                continue
             again = _tracked(duty, dp, edges, other, machine, skip, rate, speed)
             if excess_of(again[1]) < excess_of(steps) - 0.05:
                 theta, (followed, steps) = other, again
@@ -188,7 +195,7 @@ def _starts(duty: Duty, theta: Array, machine: Machine) -> list[Array]:
     grid = 2 * duty.every
     if abs(duty.u[0]) <= 0.02 * float(np.max(np.abs(duty.u))) and abs(duty.slope[0]) > 0.0:
         return [rest]
-    n = (duty.u.size - 1) // grid
+    n = (len(duty.inputs) - 1) // grid
     u, slope = duty.u[:-1:grid], duty.slope[:-1:grid]
     apart = np.abs(u - u[0]) / np.std(u) + np.abs(slope - slope[0]) / np.std(slope)
     same = n // 2 + int(np.argmin(apart[n // 2 :]))

@@ -1,10 +1,12 @@
 """The pressure difference that a machine should show under its command: the rig reduced to what p_A - p_B depends on.
 
-Where both pistons' areas are alike, p_A and p_B move against each other and their sum stands still, so the rig of
-eqs. (4.1)-(4.22) leaves five states: the difference dp, the piston's velocity v, the motor's speed omega, its current i
-and the integral I of its speed loop. Throttles and lines are left out: at the piston they act as more volume (a softer
-oil) and a little more damping, which the fit finds. The laws are those of `sealscope.physics`; the numbers are the
-detector's own, from a rig it may assume, and none of them is the recorded machine's.
+Where both pistons' areas are alike, p_A and p_B move against each other, so the rig of eqs. (4.1)-(4.22) leaves five
+states: the difference dp, the piston's velocity v, the motor's speed omega, its current i and the integral I of its
+speed loop. Long strokes change the chambers' volumes, and with them the stiffness and the pressures' sum, on which
+friction depends: the sum is taken from the record, the piston's place from the model itself. Throttles and lines are
+left out: at the piston they act as more volume (a softer oil) and a little more damping, which the fit finds. The laws
+are those of `sealscope.physics`; the numbers are the detector's own, from a rig it may assume, and none of them is the
+recorded machine's.
 """
 
 from __future__ import annotations
@@ -25,14 +27,17 @@ from sealscope.recordings.recording import Array
 
 #: What is estimated: speed per volt of the command [rad/(s V)], lead of the command [s], what the speed has beyond it
 #: [rad/s], stiffness of the oil [Pa], conductance past the piston and the pump [m^3/(s Pa)], Coulomb friction [N],
-#: viscous friction [N s/m], breakaway over Coulomb friction [1], decay of the breakaway [s/m].
-PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c")
-GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C = range(len(PARAMETERS))
+#: viscous friction [N s/m], breakaway over Coulomb friction [1], decay of the breakaway [s/m]; Coulomb friction per
+#: pressure [N/Pa]; share of the stiffness that follows the stroke [1], mid-stroke's offset as a share of V [1].
+PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c", "F_cfr", "stroke", "offset")
+GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C, F_CFR, STROKE, OFFSET = range(len(PARAMETERS))
 #: Runs that one call makes side by side.
 RUNS = WIDTH
 STATES = 5
 State = tuple[float, float, float, float, float]
-Parameters = tuple[float, float, float, float, float, float, float, float, float]
+Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+#: Largest share of V that a stroke takes away, squared.
+_LARGEST_SHARE = 0.75
 #: Longest step of the solver [s]: a tenth of a radian at the ringing of the thesis's rig would be 2e-4 s; RK4 at 1e-3 s
 #: is within 100 Pa, far under the transducers' noise.
 LONGEST_STEP = 1.01e-3
@@ -81,7 +86,7 @@ def machine_of(rig: Rig) -> Machine:
 
 
 def nominal(rig: Rig) -> Array:
-    """The parameters (9,) that a rig has about its charge pressure with no leak past the piston."""
+    """The parameters (12,) that a rig has about its charge pressure with no leak past the piston."""
     friction = rig.friction
     coulomb = coulomb_friction(
         rig.fluid.p_charge,
@@ -101,20 +106,36 @@ def nominal(rig: Rig) -> Array:
             friction.F_v,
             friction.K_brk,
             friction.C_c,
+            friction.F_cfr,
+            0.5,
+            0.0,
         ]
     )
 
 
 @contracted
-def reduced_rates(y: State, u: float, theta: Parameters, m: Machine) -> State:
-    """dy/dt of y = (dp, v, omega, i, I) under the command u [V]."""
+def stiffening(travel: float, theta: Parameters) -> float:
+    """Stiffness of both chambers together at a place of the stroke over that at mid-stroke [1].
+
+    1 + s (1 / (1 - q^2) - 1), q = `travel` + o: with V_A = V + A x, V_B = V - A x and A x = q V, 1/V_A + 1/V_B = 2 /
+    (V (1 - q^2)); s is 0 for a machine whose volumes are fixed. The inverse is its series up to q^12.
+    """
+    q = travel + theta[OFFSET]
+    square = min(q * q, _LARGEST_SHARE)
+    more = square * (1.0 + square * (1.0 + square * (1.0 + square * (1.0 + square * (1.0 + square)))))
+    return 1.0 + theta[STROKE] * more
+
+
+@contracted
+def reduced_rates(y: State, u: float, stiffness: float, coulomb: float, theta: Parameters, m: Machine) -> State:
+    """dy/dt of y = (dp, v, omega, i, I) under the command u [V]; `stiffness` [Pa], `coulomb` [N] at this instant."""
     dp, v, omega, i, integral = y
     error = theta[GAIN] * u + theta[BIAS] - omega
     voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
-    friction = stribeck_friction(v, theta[F_C], theta[K_BRK], theta[C_C], theta[F_V], m.v_th, False)
+    friction = stribeck_friction(v, coulomb, theta[K_BRK], theta[C_C], theta[F_V], m.v_th, False)
     flow = pump_flow(omega, dp, m.q_b, 0.0) - m.A * v - laminar_leakage(dp, theta[G])
     return (
-        2.0 * pressure_rate(flow, m.V, theta[K]),
+        2.0 * pressure_rate(flow, m.V, stiffness),
         piston_acceleration(0.5 * dp, -0.5 * dp, friction, 0.0, 0.0, m.A, m.A, m.M_eq),
         shaft_acceleration(i, omega, pump_torque(dp, m.q_b), m.C_m, m.B_M, m.J_M),
         winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
@@ -129,8 +150,7 @@ def _moved(y: State, h: float, k: State) -> State:
 
 @kernel
 def pressure_differences(
-    u: np.ndarray,
-    slope: np.ndarray,
+    inputs: np.ndarray,
     h: float,
     every: int,
     theta: np.ndarray,
@@ -138,16 +158,19 @@ def pressure_differences(
     m: Machine,
     state: np.ndarray,
     out: np.ndarray,
+    speeds: bool,
 ) -> None:
-    """Write dp [Pa] of RUNS runs at each sample into `out` (n, RUNS), by RK4 in steps of h [s], `every` to a sample.
+    """Write dp [Pa], or v [m/s] if `speeds`, of RUNS runs at each sample into `out` (n, RUNS), by RK4 in steps of
+    h [s], `every` to a sample.
 
-    `u`, `slope`: (2 every n + 1,) command [V] and its derivative [V/s] at every half step; `theta`: (segments, 9, RUNS)
-    parameters, `segment` (n,) which of them holds at a sample; `state`: (5, RUNS) at the first sample, in place.
+    `inputs`: (2 every n + 1, 4) at every half step: command [V], its derivative [V/s], the piston's place as A x / V,
+    p_A + p_B from their mean [Pa]; `theta`: (segments, 12, RUNS) parameters, `segment` (n,) which of them holds at a
+    sample; `state`: (5, RUNS) at the first sample, in place.
     """
     y = (load(state, 0), load(state, 1), load(state, 2), load(state, 3), load(state, 4))
     for sample in range(segment.size):
-        store(out, sample, y[0])
-        row = 9 * segment[sample]
+        store(out, sample, y[1] if speeds else y[0])
+        row = 12 * segment[sample]
         lead = load(theta, row + LEAD)
         now = (
             load(theta, row + GAIN),
@@ -159,14 +182,22 @@ def pressure_differences(
             load(theta, row + F_V),
             load(theta, row + K_BRK),
             load(theta, row + C_C),
+            load(theta, row + F_CFR),
+            load(theta, row + STROKE),
+            load(theta, row + OFFSET),
         )
         for step in range(every):
             at = 2 * (sample * every + step)
-            u_0, u_1, u_2 = u[at] + lead * slope[at], u[at + 1] + lead * slope[at + 1], u[at + 2] + lead * slope[at + 2]
-            k_1 = reduced_rates(y, u_0, now, m)
-            k_2 = reduced_rates(_moved(y, 0.5 * h, k_1), u_1, now, m)
-            k_3 = reduced_rates(_moved(y, 0.5 * h, k_2), u_1, now, m)
-            k_4 = reduced_rates(_moved(y, h, k_3), u_2, now, m)
+            u_0 = inputs[at, 0] + lead * inputs[at, 1]
+            u_1 = inputs[at + 1, 0] + lead * inputs[at + 1, 1]
+            u_2 = inputs[at + 2, 0] + lead * inputs[at + 2, 1]
+            # place and pressures change little within a step: they hold as they are in its middle
+            stiff = now[K] * stiffening(inputs[at + 1, 2], now)
+            coulomb = now[F_C] + now[F_CFR] * inputs[at + 1, 3]
+            k_1 = reduced_rates(y, u_0, stiff, coulomb, now, m)
+            k_2 = reduced_rates(_moved(y, 0.5 * h, k_1), u_1, stiff, coulomb, now, m)
+            k_3 = reduced_rates(_moved(y, 0.5 * h, k_2), u_1, stiff, coulomb, now, m)
+            k_4 = reduced_rates(_moved(y, h, k_3), u_2, stiff, coulomb, now, m)
             y = _moved(_moved(_moved(_moved(y, h / 6.0, k_1), h / 3.0, k_2), h / 3.0, k_3), h / 6.0, k_4)
     for state_row in range(5):
         store(state, state_row, y[state_row] + spread(0.0))

@@ -108,7 +108,7 @@ def threshold_of(correlation: Array, probability: float) -> float:
 
 def _within(followed: Followed, recording: Recording, probability: float) -> Evidence:
     """The evidence on a rise of G within the record."""
-    from sealscope.diagnosis.pressure_track import excess_of
+    from sealscope.diagnosis.pressure_steps import excess_of
 
     steps, begin = followed.steps, float(recording.t[0])
     inner = slice(LEAST - 1, followed.blocks - LEAST)

@@ -1,13 +1,9 @@
-"""The fitted parameters followed through a record, block by block, and a step of the leak's conductance in them.
+"""The fitted parameters followed through a record, block by block.
 
 In every block the model is linear about the block's own parameters: its information matrix N_b and right side r_b come
 from the slopes of dp. The parameters theta_b wander from block to block (a random walk, each with a strength that
-machines have), so that the whole record is one normal model with precision matrix Lambda (block tridiagonal). A step d
-of G after block k adds N_b e_G d to the right sides of all later blocks; with everything else eliminated its estimate
-is s_k / I_k with variance 1 / I_k, and z_k = s_k / sqrt(I_k) is standard normal where nothing steps, with a known
-correlation between any two instants.
-Source: A. C. Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, ch. 4; P. de Jong,
-J. Penzer, Diagnosing shocks in time series, JASA 93 (1998) 796-806.
+machines have), so that the whole record is one normal model with precision matrix Lambda (block tridiagonal).
+Source: A. C. Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, ch. 4.
 """
 
 from __future__ import annotations
@@ -18,22 +14,40 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.pressure_fit import Duty, differences, steps_of
-from sealscope.diagnosis.pressure_laws import BIAS, C_C, F_C, F_V, GAIN, K_BRK, LEAD, PARAMETERS, G, K, Machine
+from sealscope.diagnosis.pressure_duty import Duty, differences
+from sealscope.diagnosis.pressure_fit import steps_of
+from sealscope.diagnosis.pressure_laws import (
+    BIAS,
+    C_C,
+    F_C,
+    F_CFR,
+    F_V,
+    GAIN,
+    K_BRK,
+    LEAD,
+    OFFSET,
+    PARAMETERS,
+    STROKE,
+    G,
+    K,
+    Machine,
+)
 from sealscope.recordings.recording import Array
 
 #: How far each parameter may wander in 90 s (standard deviation): shares of its value, lead in s, G in m^3/(s Pa).
 WANDER = {GAIN: 2e-3, K: 0.03, F_C: 0.06, F_V: 0.06, K_BRK: 0.02, C_C: 0.02}
-WANDER_LEAD, WANDER_G = 1e-4, 3e-14
+WANDER_REST = {LEAD: 1e-4, G: 3e-14, F_CFR: 2e-8, STROKE: 0.02, OFFSET: 0.05}
 _WANDER_SECONDS = 90.0
 #: The bias of the speed settles within a minute of a start: this share of the command's speed in 6 s.
 _WANDER_BIAS = 0.003
 #: Where the record's mean parameters may be, around the first fit (standard deviations as above).
 ANCHOR = {GAIN: 0.02, K: 0.1, F_C: 0.1, F_V: 0.15, K_BRK: 0.1, C_C: 0.15}
-ANCHOR_LEAD, ANCHOR_G = 5e-4, 1.5e-12
-#: Wandering that is tried, times the usual one: the likelihood chooses.
-SCALES = (1.0, 2.0, 4.0)
+ANCHOR_REST = {LEAD: 5e-4, G: 1.5e-12, F_CFR: 5e-7, STROKE: 0.3, OFFSET: 0.2}
 _PASSES = 10
+#: Blocks are stuck beside the way whose residual is by so many of its deviations larger than the others', or before or
+#: after which the stiffness leaps by so many deviations of its walk: they are set between their neighbours, at one of
+#: these biases of the speed, in units of the bias's own wandering, and followed once more.
+_STUCK, _LEAPS, _BIASES = 3.0, 1.7, np.array([0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, 2.0])
 #: A jump: so many times the wandering from block to block.
 _LEAP = 50.0
 #: Shares of a Gauss-Newton step that are tried side by side, and the fall of the cost to go on for.
@@ -43,12 +57,12 @@ _ENOUGH = 1.0
 #: is left to find in a block is small and the model is linear over it.
 _LEASHES = (0.1, 0.3, 1.0)
 _CONSTANT = len(PARAMETERS)
-_SIZE = _CONSTANT + 1
+SIZE = _CONSTANT + 1
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A record followed: blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 9) about which the model is
+    """A record followed: blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 12) about which the model is
     linear; `N` (b, p, p), `r` (b, p) information in units of `units` (p,), the last a constant of dp; `variance`
     [Pa^2] of the residual and of each block's (b,)."""
 
@@ -63,30 +77,13 @@ class Track:
     seconds: float
 
 
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """A step of G after each block: `size`, `deviation` (b - 1,) [m^3/(s Pa)], `z` and their `correlation`; `level`
-    (b,) the wandering G with no step, and its `level_deviation`; `scale` of the wandering that was chosen; `excess`:
-    chi square of the blocks against the wandering, and its degrees of freedom."""
-
-    size: Array
-    deviation: Array
-    z: Array
-    correlation: Array
-    level: Array
-    level_deviation: Array
-    scale: float
-    excess: tuple[float, float]
+def _deviations(theta: Array, shares: dict[int, float], rest: dict[int, float]) -> Array:
+    return np.array([shares.get(k, 0.0) * abs(theta[k]) + rest.get(k, 0.0) for k in range(len(PARAMETERS))])
 
 
-def _shares(theta: Array, shares: dict[int, float]) -> Array:
-    return np.array([shares.get(k, 0.0) * abs(theta[k]) for k in range(len(PARAMETERS))])
-
-
-def _wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
+def wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
     """Standard deviation (p,) of the walk from block to block, in `units`."""
-    walk = _shares(theta, WANDER)
-    walk[LEAD], walk[G] = WANDER_LEAD, WANDER_G
+    walk = _deviations(theta, WANDER, WANDER_REST)
     walk *= np.sqrt(seconds / _WANDER_SECONDS)
     walk[BIAS] = _WANDER_BIAS * speed * np.sqrt(seconds / 6.0)
     return np.append(walk, 1500.0 * np.sqrt(seconds / _WANDER_SECONDS)) / units
@@ -94,15 +91,14 @@ def _wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
 
 def _anchor(theta: Array, units: Array) -> Array:
     """Weight (p,) of the first fit on the record's mean parameters."""
-    deviation = _shares(theta, ANCHOR)
-    deviation[LEAD], deviation[G] = ANCHOR_LEAD, ANCHOR_G
-    weight = np.zeros(_SIZE)
+    deviation = _deviations(theta, ANCHOR, ANCHOR_REST)
+    weight = np.zeros(SIZE)
     known = deviation > 0
     weight[:_CONSTANT][known] = (units[:_CONSTANT][known] / deviation[known]) ** 2
     return weight
 
 
-def _precision(N: Array, walk: Array, anchor: Array) -> Array:
+def precision(N: Array, walk: Array, anchor: Array) -> Array:
     """Lambda (b p, b p) of all blocks' parameters; `walk` (b - 1, p) from each block to the next."""
     blocks, p, _ = N.shape
     found = np.zeros((blocks, p, blocks, p))
@@ -120,7 +116,8 @@ def _precision(N: Array, walk: Array, anchor: Array) -> Array:
     return found.reshape(blocks * p, blocks * p)
 
 
-def _right(r: Array, anchor: Array, centre: Array) -> Array:
+def right_sides(r: Array, anchor: Array, centre: Array) -> Array:
+    """Right sides (b, p) of the blocks with the first fit's weight `anchor` (p,) on `centre` (p,) in them."""
     return r + anchor * centre / len(r)
 
 
@@ -136,10 +133,10 @@ def track(
     jumps: Array | None = None,
     from_path: Array | None = None,
 ) -> Track:
-    """Follow the parameters from the first fit `theta` (9,) through blocks between `edges` of the whole record.
+    """Follow the parameters from the first fit `theta` (12,) through blocks between `edges` of the whole record.
 
     `start` (5,): the model's state at the first sample; `jumps` (b - 1, p): how many times farther than usual each
-    parameter may go from a block to the next; `from_path` (b, 9): where to begin, the first fit by default. Blocks are
+    parameter may go from a block to the next; `from_path` (b, 12): where to begin, the first fit by default. Blocks are
     linearised about their own parameters, until these stand still; the trend of the speed's bias within a block is
     eliminated.
     """
@@ -150,7 +147,7 @@ def track(
     units = np.append(h, 1.0)
     seconds = float(np.median(np.diff(edges))) / rate
     speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(duty.u))
-    walk = np.tile(_wander(theta, units, seconds, speed), (blocks - 1, 1))
+    walk = np.tile(wander(theta, units, seconds, speed), (blocks - 1, 1))
     if jumps is not None:
         walk *= jumps
     anchor = _anchor(theta, units)
@@ -159,32 +156,33 @@ def track(
     path = np.tile(theta, (blocks, 1)) if from_path is None else from_path
     limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
 
-    def cost(shown: Array, at: Array, variance: float, walk: Array) -> float:
-        misfit = sum(float(here.size * np.var(here)) for here in (dp[one] - shown[one] for one in limits))
+    def misfits(shown: Array) -> Array:
+        return np.array([here.size * np.var(here) for here in (dp[one] - shown[one] for one in limits)])
+
+    def strain(at: Array, walk: Array) -> float:
         steps = np.diff(at, axis=0) / h / walk[:, :-1]
         off = at.mean(axis=0) / h - centre[:-1]
-        return misfit / variance + float(np.sum(steps**2)) + float(anchor[:-1] @ off**2)
+        return float(np.sum(steps**2)) + float(anchor[:-1] @ off**2)
 
-    found: Track | None = None
-    for number in range(_PASSES):
+    def freed(path: Array, stuck: NDArray[np.bool_]) -> Array:
+        """The path with stuck blocks set between their neighbours, at the speed's bias that suits each best."""
+        at, sound = np.arange(blocks), np.flatnonzero(np.logical_not(stuck))
+        between = np.column_stack([np.interp(at, sound, path[sound, k]) for k in range(_CONSTANT)])
+        tries = np.tile(between, (_BIASES.size, 1, 1))
+        tries[:, :, BIAS] += _BIASES[:, None] * _WANDER_BIAS * speed
+        seen = differences(duty, tries, machine, segment, np.tile(start, (_BIASES.size, 1)))
+        best = np.argmin([misfits(one) for one in seen], axis=0)
+        return np.where(stuck[:, None], tries[best, at], path)
+
+    before: tuple[float, float, Track] | None = None
+    last = _PASSES
+    number = 0
+    while True:
         sets = np.tile(path, (_CONSTANT + 1, 1, 1))
         for k in range(_CONSTANT):
             sets[k + 1, :, k] += h[k]
         shown = differences(duty, sets, machine, segment, np.tile(start, (_CONSTANT + 1, 1)))
-        N, r = np.empty((blocks, _SIZE, _SIZE)), np.empty((blocks, _SIZE))
-        squares, counts = np.empty(blocks), np.empty(blocks)
-        for b, here in enumerate(limits):
-            slopes = shown[1:, here] - shown[0, here]
-            count = slopes.shape[1]
-            ramp = slopes[BIAS] * np.linspace(-1.0, 1.0, count)
-            X = np.vstack([slopes, np.ones(count), ramp])
-            rest = dp[here] - shown[0, here]
-            H, g = X @ X.T, X @ rest
-            lost = H[:-1, -1] / H[-1, -1]
-            H, g, gone = H[:-1, :-1] - np.outer(lost, H[:-1, -1]), g[:-1] - lost * g[-1], g[-1] ** 2 / H[-1, -1]
-            squares[b] = float(rest @ rest - gone - g @ np.linalg.lstsq(H, g, rcond=1e-12)[0])
-            counts[b] = count - _SIZE - 1
-            N[b], r[b] = H, g + H @ np.append(path[b] / h, 0.0)
+        N, r, squares, counts = _normal(dp, shown, limits, path / h)
         variance = float(squares.sum() / counts.sum())
         found = Track(
             edges,
@@ -197,33 +195,71 @@ def track(
             np.concatenate([anchor, centre]),
             seconds,
         )
-        if number == _PASSES - 1:
-            break
         allowed = leashes[min(number, len(leashes) - 1)] * walk
-        solved = np.linalg.solve(_precision(found.N, allowed, anchor), _right(found.r, anchor, centre).reshape(-1))
-        fresh = _held(solved.reshape(blocks, _SIZE)[:, :_CONSTANT] * h, theta)
+        solved = np.linalg.solve(precision(found.N, allowed, anchor), right_sides(found.r, anchor, centre).reshape(-1))
+        fresh = _held(solved.reshape(blocks, SIZE)[:, :_CONSTANT] * h, theta)
         tries = path + _SHARES[:, None, None] * (fresh - path)
         seen = differences(duty, tries, machine, segment, np.tile(start, (_SHARES.size, 1)))
-        costs = [cost(one, at, variance, allowed) for one, at in zip(seen, tries, strict=True)]
+        apart = np.array([misfits(one).sum() for one in seen])
+        costs = apart / variance + np.array([strain(at, allowed) for at in tries])
         best = int(np.nanargmin(costs))
-        gained = cost(shown[0], path, variance, allowed) - costs[best]
+        gained = float(misfits(shown[0]).sum()) / variance + strain(path, allowed) - costs[best]
         if gained > 0.0:
             path = tries[best]
-        if not gained > _ENOUGH and number >= len(leashes) - 1:
-            break
-    assert found is not None
-    return found
+        number += 1
+        if number < len(leashes) or (gained > _ENOUGH and number < last):
+            continue
+        if before is not None:
+            return before[2] if before[0] / variance + before[1] < costs[best] else found
+        stuck = _stuck(found, counts, walk if jumps is None else None)
+        if not np.any(stuck) or np.all(stuck):
+            return found
+        before = float(apart[best]), strain(tries[best], allowed), found
+        path = freed(path, stuck)
+        last = number + _PASSES
 
 
-def excess_of(steps: Steps) -> float:
-    """Chi square of the blocks over its degrees of freedom, beside the best step either way (Birge's ratio)."""
-    chi_square, freedom = steps.excess
-    return float((chi_square - np.max(np.abs(steps.z)) ** 2) / freedom)
+def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Array, Array, Array]:
+    """Of each block between `limits`: N (b, p, p) and r (b, p) of the model that is linear about `at` (b, 12) [units],
+    the sum of squares (b,) that no parameters explain, and its degrees of freedom (b,).
+
+    `shown` (13, n): the model there, and a unit more of each parameter. The trend of the speed's bias is eliminated.
+    """
+    blocks = len(limits)
+    N, r = np.empty((blocks, SIZE, SIZE)), np.empty((blocks, SIZE))
+    squares, counts = np.empty(blocks), np.empty(blocks)
+    for b, here in enumerate(limits):
+        slopes = shown[1:, here] - shown[0, here]
+        count = slopes.shape[1]
+        ramp = slopes[BIAS] * np.linspace(-1.0, 1.0, count)
+        X = np.vstack([slopes, np.ones(count), ramp])
+        rest = dp[here] - shown[0, here]
+        H, g = X @ X.T, X @ rest
+        lost = H[:-1, -1] / H[-1, -1]
+        H, g, gone = H[:-1, :-1] - np.outer(lost, H[:-1, -1]), g[:-1] - lost * g[-1], g[-1] ** 2 / H[-1, -1]
+        squares[b] = float(rest @ rest - gone - g @ np.linalg.lstsq(H, g, rcond=1e-12)[0])
+        counts[b] = count - SIZE - 1
+        N[b], r[b] = H, g + H @ np.append(at[b], 0.0)
+    return N, r, squares, counts
+
+
+def _stuck(found: Track, counts: Array, walk: Array | None) -> NDArray[np.bool_]:
+    """Blocks (b,) that turns of Gauss and Newton left beside the way: their residual is larger than that of the others,
+    or the stiffness leaps, and then those on the shorter side of the leap; `walk` (b - 1, p) [units]: None where leaps
+    are allowed."""
+    here = found.block_variance
+    stuck = here > np.median(here) * (1.0 + _STUCK * np.sqrt(2.0 / counts))
+    if walk is not None:
+        leaps = np.abs(np.diff(found.path[:, K])) / found.units[K] / walk[:, K]
+        after = int(np.argmax(leaps)) + 1
+        if leaps[after - 1] > _LEAPS:
+            stuck[after if 2 * after >= here.size else 0 : None if 2 * after >= here.size else after] = True
+    return np.asarray(stuck)
 
 
 def leap(blocks: int, after: int, *parameters: int) -> Array:
     """What lets some parameters jump after a block: factors (b - 1, p) on the walk."""
-    factors = np.ones((blocks - 1, _SIZE))
+    factors = np.ones((blocks - 1, SIZE))
     factors[after, list(parameters)] = _LEAP
     return factors
 
@@ -234,49 +270,3 @@ def _held(path: Array, theta: Array) -> Array:
         path[:, k] = np.clip(path[:, k], 0.3 * theta[k], 3.0 * theta[k])
     path[:, K_BRK] = np.maximum(path[:, K_BRK], 1.05)
     return path
-
-
-def steps_in(followed: Track, theta: Array, speed: float, scales: Sequence[float] = SCALES) -> Steps:
-    """A step of G after each block, everything else free to wander; how much it wanders, the likelihood chooses."""
-    anchor, centre = np.split(followed.anchor, 2)
-    walk = np.tile(_wander(theta, followed.units, followed.seconds, speed), (len(followed.N) - 1, 1))
-    right = _right(followed.r, anchor, centre).reshape(-1)
-    blocks = len(followed.N)
-    best: tuple[float, float, Array, float] | None = None
-    for scale in scales:
-        L = np.asarray(np.linalg.cholesky(_precision(followed.N, scale * walk, anchor)), dtype=np.float64)
-        half = np.linalg.solve(L, right)
-        fit = float(half @ half)
-        likelihood = fit - 2.0 * np.sum(np.log(np.diagonal(L)))
-        likelihood -= 2.0 * np.sum(np.log(scale * walk))
-        if best is None or likelihood > best[0] + 2.0:
-            best = (float(likelihood), scale, L, fit)
-    assert best is not None
-    _, scale, L, fit = best
-    free = sum(float(r @ np.linalg.lstsq(N, r, rcond=1e-12)[0]) for N, r in zip(followed.N, followed.r, strict=True))
-    free += float(np.sum(anchor * centre**2))
-    later_blocks = np.zeros((blocks, _SIZE, blocks - 1))
-    for k in range(1, blocks):
-        later_blocks[k:, :, k - 1] = followed.N[k:, :, G]
-    inner = later_blocks.reshape(blocks * _SIZE, blocks - 1)
-    level_rows = np.zeros((blocks * _SIZE, blocks))
-    level_rows[np.arange(blocks) * _SIZE + G, np.arange(blocks)] = 1.0
-    solved = np.linalg.solve(L, np.column_stack([inner, right, level_rows]))
-    steps, half, levels = solved[:, : blocks - 1], solved[:, blocks - 1], solved[:, blocks:]
-    later = np.cumsum(followed.N[::-1, G, G])[::-1]
-    at = np.arange(1, blocks)
-    information = later[np.maximum(at[:, None], at[None, :])] - steps.T @ steps
-    right_sum = np.cumsum(followed.r[::-1, G])[::-1][1:]
-    score = right_sum - steps.T @ half
-    own = np.sqrt(np.diagonal(information))
-    unit = followed.units[G]
-    return Steps(
-        score / own**2 * unit,
-        unit / own,
-        score / own,
-        information / np.outer(own, own),
-        levels.T @ half * unit,
-        np.sqrt(np.sum(levels**2, axis=0)) * unit,
-        scale,
-        (free - fit, float(_SIZE * (blocks - 1) + np.count_nonzero(anchor))),
-    )
