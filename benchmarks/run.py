@@ -38,8 +38,11 @@ def main() -> None:
     streams = ["bench_streams.py", "--json", str(results / "streams.json")]
     if chosen.quick:
         streams += ["--rounds", "3"]
+    gpu = ["bench_gpu.py", "--json", str(results / "gpu.json")]
+    if chosen.quick:
+        gpu += ["--runs", "2000", "--rounds", "2"]
     print(f"{platform.machine()}, {platform.python_implementation()} {platform.python_version()}", flush=True)
-    for words in (solvers, batch, streams):
+    for words in (solvers, batch, streams, gpu):
         subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=True)
 
 

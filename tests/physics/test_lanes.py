@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from sealscope.compiled import contracted, kernel
+from sealscope.physics.fixed import left_to_table
 from sealscope.physics.friction import stribeck_friction
 from sealscope.physics.lane_runs import (
     ACCOUNTS,
@@ -144,7 +145,7 @@ def test_every_lane_has_numbers_of_its_own(check_rig, drive):
     account[:, LEAST] = np.inf
     advance_lanes_rk4(
         (0, 1), state, h, 0, nodes, shape, drive_rows, np.zeros((1, LEAK_ROWS, WIDTH)), np.ascontiguousarray(table),
-        np.array([0, n]), rig_numbers(rigs[0]), 1, told, 0, account,
+        np.array([0, n]), left_to_table(rig_numbers(rigs[0]), LANE_FIELDS), 1, told, 0, account,
     )  # fmt: skip
     for lane, rig in enumerate(rigs):
         alone = drive(rig, n * h, rate=2000.0, step=h)

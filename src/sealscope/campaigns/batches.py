@@ -78,13 +78,11 @@ def check_plan(plan: Plan, cases: Sequence[Case]) -> None:
 
 def check_device(plan: Plan, device: str) -> None:
     """Raise InputError for a device that is not there, before the work and not as the error of every row."""
-    from sealscope.simulation.batch import simulate_batch
-    from sealscope.simulation.experiment import Experiment
+    from sealscope.simulation.batch import runner_of
 
     if device not in RUNS:
         raise InputError(f"--device must be {' or '.join(RUNS)}, got {device}")
-    if device != "cpu":
-        simulate_batch([Experiment(plan.rig, duration=1.0)], device=device)
+    runner_of(device)
 
 
 def in_batches(plan: Plan, cases: Sequence[Case], threads: int, device: str = "cpu") -> Generator[Row, None, None]:

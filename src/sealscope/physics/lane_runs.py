@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
+from sealscope.physics.fixed import settled, taken
 from sealscope.physics.imex import imex_step
 from sealscope.physics.lanes import load, store
 from sealscope.physics.leakage import piston_leakage
@@ -16,10 +17,11 @@ from sealscope.physics.rig import RigNumbers
 from sealscope.physics.rk4 import rk4_step
 from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, State
 
-#: The fields of `RigNumbers` that differ from lane to lane, in the order of a table's rows; the others are choices.
+#: The fields of `RigNumbers` that differ from lane to lane, in the order of a table's rows, and those that do not.
 LANE_FIELDS = tuple(
     name for name, kind in RigNumbers.__annotations__.items() if getattr(kind, "__forward_arg__", kind) == "float"
 )
+CHOICES = tuple(name for name in RigNumbers._fields if name not in LANE_FIELDS)
 #: Rows that describe a leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
 #: and the G and C whose flow goes to the account (those of the leak, or of one that is being sized).
 LEAK_ROWS = 6
@@ -36,59 +38,59 @@ FLOW, OPEN, REACH, LEAST, SOUND = range(ACCOUNTS)
 
 @contracted
 def lane_numbers(table: np.ndarray, at: int, p: RigNumbers) -> RigNumbers:
-    """The numbers of a group from rows at, at + 1, .. of a table, and the choices of `p`."""
-    k = at
+    """The numbers of a group: those of `p`, and where these are () (`fixed.left_to_table`) the group's own, from rows
+    at, at + 1, .. of a table of all `LANE_FIELDS`."""
     return RigNumbers(
-        load(table, k),
-        load(table, k + 1),
-        load(table, k + 2),
-        load(table, k + 3),
-        load(table, k + 4),
-        load(table, k + 5),
-        load(table, k + 6),
-        load(table, k + 7),
-        load(table, k + 8),
-        load(table, k + 9),
-        load(table, k + 10),
-        load(table, k + 11),
-        load(table, k + 12),
-        p.throttled,
-        load(table, k + 13),
-        load(table, k + 14),
-        load(table, k + 15),
-        load(table, k + 16),
-        load(table, k + 17),
-        load(table, k + 18),
-        load(table, k + 19),
-        load(table, k + 20),
-        load(table, k + 21),
-        load(table, k + 22),
-        load(table, k + 23),
-        load(table, k + 24),
-        p.position_dependent,
-        load(table, k + 25),
-        load(table, k + 26),
-        load(table, k + 27),
-        load(table, k + 28),
-        load(table, k + 29),
-        load(table, k + 30),
-        load(table, k + 31),
-        load(table, k + 32),
-        load(table, k + 33),
-        p.coulomb_of_difference,
-        p.literal_bracket,
-        load(table, k + 34),
+        taken(p.omega_per_volt, table, at + 0),
+        taken(p.k_p, table, at + 1),
+        taken(p.K_i, table, at + 2),
+        taken(p.V_max, table, at + 3),
+        taken(p.i_max, table, at + 4),
+        taken(p.R_c, table, at + 5),
+        taken(p.L_c, table, at + 6),
+        taken(p.C_e, table, at + 7),
+        taken(p.C_m, table, at + 8),
+        taken(p.J_M, table, at + 9),
+        taken(p.B_M, table, at + 10),
+        taken(p.q_b, table, at + 11),
+        taken(p.G_pump, table, at + 12),
+        settled(p.throttled),
+        taken(p.c_A_in, table, at + 13),
+        taken(p.c_A_out, table, at + 14),
+        taken(p.c_B_in, table, at + 15),
+        taken(p.c_B_out, table, at + 16),
+        taken(p.dp_0, table, at + 17),
+        taken(p.V_1, table, at + 18),
+        taken(p.V_2, table, at + 19),
+        taken(p.A_A, table, at + 20),
+        taken(p.A_B, table, at + 21),
+        taken(p.L, table, at + 22),
+        taken(p.M_eq, table, at + 23),
+        taken(p.V, table, at + 24),
+        settled(p.position_dependent),
+        taken(p.k_stop, table, at + 25),
+        taken(p.d_stop, table, at + 26),
+        taken(p.F_l, table, at + 27),
+        taken(p.F_pr, table, at + 28),
+        taken(p.F_cfr, table, at + 29),
+        taken(p.C_c, table, at + 30),
+        taken(p.K_brk, table, at + 31),
+        taken(p.F_v, table, at + 32),
+        taken(p.v_th, table, at + 33),
+        settled(p.coulomb_of_difference),
+        settled(p.literal_bracket),
+        taken(p.K_oil, table, at + 34),
         p.aerated,
-        load(table, k + 35),
-        load(table, k + 36),
+        taken(p.air, table, at + 35),
+        taken(p.n_air, table, at + 36),
         p.open_circuit,
-        load(table, k + 37),
-        load(table, k + 38),
-        p.made_up,
-        load(table, k + 39),
-        load(table, k + 40),
-        load(table, k + 41),
-        load(table, k + 42),
+        taken(p.G_ext_A, table, at + 37),
+        taken(p.G_ext_B, table, at + 38),
+        settled(p.made_up),
+        taken(p.p_crack, table, at + 39),
+        taken(p.G_check, table, at + 40),
+        taken(p.V_gas, table, at + 41),
+        taken(p.p_charge, table, at + 42),
     )
 
 
@@ -166,7 +168,7 @@ def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> A
 
 
 @contracted
-def _advance(
+def advance(
     groups: tuple[int, int],
     y: np.ndarray,
     h: float,
@@ -184,6 +186,7 @@ def _advance(
     begin: int,
     account: np.ndarray,
 ) -> None:
+    """`advance_lanes_rk4`, or `advance_lanes_imex` where `implicit`, for lanes or for the one number of a thread."""
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
         z = lane_state(y, g * states)
@@ -208,13 +211,16 @@ def _advance(
         out = (g * told.shape[1] + begin) * TOLD
         for cell in range(cells):
             q = lane_numbers(table, (g * cells + cell) * fields, p)
+            due = 0  # steps before the next output; cells begin at one
             for step in range(bounds[cell], bounds[cell + 1]):
                 t = (start + step) * h
-                if step % every == 0:
+                if due == 0:
+                    due = every
                     store(told, out, z[P_A])
                     store(told, out + 1, z[P_B])
                     out += TOLD
                     noted = _noted(z, leak, t + nodes[0], noted, q)
+                due -= 1
                 if implicit:
                     z = _imex(z, h, t, nodes, shape, step, gain, leak, q)
                 else:
@@ -250,7 +256,7 @@ def advance_lanes_rk4(
     `bounds` (cells + 1,) the step at which each cell begins; `told`: (groups, outputs, TOLD, WIDTH), written from
     output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).
     """
-    _advance(groups, y, h, start, nodes, shape, drive, leaks, table, bounds, p, False, every, told, begin, account)
+    advance(groups, y, h, start, nodes, shape, drive, leaks, table, bounds, p, False, every, told, begin, account)
 
 
 @kernel
@@ -272,4 +278,4 @@ def advance_lanes_imex(
     account: np.ndarray,
 ) -> None:
     """`advance_lanes_rk4` for throttled rigs, by the implicit-explicit method."""
-    _advance(groups, y, h, start, nodes, shape, drive, leaks, table, bounds, p, True, every, told, begin, account)
+    advance(groups, y, h, start, nodes, shape, drive, leaks, table, bounds, p, True, every, told, begin, account)

@@ -1,28 +1,33 @@
-"""Lanes: a vector of doubles that the laws take in place of one number, so that one source serves one run and eight.
+"""Lanes: a vector of doubles that the laws take in place of one number, so that one source serves one run, eight on a
+processor's vector registers, and one a thread on a GPU.
 
 A law written without branches on its numbers (`select` instead of `if`) is compiled for plain floats and for `LANES`
 alike; each operation on lanes is one instruction over a whole vector register where the processor has it (two or four
 where its registers are shorter), by construction and not by a compiler's guess. Products and sums of lanes may be
 contracted to fused multiply-adds, so a lane and a plain run agree to rounding, not to the bit. Lanes live inside
-compiled functions only: `load` and `store` move them from and to rows of arrays.
+compiled functions only: `load` and `store` move them from and to rows of arrays. On a GPU, and in plain Python as its
+simulator runs it, there are no lanes: each thread has one run, and `load` and `store` move one plain number, that of
+the thread's own place in the row.
 """
 
 from __future__ import annotations
 
 import math
 import operator
+import threading
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
+from numba.core.typing import Context
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
+from numba.extending import lower_builtin, lower_cast, models, register_model
 
 from sealscope.compiled import contracted
 
-#: Runs side by side: a register of 512 bits.
-WIDTH = 8
+#: Runs side by side: a register of 512 bits; threads of a GPU that run in step, and so the places of a row there.
+WIDTH, WARP = 8, 32
 _FLAGS = ("contract",)
 
 
@@ -140,13 +145,18 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
     lower_builtin(_function, Mask, Mask)(lambda context, builder, sig, args, name=_name: getattr(builder, name)(*args))
 
 
-def _compile(function: Any, arity: int, result: Any, build: Any) -> None:
-    """Give a plain function a compiled form too: `build(context, builder, kinds, values)` makes the instructions."""
+def lowered(function: Any, arity: int, result: Any, build: Any) -> None:
+    """Give a plain function a compiled form too: `result(kinds, device)` is the kind of what it returns (None where it
+    does not take these kinds), and `build(context, builder, kinds, values)` makes the instructions. `device` is true
+    where code for a GPU is made."""
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            return signature(result(args), *args) if len(args) == arity and not kws else None
+            if len(args) != arity or kws:
+                return None
+            kind = result(args, not isinstance(self.context, Context))
+            return None if kind is None else signature(kind, *args)
 
     lower_builtin(function, *[types.Any] * arity)(
         lambda context, builder, sig, args: build(context, builder, sig.args, args)
@@ -166,7 +176,9 @@ def _select(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return builder.select(values[0], a, b)
 
 
-_compile(select, 3, lambda kinds: LANES if any(isinstance(k, Lanes | Mask) for k in kinds) else types.float64, _select)
+lowered(
+    select, 3, lambda kinds, _: LANES if any(isinstance(k, Lanes | Mask) for k in kinds) else types.float64, _select
+)
 
 
 def anywhere(condition: Any) -> Any:
@@ -180,7 +192,7 @@ def _anywhere(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return builder.icmp_unsigned("!=", builder.bitcast(values[0], ir.IntType(WIDTH)), ir.Constant(ir.IntType(WIDTH), 0))
 
 
-_compile(anywhere, 1, lambda kinds: types.boolean, _anywhere)
+lowered(anywhere, 1, lambda *_: types.boolean, _anywhere)
 
 
 def power_of_two(n: Any) -> Any:
@@ -199,54 +211,92 @@ def _power_of_two(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return builder.bitcast(builder.shl(exponent, constant(52)), real)
 
 
-_compile(power_of_two, 1, lambda kinds: kinds[0], _power_of_two)
-
-
-def _row(context: Any, builder: Any, kind: Any, array: Any, row: Any) -> Any:
-    data = context.make_array(kind)(context, builder, array).data
-    at = builder.mul(row, ir.Constant(row.type, WIDTH))
-    return builder.bitcast(cgutils.gep_inbounds(builder, data, at), _DOUBLE.as_pointer())
+lowered(power_of_two, 1, lambda kinds, _: kinds[0], _power_of_two)
 
 
 def _is_block(array: Any) -> bool:
     return isinstance(array, types.Array) and array.dtype == types.float64 and array.layout == "C"
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def load(typingctx: Any, array: Any, row: Any) -> Any:
-    """The lanes of row `row` of a C-ordered array (..., WIDTH), rows counted through all leading axes."""
-    if not (_is_block(array) and isinstance(row, types.Integer)):
+def on_device(context: Any) -> bool:
+    """Whether a target context makes code for a GPU."""
+    return not isinstance(context.typing_context, Context)
+
+
+def _place(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
+    """Where the lanes of a row are; on a GPU, where the number of this thread is."""
+    data = context.make_array(kinds[0])(context, builder, values[0]).data
+    row = context.cast(builder, values[1], kinds[1], types.intp)
+    if on_device(context):
+        kind = ir.FunctionType(ir.IntType(32), [])
+        thread = cgutils.get_or_insert_function(builder.module, kind, "llvm.nvvm.read.ptx.sreg.tid.x")
+        own = builder.and_(builder.call(thread, []), ir.Constant(ir.IntType(32), WARP - 1))
+        at = builder.mul(row, ir.Constant(row.type, WARP))
+        return cgutils.gep_inbounds(builder, data, builder.add(at, builder.zext(own, row.type)))
+    at = builder.mul(row, ir.Constant(row.type, WIDTH))
+    return builder.bitcast(cgutils.gep_inbounds(builder, data, at), _DOUBLE.as_pointer())
+
+
+def _own(array: Any, row: int) -> tuple[Any, int]:
+    """In plain Python: all numbers of an array, and where this thread's number of a row is among them. The simulator
+    wraps arrays twice, and each attribute of its wrappers is slow."""
+    for wrapper in ("_item", "_ary"):
+        array = getattr(array, wrapper, array)
+    width = array.shape[-1]
+    return array.reshape(-1), row * width + getattr(threading.current_thread(), "thread_id", 0) % width
+
+
+def load(array: Any, row: int) -> Any:
+    """The lanes of row `row` of a C-ordered array (..., WIDTH), rows counted through all leading axes; on a GPU the
+    thread's number of row `row` of an array (..., WARP)."""
+    numbers, at = _own(array, row)
+    return numbers[at]
+
+
+def load_number(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
+    """The instructions of `load`."""
+    return builder.load(_place(context, builder, kinds, values), align=8)
+
+
+def _loaded(kinds: Any, device: bool) -> Any:
+    if not (_is_block(kinds[0]) and isinstance(kinds[1], types.Integer)):
         return None
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        index = context.cast(builder, args[1], sig.args[1], types.intp)
-        return builder.load(_row(context, builder, sig.args[0], args[0], index), align=8)
-
-    return signature(LANES, array, row), build
+    return types.float64 if device else LANES
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def store(typingctx: Any, array: Any, row: Any, value: Any) -> Any:
-    """Write lanes into row `row` of a C-ordered array (..., WIDTH)."""
-    if not (_is_block(array) and isinstance(row, types.Integer) and isinstance(value, Lanes)):
-        return None
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        index = context.cast(builder, args[1], sig.args[1], types.intp)
-        builder.store(args[2], _row(context, builder, sig.args[0], args[0], index), align=8)
-        return context.get_dummy_value()
-
-    return signature(types.none, array, row, value), build
+lowered(load, 2, _loaded, load_number)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def spread(typingctx: Any, value: Any) -> Any:
+def store(array: Any, row: int, value: Any) -> None:
+    """Write lanes into row `row` of a C-ordered array (..., WIDTH); on a GPU the thread's number."""
+    numbers, at = _own(array, row)
+    numbers[at] = value
+
+
+def _store(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
+    builder.store(values[2], _place(context, builder, kinds, values), align=8)
+    return context.get_dummy_value()
+
+
+def _stored(kinds: Any, device: bool) -> Any:
+    return types.none if _loaded(kinds, device) == kinds[2] else None
+
+
+lowered(store, 3, _stored, _store)
+
+
+def spread(value: Any) -> Any:
     """The same number in every lane."""
+    return float(value)
 
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _as_lanes(context, builder, args[0], sig.args[0])
 
-    return signature(LANES, value), build
+def _spread_out(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
+    if on_device(context):
+        return context.cast(builder, values[0], kinds[0], types.float64)
+    return _as_lanes(context, builder, values[0], kinds[0])
+
+
+lowered(spread, 1, lambda kinds, device: types.float64 if device else LANES, _spread_out)
 
 
 _LOG2_E = 1.4426950408889634

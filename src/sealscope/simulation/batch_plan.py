@@ -90,7 +90,7 @@ def _shape(command: Command) -> tuple[Any, Command, float, float]:
 def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
     """The experiments in sets; raises InputError where one cannot be in a batch, or their records differ in length or
     rate."""
-    from sealscope.physics.lane_runs import LANE_FIELDS
+    from sealscope.physics.lane_runs import CHOICES
     from sealscope.physics.rig import rig_numbers
     from sealscope.simulation.integrate import choose_method
 
@@ -99,18 +99,20 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
     first = experiments[0]
     found: dict[Any, list[Member]] = {}
     shapes: dict[Any, Command] = {}
+    known: dict[int, RigNumbers] = {}  # by rig: most batches have few of them
     for place, one in enumerate(experiments):
         for name, own, common in (("duration", one.duration, first.duration), ("rate", one.rate, first.rate)):
             if own != common:
                 raise InputError(f"runs of a batch must have one {name}, got {common:g} and {own:g} (run {place})")
         refuse(one, place)
-        numbers, effects = rig_numbers(one.rig), one.effects()
+        numbers = known.get(id(one.rig)) or known.setdefault(id(one.rig), rig_numbers(one.rig))
+        effects = one.effects()
         if any(effect.field.startswith("G_ext") for effect in effects):
             numbers = numbers._replace(open_circuit=(True,))
         if any(effect.field == "air" for effect in effects):
             numbers = numbers._replace(aerated=(True,))
         key, shape, gain, offset = _shape(one.commanded)
-        choices = tuple(value for name, value in numbers._asdict().items() if name not in LANE_FIELDS)
+        choices = tuple(getattr(numbers, name) for name in CHOICES)
         kind = (key, choices, choose_method(one.rig, one.method))
         shapes[kind] = shape
         found.setdefault(kind, []).append(Member(place, one, numbers, effects, gain, offset))
@@ -169,7 +171,9 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     than its resolution; a jump begins a cell."""
     from sealscope.physics.lane_runs import LANE_FIELDS
 
-    base = np.array([[float(getattr(one.numbers, name)) for name in LANE_FIELDS] for one in members])
+    numbers = {id(one.numbers): one.numbers for one in members}
+    rows = {key: [float(getattr(one, name)) for name in LANE_FIELDS] for key, one in numbers.items()}
+    base = np.array([rows[id(one.numbers)] for one in members])
     effects = [effect for one in members for effect in one.effects]
     if not effects:
         return Cells(np.array([0, n_out]), base, (), np.empty((len(members), 0, 1)))

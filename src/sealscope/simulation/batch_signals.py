@@ -20,6 +20,9 @@ LEVELS = 4
 QUANTITIES = LEVELS + 1
 #: Samples that pass through the filters at a time, and the taps of db8.
 BLOCK, TAPS = 64, 16
+#: Samples that the anti-alias filter finds at a time.
+TILE = 8
+Taps = tuple[float, ...]
 #: Rows of a channel's instrument: gain, offset, own noise, common noise and what each grows by a sample; walk a sample,
 #: hum, hum's turns a sample and at the start; least and largest pressure; volts at the least, volts per pascal, volts
 #: per count, counts at most.
@@ -69,34 +72,96 @@ def _read(true: Any, sensor: np.ndarray, at: int, own: Any, common: Any, walk: A
 
 
 @contracted
-def _filtered(told: np.ndarray, at: int, taps: np.ndarray) -> Any:
-    """The anti-alias filter at one sample; `at`: row of its first tap."""
-    total = spread(0.0)
-    for k in range(taps.size):
-        total = total + taps[k] * load(told, at + TOLD * k)
-    return total
-
-
-@contracted
-def _filtered_late(told: np.ndarray, at: int, taps: np.ndarray, row: int, count: int) -> Any:
-    """The same with taps of each lane's own, from row `row` of `taps` on."""
+def _filtered(told: np.ndarray, at: int, taps: np.ndarray, first: int, count: int) -> Any:
+    """The anti-alias filter at one sample; `at`: row of its first tap, taps first .. first + count - 1."""
     total = spread(0.0)
     for k in range(count):
-        total = total + load(taps, row + k) * load(told, at + TOLD * k)
+        total = total + taps[first + k] * load(told, at + TOLD * k)
     return total
 
 
 @contracted
-def _split(rows: np.ndarray, source: int, hole: int, low: np.ndarray, high: np.ndarray, m: int, a: int, d: int) -> None:
-    """Causal low- and high-pass of m samples from row `source` on, into rows from `a` and `d` on."""
+def _filter_tile(told: np.ndarray, at: int, taps: np.ndarray, factor: int, rows: np.ndarray, to: int) -> None:
+    """The anti-alias filter at TILE samples, `factor` outputs apart, into rows from `to` on; each output is loaded
+    once. `taps` begin and end with (TILE - 1) factor zeros, so that all samples take the same outputs."""
+    t_0, t_1, t_2, t_3 = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
+    t_4, t_5, t_6, t_7 = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
+    zeros = (TILE - 1) * factor
+    for k in range(taps.size - zeros):
+        x = load(told, at + TOLD * k)
+        tap = zeros + k
+        t_0 = t_0 + taps[tap] * x
+        t_1 = t_1 + taps[tap - factor] * x
+        t_2 = t_2 + taps[tap - 2 * factor] * x
+        t_3 = t_3 + taps[tap - 3 * factor] * x
+        t_4 = t_4 + taps[tap - 4 * factor] * x
+        t_5 = t_5 + taps[tap - 5 * factor] * x
+        t_6 = t_6 + taps[tap - 6 * factor] * x
+        t_7 = t_7 + taps[tap - 7 * factor] * x
+    store(rows, to, t_0)
+    store(rows, to + 1, t_1)
+    store(rows, to + 2, t_2)
+    store(rows, to + 3, t_3)
+    store(rows, to + 4, t_4)
+    store(rows, to + 5, t_5)
+    store(rows, to + 6, t_6)
+    store(rows, to + 7, t_7)
+
+
+@contracted
+def _filter_block(told: np.ndarray, at: int, factor: int, taps: np.ndarray, rows: np.ndarray, to: int, m: int) -> None:
+    """The anti-alias filter at m samples, into rows from `to` on."""
+    zeros = (TILE - 1) * factor
+    count = taps.size - 2 * zeros
+    i = 0
+    while count > 1 and i + TILE <= m:
+        _filter_tile(told, at + i * factor * TOLD, taps, factor, rows, to + i)
+        i += TILE
+    for k in range(i, m):
+        store(rows, to + k, _filtered(told, at + k * factor * TOLD, taps, zeros, count))
+
+
+@contracted
+def _filter_late(
+    told: np.ndarray, at: int, factor: int, taps: np.ndarray, row: int, count: int, rows: np.ndarray, to: int, m: int
+) -> None:
+    """`_filter_block` with taps of each lane's own, from row `row` of `taps` on."""
     for i in range(m):
-        smooth, detail = spread(0.0), spread(0.0)
-        for k in range(TAPS):
-            x = load(rows, source + i - hole * k)
-            smooth = smooth + low[k] * x
-            detail = detail + high[k] * x
-        store(rows, a + i, smooth)
-        store(rows, d + i, detail)
+        total = spread(0.0)
+        for k in range(count):
+            total = total + load(taps, row + k) * load(told, at + (i * factor + k) * TOLD)
+        store(rows, to + i, total)
+
+
+@contracted
+def _behind(w: Any, x: Any) -> Any:
+    """The last TAPS values with a new one before them."""
+    return x, w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7], w[8], w[9], w[10], w[11], w[12], w[13], w[14]
+
+
+@contracted
+def _weighed(c: Any, w: Any) -> Any:
+    """The sum of TAPS products, in their order."""
+    total = c[0] * w[0] + c[1] * w[1] + c[2] * w[2] + c[3] * w[3] + c[4] * w[4] + c[5] * w[5] + c[6] * w[6]
+    total = total + c[7] * w[7] + c[8] * w[8] + c[9] * w[9] + c[10] * w[10] + c[11] * w[11] + c[12] * w[12]
+    return total + c[13] * w[13] + c[14] * w[14] + c[15] * w[15]
+
+
+@contracted
+def _split(rows: np.ndarray, source: int, hole: int, low: Taps, high: Taps, m: int, a: int, d: int) -> None:
+    """Causal low- and high-pass of m samples from row `source` on, into rows from `a` and `d` on.
+
+    Samples `hole` apart follow one another, so that each is loaded once.
+    """
+    for phase in range(min(hole, m)):
+        x = load(rows, source + phase)
+        w = (x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x)
+        for k in range(1 - TAPS, 0):
+            w = _behind(w, load(rows, source + phase + hole * k))
+        for i in range(phase, m, hole):
+            w = _behind(w, load(rows, source + i))
+            store(rows, a + i, _weighed(low, w))
+            store(rows, d + i, _weighed(high, w))
 
 
 @contracted
@@ -116,9 +181,10 @@ def _summed(
     The details are those of samples first, first + 1, ..; `sums` rows at, at + QUANTITIES, .. are the segments'.
     """
     segments = bounds.size - 1
-    segment = int(np.searchsorted(bounds, first, side="right")) - 1
-    i = 0 if segment >= 0 else bounds[0] - first
-    segment = max(segment, 0)
+    segment = 0
+    while segment < segments and bounds[segment + 1] <= first:
+        segment += 1
+    i = max(bounds[0] - first, 0)
     while i < m and segment < segments:
         stop = min(m, bounds[segment + 1] - first)
         total = load(sums, at + segment * QUANTITIES)
@@ -138,8 +204,8 @@ def _transform(
     at: int,
     m: int,
     sample: int,
-    low: np.ndarray,
-    high: np.ndarray,
+    low: Taps,
+    high: Taps,
     bounds: np.ndarray,
     sums: np.ndarray,
     to: int,
@@ -164,6 +230,61 @@ def _transform(
         store(rows, late + i, load(rows, late + m + i))
 
 
+@contracted
+def sense(
+    groups: tuple[int, int],
+    told: np.ndarray,
+    begin: int,
+    factor: int,
+    taps: np.ndarray,
+    own_taps: np.ndarray,
+    first: int,
+    last: int,
+    sensors: np.ndarray,
+    keys: np.ndarray,
+    walks: np.ndarray,
+    filters: np.ndarray,
+    low: Taps,
+    high: Taps,
+    bounds: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """`sense_lanes` for any kind of number: lanes, or the one number of a thread."""
+    segments = bounds.size - 1
+    late = own_taps.shape[2]
+    head = STARTS[0] + HISTORIES[0]
+    for g in range(groups[0], groups[1]):
+        key = load(keys, g)
+        walk_A, walk_B = load(walks, TOLD * g), load(walks, TOLD * g + 1)
+        one, two = TOLD * g * INSTRUMENT_ROWS, (TOLD * g + 1) * INSTRUMENT_ROWS
+        a, b = TOLD * g * FILTER_ROWS, (TOLD * g + 1) * FILTER_ROWS
+        for start in range(first, last, BLOCK):
+            m = min(BLOCK, last - start)
+            at = (g * told.shape[1] + begin + (start - first) * factor) * TOLD
+            if late > 1:
+                _filter_late(told, at, factor, own_taps, TOLD * g * late, late, filters, a + head, m)
+                _filter_late(told, at + 1, factor, own_taps, (TOLD * g + 1) * late, late, filters, b + head, m)
+            else:
+                _filter_block(told, at, factor, taps, filters, a + head, m)
+                _filter_block(told, at + 1, factor, taps, filters, b + head, m)
+            for i in range(m):
+                s = start + i
+                own_A, own_B = normals(key, 3 * s)
+                common, step_A = normals(key, 3 * s + 1)
+                step_B, _ = normals(key, 3 * s + 2)
+                walk_A = walk_A + load(sensors, one + WALK) * step_A
+                walk_B = walk_B + load(sensors, two + WALK) * step_B
+                since = float(s - first)
+                read_A = _read(load(filters, a + head + i), sensors, one, own_A, common, walk_A, s, since)
+                read_B = _read(load(filters, b + head + i), sensors, two, own_B, common, walk_B, s, since)
+                store(filters, a + head + i, read_A)
+                store(filters, b + head + i, read_B)
+            _transform(filters, a, m, start, low, high, bounds, sums, TOLD * g * segments * QUANTITIES)
+            _transform(filters, b, m, start, low, high, bounds, sums, (TOLD * g + 1) * segments * QUANTITIES)
+        store(walks, TOLD * g, walk_A)
+        store(walks, TOLD * g + 1, walk_B)
+
+
 @kernel
 def sense_lanes(
     groups: tuple[int, int],
@@ -178,48 +299,20 @@ def sense_lanes(
     keys: np.ndarray,
     walks: np.ndarray,
     filters: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
+    low: Taps,
+    high: Taps,
     bounds: np.ndarray,
     sums: np.ndarray,
 ) -> None:
     """Read samples first <= s < last of the groups' runs and add the squares of their details to `sums`.
 
     `told`: (groups, outputs, TOLD, WIDTH), the first tap of sample `first` on output `begin`, `factor` outputs a
-    sample; `taps` of the anti-alias filter, or `own_taps` (groups, TOLD, taps, WIDTH) where channels are late;
-    `sensors`: (groups, TOLD, INSTRUMENT_ROWS, WIDTH), as at sample `first`; `keys`: (groups, WIDTH) of the noise;
-    `walks`: (groups, TOLD, WIDTH) zero drift so far [Pa]; `filters`: (groups, TOLD, FILTER_ROWS, WIDTH); `bounds`:
-    (segments + 1,) samples; `sums`: (groups, TOLD, segments, QUANTITIES, WIDTH).
+    sample; `taps` of the anti-alias filter with (TILE - 1) factor zeros on both sides, or `own_taps` (groups, TOLD,
+    taps, WIDTH) where channels are late (one row elsewhere); `sensors`: (groups, TOLD, INSTRUMENT_ROWS, WIDTH), as at
+    sample `first`; `keys`: (groups, WIDTH) of the noise; `walks`: (groups, TOLD, WIDTH) zero drift so far [Pa];
+    `filters`: (groups, TOLD, FILTER_ROWS, WIDTH); `low`, `high`: the wavelet's taps; `bounds`: (segments + 1,) samples;
+    `sums`: (groups, TOLD, segments, QUANTITIES, WIDTH).
     """
-    segments = bounds.size - 1
-    late = own_taps.shape[2]
-    head = STARTS[0] + HISTORIES[0]
-    for g in range(groups[0], groups[1]):
-        key = load(keys, g)
-        walk_A, walk_B = load(walks, TOLD * g), load(walks, TOLD * g + 1)
-        one, two = TOLD * g * INSTRUMENT_ROWS, (TOLD * g + 1) * INSTRUMENT_ROWS
-        a, b = TOLD * g * FILTER_ROWS, (TOLD * g + 1) * FILTER_ROWS
-        for start in range(first, last, BLOCK):
-            m = min(BLOCK, last - start)
-            for i in range(m):
-                s = start + i
-                at = (g * told.shape[1] + begin + (s - first) * factor) * TOLD
-                own_A, own_B = normals(key, 3 * s)
-                common, step_A = normals(key, 3 * s + 1)
-                step_B, _ = normals(key, 3 * s + 2)
-                walk_A = walk_A + load(sensors, one + WALK) * step_A
-                walk_B = walk_B + load(sensors, two + WALK) * step_B
-                since = float(s - first)
-                if late > 0:
-                    true_A = _filtered_late(told, at, own_taps, TOLD * g * late, late)
-                    true_B = _filtered_late(told, at + 1, own_taps, (TOLD * g + 1) * late, late)
-                else:
-                    true_A, true_B = _filtered(told, at, taps), _filtered(told, at + 1, taps)
-                read_A = _read(true_A, sensors, one, own_A, common, walk_A, s, since)
-                read_B = _read(true_B, sensors, two, own_B, common, walk_B, s, since)
-                store(filters, a + head + i, read_A)
-                store(filters, b + head + i, read_B)
-            _transform(filters, a, m, start, low, high, bounds, sums, TOLD * g * segments * QUANTITIES)
-            _transform(filters, b, m, start, low, high, bounds, sums, (TOLD * g + 1) * segments * QUANTITIES)
-        store(walks, TOLD * g, walk_A)
-        store(walks, TOLD * g + 1, walk_B)
+    sense(
+        groups, told, begin, factor, taps, own_taps, first, last, sensors, keys, walks, filters, low, high, bounds, sums
+    )
