@@ -1,16 +1,25 @@
-"""Has the mean of a series of vectors changed, and when? A scan over every instant, and what the scan gives when
-nothing has changed.
+"""Has the mean of a series of vectors changed at once, beyond its scatter and a slow drift? A scan over every instant,
+and what the scan gives when nothing has changed at once.
 
-The series x_1..x_n (blocks) has a covariance S, estimated from the differences of neighbours, which a single step
-does not inflate. For a step after block k,
+The series x_1..x_n (blocks) is
+
+    x_i = mean + B b_i + e_i,   b_i - b_{i-1} ~ N(0, I),
+
+scatter e with a covariance S, estimated from the differences of neighbours, which a single step does not inflate, and
+random walks b, whose columns B say how far a sound machine moves each quantity in a block (`Drift`; none: B = 0). For a
+step of the height h after block k, T2(k) is twice the log likelihood ratio of "the mean changed after k" against "it
+did not", by generalised least squares; without drift
 
     T2(k) = n / (k (n - k)) c_k' S^-1 c_k,   c_k = sum_{i <= k} (x_i - mean)
 
-is twice the log likelihood ratio of "the mean changed after k" against "it did not" (Srivastava & Worsley, Likelihood
-ratio tests for a change in the multivariate normal mean, JASA 81 (1986) 199-204). The threshold is the quantile of
-max T2 over random orders of the same blocks: without a change every order is as likely as the one observed. Pairs of
-neighbours are moved together, so that the short memory of the blocks (the filters reach from one into the next) stays
-in the null distribution; longer runs would carry the very step that is looked for.
+(Srivastava & Worsley, Likelihood ratio tests for a change in the multivariate normal mean, JASA 81 (1986) 199-204).
+Cosines (DCT-II) make it quick: of a random walk whose level is unknown they are the Karhunen-Loeve functions, so that
+scatter and walk are independent from cosine to cosine, with the variance 1 + lambda / (4 sin^2(pi m / 2n)).
+
+The threshold is the quantile of max T2 over random orders of the same blocks with random walks of B added: without a
+change at once every order is as likely as the one observed. Pairs of neighbours are moved together, so that the short
+memory of the blocks (the filters reach from one into the next) stays in the null distribution; longer runs would carry
+the very step that is looked for.
 """
 
 from __future__ import annotations
@@ -18,6 +27,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.recordings.recording import Array
 
@@ -25,8 +35,27 @@ from sealscope.recordings.recording import Array
 #: exp(-x/2))^2 (Eo & Morley, Likelihood-ratio-based confidence sets for the timing of structural breaks, Quantitative
 #: Economics 6 (2015) 463-497).
 ONSET_CUT = -2.0 * np.log(1.0 - np.sqrt(0.95))
+#: Directions whose scatter is less than this share of the largest are sums of others.
+_RANK = 1e-8
 _BATCH = 250
 _RUN = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """What the columns of a series do without the step that is looked for.
+
+    `walks` (f, q): deviation by which each of q independent random walks moves each column in one block; `other` (f,
+    c): directions of steps that are none of those looked for, and fitted beside them.
+    """
+
+    walks: Array
+    other: Array
+
+    @classmethod
+    def none(cls, f: int) -> Drift:
+        """No drift and no other steps."""
+        return cls(np.zeros((f, 0)), np.zeros((f, 0)))
 
 
 @dataclass(frozen=True)
@@ -43,42 +72,136 @@ class Scan:
         return float(self.joint.max()) > self.trend
 
 
-def _statistics(x: np.ndarray, joint: list[int], least: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T2 (m, n-1), single (m, n-1, f) and trend T2 (m,) of a stack of series x (m, n, f); steps nearer than `least`
-    blocks to an end are left out."""
-    _, n, _ = x.shape
-    centred = x - x.mean(axis=1, keepdims=True)
-    differences = np.diff(x, axis=1)
-    covariance = np.einsum("mni,mnj->mij", differences, differences) / (2.0 * (n - 1))
-    sums = np.cumsum(centred, axis=1)[:, :-1]
-    k = np.arange(1, n)
-    weight = n / (k * (n - k))
-    weight[: least - 1] = 0.0
-    weight[n - least :] = 0.0
-    deviation = np.sqrt(np.einsum("mii->mi", covariance))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        single = np.nan_to_num(-sums / deviation[:, None, :] * np.sqrt(weight)[:, None])
-    inverse = np.linalg.pinv(covariance[:, joint][:, :, joint], rcond=1e-8, hermitian=True)
-    chosen = sums[..., joint]
-    t2 = np.einsum("mkj,mkj->mk", chosen @ inverse, chosen) * weight
-    time = np.arange(n) - (n - 1) / 2.0
-    slope = np.einsum("n,mnj->mj", time, centred[..., joint])
-    trend = np.einsum("mi,mij,mj->m", slope, inverse, slope) / np.sum(time**2)
-    return t2, single, trend
-
-
 def least_blocks(n: int) -> int:
     """Fewest blocks on either side of a step."""
     return max(3, round(0.03 * n))
 
 
-def scan(x: Array, joint: list[int]) -> Scan:
-    """Scan a series x (n, f) for a step; `joint`: the columns that are judged together."""
-    t2, single, trend = _statistics(x[None], joint, least_blocks(len(x)))
-    return Scan(t2[0], single[0], float(trend[0]))
+class StepScan:
+    """The statistics of series of n blocks that scatter and drift as `x` (n, f) does.
+
+    `joint`: the columns that are judged together; `drift`: what they do without a step (default: nothing). Columns in
+    which `drift.other` has a share are read beside them. Steps nearer than `least` blocks to an end are left out.
+    """
+
+    def __init__(self, x: Array, joint: list[int], drift: Drift | None = None, *, least: int | None = None) -> None:
+        n, f = x.shape
+        self.n, self.f, self.x = n, f, x
+        self.drift = Drift.none(f) if drift is None else drift
+        self.least = least_blocks(n) if least is None else least
+        self.used = sorted({*joint, *np.flatnonzero(np.any(self.drift.other != 0, axis=1)).tolist()})
+        differences = np.diff(x, axis=0)
+        scatter = differences.T @ differences / (2.0 * (n - 1))
+        walks = self.drift.walks @ self.drift.walks.T
+        unit = np.sqrt(np.diag(scatter))
+        unit[unit == 0] = 1.0
+        m = np.arange(1, n)
+        self.walk = np.concatenate([[0.0], 0.25 / np.sin(0.5 * np.pi / n * m) ** 2])
+        self.single_pass = self._passed(np.diag(walks) / unit**2)
+        self.single_gain = self._gain(self.single_pass)
+        part = np.ix_(self.used, self.used)
+        self.to, strength = _independent(scatter[part], walks[part], unit[self.used])
+        self.passed = self._passed(strength)
+        place = [self.used.index(column) for column in joint]
+        self.steps = np.concatenate([self.to[place].T, self.to.T @ self.drift.other[self.used]], axis=1)
+        self.quadratic = _quadratic(self.steps, self._gain(self.passed), len(joint))
+        self.ramp = _cosines(np.linspace(0.0, 1.0, n)[:, None])[:, 0]
+        ramp_gain = np.sum(self.passed * self.ramp[:, None] ** 2, axis=0)
+        self.ramp_quadratic = _quadratic(self.steps, ramp_gain[None], len(joint))[0]
+
+    def _passed(self, strength: Array) -> Array:
+        """Precision (n, j) of each cosine of series whose walk has the variance `strength` (j,) a block, that of the
+        scatter being 1; 0 for the mean, which is unknown."""
+        passed = 1.0 / (1.0 + self.walk[:, None] * strength)
+        passed[0] = 0.0
+        return np.asarray(passed)
+
+    def _gain(self, passed: Array) -> Array:
+        """Information (n - 1, j) on a step after k = 1..n-1: the cosines of a step are s_m^2 = 2/n sin^2(pi m k/n) /
+        (4 sin^2(pi m / 2n)), and the sum over passed s^2 is a Fourier transform."""
+        share = passed * self.walk[:, None]
+        return np.asarray((share.sum(axis=0) - np.fft.fft(share, axis=0).real[1:]) / self.n)
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """T2 (m, n-1), single (m, n-1, f) and trend T2 (m,) of a stack of series x (m, n, f), each first brought to the
+        scatter of the series that this scan was made for: so each is judged by what itself scatters, as that one is."""
+        from scipy.fft import idct
+
+        differences = np.diff(x, axis=1)
+        unit = np.sqrt(0.5 * np.mean(differences**2, axis=1, keepdims=True))
+        unit[unit == 0] = np.inf
+        alone = -np.cumsum(idct(_cosines(x / unit) * self.single_pass, axis=1, norm="ortho"), axis=1)[:, :-1]
+        passed = _cosines(_rescattered(x[..., self.used] @ self.to)) * self.passed
+        score = -np.cumsum(idct(passed, axis=1, norm="ortho"), axis=1)[:, :-1] @ self.steps
+        single = alone / np.sqrt(self.single_gain)
+        t2 = np.einsum("mkb,mkb->mk", np.einsum("mka,kab->mkb", score, self.quadratic), score)
+        for series in (t2, single):
+            series[:, : self.least - 1] = 0.0
+            series[:, self.n - self.least :] = 0.0
+        slope = np.einsum("mnj,n->mj", passed, self.ramp) @ self.steps
+        return t2, single, np.einsum("ma,ab,mb->m", slope, self.ramp_quadratic, slope)
+
+    def found(self) -> Scan:
+        """The scan of x itself."""
+        t2, single, trend = self(self.x[None])
+        return Scan(t2[0], single[0], float(trend[0]))
+
+    def orders(self, count: int, random: np.random.Generator) -> Array:
+        """`count` series (count, n, f) as x would be without a step: its blocks in a random order, and walks."""
+        moved = self.x[_orders(self.n, count, random)]
+        walks = self.drift.walks
+        if walks.any():
+            moved = moved + np.cumsum(random.standard_normal((count, self.n, walks.shape[1])), axis=1) @ walks.T
+        return moved
+
+    def null(self, count: int, seed: int = 0) -> tuple[Array, Array, Array]:
+        """Largest T2 (count,), largest |single| (count, f) and trend T2 (count,) of `count` series without a step."""
+        random = np.random.default_rng(seed)
+        t2_max, single_max, trend = np.empty(count), np.empty((count, self.f)), np.empty(count)
+        for first in range(0, count, _BATCH):
+            here = slice(first, min(first + _BATCH, count))
+            t2, single, trend[here] = self(self.orders(here.stop - first, random))
+            t2_max[here] = t2.max(axis=1)
+            single_max[here] = np.abs(single).max(axis=1)
+        return t2_max, single_max, trend
 
 
-def _orders(n: int, count: int, random: np.random.Generator) -> np.ndarray:
+def _cosines(x: Array) -> Array:
+    """Orthonormal DCT-II over the second axis from the end."""
+    from scipy.fft import dct
+
+    return np.asarray(dct(x, axis=-2, norm="ortho"))
+
+
+def _rescattered(z: Array) -> Array:
+    """A stack of series z (m, n, r), each turned and stretched as little as gives it the scatter I."""
+    differences = np.diff(z, axis=1)
+    scatter = np.matmul(differences.transpose(0, 2, 1), differences) / (2.0 * differences.shape[1])
+    values, vectors = np.linalg.eigh(scatter)
+    root = vectors / np.sqrt(np.maximum(values, _RANK))[:, None, :]
+    return np.asarray(z @ (root @ vectors.transpose(0, 2, 1)))
+
+
+def _independent(scatter: Array, walks: Array, unit: Array) -> tuple[Array, Array]:
+    """Sums of the columns, as columns of (u, r), that scatter by 1 and walk independently of one another, and the
+    variances (r,) of their walks: the simultaneous diagonalisation of both covariances."""
+    values, vectors = np.linalg.eigh(scatter / np.outer(unit, unit))
+    kept = values > _RANK * max(float(values[-1]), np.finfo(float).tiny)
+    white = vectors[:, kept] / np.sqrt(values[kept]) / unit[:, None]
+    strength, turn = np.linalg.eigh(white.T @ walks @ white)
+    return white @ turn, np.maximum(strength, 0.0)
+
+
+def _quadratic(steps: Array, gain: Array, wanted: int) -> Array:
+    """The form (k, a, a) that makes T2 of scores: the inverse of the information on all heights, less that on those
+    beyond the first `wanted` alone."""
+    information = np.einsum("ja,kj,jb->kab", steps, gain, steps)
+    form = np.linalg.pinv(information, rcond=_RANK, hermitian=True)
+    form[:, wanted:, wanted:] -= np.linalg.pinv(information[:, wanted:, wanted:], rcond=_RANK, hermitian=True)
+    return np.asarray(form)
+
+
+def _orders(n: int, count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """`count` random orders of n blocks in which neighbours stay together in pairs."""
     starts = np.arange(0, n, _RUN)
     orders = np.empty((count, n), dtype=np.int64)
@@ -93,19 +216,6 @@ def permutations_for(false_alarm_probability: float) -> int:
     return max(999, int(np.ceil(20.0 / false_alarm_probability)) - 1)
 
 
-def null_maxima(x: Array, joint: list[int], count: int, seed: int = 0) -> tuple[Array, Array]:
-    """Largest T2 (count,) and largest |single| (count, f) of `count` random orders of the blocks x (n, f)."""
-    random = np.random.default_rng(seed)
-    t2_max, single_max = np.empty(count), np.empty((count, x.shape[1]))
-    least = least_blocks(len(x))
-    for first in range(0, count, _BATCH):
-        orders = _orders(len(x), min(_BATCH, count - first), random)
-        t2, single, _ = _statistics(x[orders], joint, least)
-        t2_max[first : first + len(orders)] = t2.max(axis=1)
-        single_max[first : first + len(orders)] = np.abs(single).max(axis=1)
-    return t2_max, single_max
-
-
 def upper_quantile(null: Array, probability: float) -> Array:
     """Threshold that a null sample (m, ...) exceeds with `probability`: its order statistic of rank ceil((1 - p)(m +
     1)), so that the rate is at most p."""
@@ -115,17 +225,17 @@ def upper_quantile(null: Array, probability: float) -> Array:
 
 
 def two_samples(x: Array, split: int, joint: list[int], count: int, seed: int = 0) -> tuple[float, Array, Array, Array]:
-    """T2 and single statistics for a step after block `split` alone, and their null samples over random orders: (t2,
-    single (f,), t2 null, |single| null)."""
+    """T2 and single statistics for a step after block `split` alone, without drift, and their null samples over random
+    orders: (t2, single (f,), t2 null, |single| null)."""
     random = np.random.default_rng(seed)
-    t2, single, _ = _statistics(x[None], joint, 1)
+    scan = StepScan(x, joint, least=1)
+    found = scan.found()
     t2_null, single_null = np.empty(count), np.empty((count, x.shape[1]))
     for first in range(0, count, _BATCH):
-        orders = _orders(len(x), min(_BATCH, count - first), random)
-        some_t2, some_single, _ = _statistics(x[orders], joint, 1)
-        t2_null[first : first + len(orders)] = some_t2[:, split - 1]
-        single_null[first : first + len(orders)] = np.abs(some_single[:, split - 1])
-    return float(t2[0, split - 1]), single[0, split - 1], t2_null, single_null
+        some_t2, some_single, _ = scan(scan.orders(min(_BATCH, count - first), random))
+        t2_null[first : first + len(some_t2)] = some_t2[:, split - 1]
+        single_null[first : first + len(some_t2)] = np.abs(some_single[:, split - 1])
+    return float(found.joint[split - 1]), found.single[split - 1], t2_null, single_null
 
 
 def onset_interval(joint: Array) -> tuple[int, int]:

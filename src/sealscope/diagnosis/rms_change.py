@@ -15,9 +15,10 @@ import numpy as np
 
 from sealscope.diagnosis.against_baseline import against
 from sealscope.diagnosis.blocks import Blocks, chambers_of, cut
-from sealscope.diagnosis.change import Scan, null_maxima, onset_interval, permutations_for, scan, upper_quantile
+from sealscope.diagnosis.change import Drift, Scan, StepScan, onset_interval, permutations_for, upper_quantile
+from sealscope.diagnosis.rms_drift import drift_beyond_noise, drift_of, settled
 from sealscope.diagnosis.rms_results import JUDGED, describe_change, excess, largest_changes, method_result
-from sealscope.diagnosis.verdict import Evidence, MethodResult, Verdict
+from sealscope.diagnosis.verdict import Evidence, MethodResult
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import shortest
 
@@ -58,61 +59,61 @@ class RmsChange:
             )
         if blocks.still is not None:
             return Evidence("cannot tell", f"the pressures cannot be trusted: {blocks.still}")
+        return self._judged(settled(blocks), probability)
+
+    def _judged(self, blocks: Blocks, probability: float) -> Evidence:
         x = blocks.log_rms
-        joint = blocks.columns(*JUDGED)
-        found = scan(x, joint)
-        t2_null, single_null = null_maxima(x, joint, permutations_for(probability))
-        threshold = float(upper_quantile(t2_null, probability))
+        drift, d1 = drift_of(blocks), blocks.columns("d1")
+        scan = StepScan(x, blocks.columns(*JUDGED), drift)
+        found = scan.found()
+        null, single_null, trend_null = scan.null(permutations_for(probability))
+        threshold, most_even = (float(upper_quantile(one, probability)) for one in (null, trend_null))
         thresholds = upper_quantile(single_null, probability)
         methods = self._methods(blocks, found.single, thresholds)
 
         step = int(np.argmax(found.joint))
-        score = float(found.joint[step])
-        verdict: Verdict = "leak" if score > threshold else "no leak"
         changes = x[step + 1 :].mean(axis=0) - x[: step + 1].mean(axis=0)
         told = largest_changes(blocks.names, found.single[step], changes, thresholds)
-        if verdict == "no leak":
-            reason = (
-                f"no change of the details' RMS within the recording beyond its scatter (T2 {score:.1f}, "
-                f"threshold {threshold:.1f}); "
-                "a leak that was there from the start would need a --baseline to be seen"
-            )
-            return Evidence(verdict, reason, score, threshold, methods=methods)
-        scans = [found]
-        noise = np.abs(found.single).max(axis=0)
-        if any(noise[k] > thresholds[k] for k in blocks.columns("d1")):
-            loudest = max(blocks.columns("d1"), key=lambda k: noise[k])
-            split = int(np.argmax(np.abs(found.single[:, loudest]))) + 1
-            found, threshold = self._without_noise(x, split, probability)
-            scans.append(found)
+        noise = StepScan(x[:, d1], list(range(len(d1))), Drift(drift.walks[d1], np.zeros((len(d1), 0))))
+        noisy = noise.found()
+        even = found
+        if float(noisy.joint.max()) > float(upper_quantile(noise.null(permutations_for(probability))[0], probability)):
+            found, threshold = self._without_noise(blocks, int(np.argmax(noisy.joint)) + 1, probability)
             step = int(np.argmax(found.joint))
-            score = float(found.joint[step])
-            if score <= threshold:
+            even = noisy if noisy.trend > noisy.joint.max() else found
+            told += ", beyond a change of the noise"
+            if even is found and found.joint[step] <= threshold:
                 reason = (
                     "the noise (d1) changed, and the other details by no more than it: a sensor or its "
                     "wiring changed, or the leak is hidden"
                 )
-                return Evidence("cannot tell", reason, score, threshold, methods=methods)
-            told += ", beyond a change of the noise"
-        first, last = onset_interval(found.joint)
-        onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
-        drift = next((one for one in scans if not one.step_wins()), None)
-        if drift is not None:
+                return Evidence("cannot tell", reason, float(found.joint[step]), threshold, methods=methods)
+        score = float(found.joint[step])
+        if not even.step_wins() and (score > threshold or even.trend > most_even or even is noisy):
+            what = "the noise (d1) changed" if even is noisy else told
             reason = (
-                f"{told}, evenly over the recording (trend T2 {drift.trend:.1f}, step "
-                f"{drift.joint.max():.1f}): a drift and a growing leak look alike"
+                f"{what}, evenly over the recording (trend T2 {even.trend:.1f}, step {even.joint.max():.1f}): a drift "
+                "and a growing leak look alike"
             )
             return Evidence("cannot tell", reason, score, threshold, methods=methods)
+        if score <= threshold:
+            reason = (
+                f"no change of the details' RMS within the recording beyond its scatter and a sound machine's drift "
+                f"(T2 {score:.1f}, threshold {threshold:.1f}); "
+                "a leak that was there from the start would need a --baseline to be seen"
+            )
+            return Evidence("no leak", reason, score, threshold, methods=methods)
+        first, last = onset_interval(found.joint)
+        onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
         reason = f"{told} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"
-        return Evidence(verdict, reason, score, threshold, onset, interval, methods=methods)
+        return Evidence("leak", reason, score, threshold, onset, interval, methods=methods)
 
     @staticmethod
-    def _without_noise(log_rms: Array, split: int, probability: float) -> tuple[Scan, float]:
-        beyond = excess(log_rms, split)
-        joint = list(range(beyond.shape[1]))
-        found = scan(beyond, joint)
-        null, _ = null_maxima(beyond, joint, permutations_for(probability), seed=1)
-        return found, float(upper_quantile(null, probability))
+    def _without_noise(blocks: Blocks, split: int, probability: float) -> tuple[Scan, float]:
+        beyond = excess(blocks.log_rms, split)
+        scan = StepScan(beyond, list(range(beyond.shape[1])), drift_beyond_noise(blocks))
+        null, _, _ = scan.null(permutations_for(probability), seed=1)
+        return scan.found(), float(upper_quantile(null, probability))
 
     @staticmethod
     def _methods(blocks: Blocks, single: Array, thresholds: Array) -> tuple[MethodResult, ...]:

@@ -247,7 +247,7 @@ def _all() -> Iterator[Scorer]:
         "rms change, own threshold",
         "two-sided",
         "search",
-        "T2 less the threshold that random orders of the recording's own blocks give: what diagnose does alone",
+        "T2 less the threshold that random orders of the recording's own blocks with a sound machine's drift give",
         _own_scan,
         0.0,
     )
