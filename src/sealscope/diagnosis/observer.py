@@ -28,6 +28,7 @@ from sealscope.diagnosis.observer_stream import (
     whole,
 )
 from sealscope.diagnosis.observer_tally import Estimates
+from sealscope.diagnosis.remembered import remembered
 from sealscope.diagnosis.verdict import Evidence, LeakCourse
 from sealscope.recordings.recording import Array, Recording
 
@@ -121,7 +122,8 @@ class Observer:
             return Evidence("cannot tell", wrong)
         step = self._step(series, false_alarm_probability)
         if baseline:
-            others = [self.follow(one) for one in baseline if formulation_of(one) == series.formulation]
+            alike = [one for one in baseline if formulation_of(one) == series.formulation]
+            others = [remembered(one, self.name, self.rig, self.follow) for one in alike]
             return compare(recording, series, baseline, others, step, false_alarm_probability)
         return within(series, step)
 

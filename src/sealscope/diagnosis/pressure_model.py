@@ -17,6 +17,7 @@ import numpy as np
 from sealscope.diagnosis.blocks import CHAMBERS, find_cycle
 from sealscope.diagnosis.change import ONSET_CUT, upper_quantile
 from sealscope.diagnosis.pressure_level import Level, against_levels
+from sealscope.diagnosis.remembered import remembered
 from sealscope.diagnosis.verdict import LITRE_PER_MINUTE, Cause, Evidence, LeakCourse, MethodResult
 from sealscope.recordings.recording import Array, Recording
 
@@ -70,7 +71,8 @@ class PressureModel:
         within = _within(followed, recording, probability)
         if not baseline:
             return within
-        known = [one for one in (self._follow(other) for other in baseline) if not isinstance(one, str)]
+        others = [remembered(other, self.name, self.rig, self._follow) for other in baseline]
+        known = [one for one in others if not isinstance(one, str)]
         levels = [Level(one.level, one.level_deviation, one.command_rms) for one in known]
         own = Level(followed.level, followed.level_deviation, followed.command_rms)
         return against_levels(own, levels, within, probability, _mean_drop(recording))

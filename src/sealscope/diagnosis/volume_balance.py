@@ -19,6 +19,7 @@ from sealscope.diagnosis.balance_blocks import BalanceBlocks, block_samples, cha
 from sealscope.diagnosis.balance_fit import BalanceFit, fit_balance
 from sealscope.diagnosis.balance_search import search
 from sealscope.diagnosis.balance_words import describe_leak, no_step, trouble
+from sealscope.diagnosis.remembered import remembered
 from sealscope.diagnosis.step_in_drift import FEWEST
 from sealscope.diagnosis.verdict import Evidence, MethodResult
 from sealscope.recordings.recording import Recording
@@ -40,6 +41,7 @@ class VolumeBalance:
     reads = ("u", "theta", "omega", "x", "p_1", "p_2", "p_A", "p_B")
 
     def __init__(self, rig: Rig) -> None:
+        self.rig = rig
         self.area = float(0.5 * (rig.cylinder.A_A + rig.cylinder.A_B))
         self.displacement = float(rig.pump.q_b / (2.0 * np.pi))
 
@@ -64,7 +66,8 @@ class VolumeBalance:
         within = self._within(fit, probability, metres)
         if not baseline:
             return within
-        others = [one for one, _ in (self.fit(other) for other in baseline) if one is not None]
+        fits = (remembered(other, self.name, self.rig, self.fit) for other in baseline)
+        others = [one for one, _ in fits if one is not None]
         return against_baseline(fit, others, within, probability, metres=metres)
 
     def blocks(self, recording: Recording, length: int | None = None) -> BalanceBlocks:
