@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.integrate import Trajectory, integrate
@@ -14,6 +17,18 @@ from sealscope.simulation.integrate import Trajectory, integrate
 #: The rig of the independent results: 26.7 rad/s per volt, 0.25 MPa everywhere at the start, line volumes of 50 cm^3.
 CHECK_RIG = {"omega_per_volt": 26.7, "p_charge": 0.25e6, "V_1": 50e-6, "V_2": 50e-6}
 HALF_CLOSED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
+
+
+def pytest_configure() -> None:
+    """One BLAS thread: the matrices are small, and two test processes with two threads each take ten times as long.
+
+    And interrupts reach the processes that tests start, also where the tests run in the background of a shell that
+    ignores them for its jobs: an ignored signal is inherited, a handled one is not.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    threadpool_limits(limits=1)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

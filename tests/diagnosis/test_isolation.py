@@ -197,7 +197,7 @@ def simulated(words: str, command: str) -> Recording:
     return run(make_experiment(command=command, duration=120.0, values=values, seed=3, **what)).recording
 
 
-@pytest.mark.parametrize("command", ["3 sin(4t)", "8 sin(t)"])
+@pytest.mark.parametrize("command", ["3 sin(4t)", pytest.param("8 sin(t)", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("words", "cause"),
     [

@@ -24,7 +24,7 @@ def _walk(share: float):  # type: ignore[no-untyped-def]
     return lambda random: random.standard_normal(50) + np.cumsum(share * random.standard_normal(50))
 
 
-@pytest.mark.parametrize("expected, true", [(0.03, 0.03), (3.0, 3.0), (3.0, 0.3)])
+@pytest.mark.parametrize("expected, true", [(0.03, 0.03), (3.0, 3.0), pytest.param(3.0, 0.3, marks=pytest.mark.slow)])
 def test_false_alarms_are_those_asked_for(expected: float, true: float) -> None:
     """Walks as strong as expected, or weaker: 5 % of 120 is 6, and 14 or more would come three times in 1000."""
     rate = _null_rate(_walk(true**0.5), 120, 0.05, expected_walk=expected, wary=expected > 1.0)
@@ -35,9 +35,11 @@ def test_false_alarms_are_those_asked_for(expected: float, true: float) -> None:
     "name, drift",
     [
         ("warm-up", lambda t, r: 8.0 * np.exp(-t / 10.0)),
-        ("cooling", lambda t, r: -8.0 * np.exp(-t / 10.0)),
+        pytest.param("cooling", lambda t, r: -8.0 * np.exp(-t / 10.0), marks=pytest.mark.slow),
         ("even", lambda t, r: 0.2 * t),
-        ("wander of 60 s", lambda t, r: 4.0 * np.sin(2 * np.pi * t / 20.0 + 6.3 * r.random())),
+        pytest.param(
+            "wander of 60 s", lambda t, r: 4.0 * np.sin(2 * np.pi * t / 20.0 + 6.3 * r.random()), marks=pytest.mark.slow
+        ),
         ("wander of 150 s", lambda t, r: 4.0 * np.sin(2 * np.pi * t / 50.0 + 6.3 * r.random())),
     ],
 )

@@ -89,7 +89,7 @@ def test_z_is_standard_normal_with_the_stated_correlation(linear: tuple[Track, n
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.03)
 
 
-@pytest.mark.parametrize("scales", [(1.0,), (1.0, 2.0, 4.0)])
+@pytest.mark.parametrize("scales", [(1.0,), pytest.param((1.0, 2.0, 4.0), marks=pytest.mark.slow)])
 def test_the_threshold_holds_its_probability(linear: tuple[Track, np.ndarray, float], scales: tuple) -> None:
     """5 % of 400: 20, between 8 and 33 but for three times in 1000; choosing the wandering too must not raise it."""
     like, theta, speed = linear

@@ -108,7 +108,7 @@ def test_finds_a_growth_and_says_how_long_it_took() -> None:
 
 
 @pytest.mark.parametrize("name", DRIFTS)
-@pytest.mark.parametrize("height", [4.0, 12.0])
+@pytest.mark.parametrize("height", [pytest.param(4.0, marks=pytest.mark.slow), 12.0])
 def test_false_alarms_do_not_depend_on_the_drift(name: str, height: float) -> None:
     """At 5 %, of 150 series without a step: no more than chance allows once in 10 000 such tests."""
     random = np.random.default_rng(3)

@@ -31,6 +31,7 @@ def test_smallest_leak_with_throttles_half_closed(records) -> None:  # type: ign
         assert one.leak_lpm is None
 
 
+@pytest.mark.slow
 def test_larger_leak_without_throttles(records) -> None:  # type: ignore[no-untyped-def]
     """0.015 L/min: 18 of 20 fresh seeds in the benchmark; of these eight at most two are missed."""
     found = [diagnose(records(seed, leak="0.015 L/min from 90 s")) for seed in range(8)]
@@ -114,6 +115,7 @@ def test_white_noise_alarms_as_seldom_as_stated_at_any_rate(rate: float, samples
     assert alarms <= 12  # of 100 at 5 %: more has a probability of 0.1 %
 
 
+@pytest.mark.slow
 def test_white_noise_at_a_low_rate(noise_record) -> None:  # type: ignore[no-untyped-def]
     """The filters' memory must not pass for a change where a second has few samples."""
     found = [diagnose(noise_record(seed, 6000, 10.0), false_alarm_probability=0.05).verdict for seed in range(30)]
