@@ -134,7 +134,8 @@ class StepScan:
         passed = _cosines(_rescattered(x[..., self.used] @ self.to)) * self.passed
         score = -np.cumsum(idct(passed, axis=1, norm="ortho"), axis=1)[:, :-1] @ self.steps
         single = alone / np.sqrt(self.single_gain)
-        t2 = np.einsum("mkb,mkb->mk", np.einsum("mka,kab->mkb", score, self.quadratic), score)
+        by_step = score.transpose(1, 0, 2)
+        t2 = np.einsum("kmb,kmb->mk", np.matmul(by_step, self.quadratic), by_step)
         for series in (t2, single):
             series[:, : self.least - 1] = 0.0
             series[:, self.n - self.least :] = 0.0
@@ -204,11 +205,13 @@ def _quadratic(steps: Array, gain: Array, wanted: int) -> Array:
 def _orders(n: int, count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """`count` random orders of n blocks in which neighbours stay together in pairs."""
     starts = np.arange(0, n, _RUN)
-    orders = np.empty((count, n), dtype=np.int64)
-    for row in orders:
-        shifted = np.roll(np.arange(n), int(random.integers(n)))
-        row[:] = np.concatenate([shifted[start : start + _RUN] for start in random.permutation(starts)])
-    return orders
+    shifts, chosen = np.empty((count, 1), dtype=np.int64), np.empty((count, starts.size), dtype=np.int64)
+    for k in range(count):
+        shifts[k] = random.integers(n)
+        chosen[k] = random.permutation(starts)
+    places = (chosen[:, :, None] + np.arange(_RUN)).reshape(count, -1)
+    places = places[places < n].reshape(count, n)  # the last run may be a short one
+    return np.asarray((places - shifts) % n)
 
 
 def permutations_for(false_alarm_probability: float) -> int:
