@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -123,3 +125,26 @@ def test_a_detector_s_score_may_be_calibrated(recording: Recording) -> None:
     assert len(seen) == 1
     with pytest.raises(InputError, match="did you mean 'looker, calibrated'"):
         scorer("looker, calibratd")
+
+
+def test_two_at_a_time_and_as_each_by_itself(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two detectors that wait for one another both come to an end; evidence stands in the registry's order."""
+    both = threading.Barrier(2, timeout=20.0)
+
+    class Waiting(Looker):
+        def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
+            both.wait()
+            return super().examine(recording, baseline, probability)
+
+    class First(Waiting):
+        name = "first"
+
+    class Second(Waiting):
+        name = "second"
+
+    monkeypatch.setattr(contract, "DETECTORS", {"second": Second, "first": First})
+    whole = Examination(recording, false_alarm_probability=0.05)
+    fused = whole.fused()
+    assert [one.name for one in fused.methods] == ["second", "first"]
+    assert len(seen) == 2
+    assert whole.evidence("first").score == 0.05

@@ -93,9 +93,21 @@ class Examination:
     def fused(self) -> Fused:
         """One verdict from all registered detectors; what sees a change in the pressures and cannot name its cause is
         believed where nothing else stepped with it (`isolation`)."""
-        said = [self.said(name) for name in detectors()]
+        said = self._all()
         found = fuse([one if one.name == ORDER[0] else replace(one, evidence=self._isolated(one)) for one in said])
         return self._named(found)
+
+    def _all(self) -> list[Said]:
+        """What every registered detector says, two at a time: compiled code runs beside the interpreter, and what a
+        detector says does not depend on the others."""
+        from concurrent.futures import ThreadPoolExecutor
+
+        from threadpoolctl import threadpool_limits
+
+        names = list(detectors())
+        # the limit is the process's: set here, it does not change while detectors come and go
+        with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
+            return list(pool.map(self.said, names))
 
     def _named(self, found: Fused) -> Fused:
         """A verdict other than `leak` that names no cause, with that of a step which no detector asked about."""
