@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from bench_solvers import CASES, FREQUENCY, RATE, Case, build, quartiles, rms, theirs, write
 
-from sealscope.simulation.batch import simulate_batch
+from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment, make_experiment
 from sealscope.simulation.simulate import run
 

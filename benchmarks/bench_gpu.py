@@ -24,7 +24,7 @@ import numpy as np
 from bench_solvers import CASES, FREQUENCY, PEERS, RATE, Case, ours, quartiles, rms, write
 
 from sealscope.errors import InputError
-from sealscope.simulation.batch import runner_of, simulate_batch
+from sealscope.simulation.batch.batch import runner_of, simulate_batch
 from sealscope.simulation.experiment import Experiment, make_experiment
 
 #: Most seconds that 100 000 runs of 180 s may take, by case.

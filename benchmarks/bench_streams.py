@@ -20,7 +20,7 @@ import numpy as np
 import pywt
 from bench_signals import LEVELS
 
-from sealscope.diagnosis.fleet import Fleet
+from sealscope.diagnosis.fleet.fleet import Fleet
 from sealscope.signals.fleet import FleetRms
 
 RATE = 500.0
@@ -62,7 +62,7 @@ def fleet_of(actuators: int) -> Callable[[np.ndarray], object]:
     """A fleet whose actuators have all learned (from noise), so that every test runs."""
     fleet = Fleet(RATE, actuators, learn_s=200.0)
     rng = np.random.default_rng(1)
-    from sealscope.diagnosis.fleet_tests import judge
+    from sealscope.diagnosis.fleet.sequential_tests import judge
 
     for decision in range(100):
         judge(rng.normal(size=fleet._y.shape), decision, fleet._learn, fleet._limits, *fleet._tests)

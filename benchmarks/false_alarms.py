@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.diagnosis.contract import DETECTORS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.examination import Examination
+from sealscope.diagnosis.registry import DETECTORS
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import make_experiment
 from sealscope.simulation.instruments import record

@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.diagnose import diagnose
-    from sealscope.diagnosis.verdict import Diagnosis
+    from sealscope.diagnosis.verdict.evidence import Diagnosis
     from sealscope.parameters import Rig, load_rig
     from sealscope.recordings import Recording, inspect, read, write
     from sealscope.reporting import write_page
-    from sealscope.simulation.batch import simulate_batch
+    from sealscope.simulation.batch.batch import simulate_batch
     from sealscope.simulation.experiment import Experiment, make_experiment
     from sealscope.simulation.proof import prove
     from sealscope.simulation.simulate import run, simulate
 
 _HOMES = {
-    "Diagnosis": "diagnosis.verdict",
+    "Diagnosis": "diagnosis.verdict.evidence",
     "Experiment": "simulation.experiment",
     "Recording": "recordings.recording",
     "Rig": "parameters",
@@ -34,7 +34,7 @@ _HOMES = {
     "read": "recordings",
     "run": "simulation.simulate",
     "simulate": "simulation.simulate",
-    "simulate_batch": "simulation.batch",
+    "simulate_batch": "simulation.batch.batch",
     "write": "recordings",
     "write_page": "reporting",
 }

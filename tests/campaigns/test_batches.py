@@ -19,8 +19,8 @@ from sealscope.campaigns.plan import read_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.campaigns.short_runs import Steps, place_of_run
 from sealscope.campaigns.work import work
-from sealscope.diagnosis.calibrated import place_of
-from sealscope.diagnosis.scorers import Look
+from sealscope.diagnosis.calibration.calibrated import place_of
+from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.simulate import run

@@ -15,7 +15,7 @@ from sealscope.campaigns.planning import experiment_for
 from sealscope.campaigns.prediction import ChangeDetector, Responses
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.bench import Machine
+from sealscope.simulation.bench.machines import Machine
 from sealscope.simulation.commands import Sine
 from sealscope.simulation.experiment import Experiment
 
@@ -37,7 +37,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         values = {"friction.F_v": 300.0 * share, "sensors.p_A.noise": 9e4}
         return Machine(profile, seed, rig, duration, values, (), Sine(8.0, 1.0), 0.0)
 
-    monkeypatch.setattr("sealscope.simulation.bench.draw", draw)
+    monkeypatch.setattr("sealscope.simulation.bench.machines.draw", draw)
     return asked
 
 

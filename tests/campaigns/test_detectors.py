@@ -19,14 +19,14 @@ from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.campaigns.statement import Statement, cause_of
 from sealscope.campaigns.store import read_rows
 from sealscope.campaigns.work import Row
-from sealscope.diagnosis import contract, plugins
-from sealscope.diagnosis.calibrated import diagnose_calibrated
-from sealscope.diagnosis.calibration import load
+from sealscope.diagnosis import plugins, registry
+from sealscope.diagnosis.calibration.calibrated import diagnose_calibrated
+from sealscope.diagnosis.calibration.thresholds import load
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict import Evidence
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.recordings import read
-from sealscope.reporting.campaign_page import campaign_text, render_campaign_page
+from sealscope.reporting.campaign.page import campaign_text, render_campaign_page
 
 PLAN = """
 [campaign]
@@ -84,8 +84,8 @@ class Watcher:
 
 @pytest.fixture
 def plan(tmp_path, monkeypatch):
-    quick = {name: contract.DETECTORS[name] for name in ("volume balance", "rms change")}
-    monkeypatch.setattr(contract, "DETECTORS", {**quick, "watcher": Watcher})
+    quick = {name: registry.DETECTORS[name] for name in ("volume balance", "rms change")}
+    monkeypatch.setattr(registry, "DETECTORS", {**quick, "watcher": Watcher})
     monkeypatch.setattr(plugins, "_found", lambda: ())
     plugins.plug_ins.cache_clear()
     entry.cache_clear()
@@ -332,7 +332,7 @@ def test_the_documented_plan_is_sound_where_the_example_is_installed(monkeypatch
     made = runpy.run_path(str(example / "ringing_energy.py"))["RingingEnergy"]
     with pytest.raises(InputError, match="ringing energy"):
         load_plan(example / "judge.toml")
-    monkeypatch.setattr(contract, "DETECTORS", {**contract.DETECTORS, "ringing energy": made})
+    monkeypatch.setattr(registry, "DETECTORS", {**registry.DETECTORS, "ringing energy": made})
     plan = load_plan(example / "judge.toml")
     assert [name for name in plan.detectors if entry(name).needs_calibration] == ["ringing energy, calibrated"]
     assert plan.views == {"pressures": ("u", "p_A", "p_B")}

@@ -10,7 +10,7 @@ from sealscope.campaigns.machines import SIZING_SECONDS, closing_values, experim
 from sealscope.campaigns.plan import load_plan
 from sealscope.campaigns.work import work
 from sealscope.errors import InputError
-from sealscope.simulation import profile
+from sealscope.simulation.bench import profile
 from sealscope.simulation.simulate import run
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from sealscope.campaigns.noise_responses import halves, instrument_noise, responses
 from sealscope.campaigns.prediction import ChangeDetector, Responses, predict
-from sealscope.diagnosis.scorers import Look
+from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
+from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Leak
 from sealscope.simulation.sensitivity import CHAMBERS, clean_channels
 
 DETECTORS = (

@@ -65,7 +65,7 @@ def test_what_breaks_a_rule_is_one_line_with_the_place(tmp_path, text, before, a
 
 
 def test_the_packaged_plans_are_sound():
-    pytest.importorskip("sealscope.simulation.bench")
+    pytest.importorskip("sealscope.simulation.bench.machines")
     for name in plan_names():
         plan = load_plan(name)
         assert plan.name == name

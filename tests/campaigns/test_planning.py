@@ -23,10 +23,10 @@ from sealscope.campaigns.prediction import (
 )
 from sealscope.campaigns.work import work
 from sealscope.cli.plan import plan
-from sealscope.diagnosis.scorers import Look
+from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
+from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Leak
 from sealscope.simulation.simulate import run
 
 FELL, ROSE, CHANGED = (ChangeDetector("d3", "p_A", side) for side in ("fell", "rose", "changed"))

@@ -21,7 +21,7 @@ from sealscope.campaigns.prediction import (
     probability,
 )
 from sealscope.campaigns.work import Row
-from sealscope.diagnosis.scorers import SCORERS
+from sealscope.diagnosis.calibration.scorers import SCORERS
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from sealscope.diagnosis import contract
+from sealscope.diagnosis import registry
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import make_experiment
 from sealscope.simulation.instruments import record
@@ -21,7 +21,7 @@ Records = Callable[..., Recording]
 @pytest.fixture
 def rms_change_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `diagnose` run the detector `rms change` and no other."""
-    monkeypatch.setattr(contract, "DETECTORS", {"rms change": contract.DETECTORS["rms change"]})
+    monkeypatch.setattr(registry, "DETECTORS", {"rms change": registry.DETECTORS["rms change"]})
 
 
 @pytest.fixture(scope="session")

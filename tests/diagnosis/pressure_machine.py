@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from sealscope.diagnosis.pressure_laws import G
-from sealscope.diagnosis.pressure_track import Track, wander
+from sealscope.diagnosis.pressure_model.laws import G
+from sealscope.diagnosis.pressure_model.track import Track, wander
 from sealscope.recordings.recording import Recording
+from sealscope.simulation.changes.drifts import Drift, Linear
 from sealscope.simulation.commands import Command, Recorded
-from sealscope.simulation.drifts import Drift, Linear
 from sealscope.simulation.experiment import Experiment, make_experiment
 from sealscope.simulation.instruments import record
 from sealscope.simulation.integrate import Trajectory

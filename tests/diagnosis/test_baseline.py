@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.against_baseline import predict, student_threshold
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.rms_results import excess
+from sealscope.diagnosis.rms_change.against_baseline import predict, student_threshold
+from sealscope.diagnosis.rms_change.results import excess
 from sealscope.recordings.recording import Recording
 
 pytestmark = pytest.mark.usefixtures("rms_change_alone")

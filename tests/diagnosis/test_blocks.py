@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.blocks import BLOCK_SAMPLES, BLOCK_SECONDS, cut, find_cycle, whole_log_rms
+from sealscope.diagnosis.rms_change.blocks import BLOCK_SAMPLES, BLOCK_SECONDS, cut, whole_log_rms
+from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import details
 from sealscope.simulation.commands import parse_command

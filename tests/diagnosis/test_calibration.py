@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.calibrated import DEFAULT_DETECTORS, calibrate_on, diagnose_calibrated, place_of
-from sealscope.diagnosis.calibration import Place, as_dict, calibrate, grouped, load, save, with_judge
-from sealscope.diagnosis.operating_point import OperatingPoint
-from sealscope.diagnosis.scorers import SCORERS, Look, scorer
+from sealscope.diagnosis.baseline.operating_point import OperatingPoint
+from sealscope.diagnosis.calibration.calibrated import DEFAULT_DETECTORS, calibrate_on, diagnose_calibrated, place_of
+from sealscope.diagnosis.calibration.scorers import SCORERS, Look, scorer
+from sealscope.diagnosis.calibration.thresholds import Place, as_dict, calibrate, grouped, load, save, with_judge
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.recording import Recording
 

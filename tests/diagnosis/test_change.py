@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis.change import (
+from sealscope.diagnosis.changepoint.abrupt import (
     ONSET_CUT,
     Drift,
     Scan,
@@ -19,7 +19,7 @@ from sealscope.diagnosis.change import (
     two_samples,
     upper_quantile,
 )
-from sealscope.diagnosis.change import _orders as orders
+from sealscope.diagnosis.changepoint.abrupt import _orders as orders
 
 
 def scan(x: np.ndarray, joint: list[int], drift: Drift | None = None) -> Scan:

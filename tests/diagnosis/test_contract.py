@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.contract import detectors
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict import Evidence
+from sealscope.diagnosis.registry import detectors
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Recording
 

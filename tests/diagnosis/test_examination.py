@@ -7,11 +7,11 @@ import threading
 import numpy as np
 import pytest
 
-from sealscope.diagnosis import contract
+from sealscope.diagnosis import registry
+from sealscope.diagnosis.calibration.scorers import Look, scorer
 from sealscope.diagnosis.examination import Examination, assumed_rig
-from sealscope.diagnosis.scorers import Look, scorer
 from sealscope.diagnosis.trust import does_not_move
-from sealscope.diagnosis.verdict import Evidence
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 
@@ -44,7 +44,7 @@ class Reader(Looker):
 
 @pytest.fixture
 def recording(monkeypatch: pytest.MonkeyPatch) -> Recording:
-    monkeypatch.setattr(contract, "DETECTORS", {"looker": Looker, "reader": Reader})
+    monkeypatch.setattr(registry, "DETECTORS", {"looker": Looker, "reader": Reader})
     seen.clear()
     channels = {name: np.sin(np.arange(100.0)) for name in ("u", "x", "p_A", "p_B", "q_leak")}
     return Recording(np.arange(100.0), channels, dict.fromkeys(channels, "count"), 1.0)
@@ -142,7 +142,7 @@ def test_two_at_a_time_and_as_each_by_itself(recording: Recording, monkeypatch: 
     class Second(Waiting):
         name = "second"
 
-    monkeypatch.setattr(contract, "DETECTORS", {"second": Second, "first": First})
+    monkeypatch.setattr(registry, "DETECTORS", {"second": Second, "first": First})
     whole = Examination(recording, false_alarm_probability=0.05)
     fused = whole.fused()
     assert [one.name for one in fused.methods] == ["second", "first"]

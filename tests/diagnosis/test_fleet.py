@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis.fleet import LEARNING, MISSING, STILL, WATCHED, Fleet
-from sealscope.diagnosis.fleet_tests import NUMBERS, forget, judge
-from sealscope.diagnosis.run_length import cusum_run_length, cusum_threshold, glr_run_length, glr_threshold
+from sealscope.diagnosis.fleet.fleet import LEARNING, MISSING, STILL, WATCHED, Fleet
+from sealscope.diagnosis.fleet.run_length import cusum_run_length, cusum_threshold, glr_run_length, glr_threshold
+from sealscope.diagnosis.fleet.sequential_tests import NUMBERS, forget, judge
 from sealscope.errors import InputError
 
 RATE = 200.0

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.fusion import ORDER, Said, alarmed, fuse, passes
-from sealscope.diagnosis.next_check import next_check
-from sealscope.diagnosis.verdict import Cause, Evidence, LeakCourse, MethodResult, Verdict
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse, MethodResult, Verdict
+from sealscope.diagnosis.verdict.fusion import ORDER, Said, alarmed, fuse, passes
+from sealscope.diagnosis.verdict.next_check import next_check
 
 LEAK = Evidence("leak", "it leaks", 9.0, 3.0)
 NONE = Evidence("no leak", "it does not", 1.0, 3.0)

@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sealscope.diagnosis import contract
+from sealscope.diagnosis import registry
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.examination import Examination
-from sealscope.diagnosis.isolation import isolated, other_cause, signatures, unasked
-from sealscope.diagnosis.next_check import next_check
-from sealscope.diagnosis.verdict import Evidence
+from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.isolation import isolated, other_cause, signatures, unasked
+from sealscope.diagnosis.verdict.next_check import next_check
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 
 ONSET, RATE = 61.3, 500.0
@@ -145,14 +145,14 @@ def test_the_fused_verdict_heeds_it_and_a_volume_balance_does_not_need_it(monkey
 
     recording = made(strokes=1.15)
     for name in ("rms change", "observer", "pressure model"):
-        monkeypatch.setattr(contract, "DETECTORS", {name: lambda rig, name=name: Says(name)})
+        monkeypatch.setattr(registry, "DETECTORS", {name: lambda rig, name=name: Says(name)})
         whole = Examination(recording, false_alarm_probability=0.05)
         fused = whole.fused()
         assert (fused.judge, fused.evidence.verdict, fused.evidence.cause) == (name, "cannot tell", "friction change")
         # the thesis's rule alone stays what it is: it names no cause
         assert whole.evidence(name).verdict == ("leak" if name == "rms change" else "cannot tell")
         assert Examination(made(), false_alarm_probability=0.05).fused().evidence.verdict == "leak"
-    monkeypatch.setattr(contract, "DETECTORS", {"volume balance": lambda rig: Says("volume balance")})
+    monkeypatch.setattr(registry, "DETECTORS", {"volume balance": lambda rig: Says("volume balance")})
     assert Examination(recording, false_alarm_probability=0.05).fused().evidence.verdict == "leak"
 
 
@@ -166,7 +166,7 @@ def test_unasked_it_names_what_stepped_plainly_and_nothing_else(monkeypatch: pyt
         def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
             return Evidence("no leak", "it did not rise", 1.0, 3.0)
 
-    monkeypatch.setattr(contract, "DETECTORS", {"observer": lambda rig: Sound()})
+    monkeypatch.setattr(registry, "DETECTORS", {"observer": lambda rig: Sound()})
     for changed, cause in (
         ({"strokes": 1.2}, "friction change"),
         ({"u": 1.1}, "changed duty"),

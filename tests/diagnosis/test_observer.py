@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis import observer_pressure
-from sealscope.diagnosis.observer import LEAST_SECONDS, Observer, block_length
-from sealscope.diagnosis.observer_model import G_UNIT, PARAMETERS, assume, start_parameters
-from sealscope.diagnosis.observer_stream import ObserverStream, channels_of, formulation_of
-from sealscope.diagnosis.observer_volume import VolumeFilter
+from sealscope.diagnosis.observer import pressure_filter
+from sealscope.diagnosis.observer.detector import LEAST_SECONDS, Observer, block_length
+from sealscope.diagnosis.observer.model import G_UNIT, PARAMETERS, assume, start_parameters
+from sealscope.diagnosis.observer.stream import ObserverStream, channels_of, formulation_of
+from sealscope.diagnosis.observer.volume_filter import VolumeFilter
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
@@ -62,11 +62,11 @@ def test_jacobians_are_the_rates_own_slopes(thesis: Rig, v: float, commanded: bo
     z[5] = v
     drive = 3.0 if commanded else 31.0
     J, B = np.zeros((4, 4)), np.zeros((4, 8))
-    observer_pressure._slopes(z, q, z[2] if commanded else drive, a, J, B)
+    pressure_filter._slopes(z, q, z[2] if commanded else drive, a, J, B)
 
     def rates(z: np.ndarray, q: np.ndarray) -> np.ndarray:
         dz = np.zeros(7)
-        observer_pressure._rates(z, q, drive, commanded, a, dz)
+        pressure_filter._rates(z, q, drive, commanded, a, dz)
         return dz[3:]
 
     def slope(which: int, of: int, h: float) -> np.ndarray:
@@ -90,11 +90,11 @@ def test_sensitivities_are_carried_by_the_exponential(thesis: Rig) -> None:
     a = assume(thesis)
     z, q = _point()
     J, B = np.zeros((4, 4)), np.zeros((4, 8))
-    observer_pressure._slopes(z, q, z[2], a, J, B)
+    pressure_filter._slopes(z, q, z[2], a, J, B)
     h = 2e-4
     S = np.hstack([np.eye(4), np.zeros((4, 8))])
     buffers = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 12))
-    observer_pressure._carry(J, B, h, *buffers, S)
+    pressure_filter._carry(J, B, h, *buffers, S)
     whole = expm(h * np.block([[J, B], [np.zeros((8, 12))]]))[:4]
     scale = np.abs(whole).max(axis=0)
     assert np.all(np.abs(S - whole) <= 1e-5 * scale + 1e-300)

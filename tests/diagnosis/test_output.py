@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis.contract import detectors
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict import Cause, Diagnosis
+from sealscope.diagnosis.registry import detectors
+from sealscope.diagnosis.verdict.evidence import Cause, Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from sealscope.diagnosis import plugins
-from sealscope.diagnosis.contract import DETECTORS, detectors
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.registry import DETECTORS, detectors
 from sealscope.recordings.recording import Recording
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "ringing-energy"
 GOOD = """
-from sealscope.diagnosis.verdict import Evidence
+from sealscope.diagnosis.verdict.evidence import Evidence
 class Good:
     name = "good"
     def __init__(self, rig): self.rig = rig.name
@@ -32,7 +32,7 @@ Install = Callable[..., None]
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Install a distribution of that name with its source and entry points, as pip would leave it."""
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr("sealscope.diagnosis.contract.DETECTORS", {"rms change": DETECTORS["rms change"]})
+    monkeypatch.setattr("sealscope.diagnosis.registry.DETECTORS", {"rms change": DETECTORS["rms change"]})
 
     def made(distribution: str, source: str, points: dict[str, str]) -> None:
         (tmp_path / f"{distribution}.py").write_text(source, encoding="utf-8")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.blocks import find_cycle
-from sealscope.diagnosis.pressure_duty import Duty, differences, duty_of, moving
-from sealscope.diagnosis.pressure_follow import Followed, follow
-from sealscope.diagnosis.pressure_laws import (
+from sealscope.diagnosis.pressure_model.duty import Duty, differences, duty_of, moving
+from sealscope.diagnosis.pressure_model.follow import Followed, follow
+from sealscope.diagnosis.pressure_model.laws import (
     F_C,
     F_CFR,
     F_V,
@@ -24,6 +23,7 @@ from sealscope.diagnosis.pressure_laws import (
     stiffening,
 )
 from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Recording
 
 from .pressure_machine import G_PUMP, P_CHARGE, recorded, true_difference, true_states

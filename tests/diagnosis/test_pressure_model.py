@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from sealscope.diagnosis.blocks import find_cycle
-from sealscope.diagnosis.pressure_duty import duty_of
-from sealscope.diagnosis.pressure_follow import Followed, follow
-from sealscope.diagnosis.pressure_laws import GAIN, STATES, G, machine_of, nominal
-from sealscope.diagnosis.pressure_model import PressureModel, threshold_of
-from sealscope.diagnosis.pressure_steps import steps_in
-from sealscope.diagnosis.pressure_track import Track, track
+from sealscope.diagnosis.pressure_model.detector import PressureModel, threshold_of
+from sealscope.diagnosis.pressure_model.duty import duty_of
+from sealscope.diagnosis.pressure_model.follow import Followed, follow
+from sealscope.diagnosis.pressure_model.laws import GAIN, STATES, G, machine_of, nominal
+from sealscope.diagnosis.pressure_model.steps import steps_in
+from sealscope.diagnosis.pressure_model.track import Track, track
 from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import COUNTS, Recording
 
 from .pressure_machine import G_PUMP, LEAK, ONSET, P_CHARGE, of_linear_model, recorded

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.baseline.operating_point import operating_point
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.operating_point import operating_point
 from sealscope.recordings import read
 from sealscope.recordings.recording import Recording
 

@@ -8,9 +8,9 @@ import weakref
 import numpy as np
 import pytest
 
-from sealscope.diagnosis import remembered as module
-from sealscope.diagnosis.observer import Observer
-from sealscope.diagnosis.remembered import remembered
+from sealscope.diagnosis.baseline import memo as module
+from sealscope.diagnosis.baseline.memo import remembered
+from sealscope.diagnosis.observer.detector import Observer
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.simulate import simulate

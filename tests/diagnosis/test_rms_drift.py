@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.blocks import QUANTITIES, Blocks
-from sealscope.diagnosis.rms_change import RmsChange
-from sealscope.diagnosis.rms_drift import (
+from sealscope.diagnosis.rms_change.blocks import QUANTITIES, Blocks
+from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.drift import (
     LEAST_SHARE,
     MACHINE_WANDER,
     NOISE_WANDER,
@@ -18,7 +18,7 @@ from sealscope.diagnosis.rms_drift import (
     own_shares,
     settled,
 )
-from sealscope.diagnosis.rms_results import excess
+from sealscope.diagnosis.rms_change.results import excess
 
 BLOCK = 1.5
 #: Deviation of a block's log RMS of d1..d4 and d3d4 where it is white noise at 500 Hz.

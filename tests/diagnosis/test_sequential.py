@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from scipy.special import pdtr
 
-from sealscope.diagnosis.sequential import BalanceState, SequentialBalance
-from sealscope.diagnosis.volume_balance import VolumeBalance
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.diagnosis.volume_balance.stream import BalanceState, SequentialBalance
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording

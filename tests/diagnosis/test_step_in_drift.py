@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.special import bdtr, bdtrc
 
-from sealscope.diagnosis.smooth_drift import DriftFamily, interventions, strengths
-from sealscope.diagnosis.step_in_drift import find_step
+from sealscope.diagnosis.changepoint.smooth_drift import DriftFamily, interventions, strengths
+from sealscope.diagnosis.changepoint.step_in_drift import find_step
 from sealscope.errors import InputError
 
 N = 57

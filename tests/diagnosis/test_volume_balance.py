@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.balance_fit import told_apart
-from sealscope.diagnosis.balance_words import level_interval
-from sealscope.diagnosis.volume_balance import VolumeBalance
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.diagnosis.volume_balance.evidence import level_interval
+from sealscope.diagnosis.volume_balance.fit import told_apart
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import COUNTS, Recording
 

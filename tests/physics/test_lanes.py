@@ -11,9 +11,14 @@ import numpy as np
 import pytest
 
 from sealscope.compiled import contracted, kernel
-from sealscope.physics.fixed import left_to_table
 from sealscope.physics.friction import stribeck_friction
-from sealscope.physics.lane_runs import (
+from sealscope.physics.lanes import WIDTH, anywhere, exponential, load, power_of_two, select, spread, store
+from sealscope.physics.motor import winding_current_rate
+from sealscope.physics.restrictors import implicit_orifice_flow, orifice_flow
+from sealscope.physics.rig import OUTPUTS, RigNumbers, initial_state, rig_numbers
+from sealscope.physics.solvers.rk4 import RK4_NODES
+from sealscope.physics.vector.fixed import left_to_table
+from sealscope.physics.vector.runs import (
     ACCOUNTS,
     LANE_FIELDS,
     LEAK_ROWS,
@@ -21,11 +26,6 @@ from sealscope.physics.lane_runs import (
     TOLD,
     advance_lanes_rk4,
 )
-from sealscope.physics.lanes import WIDTH, anywhere, exponential, load, power_of_two, select, spread, store
-from sealscope.physics.motor import winding_current_rate
-from sealscope.physics.restrictors import implicit_orifice_flow, orifice_flow
-from sealscope.physics.rig import OUTPUTS, RigNumbers, initial_state, rig_numbers
-from sealscope.physics.rk4 import RK4_NODES
 
 
 @contracted

@@ -9,7 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings import assemble, inspect, read
+from sealscope.recordings import inspect, read
+from sealscope.recordings.formats import table as assemble
 
 GOOD = "t [s],p_A [bar],note\n0,1,a\n0.002,2,b\n0.004,3,c\n"
 

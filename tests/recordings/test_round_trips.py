@@ -138,7 +138,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
 
     module = {"nc": "netcdf", "csv": "text", "parquet": "parquet"}[suffix]
     writer = {"nc": "write_netcdf", "csv": "write_text", "parquet": "write_parquet"}[suffix]
-    monkeypatch.setattr(f"sealscope.recordings.{module}.{writer}", fail)
+    monkeypatch.setattr(f"sealscope.recordings.formats.{module}.{writer}", fail)
     with pytest.raises(InputError, match="No space left on device"):
         write(plain(), path)
     assert path.read_bytes() == before
@@ -149,7 +149,7 @@ def test_interrupted_by_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def interrupt(*args: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sealscope.recordings.text.write_text", interrupt)
+    monkeypatch.setattr("sealscope.recordings.formats.text.write_text", interrupt)
     with pytest.raises(KeyboardInterrupt):
         write(plain(), tmp_path / "log.csv")
     assert list(tmp_path.iterdir()) == []

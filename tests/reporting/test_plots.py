@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from sealscope.errors import MissingExtra
-from sealscope.reporting.plot_style import STYLES, caption, typeset
-from sealscope.reporting.plots import MOST_SVG_BYTES, UNRESOLVED, draw, grid_of, visible
-from sealscope.reporting.thesis_files import figure_rows, publish
-from sealscope.reporting.thesis_page import VERDICTS, cell, render_thesis_page, write_thesis_page
+from sealscope.reporting.thesis.files import figure_rows, publish
+from sealscope.reporting.thesis.page import VERDICTS, cell, render_thesis_page, write_thesis_page
+from sealscope.reporting.thesis.plot_style import STYLES, caption, typeset
+from sealscope.reporting.thesis.plots import MOST_SVG_BYTES, UNRESOLVED, draw, grid_of, visible
 from sealscope.thesis.items import Entry, Item
 from sealscope.thesis.products import Claim, Curve, Figure, Image, Number, Panel, Role, Table
 

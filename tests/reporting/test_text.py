@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sealscope.reporting import diagnosis_text, words
+from sealscope.reporting import diagnosis_text, messages
 
 
 @pytest.mark.parametrize(
@@ -23,14 +23,14 @@ from sealscope.reporting import diagnosis_text, words
     ],
 )
 def test_numbers_are_short_and_without_needless_exponents(value, shown):
-    assert words.number(value) == shown
+    assert messages.number(value) == shown
 
 
 def test_times_beyond_an_hour_are_shown_as_a_clock_too():
-    assert words.clock(91.26) == "91.3 s"
-    assert words.clock(7325.0) == "7325.0 s (2:02:05)"
-    assert words.clock(0.06) == "0.06 s"
-    assert words.clock(None) == "–"
+    assert messages.clock(91.26) == "91.3 s"
+    assert messages.clock(7325.0) == "7325.0 s (2:02:05)"
+    assert messages.clock(0.06) == "0.06 s"
+    assert messages.clock(None) == "–"
 
 
 def test_a_leak_in_words(make_diagnosis):
@@ -55,7 +55,7 @@ def test_no_leak_claims_no_onset_and_no_flow(make_diagnosis):
 
 def test_no_leak_says_how_large_one_could_be(make_diagnosis):
     bound = {"verdict": "no leak", "score": 1.5, "onset_s": None, "leak_lpm": 1e-5, "leak_interval_lpm": (-8e-5, 1e-4)}
-    assert words.how_much(make_diagnosis(**bound)) == "none found; at most 0.0001 L/min (95 % interval)"
+    assert messages.how_much(make_diagnosis(**bound)) == "none found; at most 0.0001 L/min (95 % interval)"
 
 
 def test_another_cause_is_told_with_what_to_check(make_diagnosis):
@@ -66,11 +66,11 @@ def test_another_cause_is_told_with_what_to_check(make_diagnosis):
     text = " ".join(diagnosis_text(found).split())
     assert "cause friction change" in text
     assert f"next {check}" in text
-    assert words.headline(found) == "No leak found across the piston, but something changed: friction change"
+    assert messages.headline(found) == "No leak found across the piston, but something changed: friction change"
     leak = make_diagnosis(cause="piston leak", next_check="hold the piston against a load", quality=())
-    assert words.headline(leak) == "Leak: oil bypasses the piston"
-    assert words.next_steps(leak)[0] == "hold the piston against a load"
-    assert words.next_steps(make_diagnosis(cause="friction change", next_check=check, quality=()))[0] != check
+    assert messages.headline(leak) == "Leak: oil bypasses the piston"
+    assert messages.next_steps(leak)[0] == "hold the piston against a load"
+    assert messages.next_steps(make_diagnosis(cause="friction change", next_check=check, quality=()))[0] != check
 
 
 def test_a_method_without_a_score_says_why(no_verdict, make_diagnosis):
@@ -104,4 +104,4 @@ def test_control_characters_of_a_file_name_do_not_reach_the_terminal(make_diagno
     ("p", "shown"), [(0.05, "5 % (1 in 20)"), (1e-5, "0.001 % (1 in 100000)"), (0.4, "(1 in 2.5)")]
 )
 def test_false_alarm_rates_in_words(make_diagnosis, p, shown):
-    assert shown in words.false_alarms(make_diagnosis(false_alarm_probability=p))
+    assert shown in messages.false_alarms(make_diagnosis(false_alarm_probability=p))

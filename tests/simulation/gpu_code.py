@@ -21,9 +21,9 @@ import numpy as np
 from numba import cuda, types
 from numba.cuda.cudadrv import nvvm
 
-from sealscope.simulation import batch_gpu
-from sealscope.simulation.batch import simulate_batch
-from sealscope.simulation.bench import draw
+from sealscope.simulation.batch import gpu as batch_gpu
+from sealscope.simulation.batch.batch import simulate_batch
+from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.experiment import Experiment, make_experiment
 
 KERNELS = ("_advance_rk4", "_advance_imex", "_sense", "_move", "_clear")

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sealscope.simulation.batch import Batch, simulate_batch
+from sealscope.simulation.batch.batch import Batch, simulate_batch
 from sealscope.simulation.experiment import Experiment, make_experiment
 
 

@@ -13,10 +13,10 @@ from sealscope.compiled import kernel
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.physics.lanes import WIDTH, load, store
 from sealscope.signals.details import details
-from sealscope.simulation.batch import simulate_batch
-from sealscope.simulation.bench import draw
+from sealscope.simulation.batch.batch import simulate_batch
+from sealscope.simulation.batch.noise import half_turn_sine, keys, logarithm, normals
+from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.lane_noise import half_turn_sine, keys, logarithm, normals
 from sealscope.simulation.simulate import run
 
 QUIET = {f"sensors.{channel}.{what}": 0.0 for channel in ("p_A", "p_B") for what in ("noise", "drift")}

@@ -18,11 +18,11 @@ import pytest
 
 from sealscope.compiled import kernel, law
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.physics.fixed import FIXED, left_to_table, pair, settled, taken
-from sealscope.physics.lane_runs import CHOICES, LANE_FIELDS
 from sealscope.physics.lanes import lowered, store
 from sealscope.physics.rig import rig_numbers
-from sealscope.simulation.batch import runner_of, simulate_batch
+from sealscope.physics.vector.fixed import FIXED, left_to_table, pair, settled, taken
+from sealscope.physics.vector.runs import CHOICES, LANE_FIELDS
+from sealscope.simulation.batch.batch import runner_of, simulate_batch
 from sealscope.simulation.experiment import make_experiment
 
 from . import gpu_runs
@@ -70,9 +70,9 @@ from numba import cuda, types
 
 # a device function asks the GPU for its kind even where code is made for a stated one
 numba.cuda.dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=(9, 0))
-from sealscope.physics.fixed import left_to_table
+from sealscope.physics.vector.fixed import left_to_table
 from sealscope.physics.rig import rig_numbers
-from sealscope.simulation import batch_gpu
+from sealscope.simulation.batch import gpu as batch_gpu
 from sealscope.simulation.experiment import make_experiment
 
 
@@ -176,14 +176,14 @@ def test_what_is_missing_for_a_gpu_is_said(monkeypatch):
 
 
 def test_a_gpu_that_is_not_there_is_refused(monkeypatch):
-    batch_gpu = pytest.importorskip("sealscope.simulation.batch_gpu", reason="numba has no CUDA target here")
+    batch_gpu = pytest.importorskip("sealscope.simulation.batch.gpu", reason="numba has no CUDA target here")
     monkeypatch.setattr(batch_gpu.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match="needs an NVIDIA GPU and its driver, and none is found; use device cpu"):
         batch_gpu.require_device()
 
 
 def test_a_gpu_that_disagrees_is_refused():
-    batch_gpu = pytest.importorskip("sealscope.simulation.batch_gpu", reason="numba has no CUDA target here")
+    batch_gpu = pytest.importorskip("sealscope.simulation.batch.gpu", reason="numba has no CUDA target here")
     refuse = batch_gpu.refuse_disagreement
     expected = np.random.default_rng(1).uniform(1.0, 2.0, (4, 2, 1, 5))
     places = [3, 5, 8, 13]

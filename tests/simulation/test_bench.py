@@ -11,11 +11,11 @@ import pytest
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import rig_numbers
-from sealscope.simulation.bench import centred_start, draw
-from sealscope.simulation.changes import LONGEST_BLOCK, Schedule
-from sealscope.simulation.drifts import RESOLUTION
+from sealscope.simulation.bench.machines import centred_start, draw
+from sealscope.simulation.bench.profile import Profile, load_profile
+from sealscope.simulation.changes.drifts import RESOLUTION
+from sealscope.simulation.changes.rig import LONGEST_BLOCK, Schedule
 from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.profile import Profile, load_profile
 from sealscope.simulation.simulate import run
 
 PSI = 6894.757293168361

@@ -10,7 +10,7 @@ import pytest
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.simulation.commands import Recorded, Sine
 from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.faults import Leak, Tabulated
+from sealscope.simulation.faults.faults import Leak, Tabulated
 from sealscope.simulation.proof import prove
 from sealscope.simulation.simulate import run, trajectory
 

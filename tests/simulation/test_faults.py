@@ -10,12 +10,12 @@ import pytest
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.simulation.commands import Sine, Step
-from sealscope.simulation.duty import DutyChange
 from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.fault_words import parse_fault
-from sealscope.simulation.faults import From, Growing, Tabulated
-from sealscope.simulation.rig_faults import AirInOil, ExternalLeakage, FrictionChange, PumpLeakage
-from sealscope.simulation.sensor_faults import SensorGain, SensorOffset, SensorStuck
+from sealscope.simulation.faults.duty import DutyChange
+from sealscope.simulation.faults.faults import From, Growing, Tabulated
+from sealscope.simulation.faults.parse import parse_fault
+from sealscope.simulation.faults.rig import AirInOil, ExternalLeakage, FrictionChange, PumpLeakage
+from sealscope.simulation.faults.sensors import SensorGain, SensorOffset, SensorStuck
 from sealscope.simulation.simulate import run, write_truth
 
 PSI = 6894.757293168361

@@ -12,11 +12,11 @@ from scipy.integrate import solve_ivp
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import rig_numbers
-from sealscope.simulation.changes import LONGEST_BLOCK, Effect, Schedule
-from sealscope.simulation.drifts import RESOLUTION, Drift, Linear, Table, Wander
+from sealscope.simulation.changes.drifts import RESOLUTION, Drift, Linear, Table, Wander
+from sealscope.simulation.changes.rig import LONGEST_BLOCK, Effect, Schedule
 from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.faults.rig import FrictionChange, PumpLeakage
 from sealscope.simulation.instruments import FILTER_REACH, decimate
-from sealscope.simulation.rig_faults import FrictionChange, PumpLeakage
 from sealscope.simulation.simulate import run, simulate
 
 PRESSURES = ("p_1", "p_2", "p_A", "p_B")

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import stdtrit
 
-from sealscope.diagnosis.verdict import Evidence, MethodResult
+from sealscope.diagnosis.verdict.evidence import Evidence, MethodResult
 from sealscope.parameters import Rig
 from sealscope.recordings import Recording
 from sealscope.signals.details import details

@@ -19,9 +19,9 @@ from sealscope.campaigns.machines import fault_of, sized_once, sizing_run, unsiz
 from sealscope.campaigns.plan import Plan
 from sealscope.campaigns.short_runs import Steps, place_of_run, stepped
 from sealscope.campaigns.work import Row, failed
-from sealscope.diagnosis.blocks import CHAMBERS
-from sealscope.diagnosis.scorers import Sides, scorer, side_bounds
+from sealscope.diagnosis.calibration.scorers import Sides, scorer, side_bounds
 from sealscope.errors import InputError, SealscopeError
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.filters import IntArray
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def bounds_of(plan: Plan) -> IntArray:
 
 def check_plan(plan: Plan, cases: Sequence[Case]) -> None:
     """Raise InputError, naming it, for what of a plan no batch can do."""
-    from sealscope.simulation.batch_plan import refuse
+    from sealscope.simulation.batch.layout import refuse
 
     def no(rule: str) -> InputError:
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
@@ -78,7 +78,7 @@ def check_plan(plan: Plan, cases: Sequence[Case]) -> None:
 
 def check_device(plan: Plan, device: str) -> None:
     """Raise InputError for a device that is not there, before the work and not as the error of every row."""
-    from sealscope.simulation.batch import runner_of
+    from sealscope.simulation.batch.batch import runner_of
 
     if device not in RUNS:
         raise InputError(f"--device must be {' or '.join(RUNS)}, got {device}")
@@ -99,7 +99,7 @@ class _Batches:
     """Carries out the cases of one plan."""
 
     def __init__(self, plan: Plan, threads: int, device: str) -> None:
-        from sealscope.simulation.profile import load_profile
+        from sealscope.simulation.bench.profile import load_profile
 
         self._plan, self._threads, self._device = plan, threads, device
         self._profile = load_profile(plan.profile) if plan.profile else None
@@ -131,7 +131,7 @@ class _Batches:
         return self._carried_out(drawn[:middle]) + self._carried_out(drawn[middle:])
 
     def _made(self, drawn: Sequence[tuple[Case, Experiment]]) -> list[Row]:
-        from sealscope.simulation.batch import simulate_batch
+        from sealscope.simulation.batch.batch import simulate_batch
 
         cases = [case for case, _ in drawn]
         experiments = self._sized([experiment for _, experiment in drawn])
@@ -160,10 +160,10 @@ class _Batches:
     def _sized(self, experiments: Sequence[Experiment]) -> list[Experiment]:
         """The experiments with their leaks sized as `machines.sized_once` does, side by side, and steps that resolve
         them."""
-        from sealscope.physics.limits import longest_step
         from sealscope.physics.rig import rig_numbers
-        from sealscope.simulation.batch import simulate_batch
-        from sealscope.simulation.batch_plan import with_sizes
+        from sealscope.physics.solvers.limits import longest_step
+        from sealscope.simulation.batch.batch import simulate_batch
+        from sealscope.simulation.batch.layout import with_sizes
         from sealscope.simulation.simulate import oversampling
 
         found = list(experiments)

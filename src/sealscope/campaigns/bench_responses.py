@@ -13,7 +13,7 @@ from sealscope.campaigns.cases import Case
 from sealscope.campaigns.machines import experiment_of
 from sealscope.campaigns.plan import Plan
 from sealscope.campaigns.prediction import ChangeDetector, Responses, counted
-from sealscope.diagnosis.scorers import Look
+from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError, SealscopeError, SimulationFailed
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment

@@ -18,7 +18,7 @@ import numpy as np
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import LITRE_PER_MINUTE
+from sealscope.simulation.faults.faults import LITRE_PER_MINUTE
 from sealscope.simulation.sensitivity import CHAMBERS, REFERENCE_DP, leak_sensitivity, parameter_sensitivity
 
 if TYPE_CHECKING:

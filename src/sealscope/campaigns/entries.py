@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from functools import cache
 
 from sealscope.campaigns.statement import Statement, finite
-from sealscope.diagnosis.contract import detectors
+from sealscope.diagnosis.calibration.scorers import CALIBRATED, SCORERS, VIEW, Look, Sides, scorer, split_view
 from sealscope.diagnosis.plugins import PlugIn
-from sealscope.diagnosis.scorers import CALIBRATED, SCORERS, VIEW, Look, Sides, scorer, split_view
+from sealscope.diagnosis.registry import detectors
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
 

@@ -13,9 +13,9 @@ import numpy as np
 from sealscope.campaigns.entries import Views, entry
 from sealscope.campaigns.estimates import Estimate, Named, Onset, estimates_of, named_of, onsets_of
 from sealscope.campaigns.work import Row
-from sealscope.diagnosis.calibration import Calibration, Place, calibrate
-from sealscope.diagnosis.operating_point import OperatingPoint
-from sealscope.diagnosis.scorers import scorer
+from sealscope.diagnosis.baseline.operating_point import OperatingPoint
+from sealscope.diagnosis.calibration.scorers import scorer
+from sealscope.diagnosis.calibration.thresholds import Calibration, Place, calibrate
 from sealscope.errors import InputError
 from sealscope.evaluation.auc import Area, auc
 from sealscope.evaluation.binomial import Rate, rate_of

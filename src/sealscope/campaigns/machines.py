@@ -11,9 +11,9 @@ from sealscope.campaigns.plan import Plan
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
+    from sealscope.simulation.bench.profile import Profile
     from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.faults import Fault, Leak
-    from sealscope.simulation.profile import Profile
+    from sealscope.simulation.faults.faults import Fault, Leak
 
 #: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
 SIZING_SECONDS = 13.0
@@ -32,14 +32,14 @@ def closing_values(level: str | float) -> dict[str, str | float]:
 
 def profile_key(name: str) -> str:
     """A name for what a bench profile says, the same wherever its file lies."""
-    from sealscope.simulation.profile import load_profile
+    from sealscope.simulation.bench.profile import load_profile
 
     return digest(repr(replace(load_profile(name), place="")))
 
 
 def fault_of(words: str, onset_s: float) -> Fault:
     """A fault other than a piston leak, from words; it sets in at the plan's onset unless they say when."""
-    from sealscope.simulation.fault_words import parse_fault
+    from sealscope.simulation.faults.parse import parse_fault
 
     timed = any(f" {word} " in f" {words} " for word in ("from", "growing"))
     fault = parse_fault(words if timed else f"{words} from {onset_s:g} s")
@@ -50,7 +50,7 @@ def fault_of(words: str, onset_s: float) -> Fault:
 
 def leak_of(plan: Plan, case: Case) -> tuple[Leak, ...]:
     """The case's leak, open from the plan's onset on; its size still a mean flow."""
-    from sealscope.simulation.faults import LITRE_PER_MINUTE, From, Leak
+    from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Leak
 
     if not case.leak_lpm:
         return ()
@@ -61,7 +61,7 @@ def leak_of(plan: Plan, case: Case) -> tuple[Leak, ...]:
 def unsized(plan: Plan, case: Case, profile: Profile | None = None) -> Experiment:
     """The experiment of a case: the machine that its seed draws from the bench (or the rig as it stands), the case's
     levels on top; the size of its leak still a mean flow. `profile`: the plan's bench, where it has been loaded."""
-    from sealscope.simulation.bench import Machine, draw
+    from sealscope.simulation.bench.machines import Machine, draw
     from sealscope.simulation.commands import Sine, parse_command
 
     if plan.profile:
@@ -97,7 +97,7 @@ def _once(settings: Mapping[str, str | float]) -> dict[str, str | float]:
 
 def sizing_run(experiment: Experiment) -> Experiment:
     """The short run on which an experiment's leaks are sized, open from its start."""
-    from sealscope.simulation.faults import From
+    from sealscope.simulation.faults.faults import From
 
     return replace(
         experiment,

@@ -186,7 +186,7 @@ class _Reader:
         name = head.text("profile", "none")
         if name == "none":
             return ""
-        from sealscope.simulation.profile import load_profile
+        from sealscope.simulation.bench.profile import load_profile
 
         name = self._beside(name)
         self._said("campaign.profile", lambda: load_profile(name))

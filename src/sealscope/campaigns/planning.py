@@ -25,7 +25,7 @@ from sealscope.campaigns.prediction import THESIS_DETECTORS, ChangeDetector, Res
 from sealscope.errors import InputError, SealscopeError
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array
-from sealscope.simulation.bench import centred_start
+from sealscope.simulation.bench.machines import centred_start
 from sealscope.simulation.commands import Command, parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.sensitivity import CHAMBERS

@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from sealscope.diagnosis.scorers import SCORERS, Look
+from sealscope.diagnosis.calibration.scorers import SCORERS, Look
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -35,7 +35,7 @@ CURVE_SIZES = (0.0005, 0.001, 0.0042, 0.0075, 0.015)
 
 @dataclass(frozen=True)
 class ChangeDetector:
-    """A scorer of `sealscope.diagnosis.scorers` that judges the change of one quantity over the split."""
+    """A scorer of `sealscope.diagnosis.calibration.scorers` that judges the change of one quantity over the split."""
 
     quantity: str
     chamber: str

@@ -152,7 +152,7 @@ def _row(plan: RecordedPlan, of: RecordingSet, path: Path, name: str) -> Row:
         replicate=0,
     )
     from sealscope.campaigns.entries import stated
-    from sealscope.diagnosis.calibrated import look_at, looked_at, place_of
+    from sealscope.diagnosis.calibration.calibrated import look_at, looked_at, place_of
     from sealscope.recordings import read
 
     try:

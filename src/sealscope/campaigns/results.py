@@ -16,7 +16,7 @@ from sealscope.campaigns.recorded import Progress, RecordedPlan, recorded_rows
 from sealscope.campaigns.run import RUN_BY_RUN, kept_rows, made_from
 from sealscope.campaigns.tables import rows_sheet, sheets, write_sheets
 from sealscope.campaigns.work import Row
-from sealscope.diagnosis.calibration import save
+from sealscope.diagnosis.calibration.thresholds import save
 from sealscope.errors import InputError
 
 CALIBRATION = "calibration.json"

@@ -14,7 +14,7 @@ from sealscope.campaigns.cases import Case, cases_of, code_key, digest, world
 from sealscope.campaigns.entries import entry, plug_ins_of
 from sealscope.campaigns.plan import Plan
 from sealscope.campaigns.work import Row, work
-from sealscope.diagnosis.scorers import scorer
+from sealscope.diagnosis.calibration.scorers import scorer
 from sealscope.errors import InputError
 
 #: Told how many records have their row, how many there are, and how many of those failed.

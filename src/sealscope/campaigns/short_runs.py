@@ -13,17 +13,18 @@ import numpy as np
 from sealscope.campaigns.cases import Case, digest, world
 from sealscope.campaigns.machines import unsized
 from sealscope.campaigns.plan import Plan
-from sealscope.diagnosis.blocks import CHAMBERS, find_cycle
-from sealscope.diagnosis.calibration import Place
-from sealscope.diagnosis.operating_point import operating_point
+from sealscope.diagnosis.baseline.operating_point import operating_point
+from sealscope.diagnosis.calibration.thresholds import Place
 from sealscope.errors import SealscopeError
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.simulation.commands import Sine
 from sealscope.simulation.simulate import oversampling, trajectory
 
 if TYPE_CHECKING:
+    from sealscope.simulation.bench.profile import Profile
     from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.profile import Profile
 
 #: Machines of a cell on which its step is chosen, and how long [s] each of them runs for that: the first window that
 #: `integrate` checks, and two more.
@@ -43,8 +44,8 @@ class Steps:
     def of(self, case: Case, experiment: Experiment) -> float:
         """The step of a case: what `integrate` chooses by error on `SCOUTS` machines of its cell with seeds of their
         own (the finest of those with its method), no longer than its own machine allows."""
-        from sealscope.physics.limits import longest_step
         from sealscope.physics.rig import rig_numbers
+        from sealscope.physics.solvers.limits import longest_step
         from sealscope.simulation.integrate import FINEST, LONGEST_STEP, choose_method
 
         method = choose_method(experiment.rig, experiment.method)

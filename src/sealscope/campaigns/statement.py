@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sealscope.diagnosis.verdict import LEAKS, Evidence
+from sealscope.diagnosis.verdict.evidence import LEAKS, Evidence
 from sealscope.evaluation.confusion import CANNOT_TELL
 
 PISTON_LEAK, NONE = "piston leak", "none"

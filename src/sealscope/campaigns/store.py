@@ -12,7 +12,7 @@ from typing import IO, Any
 
 from sealscope.campaigns.work import Row
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.whole import whole_file
+from sealscope.recordings.atomic import whole_file
 
 #: What rows of one folder must share, and how it is called.
 _SAME = {

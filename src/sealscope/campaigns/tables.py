@@ -12,7 +12,7 @@ from sealscope.campaigns.judge import Judgement
 from sealscope.campaigns.statement import Statement
 from sealscope.campaigns.work import Row
 from sealscope.evaluation.binomial import Rate
-from sealscope.recordings.whole import whole_file
+from sealscope.recordings.atomic import whole_file
 
 Cell = str | float | int | None
 

@@ -79,8 +79,8 @@ def work(plan: Plan, case: Case, keep: Path | None = None) -> Row:
 def _work(plan: Plan, case: Case, keep: Path | None) -> Row:
     from sealscope.campaigns.entries import stated
     from sealscope.campaigns.machines import experiment_of
-    from sealscope.diagnosis.calibrated import looked_at, place_of
-    from sealscope.diagnosis.scorers import Look
+    from sealscope.diagnosis.calibration.calibrated import looked_at, place_of
+    from sealscope.diagnosis.calibration.scorers import Look
     from sealscope.simulation.simulate import run
 
     made = run(experiment_of(plan, case))

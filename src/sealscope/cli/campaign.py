@@ -42,8 +42,8 @@ def complete_plans(incomplete: str) -> list[str]:
 
 def complete_detectors(incomplete: str) -> list[str]:
     """Names of scorers, and of detectors with a calibrated threshold, that begin so."""
-    from sealscope.diagnosis.contract import detectors
-    from sealscope.diagnosis.scorers import CALIBRATED, SCORERS
+    from sealscope.diagnosis.calibration.scorers import CALIBRATED, SCORERS
+    from sealscope.diagnosis.registry import detectors
 
     names = [*SCORERS, *(f"{name}{CALIBRATED}" for name in detectors())]
     return [name for name in names if name.startswith(incomplete)]
@@ -147,7 +147,7 @@ def _standing(standing: Standing) -> str:
 
 def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> None:
     from sealscope.campaigns.results import write_result
-    from sealscope.reporting.campaign_page import PAGE, campaign_text, write_campaign_page
+    from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
 
     result = _result(plan, folder, sheet, data)
     files = write_result(result, folder)
@@ -232,8 +232,8 @@ def calibrate(
     from hashlib import sha256
 
     from sealscope import __version__
-    from sealscope.diagnosis.calibrated import DEFAULT_DETECTORS, calibrate_on
-    from sealscope.diagnosis.calibration import save
+    from sealscope.diagnosis.calibration.calibrated import DEFAULT_DETECTORS, calibrate_on
+    from sealscope.diagnosis.calibration.thresholds import save
     from sealscope.recordings import read
 
     check_folder(output)

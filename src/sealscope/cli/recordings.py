@@ -26,7 +26,7 @@ from sealscope.cli.options import (
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.verdict import Diagnosis
+    from sealscope.diagnosis.verdict.evidence import Diagnosis
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
 
@@ -98,8 +98,8 @@ def _calibrated(
     rig: Rig | None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
     """Recording and diagnosis of each file by the thresholds of a calibration, at its false-alarm rate."""
-    from sealscope.diagnosis.calibrated import diagnose_calibrated
-    from sealscope.diagnosis.calibration import load
+    from sealscope.diagnosis.calibration.calibrated import diagnose_calibrated
+    from sealscope.diagnosis.calibration.thresholds import load
 
     if baseline:
         raise InputError("--calibration must stand without --baseline: its leak-free recordings are in it")

@@ -53,9 +53,9 @@ def reproduce(
         _list(ids or ["all"], sheet)
         return
     from sealscope.errors import InputError
-    from sealscope.reporting.plots import require_drawing
-    from sealscope.reporting.thesis_files import publish
-    from sealscope.reporting.thesis_page import write_thesis_page
+    from sealscope.reporting.thesis.files import publish
+    from sealscope.reporting.thesis.page import write_thesis_page
+    from sealscope.reporting.thesis.plots import require_drawing
     from sealscope.thesis.reproduce import reproduce as carry_out
 
     if not ids:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import chambers_of
 from sealscope.diagnosis.examination import Examination
-from sealscope.diagnosis.fusion import Fused
-from sealscope.diagnosis.next_check import next_check
-from sealscope.diagnosis.verdict import Diagnosis
+from sealscope.diagnosis.verdict.evidence import Diagnosis
+from sealscope.diagnosis.verdict.fusion import Fused
+from sealscope.diagnosis.verdict.next_check import next_check
 from sealscope.errors import InputError
+from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.quality import Finding, inspect, uniform_segments
 from sealscope.recordings.recording import Recording
 

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.contract import Detector, detectors
-from sealscope.diagnosis.fusion import ORDER, Fused, Said, fuse
+from sealscope.diagnosis.detector import Detector
+from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.trust import does_not_move
-from sealscope.diagnosis.verdict import Evidence
+from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.fusion import ORDER, Fused, Said, fuse
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.isolation import Signatures
+    from sealscope.diagnosis.verdict.isolation import Signatures
     from sealscope.parameters import Rig
 
 #: Detectors that name a cause by the pressures: they say it of nothing that another cause explains, alone either.
@@ -111,7 +112,7 @@ class Examination:
 
     def _named(self, found: Fused) -> Fused:
         """A verdict other than `leak` that names no cause, with that of a step which no detector asked about."""
-        from sealscope.diagnosis.isolation import unasked
+        from sealscope.diagnosis.verdict.isolation import unasked
 
         own = found.evidence
         if own.verdict == "leak" or own.cause is not None or self.untrusted is not None or self._signatures is None:
@@ -124,7 +125,7 @@ class Examination:
         return replace(found, evidence=replace(own, cause=stepped[1].cause, reason=words))
 
     def _isolated(self, said: Said) -> Evidence:
-        from sealscope.diagnosis.isolation import isolated
+        from sealscope.diagnosis.verdict.isolation import isolated
 
         if said.evidence.verdict != "leak" or self._signatures is None:
             return said.evidence
@@ -132,7 +133,7 @@ class Examination:
 
     @cached_property
     def _signatures(self) -> Signatures | None:
-        from sealscope.diagnosis.isolation import signatures
+        from sealscope.diagnosis.verdict.isolation import signatures
 
         with np.errstate(all="ignore"):
             return signatures(self.recording)

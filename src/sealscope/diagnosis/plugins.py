@@ -18,11 +18,11 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from sealscope.diagnosis.verdict import Cause, Evidence, Verdict
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Verdict
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.contract import Detector
+    from sealscope.diagnosis.detector import Detector
     from sealscope.parameters import Rig
 
 GROUP = "sealscope.detectors"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import BLOCK_SAMPLES, BLOCK_SECONDS, chambers_of
+from sealscope.diagnosis.rms_change.blocks import BLOCK_SAMPLES, BLOCK_SECONDS
+from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.recording import Recording
 
 #: A pressure that bends by no more than this share of its largest value is no reading.

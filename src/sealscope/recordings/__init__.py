@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING
 from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Recording
 
 if TYPE_CHECKING:
-    from sealscope.recordings.columns import split_map_option
+    from sealscope.recordings.atomic import whole_file
     from sealscope.recordings.files import read, write
+    from sealscope.recordings.formats.columns import split_map_option
     from sealscope.recordings.quality import Finding, inspect, uniform_segments
-    from sealscope.recordings.whole import whole_file
 
 _HOMES = {
-    "split_map_option": "columns",
+    "split_map_option": "formats.columns",
     "read": "files",
     "write": "files",
     "Finding": "quality",
     "inspect": "quality",
     "uniform_segments": "quality",
-    "whole_file": "whole",
+    "whole_file": "atomic",
 }
 
 __all__ = [

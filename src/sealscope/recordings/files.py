@@ -10,10 +10,10 @@ from math import isfinite
 from pathlib import Path
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.assemble import Table, check_writable, recording_of
-from sealscope.recordings.columns import check_channel
+from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.formats.columns import check_channel
+from sealscope.recordings.formats.table import Table, check_writable, recording_of
 from sealscope.recordings.recording import Recording
-from sealscope.recordings.whole import whole_file
 
 #: Suffix -> format.
 SUFFIXES: Mapping[str, str] = {
@@ -74,14 +74,14 @@ def _format_of(path: Path) -> str:
 
 def _opener(kind: str) -> Callable[[Path], AbstractContextManager[Table]]:
     if kind == "netcdf":
-        from sealscope.recordings.netcdf import open_hdf5
+        from sealscope.recordings.formats.netcdf import open_hdf5
 
         return open_hdf5
     if kind == "parquet":
-        from sealscope.recordings.parquet import open_parquet
+        from sealscope.recordings.formats.parquet import open_parquet
 
         return open_parquet
-    from sealscope.recordings.text import open_text
+    from sealscope.recordings.formats.text import open_text
 
     return open_text
 
@@ -148,14 +148,14 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
     check_writable(recording)
     with whole_file(file) as temporary:
         if kind == "netcdf":
-            from sealscope.recordings.netcdf import write_netcdf
+            from sealscope.recordings.formats.netcdf import write_netcdf
 
             write_netcdf(recording, temporary)
         elif kind == "parquet":
-            from sealscope.recordings.parquet import write_parquet
+            from sealscope.recordings.formats.parquet import write_parquet
 
             write_parquet(recording, temporary)
         else:
-            from sealscope.recordings.text import write_text
+            from sealscope.recordings.formats.text import write_text
 
             write_text(recording, temporary, "," if file.suffix.lower() == ".csv" else "\t")

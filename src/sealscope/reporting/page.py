@@ -16,7 +16,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
-from sealscope.reporting import charts, features, words
+from sealscope.reporting import charts, features, messages
 from sealscope.reporting.contract import DiagnosisLike, Mark
 from sealscope.reporting.schematic import schematic_context
 
@@ -68,7 +68,7 @@ def render_page(
     )
     uplot_js, charts_js = _packaged("vendor/uPlot.iife.min.js"), _packaged("templates/charts.js")
     schematic = environment.get_template("schematic.svg.j2").render(schematic_context(recording, diagnosis, rig))
-    name = words.subject(diagnosis)
+    name = messages.subject(diagnosis)
     return environment.get_template("page.html.j2").render(
         **_verdict(diagnosis, all_marks, truth_onset_s, truth_leak_lpm),
         **_evidence(recording, diagnosis, drawing, shown, all_marks),
@@ -150,7 +150,7 @@ def _version() -> str:
 
 
 def _subtitle(recording: Recording, diagnosis: DiagnosisLike) -> str:
-    facts = f"{len(recording)} samples at {recording.rate:g} Hz, {words.clock(recording.duration)}"
+    facts = f"{len(recording)} samples at {recording.rate:g} Hz, {messages.clock(recording.duration)}"
     return f"{diagnosis.file} · {facts}" if diagnosis.file else facts
 
 
@@ -169,28 +169,28 @@ def _verdict(
 ) -> dict[str, Any]:
     known = []
     if truth_onset_s is not None:
-        known.append(f"the leak begins at {words.clock(truth_onset_s)}")
+        known.append(f"the leak begins at {messages.clock(truth_onset_s)}")
         if diagnosis.onset_s is not None:
             late = diagnosis.onset_s - truth_onset_s
             known.append(f"the onset found is {abs(late):.1f} s {'late' if late >= 0 else 'early'}")
     if truth_leak_lpm is not None:
-        known.append(f"the leak is {words.number(truth_leak_lpm)} L/min on average")
+        known.append(f"the leak is {messages.number(truth_leak_lpm)} L/min on average")
     count = len(diagnosis.quality)
     worst = [s for s in ("fatal", "warning") if any(f.severity == s for f in diagnosis.quality)]
     return {
         "d": diagnosis,
-        "headline": words.headline(diagnosis),
-        "since": words.since(diagnosis),
-        "how_much": words.how_much(diagnosis),
-        "cause": words.cause(diagnosis),
-        "how_sure": words.how_sure(diagnosis),
-        "threshold_note": words.false_alarms(diagnosis),
+        "headline": messages.headline(diagnosis),
+        "since": messages.since(diagnosis),
+        "how_much": messages.how_much(diagnosis),
+        "cause": messages.cause(diagnosis),
+        "how_sure": messages.how_sure(diagnosis),
+        "threshold_note": messages.false_alarms(diagnosis),
         "quality_summary": f"{count} finding{'s' if count != 1 else ''}{f' ({worst[0]})' if worst else ''},",
         "known": "; ".join(known),
-        "steps": words.next_steps(diagnosis),
+        "steps": messages.next_steps(diagnosis),
         "marks": marks,
-        "clock": words.clock,
-        "n": words.number,
+        "clock": messages.clock,
+        "n": messages.number,
     }
 
 
@@ -286,7 +286,7 @@ def _numbers(
 
 
 def _signed_percent(percent: float | None) -> str:
-    return words.ABSENT if percent is None else f"{round(percent, 1) + 0.0:+.1f} %".replace("-", "−")
+    return messages.ABSENT if percent is None else f"{round(percent, 1) + 0.0:+.1f} %".replace("-", "−")
 
 
 def _bar(percent: float | None, limit: float) -> dict[str, Any] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
-from sealscope.reporting import words
+from sealscope.reporting import messages
 from sealscope.reporting.contract import DiagnosisLike
 
 #: parameter of the rig -> label, unit shown, SI per unit
@@ -27,7 +27,7 @@ def schematic_context(recording: Recording, diagnosis: DiagnosisLike, rig: Any |
     that it does not have is not shown.
     """
     leaking = diagnosis.verdict == "leak"
-    amount = f"{words.number(diagnosis.leak_lpm)} L/min" if leaking and diagnosis.leak_lpm is not None else ""
+    amount = f"{messages.number(diagnosis.leak_lpm)} L/min" if leaking and diagnosis.leak_lpm is not None else ""
     return {
         "leaking": leaking,
         "leak_label": f"leak {amount}".strip() if leaking else "",
@@ -45,5 +45,5 @@ def rig_values(rig: Any | None) -> dict[str, str]:
         for name in dotted.split("."):
             part = getattr(part, name, None)
         if isinstance(part, (int, float)) and not isinstance(part, bool):
-            shown[label] = f"{words.number(part / size)} {unit}"
+            shown[label] = f"{messages.number(part / size)} {unit}"
     return shown

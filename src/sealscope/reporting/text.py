@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from textwrap import fill
 
-from sealscope.reporting import words
+from sealscope.reporting import messages
 from sealscope.reporting.contract import DiagnosisLike
 
 
@@ -24,20 +24,22 @@ def diagnosis_text(diagnosis: DiagnosisLike, *, width: int = 100) -> str:
 
     `width`: columns [1]. No colours: those are the caller's matter.
     """
-    lines = [f"{_printable(words.subject(diagnosis))}: {diagnosis.verdict}"]
+    lines = [f"{_printable(messages.subject(diagnosis))}: {diagnosis.verdict}"]
     rows = [
-        ("since", words.since(diagnosis)),
-        ("how much", words.how_much(diagnosis)),
-        ("cause", words.cause(diagnosis)),
-        ("how sure", words.how_sure(diagnosis)),
+        ("since", messages.since(diagnosis)),
+        ("how much", messages.how_much(diagnosis)),
+        ("cause", messages.cause(diagnosis)),
+        ("how sure", messages.how_sure(diagnosis)),
         ("reason", diagnosis.reason or None),
     ]
     lines += [_row(label, text, width) for label, text in rows if text]
     for method in diagnosis.methods:
-        figures = f"{method.verdict} (score {words.number(method.score)}, threshold {words.number(method.threshold)})"
+        figures = (
+            f"{method.verdict} (score {messages.number(method.score)}, threshold {messages.number(method.threshold)})"
+        )
         if method.score is None and method.reason:
             figures = f"{method.verdict} ({method.reason})"
         lines.append(_row("method", f"{method.name}: {figures}", width))
     lines += [_row(finding.severity, finding.text, width) for finding in diagnosis.quality]
-    lines += [_row("next" if i == 0 else "", step, width) for i, step in enumerate(words.next_steps(diagnosis)[:2])]
+    lines += [_row("next" if i == 0 else "", step, width) for i, step in enumerate(messages.next_steps(diagnosis)[:2])]
     return "\n".join(lines)

@@ -13,12 +13,12 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes import Effect
+from sealscope.simulation.changes.drifts import Drift
+from sealscope.simulation.changes.readings import Readings
+from sealscope.simulation.changes.rig import Effect
 from sealscope.simulation.commands import Command, Sine, check_command, parse_command
-from sealscope.simulation.drifts import Drift
-from sealscope.simulation.faults import Fault, Leak, parse_leak
+from sealscope.simulation.faults.faults import Fault, Leak, parse_leak
 from sealscope.simulation.integrate import Method, choose_method
-from sealscope.simulation.readings import Readings
 from sealscope.simulation.resolution import PRESSURE_TOLERANCE
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def make_experiment(
     given = [] if leak is None else [leak] if isinstance(leak, (str, Leak)) else list(leak)
     leaks = [parse_leak(one) if isinstance(one, str) else one for one in given]
     if fault is not None:
-        from sealscope.simulation.fault_words import parse_fault
+        from sealscope.simulation.faults.parse import parse_fault
 
         several = [fault] if isinstance(fault, (str, Fault)) else list(fault)
         faults = [parse_fault(one) if isinstance(one, str) else one for one in several]

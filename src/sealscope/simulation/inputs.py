@@ -9,7 +9,7 @@ import numpy as np
 from sealscope.compiled import kernel
 from sealscope.recordings.recording import Array
 from sealscope.simulation.commands import Sine, check_command
-from sealscope.simulation.faults import Leak
+from sealscope.simulation.faults.faults import Leak
 
 if TYPE_CHECKING:
     from sealscope.simulation.experiment import Experiment

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.simulation.readings import Readings
+from sealscope.simulation.changes.readings import Readings
 
 if TYPE_CHECKING:
     from sealscope.parameters import Daq, PressureTransducer, Rig

@@ -13,7 +13,7 @@ import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes import Effect, Schedule
+from sealscope.simulation.changes.rig import Effect, Schedule
 from sealscope.simulation.resolution import PRESSURE_TOLERANCE
 
 if TYPE_CHECKING:
@@ -110,8 +110,8 @@ def integrate(
     rig, the leak or a stop that was hit, when a state is not finite, or when a pressure falls below vacuum;
     `allow_unresolved` lets all but a state that is not finite pass.
     """
-    from sealscope.physics.limits import longest_step
     from sealscope.physics.rig import rig_numbers
+    from sealscope.physics.solvers.limits import longest_step
 
     chosen = choose_method(rig, method)
     if step is not None and not (math.isfinite(step) and step > 0):
@@ -191,9 +191,9 @@ class _Run:
 
     def _advance(self, y: Array, start: int, stop: int, every: int, rows: Array, origin: int = 0) -> None:
         """Outputs start <= k < stop into rows k - origin, with `every` steps an output, from `y` on, which moves."""
-        from sealscope.physics.imex import IMEX_NODES, advance_imex
-        from sealscope.physics.limits import longest_step, longest_step_on_stop
-        from sealscope.physics.rk4 import RK4_NODES, advance_rk4
+        from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
+        from sealscope.physics.solvers.limits import longest_step, longest_step_on_stop
+        from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
         from sealscope.physics.state import survey
 
         h = 1.0 / (self.rate * every)
@@ -237,7 +237,7 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed where a step h [s] cannot resolve the rig."""
-    from sealscope.physics.limits import DECAY_LIMIT, longest_step, stiffest_rate
+    from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
     refuse_long(h, longest_step(p), "speed loop, oil columns and friction of this rig")
     limit = DECAY_LIMIT / stiffest_rate(p)

@@ -16,7 +16,7 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import LITRE_PER_MINUTE, Leak
+from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, Leak
 from sealscope.simulation.instruments import decimate
 from sealscope.simulation.simulate import oversampling, trajectory
 

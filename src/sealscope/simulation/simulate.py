@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from sealscope.recordings.atomic import whole_file
 from sealscope.recordings.recording import Array, Recording
-from sealscope.recordings.whole import whole_file
-from sealscope.simulation.drifts import Drift
+from sealscope.simulation.changes.drifts import Drift
 from sealscope.simulation.experiment import Experiment, make_experiment
-from sealscope.simulation.faults import LITRE_PER_MINUTE, Fault, Leak
+from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, Fault, Leak
 from sealscope.simulation.inputs import RunInputs
 from sealscope.simulation.instruments import FILTER_REACH, record
 from sealscope.simulation.integrate import DEFAULT_STEP, Trajectory, choose_method, integrate

@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
-from sealscope.simulation.faults import LITRE_PER_MINUTE, Leak
+from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, Leak
 from sealscope.simulation.integrate import Trajectory
 
 #: Relative distance from the mean asked for at which the search ends.

@@ -51,7 +51,7 @@ def rig_toml(calibration: Calibration, base: Rig) -> str:
 
 def write_rig(calibration: Calibration, base: Rig, path: str | os.PathLike[str]) -> None:
     """Write `rig_toml`, whole or not at all."""
-    from sealscope.recordings.whole import whole_file
+    from sealscope.recordings.atomic import whole_file
 
     with whole_file(path) as temporary:
         temporary.write_text(rig_toml(calibration, base), encoding="utf-8")

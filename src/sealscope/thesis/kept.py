@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from sealscope.recordings.atomic import whole_file
 from sealscope.recordings.recording import Recording
-from sealscope.recordings.whole import whole_file
 from sealscope.thesis.context import SimulatedRun
 from sealscope.thesis.products import Claim, Curve, Figure, Image, Number, Panel, Table
 

@@ -145,7 +145,7 @@ def _before_and_after(rms: Mapping[str, Mapping[str, tuple[float, ...]]]) -> dic
 def with_leak(quick: bool = False) -> Iterator[Row]:
     """The tests as they were: the leak opens at half time. The first test of each condition is proved by halving the
     step, except in a quick reproduction."""
-    from sealscope.simulation.faults import From
+    from sealscope.simulation.faults.faults import From
     from sealscope.simulation.proof import prove
     from sealscope.simulation.simulate import run, sized_leaks
 

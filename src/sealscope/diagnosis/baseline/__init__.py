@@ -1,0 +1,1 @@
+"""Leak-free recordings beside the one that is judged."""

@@ -1,0 +1,90 @@
+"""The operating point of a recording: what must be alike before two recordings may be compared."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sealscope.recordings.chambers import CHAMBERS, chambers_of
+from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.recording import Recording
+
+#: A stroke goes one way when its net way is more than this share of the whole way (or of the pressure difference's
+#: rms).
+ONE_WAY = 0.5
+#: Pressure levels (rms of the pressure difference) are alike within this ratio when too few recordings tell how the
+#: details follow the level.
+LEVEL_RATIO = 1.15
+_SLOW_RATE = 20.0
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """`direction`: +1, -1 for a stroke one way, 0 for a back-and-forth duty; `level`: log of the rms of the pressure
+    difference; `rate` [Hz]; `units` of the chambers; `chambers`; `command_rms` [V] and `cycle` [s] where there is a
+    command."""
+
+    direction: Literal[-1, 0, 1]
+    level: float
+    rate: float
+    units: tuple[str, ...]
+    chambers: tuple[str, ...]
+    command_rms: float | None
+    cycle: float | None
+
+
+def _direction(recording: Recording) -> Literal[-1, 0, 1]:
+    share = 0.0
+    if "x" in recording and np.ptp(recording["x"]) > 0:
+        stride = max(1, int(recording.rate / _SLOW_RATE))
+        x = recording["x"][::stride]
+        way = float(np.abs(np.diff(x)).sum())
+        share = float(x[-1] - x[0]) / way if way > 0 else 0.0
+    elif all(name in recording for name in CHAMBERS):
+        dp = recording["p_A"] - recording["p_B"]
+        rms = float(np.sqrt(np.mean(dp**2)))
+        share = float(dp.mean()) / rms if rms > 0 else 0.0
+    if abs(share) <= ONE_WAY:
+        return 0
+    return 1 if share > 0 else -1
+
+
+def operating_point(recording: Recording) -> OperatingPoint:
+    """The operating point of a recording without missing samples."""
+    chambers = chambers_of(recording)
+    pressure = recording["p_A"] - recording["p_B"] if len(chambers) == 2 else recording[chambers[0]]
+    if len(chambers) < 2:
+        pressure = pressure - pressure.mean()
+    command = recording.channels.get("u")
+    return OperatingPoint(
+        direction=_direction(recording),
+        level=0.5 * math.log(max(float(np.mean(pressure**2)), 1e-300)),
+        rate=recording.rate,
+        units=tuple(recording.units[name] for name in chambers),
+        chambers=chambers,
+        command_rms=None if command is None else float(np.sqrt(np.mean(command**2))),
+        cycle=None if command is None else find_cycle(recording),
+    )
+
+
+def difference(one: OperatingPoint, other: OperatingPoint) -> str | None:
+    """Why two recordings must not be compared, in words; None when they may. The pressure level is judged elsewhere."""
+    if one.chambers != other.chambers or one.units != other.units:
+        return "other channels or units"
+    if abs(one.rate / other.rate - 1.0) > 1e-3:
+        return f"another sampling rate ({one.rate:g} Hz and {other.rate:g} Hz)"
+    if one.direction != other.direction:
+        return "another direction of the stroke"
+    if (one.command_rms is None) != (other.command_rms is None):
+        return "only one of them has a command"
+    if one.command_rms is not None and other.command_rms is not None:
+        if not math.isclose(one.command_rms, other.command_rms, rel_tol=0.05, abs_tol=0.01):
+            return f"another command ({one.command_rms:.3g} V and {other.command_rms:.3g} V rms)"
+        if (one.cycle is None) != (other.cycle is None) or (
+            one.cycle is not None and other.cycle is not None and not math.isclose(one.cycle, other.cycle, rel_tol=0.05)
+        ):
+            return "another cycle of the command"
+    return None

@@ -1,0 +1,1 @@
+"""Thresholds for a stated false-alarm probability from leak-free recordings."""

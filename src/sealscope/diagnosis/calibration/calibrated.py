@@ -1,0 +1,148 @@
+"""Calibrate on recordings, and diagnose with a calibration: thresholds from leak-free recordings, not from within."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from sealscope.diagnosis.baseline.operating_point import operating_point
+from sealscope.diagnosis.calibration.scorers import Look, Score, scorer, split_view
+from sealscope.diagnosis.calibration.thresholds import Calibration, Group, Place, calibrate
+from sealscope.diagnosis.diagnose import analysable, why_untrusted
+from sealscope.diagnosis.verdict.evidence import Diagnosis, MethodResult, Verdict
+from sealscope.diagnosis.verdict.next_check import next_check
+from sealscope.errors import InputError
+from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.quality import Finding, inspect
+from sealscope.recordings.recording import Recording
+from sealscope.signals.details import shortest
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Detectors that a calibration holds unless others are named; the first makes the verdict.
+DEFAULT_DETECTORS = ("rms change", "d3 of p_A changed", "d4 of p_A changed", "d3 of p_B changed", "d4 of p_B changed")
+
+
+def looked_at(
+    recording: Recording, inspected: Container[str] | None = None
+) -> tuple[Recording, tuple[Finding, ...], str | None]:
+    """What of a recording can be judged, the findings on it, and why it cannot be trusted (None where it can).
+
+    `inspected`: channels to look at for findings, by default all.
+    """
+    looked = recording
+    if inspected is not None:
+        looked = recording.only(name for name in recording.channels if name in inspected)
+    quality = list(inspect(looked))
+    if not chambers_of(recording):
+        return recording, tuple(quality), "needs the pressure of a chamber (p_A or p_B)"
+    part, cut_down = analysable(recording)
+    if cut_down is not None:
+        quality.append(cut_down)
+    if len(part) < shortest():
+        return part, tuple(quality), f"needs {shortest()} samples or more without a gap, got {len(part)}"
+    return part, tuple(quality), why_untrusted(part, quality)
+
+
+def place_of(part: Recording) -> Place:
+    """Where a recording without missing samples was made."""
+    return Place(operating_point(part), part.duration)
+
+
+def look_at(part: Recording, split_share: float, rate: float, rig: Rig | None = None) -> Look:
+    """The recording as scorers see it, split at that share of its length; `rig`: what detectors may assume."""
+    return Look(part, float(part.t[0]) + split_share * part.duration, rate, rig)
+
+
+def calibrate_on(
+    recordings: Mapping[str, Recording],
+    detectors: Sequence[str] = DEFAULT_DETECTORS,
+    *,
+    false_alarm_probability: float,
+    split_share: float = 0.5,
+    rig: Rig | None = None,
+    **options: Any,
+) -> Calibration:
+    """Calibrate detectors on leak-free recordings of one machine.
+
+    `recordings`: name -> recording; one that cannot be judged raises InputError with its name and the reason: what is
+    not leak-free data of the machine in good order has no place in a calibration. `rig`: what detectors may assume of
+    the machine; `options` as for `calibrate`.
+    """
+    if not 0.0 < split_share < 1.0:
+        raise InputError(f"the split must be a share of the length between 0 and 1, got {split_share}")
+    chosen = [scorer(name) for name in detectors]
+    places: list[Place] = []
+    scores: dict[str, list[float | None]] = {one.name: [] for one in chosen}
+    for name, recording in recordings.items():
+        part, _, reason = looked_at(recording)
+        if reason is not None:
+            raise InputError(f"a leak-free recording must be in good order, got: {reason} ({name})")
+        places.append(place_of(part))
+        look = look_at(part, split_share, false_alarm_probability, rig)
+        for one in chosen:
+            scores[one.name].append(one.score(look).value)
+    return calibrate(places, scores, rate=false_alarm_probability, split_share=split_share, **options)
+
+
+def diagnose_calibrated(
+    recording: Recording, calibration: Calibration, *, file: str | None = None, rig: Rig | None = None
+) -> Diagnosis:
+    """Say whether oil bypasses the piston, by the thresholds of a calibration.
+
+    The first of the calibration's detectors makes the verdict, at its false-alarm rate; the others are told as
+    methods. A recording outside the calibrated operating points, or one the data of which cannot be trusted, is
+    `cannot tell`, with the reason. `rig`: what detectors may assume of the machine, the same as for the calibration.
+    """
+    part, quality, reason = looked_at(recording)
+    found: Group | str = reason if reason is not None else calibration.find(place_of(part))
+    look = look_at(part, calibration.split_share, calibration.rate, rig) if isinstance(found, Group) else None
+    methods = []
+    onset = None
+    for name in calibration.detectors:
+        if look is None or not isinstance(found, Group):
+            methods.append(MethodResult(name, None, None, "cannot tell", str(found)))
+            continue
+        detector, view = split_view(name)
+        score = scorer(detector).score(look.through(calibration.views[view]) if view else look)
+        methods.append(_result(name, score, found, calibration))
+        if len(methods) == 1 and methods[0].verdict == "leak":
+            onset = score.onset_s
+    judge = methods[0]
+    return Diagnosis(
+        file=file or str(recording.provenance.get("file", "recording")),
+        verdict=judge.verdict,
+        reason=judge.reason,
+        onset_s=onset,
+        onset_interval_s=None,
+        leak_lpm=None,
+        leak_interval_lpm=None,
+        false_alarm_probability=calibration.rate,
+        score=judge.score,
+        threshold=judge.threshold,
+        methods=tuple(methods),
+        quality=quality,
+        next_check=next_check(judge.verdict, None),
+    )
+
+
+def _result(name: str, score: Score, group: Group, calibration: Calibration) -> MethodResult:
+    threshold = group.thresholds.get(name)
+    if threshold is None:
+        reason = (
+            f"calibrated with {group.records} leak-free recordings at this operating point, too few for a false-alarm "
+            f"rate of {calibration.rate:g}"
+        )
+        return MethodResult(name, score.value, None, "cannot tell", reason)
+    if score.value is None or not math.isfinite(score.value):
+        return MethodResult(name, None, threshold.value, "cannot tell", score.reason or "no score")
+    verdict: Verdict = "leak" if score.value > threshold.value else "no leak"
+    sign = "over" if verdict == "leak" else "not over"
+    reason = (
+        f"{name}: score {score.value:.4g} {sign} the threshold {threshold.value:.4g}, set from {threshold.n} leak-free "
+        f"recordings for a false-alarm rate of {calibration.rate:g} (truly {threshold.low:.2g} to {threshold.high:.2g} "
+        f"at {100 * threshold.confidence:g} % confidence)"
+    )
+    return MethodResult(name, score.value, threshold.value, verdict, reason)

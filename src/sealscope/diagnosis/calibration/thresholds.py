@@ -1,0 +1,283 @@
+"""Calibrate detectors to a false-alarm rate on leak-free recordings, and keep the thresholds with what they were made
+from."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingPoint, difference
+from sealscope.diagnosis.calibration.scorers import scorer, split_view
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
+from sealscope.recordings.atomic import whole_file
+
+FORMAT = "sealscope calibration 1"
+#: How far outside the calibrated pressure levels a recording may lie: this share of their range, and this ratio.
+LEVEL_MARGIN = 0.25
+#: How far the length of a recording may differ from those calibrated with, as a ratio: scores of short recordings
+#: scatter more.
+DURATION_RATIO = 1.1
+_LARGEST_FILE = 50_000_000
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a recording was made: its operating point, and its length [s]."""
+
+    point: OperatingPoint
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class Group:
+    """One calibrated operating point: the `point` of its first recording, the ranges of all `records`, and the
+    threshold of each detector (none where the records are too few for the rate)."""
+
+    point: OperatingPoint
+    records: int
+    levels: tuple[float, float]
+    durations_s: tuple[float, float]
+    thresholds: Mapping[str, Threshold]
+
+    def refuses(self, place: Place) -> str | None:
+        """Why a recording is outside of this operating point, in words; None where it is inside."""
+        other = difference(place.point, self.point)
+        if other is not None:
+            return other
+        low, high = self.levels
+        margin = max(LEVEL_MARGIN * (high - low), math.log(LEVEL_RATIO))
+        if not low - margin <= place.point.level <= high + margin:
+            ratio = math.exp(place.point.level - (low if place.point.level < low else high))
+            return f"another pressure level ({ratio:.2g} times the nearest calibrated one)"
+        short, long = self.durations_s
+        if not short / DURATION_RATIO <= place.duration_s <= long * DURATION_RATIO:
+            return f"another length ({place.duration_s:.4g} s, calibrated with {_span(short, long, 's')})"
+        return None
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Thresholds of `detectors` for a false-alarm `rate`, by operating point.
+
+    The first detector makes the verdict, so that the rate is the verdict's own; the others are told beside it.
+    `split_share`: where detectors that compare two sides of a moment split a recording, as a share of its length.
+    `made_from`: plain values that say which recordings or which campaign it was made from; `views`: name -> channels,
+    for detectors that saw no other (`rms change @ pressures`).
+    """
+
+    rate: float
+    promise: Promise
+    confidence: float
+    detectors: tuple[str, ...]
+    split_share: float
+    groups: tuple[Group, ...]
+    made_from: Mapping[str, Any]
+    views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def find(self, place: Place) -> Group | str:
+        """The calibrated operating point of a recording, or why it is outside of all, in words."""
+        reasons = []
+        for group in self.groups:
+            reason = group.refuses(place)
+            if reason is None:
+                return group
+            reasons.append(reason)
+        # the most telling reason is that of the group that differs last, in its level or length
+        late = [one for one in reasons if one.startswith(("another pressure level", "another length"))]
+        told = (late or reasons)[0]
+        return f"outside the calibrated operating points: {told}"
+
+
+def _span(low: float, high: float, unit: str) -> str:
+    return f"{low:.4g} {unit}" if math.isclose(low, high, rel_tol=1e-3) else f"{low:.4g} to {high:.4g} {unit}"
+
+
+def grouped(places: Sequence[Place]) -> list[list[int]]:
+    """Indices of the recordings of each operating point, both in the order given; levels are not told apart, lengths
+    within a tenth are alike."""
+    groups: list[list[int]] = []
+    for number, place in enumerate(places):
+        for group in groups:
+            first = places[group[0]]
+            longer = max(place.duration_s, first.duration_s) / max(min(place.duration_s, first.duration_s), 1e-9)
+            if difference(place.point, first.point) is None and longer <= DURATION_RATIO:
+                group.append(number)
+                break
+        else:
+            groups.append([number])
+    return groups
+
+
+def calibrate(
+    places: Sequence[Place],
+    scores: Mapping[str, Sequence[float | None]],
+    *,
+    rate: float,
+    promise: Promise = "average",
+    confidence: float = 0.95,
+    split_share: float = 0.5,
+    made_from: Mapping[str, Any] | None = None,
+    views: Mapping[str, Sequence[str]] | None = None,
+) -> Calibration:
+    """Thresholds from the scores of leak-free recordings.
+
+    `places` (n,): where each was made; `scores`: detector -> (n,) scores, None where it could not tell (such a record
+    raises no alarm and counts as the lowest score). Each operating point gets, for each detector, the order statistic
+    that keeps the `promise` (`evaluation.thresholds`); one with too few records gets none. Raises InputError where no
+    operating point has enough records, saying how many it takes.
+    """
+    if not places:
+        raise InputError("a calibration needs leak-free recordings, got none")
+    if not scores:
+        raise InputError("a calibration needs at least one detector, got none")
+    seen = {name: tuple(channels) for name, channels in (views or {}).items()}
+    for name, values in scores.items():
+        _check(name, seen)
+        if len(values) != len(places):
+            raise InputError(
+                f"scores of {name!r} must be as many as the recordings, got {len(values)} for {len(places)}"
+            )
+    needed = records_needed(rate, confidence if promise == "bound" else None)
+    groups = []
+    for members in grouped(places):
+        thresholds: dict[str, Threshold] = {}
+        for name, values in scores.items():
+            own = scorer(split_view(name)[0]).threshold
+            if own is not None:
+                raise InputError(f"{name!r} has a threshold of its own and cannot be calibrated")
+            known = [values[k] for k in members]
+            finite = [value for value in known if value is not None]
+            if len(members) < needed or not finite:
+                continue
+            floor = min(finite)
+            thresholds[name] = quantile_threshold(
+                [floor if value is None else value for value in known], rate, confidence, promise
+            )
+        levels = [places[k].point.level for k in members]
+        lengths = [places[k].duration_s for k in members]
+        groups.append(
+            Group(
+                places[members[0]].point,
+                len(members),
+                (min(levels), max(levels)),
+                (min(lengths), max(lengths)),
+                thresholds,
+            )
+        )
+    if not any(group.thresholds for group in groups):
+        most = max(group.records for group in groups)
+        raise InputError(
+            f"leak-free recordings must be at least {needed} at an operating point for a false-alarm rate of {rate:g}, "
+            f"got at most {most}"
+        )
+    used = {view: seen[view] for name in scores if (view := split_view(name)[1])}
+    return Calibration(
+        rate, promise, confidence, tuple(scores), split_share, tuple(groups), dict(made_from or {}), used
+    )
+
+
+def _check(name: str, views: Mapping[str, tuple[str, ...]]) -> None:
+    """Raise InputError for a detector that is not known, or sees a set of channels that is not."""
+    detector, view = split_view(name)
+    scorer(detector)
+    if view and not views.get(view):
+        raise InputError(f"the channels that {name!r} sees must be known, got none for {view!r}")
+
+
+def as_dict(calibration: Calibration) -> dict[str, Any]:
+    """The calibration as plain JSON values."""
+    groups = [
+        {
+            "point": asdict(group.point),
+            "records": group.records,
+            "levels": list(group.levels),
+            "durations_s": list(group.durations_s),
+            "thresholds": {name: asdict(one) for name, one in group.thresholds.items()},
+        }
+        for group in calibration.groups
+    ]
+    return {
+        "format": FORMAT,
+        "false_alarm_rate": calibration.rate,
+        "promise": calibration.promise,
+        "confidence": calibration.confidence,
+        "detectors": list(calibration.detectors),
+        "split_share": calibration.split_share,
+        "made_from": dict(calibration.made_from),
+        **({"views": {k: list(v) for k, v in calibration.views.items()}} if calibration.views else {}),
+        "groups": groups,
+    }
+
+
+def save(calibration: Calibration, path: str | os.PathLike[str]) -> None:
+    """Write the calibration as JSON, whole or not at all; raises InputError where it cannot be written."""
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(as_dict(calibration), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def load(path: str | os.PathLike[str]) -> Calibration:
+    """The calibration in a file; raises UnreadableFile, naming the file, where it is none."""
+    file = Path(path)
+    try:
+        if file.stat().st_size > _LARGEST_FILE:
+            raise UnreadableFile(f"a calibration must be at most {_LARGEST_FILE} bytes, got more ({file})")
+        tree = json.loads(file.read_bytes())
+    except OSError as error:
+        raise UnreadableFile(f"a calibration must be readable, got: {error.strerror or error} ({file})") from None
+    except (ValueError, RecursionError):
+        raise UnreadableFile(
+            f"a calibration must be a JSON file of sealscope calibrate, got something else ({file})"
+        ) from None
+    if not isinstance(tree, dict) or tree.get("format") != FORMAT:
+        got = tree.get("format") if isinstance(tree, dict) else type(tree).__name__
+        raise UnreadableFile(f"a calibration must say format {FORMAT!r}, got {got!r} ({file})")
+    try:
+        return _from(tree)
+    except InputError as error:
+        raise UnreadableFile(f"{error} ({file})") from None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UnreadableFile(
+            f"a calibration must be complete, got a wrong or missing entry: {error} ({file})"
+        ) from None
+
+
+def _from(tree: Mapping[str, Any]) -> Calibration:
+    detectors = tuple(str(name) for name in tree["detectors"])
+    groups = []
+    for one in tree["groups"]:
+        point = dict(one["point"])
+        point |= {name: tuple(point[name]) for name in ("units", "chambers")}
+        thresholds = {name: Threshold(**values) for name, values in one["thresholds"].items()}
+        for name, threshold in thresholds.items():
+            if name not in detectors or not math.isfinite(threshold.value):
+                raise InputError(
+                    f"a threshold must be a finite number of a listed detector, got {threshold.value} of {name!r}"
+                )
+        low, high = (float(value) for value in one["levels"])
+        short, long = (float(value) for value in one["durations_s"])
+        groups.append(Group(OperatingPoint(**point), int(one["records"]), (low, high), (short, long), thresholds))
+    views = {str(name): tuple(str(one) for one in channels) for name, channels in tree.get("views", {}).items()}
+    for name in detectors:
+        _check(name, views)
+    if not detectors or not groups:
+        raise InputError("a calibration must have detectors and operating points")
+    rate, confidence, split = (float(tree[name]) for name in ("false_alarm_rate", "confidence", "split_share"))
+    if not (0.0 < rate < 1.0 and 0.0 < confidence < 1.0 and 0.0 < split < 1.0):
+        raise InputError("false_alarm_rate, confidence and split_share must be between 0 and 1")
+    return Calibration(
+        rate, tree["promise"], confidence, detectors, split, tuple(groups), dict(tree["made_from"]), views
+    )
+
+
+def with_judge(calibration: Calibration, name: str) -> Calibration:
+    """The same calibration with another of its detectors making the verdict; InputError for one it does not hold."""
+    if name not in calibration.detectors:
+        known = ", ".join(calibration.detectors)
+        raise InputError(f"the judging detector must be one of {known}, got {name!r}")
+    return replace(calibration, detectors=(name, *(one for one in calibration.detectors if one != name)))

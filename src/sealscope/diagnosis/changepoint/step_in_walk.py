@@ -1,0 +1,208 @@
+"""A step in a series that walks about as much as the observer says it does.
+
+The series g_1..g_n (one estimate of the conductance a block) is taken as level + walk + noise + size S(onset): noise
+of the stated relative deviations and unknown scale, a random walk whose variance a block is `walk` times that of the
+noise, S the share of a block that lies behind the onset. `walk` is estimated beside every onset (restricted maximum
+likelihood), with a log-normal prior around the ratio that is expected of a healthy machine: that is what a model-based
+observer knows more than `step_in_drift.find_step`, which takes any smooth drift and must see a larger step.
+
+The score is the largest t of the size over all onsets, where only a rise counts. The threshold is the quantile of the
+same maximum over series drawn from the walk found beside the step and, where the caller is `wary`, from the one found
+without a step too, whichever is higher.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.changepoint.abrupt import ONSET_CUT
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+
+#: Fewest blocks in which a step can be looked for, and fewest on either side of it.
+FEWEST, LEAST = 16, 4
+#: Walks tried: variance a block over the noise's.
+_WALKS = np.geomspace(1e-3, 100.0, 14)
+#: Onsets lie half a block apart, and in the end this share of a block.
+_FINE = 0.05
+#: A block is not resolved finer than this share of it: its leak need not act in proportion to its share of the block.
+_RESOLUTION = 0.25
+#: The block of the onset and the next, whose other states still settle, are left out of the size: their weight.
+_UNSETTLED = 1e6
+_DRAWS, _TAIL = 600, 0.1
+#: Time constants of a warm-up, as shares of the series.
+_WARM_UPS = (0.03, 0.06, 0.12, 0.25, 0.5)
+
+
+@dataclass(frozen=True)
+class Step:
+    """The best step. `score`, `threshold`; `onset`, `onset_interval` (95 %): in blocks from the beginning of the first;
+    `size`, `size_sd`: in the unit of the series; `freedom`: degrees of freedom of `size_sd`; `scale`: of the noise
+    over the stated deviations; `walk`: variance of a block's walk over the noise's; `warms_up`: an exponential
+    approach from the beginning on is likelier than the step."""
+
+    score: float
+    threshold: float
+    onset: float
+    onset_interval: tuple[float, float]
+    size: float
+    size_sd: float
+    freedom: int
+    scale: float
+    walk: float
+    warms_up: bool
+
+    @property
+    def found(self) -> bool:
+        """Whether the score is over the threshold and no warm-up explains the series better."""
+        return self.score > self.threshold and not self.warms_up
+
+    def spread_over(self, merge: int) -> Step:
+        """The same step, counted in blocks of which `merge` make one of this series."""
+        first, last = self.onset_interval
+        return replace(self, onset=self.onset * merge, onset_interval=(first * merge, last * merge))
+
+
+class _Walk:
+    """Everything about one strength of the walk: `whiten` (n, n) takes out correlation and level."""
+
+    def __init__(self, relative: Array, walk: float) -> None:
+        n = relative.size
+        number = np.arange(n)
+        self.root = np.linalg.cholesky(np.diag(relative**2) + walk * np.minimum.outer(number, number))
+        inverse = np.linalg.inv(self.root)
+        level = inverse.sum(axis=1)
+        length = float(np.linalg.norm(level))
+        unit = level / length
+        self.whiten = inverse - np.outer(unit, unit @ inverse)
+        self.log_det = 2.0 * float(np.log(np.diag(self.root)).sum()) + 2.0 * float(np.log(length))
+
+    def fit(self, y: Array, shapes: Array) -> tuple[Array, Array, Array]:
+        """Of series y (n, m) and steps `shapes` (k, n): moves along each step (k, m), what is left of the sum of
+        squares (k, m), and the steps' lengths (k,)."""
+        white = self.whiten @ shapes.T
+        lengths = np.sqrt(np.sum(white**2, axis=0))
+        target = self.whiten @ y
+        moved = (white / lengths).T @ target
+        return moved, np.maximum(np.sum(target**2, axis=0) - moved**2, np.finfo(float).tiny), lengths
+
+
+def shapes_of(onsets: Array, n: int) -> Array:
+    """S (k, n): the share of every block that lies behind each onset (k,) [blocks]."""
+    return np.clip(np.arange(1, n + 1)[None, :] - onsets[:, None], 0.0, 1.0)
+
+
+class _Scan:
+    def __init__(self, relative: Array, expected: float, spread: float) -> None:
+        self.n = relative.size
+        self.freedom = self.n - 2
+        self.onsets = np.arange(LEAST, self.n - LEAST + 0.25, 0.5)
+        self.shapes = shapes_of(self.onsets, self.n)
+        self.walks = [_Walk(relative, float(walk)) for walk in _WALKS]
+        self.prior = (np.log(_WALKS / expected) / spread) ** 2
+
+    def scores(self, y: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Of series y (n, m), for every onset (k, m): t of a rise, number of the likeliest walk."""
+        size = (self.onsets.size, y.shape[1])
+        best, t, number = np.full(size, np.inf), np.zeros(size), np.zeros(size, dtype=np.int64)
+        for row, walk in enumerate(self.walks):
+            moved, rest, lengths = walk.fit(y, self.shapes)
+            deviance = self.freedom * np.log(rest) + walk.log_det + 2.0 * np.log(lengths)[:, None] + self.prior[row]
+            better = deviance < best
+            best = np.where(better, deviance, best)
+            t = np.where(better, moved / np.sqrt(rest / self.freedom), t)
+            number[better] = row
+        return np.maximum(t, 0.0), number
+
+    def deviance(self, y: Array, shapes: Array) -> float:
+        """Least -2 log likelihood of one series y (n, 1) with any of the shapes (k, n) and any walk."""
+        return float(
+            min(
+                np.min(self.freedom * np.log(walk.fit(y, shapes)[1])) + walk.log_det + self.prior[row]
+                for row, walk in enumerate(self.walks)
+            )
+        )
+
+    def without_step(self, y: Array) -> int:
+        """Number of the walk that is likeliest for one series y (n, 1) without a step."""
+        tiny = np.finfo(float).tiny
+        deviance = [
+            (self.n - 1) * np.log(np.sum((walk.whiten @ y) ** 2) + tiny) + walk.log_det + self.prior[row]
+            for row, walk in enumerate(self.walks)
+        ]
+        return int(np.argmin(deviance))
+
+
+def find_leak_step(
+    g: Array,
+    sd: Array,
+    false_alarm_probability: float,
+    expected_walk: float,
+    *,
+    wary: bool = False,
+    spread: float = 1.0,
+    seed: int = 0,
+) -> Step:
+    """Look for a rise in a series g (n,) whose blocks have the deviations sd (n,), of unknown common scale.
+
+    `expected_walk`: variance of a block's walk over that of a block's noise; `spread`: deviation of its logarithm;
+    `wary`: the threshold must also hold for the walk that explains the series without a step.
+
+    Raises InputError where there are fewer than 16 blocks or values that are not finite.
+    """
+    if g.size < FEWEST:
+        raise InputError(f"a step needs {FEWEST} blocks or more to be found, got {g.size}")
+    if g.shape != sd.shape or not (np.all(np.isfinite(g)) and np.all(np.isfinite(sd)) and np.all(sd > 0)):
+        raise InputError("estimates and their deviations must be finite and of one shape, and deviations > 0")
+    unit = float(np.median(sd))
+    relative = sd / unit
+    scan = _Scan(relative, expected_walk, spread)
+    y = g[:, None] / unit
+    t, number = (column[:, 0] for column in scan.scores(y))
+    best = int(np.argmax(t))
+    walk = scan.walks[number[best]]
+    drawn = np.random.default_rng(seed).standard_normal((g.size, _DRAWS))
+    threshold = max(
+        _upper_tail(scan.scores(scan.walks[one].root @ drawn)[0].max(axis=0), false_alarm_probability)
+        for one in {int(number[best]), *([scan.without_step(y)] if wary else [])}
+    )
+
+    fine = np.clip(scan.onsets[best] + np.arange(-0.75, 0.75 + 1e-9, _FINE), 1.0, g.size - 1.0)
+    sharp = scan.freedom * np.log(walk.fit(y, shapes_of(fine, g.size))[1][:, 0])
+    onset = float(fine[np.argmin(sharp)])
+    cut = float(sharp.min()) + ONSET_CUT
+    coarse = scan.freedom * np.log(walk.fit(y, scan.shapes)[1][:, 0])
+    near = np.concatenate([fine[sharp <= cut], scan.onsets[(coarse <= cut) & (t > 0)]])
+
+    settled = relative.copy()
+    settled[int(np.floor(onset)) : int(np.floor(onset)) + 2] *= _UNSETTLED
+    strength = float(_WALKS[number[best]])
+    warm = np.exp(-np.arange(g.size)[None, :] / (np.array(_WARM_UPS)[:, None] * g.size))
+    warms_up = scan.deviance(y, warm) < scan.deviance(y, shapes_of(fine, g.size))
+    moved, rest, lengths = _Walk(settled, strength).fit(y, shapes_of(np.array([onset]), g.size))
+    freedom = scan.freedom - 2
+    scale = float(np.sqrt(rest[0, 0] / freedom))
+    return Step(
+        score=float(t[best]),
+        threshold=threshold,
+        onset=onset,
+        onset_interval=(float(near.min()) - _RESOLUTION, float(near.max()) + _RESOLUTION),
+        size=float(moved[0, 0] / lengths[0]) * unit,
+        size_sd=scale / float(lengths[0]) * unit,
+        freedom=freedom,
+        scale=scale,
+        walk=strength,
+        warms_up=warms_up,
+    )
+
+
+def _upper_tail(null: Array, probability: float) -> float:
+    """The value that a sample (m,) of the null exceeds with `probability`: an order statistic in its upper tenth's
+    beginning, beyond that an exponential tail, which errs to the safe side for a maximum of t."""
+    if probability >= _TAIL:
+        return float(np.quantile(null, 1.0 - probability))
+    start = float(np.quantile(null, 1.0 - _TAIL))
+    return start + float(np.mean(null[null > start] - start)) * float(np.log(_TAIL / probability))

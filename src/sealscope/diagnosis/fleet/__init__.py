@@ -1,0 +1,1 @@
+"""Many actuators watched live: details, windowed RMS and sequential tests."""

@@ -1,0 +1,1 @@
+"""Kalman filters with the leakage conductance among their states."""

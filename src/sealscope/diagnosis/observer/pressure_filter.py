@@ -1,0 +1,338 @@
+"""The extended Kalman filter over the pressures: what the leak's damping and flow do to p_A and p_B.
+
+Machine (the equations of the rig without throttles, thesis eqs. (4.1)-(4.5), (4.13)-(4.22), with the leak in them):
+
+    dp_A/dt = k/(1 + c x) (q - A_A v),  dp_B/dt = -k/(1 - c x) (q - A_B v),  q = gain D omega - G (p_A - p_B)
+    M dv/dt = A_A p_A - A_B p_B - F(v) - bias_force,  dx/dt = v,  k = stiffness K_oil/V,  c = volume_slope A/V
+
+The speed omega is the recorded one, or follows from the command by the drive's own equations, without a covariance of
+its own. The means are integrated by RK4 in steps of at most 1 ms, the sensitivities by the exponential of the Jacobian
+at each step's middle. p_A and p_B are measured, one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sealscope.compiled import kernel, law
+from sealscope.diagnosis.observer.accumulator import Blocks, close_block, new_tally
+from sealscope.diagnosis.observer.model import (
+    FLOW_NOISE,
+    FORCE_NOISE,
+    G_PRIOR,
+    G_UNIT,
+    PARAMETERS,
+    REVERSAL_NOISE,
+    REVERSAL_SPEED,
+    STIFFNESS,
+    Assumed,
+    walks,
+)
+from sealscope.physics.cylinder import piston_acceleration, pressure_rate
+from sealscope.physics.friction import coulomb_friction, stribeck_friction
+from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
+from sealscope.physics.pump import pump_flow, pump_torque
+from sealscope.recordings.recording import Array
+
+#: Order of the means: drive (integral, current, speed), then the four states that have a covariance.
+_MEANS = 7
+_STATES = 4
+_ALL = _STATES + len(PARAMETERS)
+_LONGEST_STEP = 1.0e-3
+#: Uncertainty of velocity [m/s] and position [m] at the start.
+_VELOCITY, _POSITION = 0.01, 0.05
+#: The search of the stiffness: after so many seconds so many candidates go on.
+_ROUNDS = ((6.3, 6), (12.6, 1))
+_NEVER = 1 << 62
+
+
+@law
+def friction_slopes(v: float, F_C: float, breakaway: float, a: Assumed) -> tuple[float, float, float]:
+    """Slopes of Coulomb and Stribeck friction F_C (1 + b (K_brk - 1) e) sign(v) in v, its value, and its slope in b;
+    e = exp(-C_c |v|), as `physics.friction.stribeck_friction` has it with F_v = 0."""
+    speed = abs(v)
+    stribeck = a.K_brk - 1.0
+    e = math.exp(-a.C_c * max(speed, a.v_th))
+    sign = min(max(v / a.v_th, -1.0), 1.0)
+    level = F_C * (1.0 + breakaway * stribeck * e)
+    slope = level / a.v_th if speed <= a.v_th else -F_C * breakaway * stribeck * a.C_c * e
+    return slope, level * sign, F_C * stribeck * e * sign
+
+
+@law
+def _flow(z: np.ndarray, q: np.ndarray, omega: float, a: Assumed) -> float:
+    """Flow [m^3/s] into chamber A: what the pump delivers less what leaks."""
+    return pump_flow(omega, z[3] - z[4], 2.0 * math.pi * q[4] * a.D, q[0] * G_UNIT)
+
+
+@law
+def _rates(z: np.ndarray, q: np.ndarray, drive: float, commanded: bool, a: Assumed, dz: np.ndarray) -> None:
+    """Rates of the means `z` with parameters `q`; `drive`: the command [V], or the speed [rad/s]."""
+    dp = z[3] - z[4]
+    omega = drive
+    if commanded:
+        omega = z[2]
+        error = a.omega_per_volt * drive - omega
+        voltage = controller_voltage(error, z[0], a.k_p, a.K_i, a.V_max)
+        dz[0] = error
+        dz[1] = winding_current_rate(voltage, z[1], omega, a.R_c, a.L_c, a.C_e, a.i_max)
+        dz[2] = shaft_acceleration(z[1], omega, pump_torque(dp, 2.0 * math.pi * a.D), a.C_m, a.B_M, a.J_M)
+    else:
+        dz[0] = 0.0
+        dz[1] = 0.0
+        dz[2] = 0.0
+    flow = _flow(z, q, omega, a)
+    change = q[6] * a.slope / a.V * z[6]
+    dz[3] = pressure_rate(flow - a.A_A * z[5], a.V * (1.0 + change), q[3] * a.K_oil)
+    dz[4] = pressure_rate(a.A_B * z[5] - flow, a.V * (1.0 - change), q[3] * a.K_oil)
+    F_C = q[1] * coulomb_friction(z[3], z[4], a.F_pr, a.F_cfr, False)
+    friction = stribeck_friction(z[5], F_C, 1.0 + q[7] * (a.K_brk - 1.0), a.C_c, q[2] * a.F_v, a.v_th, False)
+    dz[5] = piston_acceleration(z[3], z[4], friction, q[5], 0.0, a.A_A, a.A_B, a.M_eq)
+    dz[6] = z[5]
+
+
+@law
+def _slopes(z: np.ndarray, q: np.ndarray, omega: float, a: Assumed, J: np.ndarray, B: np.ndarray) -> None:
+    """Jacobians of the rates of (p_A, p_B, v, x): J (4, 4) in themselves, B (3, 8) in the parameters."""
+    dp = z[3] - z[4]
+    flow = _flow(z, q, omega, a)
+    stiffness = q[3] * a.K_oil / a.V
+    c = a.slope / a.V
+    share_A = 1.0 / (1.0 + q[6] * c * z[6])
+    share_B = 1.0 / (1.0 - q[6] * c * z[6])
+    k_A = stiffness * share_A
+    k_B = stiffness * share_B
+    rate_A = k_A * (flow - a.A_A * z[5])
+    rate_B = -k_B * (flow - a.A_B * z[5])
+    G = q[0] * G_UNIT
+    slope, coulomb, breakaway = friction_slopes(z[5], coulomb_friction(z[3], z[4], a.F_pr, a.F_cfr, False), q[7], a)
+    J[0, 0] = -k_A * G
+    J[0, 1] = k_A * G
+    J[0, 2] = -k_A * a.A_A
+    J[0, 3] = -rate_A * share_A * q[6] * c
+    J[1, 0] = k_B * G
+    J[1, 1] = -k_B * G
+    J[1, 2] = k_B * a.A_B
+    J[1, 3] = rate_B * share_B * q[6] * c
+    J[2, 0] = a.A_A / a.M_eq
+    J[2, 1] = -a.A_B / a.M_eq
+    J[2, 2] = -(q[1] * slope + q[2] * a.F_v) / a.M_eq
+    J[3, 2] = 1.0
+    B[0, 0] = -k_A * G_UNIT * dp
+    B[1, 0] = k_B * G_UNIT * dp
+    B[2, 1] = -coulomb / a.M_eq
+    B[2, 2] = -a.F_v * z[5] / a.M_eq
+    B[0, 3] = rate_A / q[3]
+    B[1, 3] = rate_B / q[3]
+    B[0, 4] = k_A * a.D * omega
+    B[1, 4] = -k_B * a.D * omega
+    B[2, 5] = -1.0 / a.M_eq
+    B[0, 6] = -rate_A * share_A * c * z[6]
+    B[1, 6] = rate_B * share_B * c * z[6]
+    B[2, 7] = -q[1] * breakaway / a.M_eq
+
+
+@law
+def _carry(J: np.ndarray, B: np.ndarray, h: float, E: np.ndarray, T: np.ndarray, N: np.ndarray, S: np.ndarray) -> None:
+    """Carry the sensitivities S (4, 12) over a step of h: exp(hJ) of the states, h phi_1(hJ) B of the parameters."""
+    for i in range(_STATES):
+        for j in range(_STATES):
+            T[i, j] = h / 4.0 * J[i, j]
+        T[i, i] += 1.0
+    for divisor in (3.0, 2.0, 1.0):  # Horner: phi_1 = 1 + hJ/2 (1 + hJ/3 (1 + hJ/4)), then exp = 1 + hJ phi_1
+        for i in range(_STATES):
+            for j in range(_STATES):
+                total = 0.0
+                for m in range(_STATES):
+                    total += J[i, m] * T[m, j]
+                E[i, j] = h / divisor * total
+            E[i, i] += 1.0
+        if divisor > 1.0:
+            for i in range(_STATES):
+                for j in range(_STATES):
+                    T[i, j] = E[i, j]
+    for i in range(_STATES):
+        for j in range(_ALL):
+            N[i, j] = E[i, 0] * S[0, j] + E[i, 1] * S[1, j] + E[i, 2] * S[2, j] + E[i, 3] * S[3, j]
+        for j in range(_ALL - _STATES):
+            N[i, _STATES + j] += h * (T[i, 0] * B[0, j] + T[i, 1] * B[1, j] + T[i, 2] * B[2, j])
+    for i in range(_STATES):
+        for j in range(_ALL):
+            S[i, j] = N[i, j]
+
+
+@kernel
+def advance(
+    drive: np.ndarray,
+    p_A: np.ndarray,
+    p_B: np.ndarray,
+    commanded: bool,
+    h: float,
+    steps: int,
+    a: Assumed,
+    z: np.ndarray,
+    q: np.ndarray,
+    P: np.ndarray,
+    tally: np.ndarray,
+    noise: np.ndarray,
+    walk: np.ndarray,
+    block: int,
+    rows: np.ndarray,
+) -> int:
+    """Advance the filter over samples `drive`, `p_A`, `p_B` (n,) of spacing h; returns how many `rows` it wrote.
+
+    `drive`: command [V] if `commanded`, else the mean speed [rad/s] since the sample before. Means `z` (7,), parameters
+    `q` (8,), covariance `P` (12, 12) and `tally` (see `observer_tally`) are the filter's memory and are changed in
+    place. `noise` (2,): variances of the readings [Pa^2]; `walk` (8,): variances gained from block to block.
+    """
+    J, E, T = np.zeros((_STATES, _STATES)), np.zeros((_STATES, _STATES)), np.zeros((_STATES, _STATES))
+    B, S, W = np.zeros((_STATES, len(PARAMETERS))), np.zeros((_STATES, _ALL)), np.zeros((_STATES, _ALL))
+    k1, k2, k3, k4, mid = np.zeros(_MEANS), np.zeros(_MEANS), np.zeros(_MEANS), np.zeros(_MEANS), np.zeros(_MEANS)
+    gain = np.zeros(_ALL)
+    step = h / steps
+    written = 0
+    for n in range(drive.size):
+        if tally[5] == 0.0:
+            tally[5] = 1.0
+            tally[6] = drive[n]
+            z[3] = p_A[n]
+            z[4] = p_B[n]
+            continue
+        before, after = (tally[6], drive[n]) if commanded else (drive[n], drive[n])
+        tally[6] = drive[n]
+        for i in range(_STATES):
+            for j in range(_ALL):
+                S[i, j] = 1.0 if i == j else 0.0
+        for one in range(steps):
+            left = before + (after - before) * one / steps
+            right = before + (after - before) * (one + 1) / steps
+            half = 0.5 * (left + right)
+            _rates(z, q, left, commanded, a, k1)
+            for i in range(_MEANS):
+                mid[i] = z[i] + 0.5 * step * k1[i]
+            _rates(mid, q, half, commanded, a, k2)
+            for i in range(_MEANS):
+                mid[i] = z[i] + 0.5 * step * k2[i]
+            _rates(mid, q, half, commanded, a, k3)
+            _slopes(mid, q, mid[2] if commanded else half, a, J, B)
+            for i in range(_MEANS):
+                mid[i] = z[i] + step * k3[i]
+            _rates(mid, q, right, commanded, a, k4)
+            for i in range(_MEANS):
+                z[i] += step / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+            _carry(J, B, step, E, T, W, S)
+        for i in range(_STATES):
+            for j in range(_ALL):
+                W[i, j] = 0.0
+            for m in range(_ALL):
+                for j in range(_ALL):
+                    W[i, j] += S[i, m] * P[m, j]
+        for i in range(_STATES):
+            for j in range(i, _STATES):
+                total = 0.0
+                for m in range(_ALL):
+                    total += W[i, m] * S[j, m]
+                P[i, j] = total
+                P[j, i] = total
+            for j in range(_STATES, _ALL):
+                P[i, j] = W[i, j]
+                P[j, i] = W[i, j]
+        flow = (q[3] * a.K_oil / a.V * FLOW_NOISE) ** 2 * h
+        P[0, 0] += flow
+        P[1, 1] += flow
+        P[0, 1] -= flow
+        P[1, 0] -= flow
+        force = FORCE_NOISE + REVERSAL_NOISE * math.exp(-abs(z[5]) / REVERSAL_SPEED)
+        P[2, 2] += (force / a.M_eq) ** 2 * h
+        for c in range(2):
+            innovation = (p_A[n] if c == 0 else p_B[n]) - z[3 + c]
+            variance = P[c, c] + noise[c]
+            white = innovation / math.sqrt(variance)
+            tally[1] -= 0.5 * (white * white + math.log(variance))
+            tally[2] += 0.5 * white * white
+            tally[8] += 0.5 * white * tally[9 + c]
+            tally[9 + c] = white
+            for i in range(_ALL):
+                gain[i] = P[i, c] / variance
+            for i in range(_STATES):
+                z[3 + i] += gain[i] * innovation
+            for j in range(len(PARAMETERS)):
+                q[j] += gain[_STATES + j] * innovation
+            for i in range(_ALL):
+                share = gain[i] * variance
+                for j in range(_ALL):
+                    P[i, j] -= share * gain[j]
+        tally[7] += abs(p_A[n] - p_B[n])
+        tally[0] += 1.0
+        if tally[0] >= block:
+            close_block(q, P, _STATES, 0, tally, walk, G_PRIOR, rows[written])
+            written += 1
+    return written
+
+
+class PressureFilter:
+    """The filter with its memory: `update` takes samples as they come; `blocks` are its estimates so far."""
+
+    def __init__(
+        self, a: Assumed, commanded: bool, rate: float, block: int, start: tuple[Array, Array], noise: Array
+    ) -> None:
+        self.a, self.commanded, self.h, self.block, self.noise = a, commanded, 1.0 / rate, block, noise
+        self.steps = max(1, math.ceil(self.h / _LONGEST_STEP - 1e-9))
+        self.walk = walks(block * self.h)
+        self.blocks = Blocks(len(PARAMETERS))
+        self._begin(*start)
+
+    def _begin(self, q: Array, deviations: Array) -> None:
+        self.q = q.copy()
+        self.z = np.zeros(_MEANS)
+        self.P = np.diag(np.concatenate([self.noise, [_VELOCITY**2, _POSITION**2], deviations**2]))
+        self.tally = new_tally(q[0], deviations[0])
+
+    def update(self, drive: Array, p_A: Array, p_B: Array) -> None:
+        """Take more samples, (n,) each."""
+        rows = self.blocks.room(drive.size // self.block + 1)
+        written = advance(
+            drive, p_A, p_B, self.commanded, self.h, self.steps, self.a,
+            self.z, self.q, self.P, self.tally, self.noise, self.walk, self.block, rows,
+        )  # fmt: skip
+        self.blocks.add(rows[:written])
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of all samples so far; minus infinity where the filter has lost them."""
+        found = float(self.tally[1])
+        return found if math.isfinite(found) else -math.inf
+
+
+def find_stiffness(
+    a: Assumed, commanded: bool, rate: float, start: tuple[Array, Array], noise: Array, samples: tuple[Array, ...]
+) -> float:
+    """Factor on the rig's stiffness under which the first samples are likeliest.
+
+    The ringing's frequency must be right within a few per cent before the filter can lock on to it; so a bank of
+    filters runs over the beginning, each with a stiffness of its own, and the likeliest go on.
+    """
+    q, deviations = start
+    number = PARAMETERS.index("stiffness")
+    bank = []
+    for factor in np.geomspace(*STIFFNESS):
+        begin, spread = q.copy(), deviations.copy()
+        begin[number] = factor
+        spread[number] = deviations[number] * factor
+        one = PressureFilter(a, commanded, rate, _NEVER, (begin, spread), noise)
+        one.steps = max(1, math.ceil(one.h / (2.0 * _LONGEST_STEP) - 1e-9))
+        bank.append(one)
+    first = 0
+    for seconds, left in _ROUNDS:
+        stop = round(seconds * rate)
+        for one in bank:
+            one.update(*(channel[first:stop] for channel in samples))
+        bank = sorted(bank, key=lambda one: one.log_likelihood, reverse=True)[:left]
+        first = stop
+    return float(bank[0].q[number])
+
+
+#: Length [s] of the beginning that `find_stiffness` reads.
+SEARCH_SECONDS = _ROUNDS[-1][0]

@@ -1,0 +1,185 @@
+"""The observer block by block: the same filter whether a recording comes at once or in pieces of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from sealscope.diagnosis.observer.accumulator import Estimates
+from sealscope.diagnosis.observer.model import assume, start_parameters
+from sealscope.diagnosis.observer.pressure_filter import SEARCH_SECONDS, PressureFilter, find_stiffness
+from sealscope.diagnosis.observer.volume_filter import VolumeFilter
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array, Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: What the observer rests on: `volume` on angle (or speed) and position, no friction in it; `speed` on the pressures
+#: and the angle or speed; `command` on the pressures and the command.
+Formulation = Literal["volume", "speed", "command"]
+CHAMBERS = ("p_A", "p_B")
+#: Least noise of a reading: a tenth of a step of 14 bits over 3000 psi [Pa], and the square of it in volume [m^3].
+_LEAST_PRESSURE, _LEAST_VOLUME = 100.0, 1e-10
+_SLOW_SECONDS = 0.02
+
+
+def whole(recording: Recording, name: str) -> bool:
+    """Whether a channel is there in SI units, without a gap, and moves."""
+    if name not in recording or recording.units[name] == "count":
+        return False
+    values = recording[name]
+    return bool(np.all(np.isfinite(values)) and values.size > 1 and np.ptp(values) > 0)
+
+
+def formulation_of(recording: Recording) -> Formulation | None:
+    """The formulation that a recording's channels allow; None where there is neither command nor speed."""
+    turned = whole(recording, "theta") or whole(recording, "omega")
+    if turned and whole(recording, "x"):
+        return "volume"
+    if turned:
+        return "speed"
+    return "command" if whole(recording, "u") else None
+
+
+def channels_of(formulation: Formulation, recording: Recording) -> tuple[str, ...]:
+    """The channels that a formulation reads, of those that a recording has."""
+    turning = "theta" if whole(recording, "theta") else "omega"
+    return {
+        "volume": (*CHAMBERS, turning, "x"),
+        "speed": (*CHAMBERS, turning),
+        "command": (*CHAMBERS, "u"),
+    }[formulation]
+
+
+class ObserverStream:
+    """The observer on a stream: `update` takes the next samples, `estimates` is all it knows so far.
+
+    `channels`: as `channels_of` gives them; `rate` [Hz]; `block_s` [s]: what one estimate covers, best a whole number
+    of the duty's cycles. The first seconds (`SEARCH_SECONDS`) are kept until the readings' noise, the senses of the
+    channels and the oil's stiffness are found; after that memory is bounded but for five numbers a block.
+
+    Raises InputError for a rate or a block length that is not positive.
+    """
+
+    def __init__(self, rig: Rig, channels: Sequence[str], rate: float, block_s: float) -> None:
+        if not (rate > 0 and block_s > 0):
+            raise InputError(f"rate and block length must be > 0, got {rate} Hz and {block_s} s")
+        self.rig, self.assumed, self.rate = rig, assume(rig), float(rate)
+        self.channels = tuple(channels)
+        self.block = max(2, round(block_s * rate))
+        self.block_s = self.block / self.rate
+        self._kept: list[dict[str, Array]] = []
+        self._count = 0
+        self._last: dict[str, float] = {}
+        self._filter: PressureFilter | VolumeFilter | None = None
+
+    def update(self, block: Recording) -> Estimates:
+        """Take the next samples, in order and without a gap; returns the estimates of all blocks so far.
+
+        Raises InputError where a channel is missing or not finite.
+        """
+        samples = {name: block[name] for name in self.channels}
+        for name, values in samples.items():
+            if not np.all(np.isfinite(values)):
+                raise InputError(f"channel {name} must be finite for the observer, got NaN or infinity")
+        if len(block):
+            self._take(samples)
+        return self.estimates
+
+    @property
+    def estimates(self) -> Estimates:
+        """All blocks so far."""
+        from sealscope.diagnosis.observer.accumulator import Blocks
+
+        return Blocks(1).estimates() if self._filter is None else self._filter.blocks.estimates()
+
+    def _take(self, samples: dict[str, Array]) -> None:
+        if self._filter is None:
+            self._kept.append(samples)
+            self._count += samples["p_A"].size
+            if self._count < round(SEARCH_SECONDS * self.rate):
+                return
+            samples = {name: np.concatenate([one[name] for one in self._kept]) for name in self.channels}
+            self._kept = []
+            self._begin(samples)
+        self._run(samples)
+
+    def _begin(self, samples: dict[str, Array]) -> None:
+        """Find noise, senses and stiffness from the first seconds, whatever more there is."""
+        first = {name: values[: round(SEARCH_SECONDS * self.rate)] for name, values in samples.items()}
+        stride = max(1, round(_SLOW_SECONDS * self.rate))
+        slow = {name: values[::stride] for name, values in first.items()}
+        dp = (slow["p_A"] - slow["p_B"])[1:]
+        if "x" in self.channels:
+            forward = np.diff(slow["x"])
+            self._turn = _sense(_speed(slow), forward)
+            self._push = _sense(dp, forward)
+            self._origin = {name: float(first[name][0]) for name in ("theta", "x") if name in first}
+            theta, x, drop = self._volumes(first, remember=False)
+            volume = self.assumed.D * theta - self.assumed.area * x - self.assumed.compliance * drop
+            noise = max(_fine_rms(volume), _LEAST_VOLUME) ** 2
+            self._filter = VolumeFilter(self.assumed, self.rate, self.block, noise)
+            return
+        self._turn = _sense(slow["u"][1:] if "u" in slow else _speed(slow), dp)
+        variances = np.array([max(_fine_rms(first[name]), _LEAST_PRESSURE) ** 2 for name in CHAMBERS])
+        start = start_parameters(self.rig)
+        drive = self._drive(first, remember=False)
+        commanded = "u" in self.channels
+        q, deviations = start[0].copy(), start[1].copy()
+        q[3] = find_stiffness(self.assumed, commanded, self.rate, start, variances, (drive, first["p_A"], first["p_B"]))
+        deviations[3] *= q[3]
+        self._filter = PressureFilter(self.assumed, commanded, self.rate, self.block, (q, deviations), variances)
+
+    def _run(self, samples: dict[str, Array]) -> None:
+        if isinstance(self._filter, VolumeFilter):
+            self._filter.update(*self._volumes(samples))
+        elif self._filter is not None:
+            self._filter.update(self._drive(samples), samples["p_A"], samples["p_B"])
+
+    def _volumes(self, samples: dict[str, Array], remember: bool = True) -> tuple[Array, Array, Array]:
+        """Angle, position and pressure difference, counted from the start and in one sense."""
+        dp = self._push * (samples["p_A"] - samples["p_B"])
+        x = samples["x"] - self._origin["x"]
+        if "theta" in samples:
+            return self._turn * (samples["theta"] - self._origin["theta"]), x, dp
+        omega = samples["omega"]
+        before = self._last.get("omega", float(omega[0]))
+        moved = 0.5 / self.rate * (omega + np.concatenate([[before], omega[:-1]]))
+        if "omega" not in self._last:
+            moved[0] = 0.0
+        theta = np.cumsum(np.concatenate([[self._last.get("theta", 0.0)], moved]))[1:]
+        if remember:
+            self._last = {"omega": float(omega[-1]), "theta": float(theta[-1])}
+        return self._turn * theta, x, dp
+
+    def _drive(self, samples: dict[str, Array], remember: bool = True) -> Array:
+        """The command, or the mean speed since the sample before, in the pressures' sense."""
+        name = next(one for one in ("u", "theta", "omega") if one in samples)
+        values = samples[name]
+        if name == "u":
+            return np.asarray(self._turn * values)
+        before = np.concatenate([[self._last.get(name, float(values[0]))], values[:-1]])
+        if remember:
+            self._last = {name: float(values[-1])}
+        return np.asarray(self._turn * ((values - before) * self.rate if name == "theta" else 0.5 * (values + before)))
+
+
+def _speed(slow: dict[str, Array]) -> Array:
+    return np.diff(slow["theta"]) if "theta" in slow else slow["omega"][1:]
+
+
+def _sense(one: Array, other: Array) -> float:
+    """+1, or -1 where two channels count against each other."""
+    return -1.0 if float(np.dot(one - one.mean(), other - other.mean())) < 0 else 1.0
+
+
+def _fine_rms(values: Array) -> float:
+    """RMS of d1, the finest detail: a reading's white noise."""
+    from sealscope.signals.filters import decomposition_filters
+
+    high = decomposition_filters()[1]
+    detail = np.convolve(values - values.mean(), high, "valid")
+    return float(np.sqrt(np.mean(detail**2)))

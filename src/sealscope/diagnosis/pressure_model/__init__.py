@@ -1,0 +1,1 @@
+"""A reduced model of the rig, fitted to the pressure difference and followed block by block."""

@@ -1,0 +1,192 @@
+"""Pressures and command alone: a model of the machine, fitted to the pressure difference, shows when G rises.
+
+A leak past the piston damps the ringing after each reversal; friction does so too, but moves the mean pressure
+difference of the strokes as well, and a softer oil changes the ringing's frequency. The reduced rig (`pressure_laws`)
+knows these ties. It is fitted to the record (`pressure_fit`), its parameters are followed block by block
+(`pressure_track`), and a leak is a rise of the conductance G that the wandering of all other parameters does not
+explain. Pump and piston leak in parallel here, so that the level of G says nothing of the piston: only its rise does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sealscope.diagnosis.baseline.memo import remembered
+from sealscope.diagnosis.changepoint.abrupt import ONSET_CUT, upper_quantile
+from sealscope.diagnosis.pressure_model.against_baseline import Level, against_levels
+from sealscope.diagnosis.verdict.evidence import LITRE_PER_MINUTE, Cause, Evidence, LeakCourse, MethodResult
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.recording import Array, Recording
+
+if TYPE_CHECKING:
+    from sealscope.diagnosis.pressure_model.follow import Followed
+    from sealscope.parameters import Rig
+
+#: Shortest record [s], lowest rate [Hz] that shows the ringing, fewest blocks and fewest on either side of a step.
+SHORTEST, SLOWEST_RATE, FEWEST_BLOCKS, LEAST = 40.0, 250.0, 12, 3
+#: The model must explain this share of the pressure difference's variance.
+EXPLAINED = 0.9
+#: Scatter of the blocks beyond the wandering, as chi square over its degrees of freedom: three deviations above 1.
+UNRULY = 1.2
+#: A change of a parameter from the first to the last third that no healthy machine shows within a record, as a share.
+_OTHER_CAUSE = {"friction": 0.18, "stiffness": 0.15}
+_SEED = 20
+
+
+class PressureModel:
+    """Rise of the leakage conductance from p_A, p_B and the command u."""
+
+    name = "pressure model"
+    reads = ("u", "p_A", "p_B")
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+
+    def usable(self, recording: Recording) -> str | None:
+        missing = [name for name in (*CHAMBERS, "u") if name not in recording]
+        if missing:
+            return f"needs p_A, p_B and the command u, got no {' and no '.join(missing)}"
+        strange = [name for name in CHAMBERS if recording.units[name] != "Pa"]
+        if strange:
+            return f"needs pressures in a unit of pressure, got {recording.units[strange[0]]} for {strange[0]}"
+        if recording.units["u"] != "V":
+            return f"needs the command in V, got {recording.units['u']}"
+        if recording.rate < SLOWEST_RATE:
+            return f"needs a rate of {SLOWEST_RATE:g} Hz or more to see the ringing, got {recording.rate:g} Hz"
+        if recording.duration < SHORTEST:
+            return f"needs {SHORTEST:g} s or more, got {recording.duration:.4g} s"
+        for name in ("u", *CHAMBERS):
+            if np.ptp(recording[name]) == 0:
+                return f"{name} is constant"
+        return None
+
+    def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
+        followed = self._follow(recording)
+        if isinstance(followed, str):
+            return Evidence("cannot tell", followed)
+        probability = false_alarm_probability / (2.0 if baseline else 1.0)
+        within = _within(followed, recording, probability)
+        if not baseline:
+            return within
+        others = [remembered(other, self.name, self.rig, self._follow) for other in baseline]
+        known = [one for one in others if not isinstance(one, str)]
+        levels = [Level(one.level, one.level_deviation, one.command_rms) for one in known]
+        own = Level(followed.level, followed.level_deviation, followed.command_rms)
+        return against_levels(own, levels, within, probability, _mean_drop(recording))
+
+    def _follow(self, recording: Recording) -> Followed | str:
+        from sealscope.diagnosis.pressure_model.follow import follow
+
+        cycle = find_cycle(recording)
+        followed = follow(self.rig, recording["u"], recording["p_A"], recording["p_B"], recording.rate, cycle)
+        if followed is None:
+            return "the model of the rig cannot be fitted to the pressures"
+        if followed.explained < EXPLAINED:
+            return (
+                f"the model of the rig explains {100.0 * followed.explained:.0f} % of the pressure difference, "
+                f"{100.0 * EXPLAINED:.0f} % are needed; another --rig may describe this machine"
+            )
+        if followed.blocks < FEWEST_BLOCKS:
+            return f"too short: {followed.blocks} whole blocks of {followed.seconds:.3g} s, {FEWEST_BLOCKS} are needed"
+        return followed
+
+
+def _mean_drop(recording: Recording, since: float = -np.inf) -> float:
+    """Mean |p_A - p_B| [Pa] from an instant on."""
+    late = recording.t >= since
+    return float(np.mean(np.abs(recording["p_A"][late] - recording["p_B"][late])))
+
+
+def threshold_of(correlation: Array, probability: float) -> float:
+    """What the largest of standard normal z with this correlation exceeds with the stated probability."""
+    draws = int(np.clip(60.0 / probability, 6000, 200_000))
+    root = np.linalg.cholesky(correlation + 1e-9 * np.eye(len(correlation)))
+    random = np.random.default_rng(_SEED)
+    return float(upper_quantile((random.standard_normal((draws, len(root))) @ root.T).max(axis=1), probability))
+
+
+def _within(followed: Followed, recording: Recording, probability: float) -> Evidence:
+    """The evidence on a rise of G within the record."""
+    from sealscope.diagnosis.pressure_model.steps import excess_of
+
+    steps, begin = followed.steps, float(recording.t[0])
+    inner = slice(LEAST - 1, followed.blocks - LEAST)
+    z = steps.z[inner]
+    threshold = threshold_of(steps.correlation[inner, inner], probability)
+    best = int(np.argmax(z))
+    excess = excess_of(steps)
+    cause = _other_cause(followed)
+    if excess > UNRULY:
+        seen = {
+            None: "",
+            "friction change": f"; the friction changed by {100.0 * followed.friction_change:.0f} %",
+            "air in the oil": f"; the oil's stiffness changed by {100.0 * followed.stiffness_change:.0f} %",
+        }[cause]
+        return Evidence(
+            "cannot tell",
+            f"the model of the rig does not follow this record: its parameters wander {excess:.2f} times as much as "
+            f"those of a sound machine may, {UNRULY:g} are allowed{seen}",
+            cause=cause,
+        )
+    scatter = float(np.sqrt(max(1.0, excess)))
+    score = float(z[best]) / scatter
+    edges = begin + followed.edges / recording.rate
+    onset = float(edges[inner.start + 1 + best])
+    size, deviation = float(steps.size[inner][best]), scatter * float(steps.deviation[inner][best])
+    figures = f"z {score:.2f}, threshold {threshold:.2f}"
+    found = score > threshold
+    method = MethodResult("rise of G", score, threshold, "leak" if found else "no leak")
+    if not found:
+        words = {
+            None: f"no rise of the leakage conductance beyond its scatter ({figures}); a leak that was there from the "
+            f"start would need a --baseline to be seen",
+            "friction change": f"the friction changed, the leakage conductance did not ({figures})",
+            "air in the oil": f"the oil became softer, the leakage conductance did not change ({figures})",
+        }[cause]
+        return Evidence("no leak", words, score, threshold, methods=(method,), cause=cause)
+    near = np.flatnonzero(z * np.abs(z) >= z[best] ** 2 - scatter**2 * ONSET_CUT)
+    interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
+    lpm = _mean_drop(recording, onset) / LITRE_PER_MINUTE
+    reach = 1.96 * deviation
+    limits = max(0.0, (size - reach) * lpm), (size + reach) * lpm
+    course = LeakCourse(
+        0.5 * (edges[:-1] + edges[1:]),
+        *(np.where(edges[:-1] < onset, 0.0, value) for value in (size * lpm, *limits)),
+    )
+    reason = f"the leakage conductance past piston or pump rose at {onset:.1f} s ({figures})"
+    if cause is not None:
+        why = "the friction" if cause == "friction change" else "the oil's stiffness"
+        return Evidence(
+            "cannot tell",
+            f"{reason}, but {why} changed more than it does in a sound machine",
+            score,
+            threshold,
+            methods=(method,),
+            cause=cause,
+        )
+    return Evidence(
+        "leak",
+        reason,
+        score,
+        threshold,
+        onset,
+        interval,
+        size * lpm,
+        limits,
+        methods=(method,),
+        cause="piston or pump leak",
+        course=course,
+    )
+
+
+def _other_cause(followed: Followed) -> Cause | None:
+    """What else changed more than a sound machine's drift, or None."""
+    if abs(followed.friction_change) > _OTHER_CAUSE["friction"]:
+        return "friction change"
+    if followed.stiffness_change < -_OTHER_CAUSE["stiffness"]:
+        return "air in the oil"
+    return None

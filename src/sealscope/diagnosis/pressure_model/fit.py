@@ -1,0 +1,250 @@
+"""The reduced rig fitted to a recorded pressure difference: where all later linearisation starts from.
+
+The fit is a maximum a posteriori estimate: least squares over a window of the record beside a wide normal prior around
+the numbers of a rig that is assumed. The ringing after each reversal makes many local minima (a ring too many or too
+few fits nearly as well), so the way there has three stages: gain, lead and friction from the slow part of the pressure,
+which has one minimum; the oil's stiffness from starts all over its range; then all parameters together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealscope.diagnosis.pressure_model.duty import SLOW_WIDTH, Duty, differences, gaussian
+from sealscope.diagnosis.pressure_model.laws import (
+    BIAS,
+    C_C,
+    F_C,
+    F_CFR,
+    F_V,
+    GAIN,
+    K_BRK,
+    LEAD,
+    OFFSET,
+    PARAMETERS,
+    STATES,
+    STROKE,
+    G,
+    K,
+    Machine,
+)
+from sealscope.recordings.recording import Array
+
+#: Prior standard deviations: of the logarithm of gain, K, F_C, F_v, K_brk, C_c and F_cfr; of lead [s], G [m^3/(s Pa)],
+#: the stroke's share and offset.
+PRIOR = {GAIN: 1.0, K: 0.3, F_C: 0.3, F_V: 0.3, K_BRK: 0.3, C_C: 0.3, F_CFR: 0.5}
+PRIOR_LEAD, PRIOR_G, PRIOR_STROKE, PRIOR_OFFSET = 5e-4, 1.2e-12, 0.5, 0.2
+#: How far friction may depend on the pressures where a rig knows nothing of it [N/Pa].
+LEAST_F_CFR = 5e-7
+#: What the pump alone may let pass where a rig knows nothing of it [m^3/(s Pa)].
+USUAL_G = 4e-13
+#: Length of the window, and of a shorter one for the starts: so many cycles, at least and at most so many seconds.
+LONG_WINDOW, SHORT_WINDOW = (12.0, 40.0, 75.0), (5.0, 18.0, 32.0)
+#: What the model needs to settle before the window [s].
+SETTLE = 0.8
+_GAINS = np.geomspace(0.35, 3.5, 11)
+_STIFFNESSES = np.geomspace(0.62, 1.4, 8)
+#: Weight of the slow part: its samples hang together over some 30.
+_SLOW_WEIGHT = 1.0 / 30.0
+#: Dampings tried from one start, and from each of several.
+_DAMPINGS = (0.0, 1e-3, 1e-2, 0.03, 0.1, 1.0, 10.0, 100.0)
+_FEWER_DAMPINGS = (0.0, 1e-2, 0.3, 10.0)
+#: A stroke is long that takes away this share of V.
+_LONG_STROKE = 0.25
+#: What the stiffness of a machine with long strokes may do: share that follows the stroke, offset of mid-stroke.
+_STROKES = ((0.0, 0.0), (1.0, -0.3), (1.0, -0.15), (1.0, 0.0), (1.0, 0.15), (1.0, 0.3))
+#: Starts are gone on with whose cost after the first turns is this near to the least; fits are the same minimum within
+#: this share of stiffness.
+_NEAR, _SAME = 50.0, 0.01
+
+
+def steps_of(theta: Array) -> Array:
+    """Steps (12,) of the forward differences, small against what the data can tell and large against rounding."""
+    return np.array(
+        [
+            1e-3 * theta[GAIN],
+            2e-5,
+            1e-3 * abs(theta[GAIN]),
+            5e-4 * theta[K],
+            2e-14,
+            1e-3 * theta[F_C] + 0.01,
+            1e-3 * abs(theta[F_V]) + 0.1,
+            1e-3 * theta[K_BRK],
+            3e-3 * theta[C_C] + 1e-3,
+            2e-8,
+            2e-3,
+            1e-3,
+        ]
+    )
+
+
+def _sound(theta: Array) -> bool:
+    return bool(
+        np.all(np.isfinite(theta)) and min(theta[GAIN], theta[K], theta[F_C], theta[C_C]) > 0.0 and theta[K_BRK] > 1.0
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A stretch of the record to fit: dp (n,) [Pa] after `settle` samples of command alone, the speed loop's integral
+    over the gain at its beginning, noise variance [Pa^2] of a sample; `width` > 0: samples of the Gaussian that takes
+    the ringing out."""
+
+    duty: Duty
+    dp: Array
+    settle: int
+    integral: float
+    variance: float
+    machine: Machine
+    width: float = 0.0
+
+    def slow(self, dp: Array) -> Array:
+        """The slow part of dp (..., n), its mean taken out."""
+        if self.width > 0:
+            dp = np.apply_along_axis(np.convolve, -1, dp, gaussian(self.width), "valid")
+        return np.asarray(dp - dp.mean(axis=-1, keepdims=True))
+
+    def runs(self, thetas: Array) -> Array:
+        """What the model shows in the window for parameter sets (runs, 12), as `slow` leaves it."""
+        start = np.zeros((len(thetas), STATES))
+        start[:, 4] = self.integral * thetas[:, GAIN]
+        start[:, 2] = 0.9 * self.duty.u[0] * thetas[:, GAIN]
+        start[:, 1] = start[:, 2] * self.machine.q_b / (2.0 * np.pi) / self.machine.A
+        return self.slow(differences(self.duty, thetas, self.machine, start=start)[:, self.settle :])
+
+    @property
+    def weight(self) -> float:
+        """What a squared Pa of misfit costs."""
+        return (_SLOW_WEIGHT if self.width > 0 else 1.0) / self.variance
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A normal prior: centre and standard deviation (12,) of each parameter."""
+
+    centre: Array
+    deviation: Array
+
+    def cost(self, theta: Array, free: Sequence[int]) -> float:
+        """Minus twice its logarithm, but for a constant."""
+        off = (theta - self.centre)[list(free)] / self.deviation[list(free)]
+        return float(off @ off)
+
+
+def prior_of(centre: Array) -> Prior:
+    """How far a machine may be from the rig that is assumed of it."""
+    deviation = np.array([PRIOR.get(k, 0.0) * centre[k] for k in range(len(PARAMETERS))])
+    deviation[LEAD], deviation[G], deviation[BIAS] = PRIOR_LEAD, PRIOR_G, 0.1 * centre[GAIN]
+    deviation[STROKE], deviation[OFFSET] = PRIOR_STROKE, PRIOR_OFFSET
+    deviation[F_CFR] = max(deviation[F_CFR], LEAST_F_CFR)
+    return Prior(centre, deviation)
+
+
+def _fit(
+    window: Window, thetas: Array, prior: Prior, free: Sequence[int], most: int, enough: float
+) -> tuple[Array, Array]:
+    """Levenberg-Marquardt over the free parameters from several starts (m, 12) side by side: the sets that are reached,
+    cheapest first, and their costs (m,); `enough`: gain of cost to go on for."""
+    free = list(free)
+    data = window.slow(window.dp)
+    thetas = thetas.copy()
+    shown = window.runs(thetas)
+
+    def cost_of(here: Array, at: Array) -> float:
+        misfit = window.weight * float(np.sum((data - here) ** 2)) + prior.cost(at, free)
+        return misfit if np.isfinite(misfit) else np.inf
+
+    costs = np.array([cost_of(here, at) for here, at in zip(shown, thetas, strict=True)])
+    active = list(np.flatnonzero(np.isfinite(costs)))
+    for _ in range(most):
+        if not active:
+            break
+        # slopes of all starts, and then all their tries, fill the vector registers together
+        dampings = _DAMPINGS if len(active) == 1 else _FEWER_DAMPINGS
+        h = np.array([steps_of(thetas[one]) for one in active])[:, free]
+        sets = np.repeat(thetas[active], len(free), axis=0).reshape(len(active), len(free), -1)
+        sets[:, range(len(free)), free] += h
+        moved = window.runs(sets.reshape(-1, thetas.shape[1])).reshape(len(active), len(free), -1)
+        tries = np.repeat(thetas[active], len(dampings), axis=0).reshape(len(active), len(dampings), -1)
+        for row, one in enumerate(active):
+            slopes = moved[row] - shown[one]
+            scale = h[row] / prior.deviation[free]
+            off = (thetas[one] - prior.centre)[free] / prior.deviation[free]
+            H = window.weight * (slopes @ slopes.T) + np.diag(scale**2)
+            g = window.weight * (slopes @ (data - shown[one])) - off * scale
+            for k, factor in enumerate(dampings):
+                if np.all(np.isfinite(H)):
+                    tries[row, k, free] += np.linalg.solve(H + factor * np.diag(np.diag(H)), g) * h[row]
+                if not _sound(tries[row, k]):
+                    tries[row, k] = thetas[one]
+        tried = window.runs(tries.reshape(-1, thetas.shape[1])).reshape(len(active), len(dampings), -1)
+        going = []
+        for row, one in enumerate(active):
+            reached = [cost_of(here, at) for here, at in zip(tried[row], tries[row], strict=True)]
+            best = int(np.argmin(reached))
+            gained = costs[one] - reached[best]
+            if gained > 0.0:
+                thetas[one], costs[one], shown[one] = tries[row, best], reached[best], tried[row, best]
+            if gained >= enough:
+                going.append(one)
+        active = going
+    order = np.argsort(costs, kind="stable")
+    return thetas[order], costs[order]
+
+
+def first_guess(short: Window, prior: Prior) -> Array:
+    """Parameters (12,) of which gain, lead, bias and friction fit the slow part of the pressure, the others the
+    prior's."""
+    centre = prior.centre
+    slow = Window(
+        short.duty, short.dp, short.settle, short.integral, short.variance, short.machine, SLOW_WIDTH * _rate(short)
+    )
+    starts = np.tile(centre, (_GAINS.size, 1))
+    starts[:, GAIN] *= _GAINS
+    data = slow.slow(slow.dp)
+    misfit = np.sum((slow.runs(starts) - data) ** 2, axis=1)
+    slowly = (GAIN, LEAD, BIAS, F_C, F_V, K_BRK)
+    found, _ = _fit(slow, starts[[int(np.nanargmin(misfit))]], prior, slowly, 12, 1e-2)
+    return np.asarray(found[0])
+
+
+def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Array, float, list[Array]]:
+    """The parameters (12,) of the best fit, its cost per sample, and other starts for a record that this one does not
+    lead through; `short`: part of the window, for the many starts about the first `guess`."""
+    centre = prior.centre
+    long = float(np.max(np.abs(short.duty.travel))) > _LONG_STROKE
+    starts = np.tile(guess, (_STIFFNESSES.size, 1))
+    starts[:, K] = centre[K] * _STIFFNESSES
+    if long:
+        # the stiffness may follow long strokes or not, and mid-stroke may lie anywhere: the two likeliest ways of each
+        starts = np.repeat(starts, len(_STROKES), axis=0)
+        starts[:, [STROKE, OFFSET]] = np.tile(_STROKES, (_STIFFNESSES.size, 1))
+        misfit = np.sum((short.runs(starts) - short.slow(short.dp)) ** 2, axis=1).reshape(_STIFFNESSES.size, -1)
+        likely = (
+            np.argsort(misfit, axis=1, kind="stable")[:, :2] + len(_STROKES) * np.arange(_STIFFNESSES.size)[:, None]
+        )
+        starts = starts[likely.reshape(-1)]
+    starts, costs = _fit(short, starts, prior, (GAIN, LEAD, K, G, F_V, *((OFFSET,) if long else ())), 3, 3.0)
+    everything = range(len(PARAMETERS))
+    tried, _ = _fit(short, starts[costs <= costs[0] + _NEAR], prior, everything, 8, 1.0)
+    other = next((k for k in range(1, len(tried)) if abs(tried[k, K] / tried[0, K] - 1.0) > _SAME), None)
+    finalists, _ = _fit(window, tried[[0] if other is None else [0, other]], prior, everything, 4, 1.0)
+    (theta, *_), costs = _fit(window, finalists[:1], prior, everything, 20, 0.1)
+    plain = theta.copy()
+    plain[[LEAD, BIAS]] = 0.0
+    plain[[G, F_C, F_V, K_BRK, C_C, F_CFR]] = centre[[G, F_C, F_V, K_BRK, C_C, F_CFR]]
+    return theta, float(costs[0]) / window.dp.size, [*finalists[1:], plain]
+
+
+def refit(window: Window, start: Array, prior: Prior) -> tuple[Array, float]:
+    """The best fit that is reached from another start, and its cost per sample."""
+    found, _ = _fit(window, start[None], prior, (GAIN, K), 6, 1.0)
+    found, costs = _fit(window, found, prior, range(len(PARAMETERS)), 20, 0.1)
+    return found[0], float(costs[0]) / window.dp.size
+
+
+def _rate(window: Window) -> float:
+    return 1.0 / (window.duty.h * window.duty.every)

@@ -1,0 +1,272 @@
+"""The fitted parameters followed through a record, block by block.
+
+In every block the model is linear about the block's own parameters: its information matrix N_b and right side r_b come
+from the slopes of dp. The parameters theta_b wander from block to block (a random walk, each with a strength that
+machines have), so that the whole record is one normal model with precision matrix Lambda (block tridiagonal).
+Source: A. C. Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, ch. 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.pressure_model.duty import Duty, differences
+from sealscope.diagnosis.pressure_model.fit import steps_of
+from sealscope.diagnosis.pressure_model.laws import (
+    BIAS,
+    C_C,
+    F_C,
+    F_CFR,
+    F_V,
+    GAIN,
+    K_BRK,
+    LEAD,
+    OFFSET,
+    PARAMETERS,
+    STROKE,
+    G,
+    K,
+    Machine,
+)
+from sealscope.recordings.recording import Array
+
+#: How far each parameter may wander in 90 s (standard deviation): shares of its value, lead in s, G in m^3/(s Pa).
+WANDER = {GAIN: 2e-3, K: 0.03, F_C: 0.06, F_V: 0.06, K_BRK: 0.02, C_C: 0.02}
+WANDER_REST = {LEAD: 1e-4, G: 3e-14, F_CFR: 2e-8, STROKE: 0.02, OFFSET: 0.05}
+_WANDER_SECONDS = 90.0
+#: The bias of the speed settles within a minute of a start: this share of the command's speed in 6 s.
+_WANDER_BIAS = 0.003
+#: Where the record's mean parameters may be, around the first fit (standard deviations as above).
+ANCHOR = {GAIN: 0.02, K: 0.1, F_C: 0.1, F_V: 0.15, K_BRK: 0.1, C_C: 0.15}
+ANCHOR_REST = {LEAD: 5e-4, G: 1.5e-12, F_CFR: 5e-7, STROKE: 0.3, OFFSET: 0.2}
+_PASSES = 10
+#: Blocks are stuck beside the way whose residual is by so many of its deviations larger than the others', or before or
+#: after which the stiffness leaps by so many deviations of its walk: they are set between their neighbours, at one of
+#: these biases of the speed, in units of the bias's own wandering, and followed once more.
+_STUCK, _LEAPS, _BIASES = 3.0, 1.7, np.array([0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, 2.0])
+#: A jump: so many times the wandering from block to block.
+_LEAP = 50.0
+#: Shares of a Gauss-Newton step that are tried side by side, and the fall of the cost to go on for.
+_SHARES = np.array([1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 1.4])
+_ENOUGH = 1.0
+#: How far the parameters may wander in the first passes, times the usual: the record's mean comes first, so that what
+#: is left to find in a block is small and the model is linear over it.
+_LEASHES = (0.1, 0.3, 1.0)
+_CONSTANT = len(PARAMETERS)
+SIZE = _CONSTANT + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A record followed: blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 12) about which the model is
+    linear; `N` (b, p, p), `r` (b, p) information in units of `units` (p,), the last a constant of dp; `variance`
+    [Pa^2] of the residual and of each block's (b,)."""
+
+    edges: NDArray[np.int64]
+    path: Array
+    N: Array
+    r: Array
+    units: Array
+    variance: float
+    block_variance: Array
+    anchor: Array
+    seconds: float
+
+
+def _deviations(theta: Array, shares: dict[int, float], rest: dict[int, float]) -> Array:
+    return np.array([shares.get(k, 0.0) * abs(theta[k]) + rest.get(k, 0.0) for k in range(len(PARAMETERS))])
+
+
+def wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
+    """Standard deviation (p,) of the walk from block to block, in `units`."""
+    walk = _deviations(theta, WANDER, WANDER_REST)
+    walk *= np.sqrt(seconds / _WANDER_SECONDS)
+    walk[BIAS] = _WANDER_BIAS * speed * np.sqrt(seconds / 6.0)
+    return np.append(walk, 1500.0 * np.sqrt(seconds / _WANDER_SECONDS)) / units
+
+
+def _anchor(theta: Array, units: Array) -> Array:
+    """Weight (p,) of the first fit on the record's mean parameters."""
+    deviation = _deviations(theta, ANCHOR, ANCHOR_REST)
+    weight = np.zeros(SIZE)
+    known = deviation > 0
+    weight[:_CONSTANT][known] = (units[:_CONSTANT][known] / deviation[known]) ** 2
+    return weight
+
+
+def precision(N: Array, walk: Array, anchor: Array) -> Array:
+    """Lambda (b p, b p) of all blocks' parameters; `walk` (b - 1, p) from each block to the next."""
+    blocks, p, _ = N.shape
+    found = np.zeros((blocks, p, blocks, p))
+    for b in range(blocks):
+        found[b, :, b] += N[b]
+        if b:
+            steps = np.diag(1.0 / walk[b - 1] ** 2)
+            found[b, :, b] += steps
+            found[b - 1, :, b - 1] += steps
+            found[b - 1, :, b] -= steps
+            found[b, :, b - 1] -= steps
+    for k in np.flatnonzero(anchor > 0):
+        found[:, k, :, k] += anchor[k] / blocks**2
+    found[0, range(p), 0, range(p)] += 1e-10 * np.diagonal(N[0])
+    return found.reshape(blocks * p, blocks * p)
+
+
+def right_sides(r: Array, anchor: Array, centre: Array) -> Array:
+    """Right sides (b, p) of the blocks with the first fit's weight `anchor` (p,) on `centre` (p,) in them."""
+    return r + anchor * centre / len(r)
+
+
+def track(
+    duty: Duty,
+    dp: Array,
+    edges: NDArray[np.int64],
+    theta: Array,
+    machine: Machine,
+    start: Array,
+    skip: int,
+    rate: float,
+    jumps: Array | None = None,
+    from_path: Array | None = None,
+) -> Track:
+    """Follow the parameters from the first fit `theta` (12,) through blocks between `edges` of the whole record.
+
+    `start` (5,): the model's state at the first sample; `jumps` (b - 1, p): how many times farther than usual each
+    parameter may go from a block to the next; `from_path` (b, 12): where to begin, the first fit by default. Blocks are
+    linearised about their own parameters, until these stand still; the trend of the speed's bias within a block is
+    eliminated.
+    """
+    blocks = edges.size - 1
+    n = dp.size
+    segment = np.clip(np.searchsorted(edges, np.arange(n), side="right") - 1, 0, blocks - 1).astype(np.int64)
+    h = steps_of(theta)
+    units = np.append(h, 1.0)
+    seconds = float(np.median(np.diff(edges))) / rate
+    speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(duty.u))
+    walk = np.tile(wander(theta, units, seconds, speed), (blocks - 1, 1))
+    if jumps is not None:
+        walk *= jumps
+    anchor = _anchor(theta, units)
+    leashes = _LEASHES if from_path is None else _LEASHES[-1:]
+    centre = np.append(theta / h, 0.0)
+    path = np.tile(theta, (blocks, 1)) if from_path is None else from_path
+    limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
+
+    def misfits(shown: Array) -> Array:
+        return np.array([here.size * np.var(here) for here in (dp[one] - shown[one] for one in limits)])
+
+    def strain(at: Array, walk: Array) -> float:
+        steps = np.diff(at, axis=0) / h / walk[:, :-1]
+        off = at.mean(axis=0) / h - centre[:-1]
+        return float(np.sum(steps**2)) + float(anchor[:-1] @ off**2)
+
+    def freed(path: Array, stuck: NDArray[np.bool_]) -> Array:
+        """The path with stuck blocks set between their neighbours, at the speed's bias that suits each best."""
+        at, sound = np.arange(blocks), np.flatnonzero(np.logical_not(stuck))
+        between = np.column_stack([np.interp(at, sound, path[sound, k]) for k in range(_CONSTANT)])
+        tries = np.tile(between, (_BIASES.size, 1, 1))
+        tries[:, :, BIAS] += _BIASES[:, None] * _WANDER_BIAS * speed
+        seen = differences(duty, tries, machine, segment, np.tile(start, (_BIASES.size, 1)))
+        best = np.argmin([misfits(one) for one in seen], axis=0)
+        return np.where(stuck[:, None], tries[best, at], path)
+
+    before: tuple[float, float, Track] | None = None
+    last = _PASSES
+    number = 0
+    while True:
+        sets = np.tile(path, (_CONSTANT + 1, 1, 1))
+        for k in range(_CONSTANT):
+            sets[k + 1, :, k] += h[k]
+        shown = differences(duty, sets, machine, segment, np.tile(start, (_CONSTANT + 1, 1)))
+        N, r, squares, counts = _normal(dp, shown, limits, path / h)
+        variance = float(squares.sum() / counts.sum())
+        found = Track(
+            edges,
+            path,
+            N / variance,
+            r / variance,
+            units,
+            variance,
+            squares / counts,
+            np.concatenate([anchor, centre]),
+            seconds,
+        )
+        allowed = leashes[min(number, len(leashes) - 1)] * walk
+        solved = np.linalg.solve(precision(found.N, allowed, anchor), right_sides(found.r, anchor, centre).reshape(-1))
+        fresh = _held(solved.reshape(blocks, SIZE)[:, :_CONSTANT] * h, theta)
+        tries = path + _SHARES[:, None, None] * (fresh - path)
+        seen = differences(duty, tries, machine, segment, np.tile(start, (_SHARES.size, 1)))
+        apart = np.array([misfits(one).sum() for one in seen])
+        costs = apart / variance + np.array([strain(at, allowed) for at in tries])
+        best = int(np.nanargmin(costs))
+        gained = float(misfits(shown[0]).sum()) / variance + strain(path, allowed) - costs[best]
+        if gained > 0.0:
+            path = tries[best]
+        number += 1
+        if number < len(leashes) or (gained > _ENOUGH and number < last):
+            continue
+        if before is not None:
+            return before[2] if before[0] / variance + before[1] < costs[best] else found
+        stuck = _stuck(found, counts, walk if jumps is None else None)
+        if not np.any(stuck) or np.all(stuck):
+            return found
+        before = float(apart[best]), strain(tries[best], allowed), found
+        path = freed(path, stuck)
+        last = number + _PASSES
+
+
+def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Array, Array, Array]:
+    """Of each block between `limits`: N (b, p, p) and r (b, p) of the model that is linear about `at` (b, 12) [units],
+    the sum of squares (b,) that no parameters explain, and its degrees of freedom (b,).
+
+    `shown` (13, n): the model there, and a unit more of each parameter. The trend of the speed's bias is eliminated.
+    """
+    blocks = len(limits)
+    N, r = np.empty((blocks, SIZE, SIZE)), np.empty((blocks, SIZE))
+    squares, counts = np.empty(blocks), np.empty(blocks)
+    for b, here in enumerate(limits):
+        slopes = shown[1:, here] - shown[0, here]
+        count = slopes.shape[1]
+        ramp = slopes[BIAS] * np.linspace(-1.0, 1.0, count)
+        X = np.vstack([slopes, np.ones(count), ramp])
+        rest = dp[here] - shown[0, here]
+        H, g = X @ X.T, X @ rest
+        lost = H[:-1, -1] / H[-1, -1]
+        H, g, gone = H[:-1, :-1] - np.outer(lost, H[:-1, -1]), g[:-1] - lost * g[-1], g[-1] ** 2 / H[-1, -1]
+        squares[b] = float(rest @ rest - gone - g @ np.linalg.lstsq(H, g, rcond=1e-12)[0])
+        counts[b] = count - SIZE - 1
+        N[b], r[b] = H, g + H @ np.append(at[b], 0.0)
+    return N, r, squares, counts
+
+
+def _stuck(found: Track, counts: Array, walk: Array | None) -> NDArray[np.bool_]:
+    """Blocks (b,) that turns of Gauss and Newton left beside the way: their residual is larger than that of the others,
+    or the stiffness leaps, and then those on the shorter side of the leap; `walk` (b - 1, p) [units]: None where leaps
+    are allowed."""
+    here = found.block_variance
+    stuck = here > np.median(here) * (1.0 + _STUCK * np.sqrt(2.0 / counts))
+    if walk is not None:
+        leaps = np.abs(np.diff(found.path[:, K])) / found.units[K] / walk[:, K]
+        after = int(np.argmax(leaps)) + 1
+        if leaps[after - 1] > _LEAPS:
+            stuck[after if 2 * after >= here.size else 0 : None if 2 * after >= here.size else after] = True
+    return np.asarray(stuck)
+
+
+def leap(blocks: int, after: int, *parameters: int) -> Array:
+    """What lets some parameters jump after a block: factors (b - 1, p) on the walk."""
+    factors = np.ones((blocks - 1, SIZE))
+    factors[after, list(parameters)] = _LEAP
+    return factors
+
+
+def _held(path: Array, theta: Array) -> Array:
+    """The path within what the laws can be evaluated for."""
+    for k in (GAIN, K, F_C, C_C):
+        path[:, k] = np.clip(path[:, k], 0.3 * theta[k], 3.0 * theta[k])
+    path[:, K_BRK] = np.maximum(path[:, K_BRK], 1.05)
+    return path

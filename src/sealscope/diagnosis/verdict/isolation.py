@@ -1,0 +1,285 @@
+"""What else than a leak stepped where a detector dates one: duty, a sensor, friction, the oil, its amount.
+
+A leak across the piston damps the ringing of the pressures. It moves neither chamber's mean over a cycle, nor the mean
+pressure difference of the strokes (friction sets it), nor the ringing's frequency, and never the command. Each of these
+is followed over whole cycles; one that steps at the instant of the alarm, by more than sound machines and leaks show,
+is the likelier cause. A detector that sees the pressures as a whole cannot say so itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.recording import Array, Recording
+
+#: A block is whole cycles of about so long [s]; where the pressures are looked at as they swing, means are taken over
+#: so long first, which takes the ringing out.
+BLOCK_SECONDS, SMOOTH_SECONDS = 3.0, 0.016
+#: Time on either side of the alarm that is compared, how far from the alarm the step may lie [s], fewest blocks a side.
+REACH, NEAR, FEWEST = 60.0, 10.0, 4
+#: A step must be so many times its deviation from the scatter of the blocks about an even drift.
+SURE = 4.5
+#: Steps that matter. Of the command's rms and rate, as logarithms; of the mean pressure difference of the strokes, as a
+#: logarithm; of a chamber's mean, over that mean difference.
+DUTY, FRICTION, MEAN = 0.02, 0.08, 0.04
+#: Both means fall by at least this, over that mean difference, where oil is lost.
+LOST = 0.05
+#: One chamber's mean moves alone where the other moves by less than this share of it, both move alike above that one.
+ALONE, ALIKE = 0.3, 0.6
+#: A band of half an octave that gains this factor in power while the ringing's frequency falls by this share: the
+#: ringing moved there. A leak takes power.
+GAIN, FALL = 4.0, 0.15
+#: ... and by this factor more where no detector saw a change.
+UNASKED = 1.5
+#: The ringing is looked for from here [Hz] up to a share of the rate; the top of the spectrum is noise.
+LOWEST, HIGHEST, NOISE = 16.0, 0.36, 0.38
+#: Fewest samples of a block.
+_SHORTEST = 64
+
+
+@dataclass(frozen=True)
+class OtherCause:
+    """What stepped, and in words by how much."""
+
+    cause: Cause
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
+class Signatures:
+    """A recording over n blocks of whole cycles: `t` (n,) middles [s]; `half` [s] half a block; `mean` (n, 2) of p_A
+    and p_B, `swing` (n,) log of the mean |p_A - p_B| about its mean, the ringing averaged out; `duty` (n, 2) log of the
+    command's rms and of its derivative's over it, None without a command; `power` (n, b) of p_A - p_B in bands about
+    `frequency` (b,) [Hz]; `noise` (n,) power of its noise in one line of the spectrum, `lines` (b,) of each band."""
+
+    t: Array
+    half: float
+    mean: Array
+    swing: Array
+    duty: Array | None
+    power: Array
+    frequency: Array
+    noise: Array
+    lines: Array
+
+
+def signatures(recording: Recording) -> Signatures | None:
+    """The signatures of a recording; None without both chamber pressures or where it is too short for a step."""
+    if any(name not in recording for name in CHAMBERS) or len(recording) < 2 * FEWEST * _SHORTEST:
+        return None
+    rate = recording.rate
+    cycle = find_cycle(recording) or BLOCK_SECONDS
+    length = round(cycle * max(1, round(BLOCK_SECONDS / cycle)) * rate)
+    count = len(recording) // max(length, 1)
+    if count < 2 * FEWEST or length < _SHORTEST:
+        return None
+
+    def rows(values: Array) -> Array:
+        return np.asarray(values[: count * length], dtype=np.float64).reshape(count, length)
+
+    p_A, p_B = (rows(recording[name]) for name in CHAMBERS)
+    dp = p_A - p_B
+    mean = np.stack([p_A.mean(axis=1), p_B.mean(axis=1)], axis=1)
+    dp = dp - dp.mean(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        swing: Array = np.log(np.abs(_smooth(dp, rate)).mean(axis=1))
+        duty: Array | None = None
+        if "u" in recording:
+            u = _smooth(rows(recording["u"]), rate)
+            size = u.std(axis=1)
+            duty = np.log(np.stack([size, np.diff(u, axis=1).std(axis=1) / size], axis=1))
+    power, frequency, noise, lines = _bands(dp, rate)
+    t = np.asarray(float(recording.t[0]) + (np.arange(count) + 0.5) * length / rate, dtype=np.float64)
+    return Signatures(t, 0.5 * length / rate, mean, swing, duty, power, frequency, noise, lines)
+
+
+def _smooth(rows: Array, rate: float) -> Array:
+    """Means over `SMOOTH_SECONDS` along each row."""
+    every = max(1, round(SMOOTH_SECONDS * rate))
+    whole = rows.shape[1] // every * every
+    return np.asarray(rows[:, :whole].reshape(len(rows), -1, every).mean(axis=2))
+
+
+def _bands(dp: Array, rate: float) -> tuple[Array, Array, Array, Array]:
+    """Power (n, b) in bands of half an octave, their middles (b,) [Hz], power (n,) of the noise in a line of the
+    spectrum, and the lines (b,) of each band."""
+    length = dp.shape[1]
+    spectrum = np.abs(np.fft.rfft(dp * np.hanning(length), axis=1)) ** 2
+    f = np.fft.rfftfreq(length, 1.0 / rate)
+    edges = LOWEST * 2.0 ** (0.5 * np.arange(max(2, 1 + int(2.0 * math.log2(max(HIGHEST * rate / LOWEST, 1.5))))))
+    of = np.searchsorted(edges, f, side="right") - 1
+    power = np.stack([spectrum[:, of == k].sum(axis=1) for k in range(edges.size - 1)], axis=1)
+    lines = np.array([np.count_nonzero(of == k) for k in range(edges.size - 1)], dtype=np.float64)
+    noise = np.median(spectrum[:, f > NOISE * rate], axis=1) / math.log(2.0)  # exponential: mean = median/ln 2
+    return power, edges[:-1] * 2.0**0.25, noise, lines
+
+
+def other_cause(seen: Signatures, onset_s: float, strict: float = 1.0) -> OtherCause | None:
+    """What else stepped near `onset_s` [s], the most certain first; None where nothing did.
+
+    `strict`: factor on what a step must be over its deviation, and over what sound machines show.
+    """
+    for look in (_duty, _sensor, _air, _friction, _lost):
+        found = look(seen, onset_s, strict)
+        if found is not None:
+            return found
+    return None
+
+
+def unasked(seen: Signatures) -> tuple[float, OtherCause] | None:
+    """What stepped anywhere in the recording, and about when [s], where no detector dates a change: by stricter limits,
+    since it is looked for at many instants; None where nothing did."""
+    for at in np.arange(float(seen.t[0]) + NEAR, float(seen.t[-1]), 1.5 * NEAR):
+        found = other_cause(seen, float(at), UNASKED)
+        if found is not None:
+            return float(at), found
+    return None
+
+
+def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
+    """The evidence of a leak as `cannot tell` with another cause, where one stepped at its onset; else as it is."""
+    if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS) or evidence.onset_s is None:
+        return evidence
+    found = other_cause(seen, evidence.onset_s)
+    if found is None:
+        return evidence
+    return replace(
+        evidence,
+        verdict="cannot tell",
+        reason=f"{evidence.reason}; but {found.words}: {found.cause}, which may be all of it",
+        leak_lpm=None,
+        leak_interval_lpm=None,
+        cause=found.cause,
+        course=None,
+    )
+
+
+def _step(seen: Signatures, values: Array, onset: float) -> tuple[float, float]:
+    """The surest step of `values` (n,) at an edge of blocks near the onset, beside an even drift: its size, and over
+    its deviation; (0, 0) where there is no room for one."""
+    best = (0.0, 0.0)
+    near = max(NEAR, 2.0 * seen.half)
+    first, last = np.searchsorted(seen.t, [onset - REACH - near, onset + REACH + near])
+    t, values = seen.t[first:last], values[first:last]
+    edges = t[:-1] + seen.half
+    close = edges[np.abs(edges - onset) <= near]
+    # the block that the onset falls into belongs to neither side
+    whole = np.isfinite(values) & (np.abs(t - onset) >= seen.half)
+    for at in close:
+        within = whole & (np.abs(t - at) < REACH)
+        after = within & (t > at)
+        if min(np.count_nonzero(after), np.count_nonzero(within & ~after)) < FEWEST:
+            continue
+        x = np.stack([np.ones(within.sum()), t[within] - at, after[within].astype(np.float64)], axis=1)
+        inverse = np.linalg.inv(x.T @ x)
+        beta = inverse @ (x.T @ values[within])
+        rest = values[within] - x @ beta
+        scatter = math.sqrt(float(rest @ rest) / (rest.size - 3) * float(inverse[2, 2]))
+        size = float(beta[2])
+        surely = size / max(scatter, 1e-12 * (1.0 + abs(size)))
+        if abs(surely) > abs(best[1]):
+            best = (size, surely)
+    return best
+
+
+def _duty(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
+    if seen.duty is None:
+        return None
+    for values, what in zip(seen.duty.T, ("size", "rate"), strict=True):
+        size, surely = _step(seen, values, onset)
+        if abs(size) > strict * DUTY and abs(surely) > strict * SURE:
+            return OtherCause("changed duty", f"the command changed, its {what} by {math.expm1(size):+.1%}")
+    return None
+
+
+def _sensor(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
+    scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
+    size, surely = np.array([_step(seen, values / scale, onset) for values in seen.mean.T]).T
+    one = int(np.argmax(np.abs(size)))
+    if abs(size[one]) < strict * MEAN or abs(surely[one]) < strict * SURE:
+        return None
+    if abs(size[1 - one]) > ALONE * abs(size[one]):
+        return None
+    return OtherCause(
+        "sensor fault",
+        f"the mean of {CHAMBERS[one]} alone steps by {size[one]:+.1%} of the strokes' pressure difference, which "
+        "a piston that floats between both chambers does not allow",
+    )
+
+
+def _air(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = [_step(seen, np.log(values), onset) for values in seen.power.T]
+    most = max(range(len(steps)), key=lambda k: steps[k][0])
+    size, surely = steps[most]
+    if size < strict * math.log(GAIN) or surely < strict * SURE:
+        return None
+    away = np.abs(seen.t - onset)
+    near = (away < REACH) & (away > seen.half)
+    before, after = _ringing(seen, near & (seen.t < onset)), _ringing(seen, near & (seen.t > onset))
+    if not after < (1.0 - FALL) * before:
+        return None
+    return OtherCause(
+        "air in the oil",
+        f"the ringing falls from about {before:.0f} to {after:.0f} Hz, with {math.exp(size):.1f} times the power "
+        f"near {seen.frequency[most]:.0f} Hz, so the oil became softer",
+    )
+
+
+def _ringing(seen: Signatures, blocks: NDArray[np.bool_]) -> float:
+    """Mean frequency [Hz] of the ringing in these blocks: of the power beyond the noise times f^2, which makes the
+    overtones of the strokes (power as 1/f^2) even."""
+    beyond = np.median(seen.power[blocks] - seen.noise[blocks, None] * seen.lines, axis=0)
+    weight = np.maximum(beyond, 0.0) * seen.frequency**2
+    if not weight.sum() > 0:
+        return math.nan
+    return float(np.exp(weight @ np.log(seen.frequency) / weight.sum()))
+
+
+def _friction(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
+    size, surely = _step(seen, seen.swing, onset)
+    if abs(size) < strict * FRICTION or abs(surely) < strict * SURE:
+        return None
+    return OtherCause(
+        "friction change",
+        f"the mean pressure difference of the strokes steps by {math.expm1(size):+.1%}, which friction sets",
+    )
+
+
+def _lost(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
+    """Oil lost to the outside: both chambers' means fall away from the line they were on, under all they were before;
+    they need not step, since a make-up may hold them for a while."""
+    scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
+    t = seen.t - onset
+    before = (t + seen.half <= -NEAR) & (t > -NEAR - REACH)
+    after = (t - seen.half >= NEAR) & (t < NEAR + REACH)
+    if min(np.count_nonzero(before), np.count_nonzero(after)) < FEWEST:
+        return None
+    x = np.stack([np.ones(t.size), t], axis=1)
+    inverse = np.linalg.inv(x[before].T @ x[before])
+    at = x[after].mean(axis=0)
+    fallen = []
+    for values in seen.mean.T / scale:
+        line = inverse @ (x[before].T @ values[before])
+        rest = values[before] - x[before] @ line
+        variance = float(rest @ rest) / max(rest.size - 2, 1)
+        deviation = math.sqrt(variance * (1.0 / np.count_nonzero(after) + float(at @ inverse @ at)))
+        fall = float(at @ line - values[after].mean())
+        under = float(values[before].min() - values[after].mean())
+        if fall < strict * SURE * deviation or min(fall, under) < strict * LOST:
+            return None
+        fallen.append(fall)
+    if min(fallen) < ALIKE * max(fallen):
+        return None
+    return OtherCause(
+        "external leak",
+        f"both chambers' means fall, by {np.mean(fallen):.1%} of the strokes' pressure difference: oil "
+        "leaves the circuit",
+    )

@@ -1,0 +1,1 @@
+"""The volume balance: pump flow that the piston does not displace has leaked."""

@@ -1,0 +1,218 @@
+"""The balance of volumes over blocks: one geometry for all, one conductance a block.
+
+    A x = s (q_b/(2 pi)) (theta - tau omega) - g_k integral(dp_AB) dt - (V/2K)_k dp_AB - (V_1/2K) dp_12 + a_k + b_k t
+
+is the integral of eqs. (4.16)-(4.19) of the thesis with a leak Q_L = g (p_A - p_B); half the difference of the sides is
+taken, so that what both sides lose alike cancels. `s`, the ratio of displacement and area over the assumed one, the lag
+tau of the position's reading behind the angle's, and the line volumes are shared by all blocks, because within one
+block a wrong s passes for a leak: the integral of a rectangular pressure difference is nearly the motion itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealscope.diagnosis.volume_balance.blocks import DP_12, FLOW, I_12, I_AB, I_ROOT, THETA, BalanceBlocks, Y
+from sealscope.recordings.recording import Array
+
+#: A block whose residual is over this many times the usual one does not take part, nor one with less than this share of
+#: the usual information.
+_SPOILT = 5.0
+_STILL = 0.02
+#: ... nor one in which position and angle go together by another ratio than usually, by this share.
+_OTHER_RATIO = 0.1
+#: The integrals of two pressure differences differ where what sets them apart is over this many times its noise, and
+#: give two conductances where it is over so many times.
+_APART = 1.5
+_SEPARATE = 10.0
+#: The stored oil tells the sense of the pressures where it is this many deviations from zero.
+_SURE = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class BalanceFit:
+    """`blocks`: those that took part; `left_out`: those that did not; `columns`: those that blocks share, with
+    their coefficients `beta`; `sense`: 1, or -1 where dp counts against the motion; `pump`: the pump's own conductance
+    where throttles tell it from the piston's, else None, and its deviation `pump_sd`; `g` (n,): conductance of the
+    piston, or of both together [m^3/(s Pa)], positive where oil leaks; `sd` (n,): its deviation, from the residual and
+    the noise of dp; `shared` (n, m): deviations common to the blocks, from the shared coefficients; `residual` [m^3]:
+    rms; `signal` [m^3]: rms of the motion; `slip` (n,): flow that nothing explains [m^3/s]."""
+
+    blocks: BalanceBlocks
+    left_out: BalanceBlocks
+    columns: tuple[int, ...]
+    beta: Array
+    sense: int
+    pump: float | None
+    pump_sd: float
+    g: Array
+    sd: Array
+    shared: Array
+    residual: float
+    signal: float
+    slip: Array
+
+    @property
+    def scale(self) -> float:
+        """s: displacement over area, over the assumed one; negative where an encoder counts the other way."""
+        return float(self.beta[0])
+
+    @property
+    def lag(self) -> float:
+        """tau: how far the position's reading lags behind the angle's [s]."""
+        return float(-self.beta[1] / self.beta[0]) if self.beta[0] != 0 else float("inf")
+
+    @property
+    def share_left_out(self) -> float:
+        """Share of the blocks that did not take part."""
+        return len(self.left_out) / max(1, len(self.left_out) + len(self.blocks))
+
+
+def _beyond(gram: Array, column: int) -> Array:
+    """Sums of products (n, c, c) of what `column` leaves of the others in each block."""
+    own = np.maximum(gram[:, column, column], np.finfo(float).tiny)
+    return np.asarray(gram - gram[:, :, column, None] * gram[:, None, column, :] / own[:, None, None])
+
+
+def _shared_columns(blocks: BalanceBlocks) -> list[int]:
+    """Columns whose coefficients all blocks share: the angle, its lag (the flow), the pump's ports where they are
+    recorded, and the pump's leakage where throttles set the ports so far apart from the chambers that it can be told
+    from the piston's."""
+    if blocks.gram.shape[1] <= I_12:
+        return [THETA, FLOW]
+    own = float(np.median(_beyond(blocks.gram, I_AB)[:, I_12, I_12]))
+    own_pump = own > _SEPARATE * _noise_of_integrals(blocks)
+    return [THETA, FLOW, DP_12, I_12] if own_pump else [THETA, FLOW, DP_12]
+
+
+def _noise_of_integrals(blocks: BalanceBlocks) -> float:
+    """Sum of squares in a block, beyond offset, slope and dp_AB's integral, of the random walk that noise makes of
+    dp_12's: sigma^2 step^2 L^2/15 (a Brownian path about its best line has the mean square T/15), sigma^2 that of dp_12
+    and, by the square of the factor between the two, of dp_AB."""
+    factor = np.median(blocks.gram[:, I_12, I_AB] / np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny))
+    variance = float(np.median(blocks.noise_12) + factor**2 * np.median(blocks.noise))
+    step = blocks.seconds / blocks.samples
+    return variance * step**2 * blocks.samples**2 / 15.0
+
+
+def _solve(gram: Array, shared: list[int]) -> tuple[Array, Array, Array]:
+    """Coefficients (m,) of the shared columns, their covariance over the residual's variance (m, m), and the sum of
+    squares that is left in each block (n,)."""
+    rest = _beyond(gram, I_AB)
+    total = rest.sum(axis=0)
+    size = np.sqrt(np.maximum(np.diag(total)[shared], np.finfo(float).tiny))
+    scaled = total[np.ix_(shared, shared)] / np.outer(size, size)
+    inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) / np.outer(size, size)
+    beta = inverse @ total[shared, Y]
+    part = rest[:, shared][:, :, shared]
+    left = rest[:, Y, Y] - 2.0 * rest[:, Y][:, shared] @ beta + np.einsum("i,nij,j->n", beta, part, beta)
+    return beta, inverse, np.maximum(left, 0.0)
+
+
+def fit_balance(blocks: BalanceBlocks) -> BalanceFit:
+    """Fit the balance; blocks in which the machine stands, or the residual stands out, are left out.
+
+    Needs one block or more; a fit that means nothing (no motion, encoders that do not belong together) is told by
+    `residual` and `signal`.
+    """
+    information = blocks.gram[:, I_AB, I_AB]
+    ratio = blocks.gram[:, THETA, Y] / np.maximum(blocks.gram[:, THETA, THETA], np.finfo(float).tiny)
+    usual_ratio = float(np.median(ratio))
+    keep = information > _STILL * float(np.median(information))
+    keep &= np.abs(ratio - usual_ratio) <= _OTHER_RATIO * abs(usual_ratio)
+    freedom = max(1, blocks.samples - 4)
+    shared = _shared_columns(blocks)
+    for _ in range(4):
+        if not keep.any():
+            keep = np.ones(len(blocks), dtype=bool)
+            break
+        _, _, left = _solve(blocks.gram[keep], shared)
+        usual = float(np.median(left))
+        spoilt = left > _SPOILT**2 * usual
+        if not spoilt.any() or usual == 0.0:
+            break
+        # the worst one first: what it does to the shared coefficients may make others look bad
+        worst = spoilt & (left >= 0.25 * left.max())
+        keep[np.flatnonzero(keep)[worst]] = False
+    used = blocks.chosen(keep)
+    beta, inverse, left = _solve(used.gram, shared)
+    own = np.maximum(used.gram[:, I_AB, I_AB], np.finfo(float).tiny)
+    leaning = used.gram[:, I_AB][:, shared] / own[:, None]
+    slope = used.gram[:, I_AB, Y] / own - leaning @ beta
+    usual = float(np.median(left)) / freedom
+    sense = _sense(used, slope, beta)
+    variance = np.maximum(usual, np.where(left > 2.0 * usual * freedom, left / freedom, 0.0))
+    # numerically exact data have no residual; a relative rounding error keeps deviations above zero
+    variance = np.maximum(variance, 1e-24 * used.gram[:, Y, Y] / used.samples)
+    widths, turns = np.linalg.eigh(inverse)
+    common = leaning @ turns * np.sqrt(np.maximum(widths, 0.0) * usual)
+    g = -sense * slope
+    slip = used.slope[:, Y] - used.slope[:, shared] @ beta - slope * used.slope[:, I_AB]
+    return BalanceFit(
+        blocks=used,
+        left_out=blocks.chosen(~keep),
+        columns=tuple(shared),
+        beta=beta,
+        sense=sense,
+        pump=float(-sense * beta[-1]) if I_12 in shared else None,
+        pump_sd=float(np.sqrt(inverse[-1, -1] * usual)) if I_12 in shared else 0.0,
+        g=g,
+        sd=np.sqrt(np.maximum(variance, np.finfo(float).tiny) / own + g**2 * used.walk),
+        shared=common,
+        residual=float(np.sqrt(usual)),
+        signal=float(np.sqrt(np.median(used.gram[:, Y, Y]) / used.samples)),
+        slip=slip,
+    )
+
+
+def _sense(blocks: BalanceBlocks, slope: Array, beta: Array) -> int:
+    """1 where p_A - p_B rises as the piston is pushed towards positive A x, -1 where channels count the other way.
+
+    Stored oil takes volume from the motion whatever the signs of the encoders are; where its share is not clear, the
+    pressure works along the motion on the whole (friction).
+    """
+    stored = blocks.stored[:, Y] - beta[0] * blocks.stored[:, THETA] - slope * blocks.stored[:, I_AB]
+    deviation = float(np.std(stored)) / np.sqrt(max(1, stored.size - 1))
+    mean = float(np.mean(stored))
+    if abs(mean) > _SURE * deviation:
+        return 1 if mean < 0 else -1
+    return 1 if float(np.sum(blocks.motion)) >= 0 else -1
+
+
+def told_apart(fit: BalanceFit, onset: float, rise: float, *, within: float) -> dict[str, float]:
+    """Twice the log likelihood by which a leak elsewhere, or of another law, explains a rise at `onset` [s] better than
+    a laminar leak past the piston: `orifice` (past the piston, with the root of the pressure difference), `scale` (no
+    leak: displacement or the reading of an encoder changed by a factor), `pump` (with the pressure difference at the
+    pump's ports, where it is recorded). Near 0: the data do not tell.
+
+    In each block within `within` seconds of the rise the other integral is fitted beside that of dp_AB: its coefficient
+    b_k moves by nothing if the leak is laminar and past the piston, and by all of the leak if it is the other. The
+    scatter of b_k, which knows the colour of the noise, judges between the two (Student's likelihoods). The blocks that
+    the rise passes through do not count.
+    """
+    t, half = fit.blocks.t, 0.5 * fit.blocks.seconds
+    near = np.abs(t - onset - 0.5 * rise) < within + 0.5 * rise
+    before, after = near & (t + half <= onset), near & (t - half >= onset + rise)
+    if min(before.sum(), after.sum()) < 3:
+        return {}
+    gram, shared, beta = fit.blocks.gram, list(fit.columns), fit.beta
+    rest = _beyond(gram, I_AB)
+    found = {}
+    for name, column in (("orifice", I_ROOT), ("scale", THETA), ("pump", I_12)):
+        if column >= gram.shape[1]:
+            continue
+        own = np.maximum(rest[:, column, column], np.finfo(float).tiny)
+        if column == I_12 and np.median(own[before | after]) < _APART * _noise_of_integrals(fit.blocks):
+            continue
+        b = -fit.sense * (rest[:, column, Y] - rest[:, column][:, shared] @ beta) / own
+        share = gram[:, column, I_AB] / np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny)
+        whole = float(np.mean(fit.g[after]) - np.mean(fit.g[before])) / float(np.mean(share[after]))
+        moved = float(np.mean(b[after]) - np.mean(b[before]))
+        freedom = int(before.sum() + after.sum()) - 2
+        deviation = np.sqrt(np.var(b[after], ddof=1) / after.sum() + np.var(b[before], ddof=1) / before.sum())
+        z = np.array([moved, moved - whole]) / max(float(deviation), np.finfo(float).tiny)
+        here, there = (freedom + 1) * np.log1p(z**2 / freedom)
+        found[name] = float(here - there)
+    return found

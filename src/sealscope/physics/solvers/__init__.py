@@ -1,0 +1,1 @@
+"""The integration methods, and how long a step may be."""

@@ -1,0 +1,1 @@
+"""The laws over lanes: eight runs to a vector register."""

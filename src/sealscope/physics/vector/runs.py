@@ -1,0 +1,281 @@
+"""Runs side by side: the same laws and the same two methods over lanes, eight runs to a vector register.
+
+Arrays have their lanes last. A group is WIDTH runs of one kind (the choices of `RigNumbers` are those of all of them);
+each lane has numbers, leaks and a gain and offset of the command of its own, and the command's shape is shared.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealscope.compiled import contracted, kernel
+from sealscope.physics.lanes import load, store
+from sealscope.physics.leakage import piston_leakage
+from sealscope.physics.rig import RigNumbers
+from sealscope.physics.solvers.imex import imex_step
+from sealscope.physics.solvers.rk4 import rk4_step
+from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, State
+from sealscope.physics.vector.fixed import settled, taken
+
+#: The fields of `RigNumbers` that differ from lane to lane, in the order of a table's rows, and those that do not.
+LANE_FIELDS = tuple(
+    name for name, kind in RigNumbers.__annotations__.items() if getattr(kind, "__forward_arg__", kind) == "float"
+)
+CHOICES = tuple(name for name in RigNumbers._fields if name not in LANE_FIELDS)
+#: Rows that describe a leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
+#: and the G and C whose flow goes to the account (those of the leak, or of one that is being sized).
+LEAK_ROWS = 6
+#: Rows of what a run tells at each output: p_A, p_B [Pa].
+TOLD = 2
+#: Rows of a lane's account: sum of |Q_L| [m^3/s] over the outputs, sum of the leak's opening, largest |x| [m],
+#: lowest pressure [Pa], 0 while all is finite.
+ACCOUNTS = 5
+Drive = tuple[float, float]
+Leak = tuple[float, float, float, float, float, float]
+Account = tuple[float, float, float, float, float]
+FLOW, OPEN, REACH, LEAST, SOUND = range(ACCOUNTS)
+
+
+@contracted
+def lane_numbers(table: np.ndarray, at: int, p: RigNumbers) -> RigNumbers:
+    """The numbers of a group: those of `p`, and where these are () (`fixed.left_to_table`) the group's own, from rows
+    at, at + 1, .. of a table of all `LANE_FIELDS`."""
+    return RigNumbers(
+        taken(p.omega_per_volt, table, at + 0),
+        taken(p.k_p, table, at + 1),
+        taken(p.K_i, table, at + 2),
+        taken(p.V_max, table, at + 3),
+        taken(p.i_max, table, at + 4),
+        taken(p.R_c, table, at + 5),
+        taken(p.L_c, table, at + 6),
+        taken(p.C_e, table, at + 7),
+        taken(p.C_m, table, at + 8),
+        taken(p.J_M, table, at + 9),
+        taken(p.B_M, table, at + 10),
+        taken(p.q_b, table, at + 11),
+        taken(p.G_pump, table, at + 12),
+        settled(p.throttled),
+        taken(p.c_A_in, table, at + 13),
+        taken(p.c_A_out, table, at + 14),
+        taken(p.c_B_in, table, at + 15),
+        taken(p.c_B_out, table, at + 16),
+        taken(p.dp_0, table, at + 17),
+        taken(p.V_1, table, at + 18),
+        taken(p.V_2, table, at + 19),
+        taken(p.A_A, table, at + 20),
+        taken(p.A_B, table, at + 21),
+        taken(p.L, table, at + 22),
+        taken(p.M_eq, table, at + 23),
+        taken(p.V, table, at + 24),
+        settled(p.position_dependent),
+        taken(p.k_stop, table, at + 25),
+        taken(p.d_stop, table, at + 26),
+        taken(p.F_l, table, at + 27),
+        taken(p.F_pr, table, at + 28),
+        taken(p.F_cfr, table, at + 29),
+        taken(p.C_c, table, at + 30),
+        taken(p.K_brk, table, at + 31),
+        taken(p.F_v, table, at + 32),
+        taken(p.v_th, table, at + 33),
+        settled(p.coulomb_of_difference),
+        settled(p.literal_bracket),
+        taken(p.K_oil, table, at + 34),
+        p.aerated,
+        taken(p.air, table, at + 35),
+        taken(p.n_air, table, at + 36),
+        p.open_circuit,
+        taken(p.G_ext_A, table, at + 37),
+        taken(p.G_ext_B, table, at + 38),
+        settled(p.made_up),
+        taken(p.p_crack, table, at + 39),
+        taken(p.G_check, table, at + 40),
+        taken(p.V_gas, table, at + 41),
+        taken(p.p_charge, table, at + 42),
+    )
+
+
+@contracted
+def lane_state(y: np.ndarray, at: int) -> State:
+    """The state of a group from rows at .. at + 10."""
+    return (
+        load(y, at),
+        load(y, at + 1),
+        load(y, at + 2),
+        load(y, at + 3),
+        load(y, at + 4),
+        load(y, at + 5),
+        load(y, at + 6),
+        load(y, at + 7),
+        load(y, at + 8),
+        load(y, at + 9),
+        load(y, at + 10),
+    )
+
+
+@contracted
+def opening(leak: Leak, t: float) -> float:
+    """How far a leak (`LEAK_ROWS`) is open at t [s]: 0 to 1, evenly from its start with its slope."""
+    return min(max((t - leak[2]) * leak[3], 0.0), 1.0)
+
+
+@contracted
+def _rk4(
+    z: State, h: float, t: float, nodes: np.ndarray, shape: np.ndarray, k: int, drive: Drive, leak: Leak, q: RigNumbers
+) -> State:
+    u = (
+        drive[1] + drive[0] * shape[k, 0],
+        drive[1] + drive[0] * shape[k, 1],
+        drive[1] + drive[0] * shape[k, 2],
+    )
+    s = (opening(leak, t + nodes[0]), opening(leak, t + nodes[1]), opening(leak, t + nodes[2]))
+    G = (leak[0] * s[0], leak[0] * s[1], leak[0] * s[2])
+    C = (leak[1] * s[0], leak[1] * s[1], leak[1] * s[2])
+    return rk4_step(z, h, u, G, C, q, False)
+
+
+@contracted
+def _imex(
+    z: State, h: float, t: float, nodes: np.ndarray, shape: np.ndarray, k: int, drive: Drive, leak: Leak, q: RigNumbers
+) -> State:
+    u = (
+        drive[1] + drive[0] * shape[k, 0],
+        drive[1] + drive[0] * shape[k, 1],
+        drive[1] + drive[0] * shape[k, 2],
+        drive[1] + drive[0] * shape[k, 3],
+        drive[1] + drive[0] * shape[k, 4],
+        drive[1] + drive[0] * shape[k, 5],
+    )
+    s_0, s_1, s_2 = opening(leak, t + nodes[0]), opening(leak, t + nodes[1]), opening(leak, t + nodes[2])
+    s_3, s_4, s_5 = opening(leak, t + nodes[3]), opening(leak, t + nodes[4]), opening(leak, t + nodes[5])
+    G = (leak[0] * s_0, leak[0] * s_1, leak[0] * s_2, leak[0] * s_3, leak[0] * s_4, leak[0] * s_5)
+    C = (leak[1] * s_0, leak[1] * s_1, leak[1] * s_2, leak[1] * s_3, leak[1] * s_4, leak[1] * s_5)
+    return imex_step(z, h, u, G, C, q)
+
+
+@contracted
+def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> Account:
+    """The account with an output more in it."""
+    flow, opened, reach, least, sound = account
+    share = opening(leak, t)
+    flow = flow + abs(piston_leakage(z[P_A] - z[P_B], leak[4] * share, leak[5] * share, q.dp_0))
+    least = min(least, z[P_A])
+    least = min(least, z[P_B])
+    if q.throttled:
+        least = min(least, z[P_1])
+        least = min(least, z[P_2])
+    total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10]
+    return flow, opened + share, max(abs(z[POSITION]), reach), least, sound + 0.0 * total
+
+
+@contracted
+def advance(
+    groups: tuple[int, int],
+    y: np.ndarray,
+    h: float,
+    start: int,
+    nodes: np.ndarray,
+    shape: np.ndarray,
+    drive: np.ndarray,
+    leaks: np.ndarray,
+    table: np.ndarray,
+    bounds: np.ndarray,
+    p: RigNumbers,
+    implicit: bool,
+    every: int,
+    told: np.ndarray,
+    begin: int,
+    account: np.ndarray,
+) -> None:
+    """`advance_lanes_rk4`, or `advance_lanes_imex` where `implicit`, for lanes or for the one number of a thread."""
+    cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
+    for g in range(groups[0], groups[1]):
+        z = lane_state(y, g * states)
+        gain = (load(drive, 2 * g), load(drive, 2 * g + 1))
+        a = g * LEAK_ROWS
+        leak = (
+            load(leaks, a),
+            load(leaks, a + 1),
+            load(leaks, a + 2),
+            load(leaks, a + 3),
+            load(leaks, a + 4),
+            load(leaks, a + 5),
+        )
+        a = g * ACCOUNTS
+        noted = (
+            load(account, a),
+            load(account, a + 1),
+            load(account, a + 2),
+            load(account, a + 3),
+            load(account, a + 4),
+        )
+        out = (g * told.shape[1] + begin) * TOLD
+        for cell in range(cells):
+            q = lane_numbers(table, (g * cells + cell) * fields, p)
+            due = 0  # steps before the next output; cells begin at one
+            for step in range(bounds[cell], bounds[cell + 1]):
+                t = (start + step) * h
+                if due == 0:
+                    due = every
+                    store(told, out, z[P_A])
+                    store(told, out + 1, z[P_B])
+                    out += TOLD
+                    noted = _noted(z, leak, t + nodes[0], noted, q)
+                due -= 1
+                if implicit:
+                    z = _imex(z, h, t, nodes, shape, step, gain, leak, q)
+                else:
+                    z = _rk4(z, h, t, nodes, shape, step, gain, leak, q)
+        for m in range(states):
+            store(y, g * states + m, z[m])
+        for m in range(ACCOUNTS):
+            store(account, a + m, noted[m])
+
+
+@kernel
+def advance_lanes_rk4(
+    groups: tuple[int, int],
+    y: np.ndarray,
+    h: float,
+    start: int,
+    nodes: np.ndarray,
+    shape: np.ndarray,
+    drive: np.ndarray,
+    leaks: np.ndarray,
+    table: np.ndarray,
+    bounds: np.ndarray,
+    p: RigNumbers,
+    every: int,
+    told: np.ndarray,
+    begin: int,
+    account: np.ndarray,
+) -> None:
+    """Advance groups first <= g < last of runs in place by n steps of h [s], the first of them step `start` of the run.
+
+    `y`: (groups, 11, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
+    WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields, WIDTH) with
+    `bounds` (cells + 1,) the step at which each cell begins; `told`: (groups, outputs, TOLD, WIDTH), written from
+    output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).
+    """
+    advance(groups, y, h, start, nodes, shape, drive, leaks, table, bounds, p, False, every, told, begin, account)
+
+
+@kernel
+def advance_lanes_imex(
+    groups: tuple[int, int],
+    y: np.ndarray,
+    h: float,
+    start: int,
+    nodes: np.ndarray,
+    shape: np.ndarray,
+    drive: np.ndarray,
+    leaks: np.ndarray,
+    table: np.ndarray,
+    bounds: np.ndarray,
+    p: RigNumbers,
+    every: int,
+    told: np.ndarray,
+    begin: int,
+    account: np.ndarray,
+) -> None:
+    """`advance_lanes_rk4` for throttled rigs, by the implicit-explicit method."""
+    advance(groups, y, h, start, nodes, shape, drive, leaks, table, bounds, p, True, every, told, begin, account)

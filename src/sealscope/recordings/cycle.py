@@ -1,0 +1,51 @@
+"""The cycle of a duty: how long until the command, or the pressure difference, repeats."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.recording import Recording
+
+_LONGEST_CYCLE = 20.0
+_CYCLE_CORRELATION = 0.6
+_ANALYSIS_RATE = 50.0
+
+
+def find_cycle(recording: Recording) -> float | None:
+    """Length of the duty's cycle [s] from the command, or else from the pressure difference; None when nothing repeats.
+
+    The first maximum of the autocorrelation after its first zero, at least 0.6 high, between 0.2 s and 20 s and
+    repeated five times or more; refined by a parabola.
+    """
+    if "u" in recording and np.ptp(recording["u"]) > 0:
+        signal = recording["u"]
+    elif all(name in recording for name in CHAMBERS):
+        signal = recording["p_A"] - recording["p_B"]
+    else:
+        signal = recording[next(name for name in CHAMBERS if name in recording)]
+    stride = max(1, int(recording.rate / _ANALYSIS_RATE))
+    usable = signal[: signal.size // stride * stride]
+    slow = usable.reshape(-1, stride).mean(axis=1)
+    slow = slow - slow.mean()
+    n = slow.size
+    if n < 32 or not np.any(slow):
+        return None
+    spectrum = np.abs(np.fft.rfft(slow, 2 * n)) ** 2
+    correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)
+    correlation = correlation / correlation[0]
+    longest = min(n // 5, int(_LONGEST_CYCLE * recording.rate / stride))
+    below = np.flatnonzero(correlation[:longest] < 0)
+    if below.size == 0:
+        return None
+    first = int(below[0])
+    inner = correlation[first + 1 : longest - 1]
+    peaks = np.flatnonzero((inner >= correlation[first : longest - 2]) & (inner > correlation[first + 2 : longest]))
+    peaks = peaks[inner[peaks] >= _CYCLE_CORRELATION]
+    if peaks.size == 0:
+        return None
+    best = peaks[inner[peaks] >= inner[peaks].max() - 0.05][0]
+    k = int(first + 1 + best)
+    a, b, c = correlation[k - 1 : k + 2]
+    lag = (k + 0.5 * (a - c) / (a - 2 * b + c)) * stride / recording.rate
+    return float(lag) if lag >= 0.2 else None

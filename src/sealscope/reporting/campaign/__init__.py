@@ -1,0 +1,1 @@
+"""A campaign's result as page and tables."""

@@ -1,0 +1,159 @@
+"""The diagnosis in words an engineer can act on; the one home of these sentences for page and terminal."""
+
+from __future__ import annotations
+
+from math import floor, isfinite, isnan, log10
+
+from sealscope.diagnosis.verdict.evidence import LEAKS
+from sealscope.reporting.contract import DiagnosisLike, FindingLike
+
+ABSENT = "–"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """`value` with `digits` significant digits, without an exponent where that stays short; a dash for None or NaN."""
+    if value is None or isnan(value):
+        return ABSENT
+    if not isfinite(value):
+        return "∞" if value > 0 else "−∞"
+    if value == 0 or 1e-6 <= abs(value) < 1e9:
+        places = max(0, digits - 1 - floor(log10(abs(value)))) if value else 0
+        text = f"{value:.{places}f}"
+        text = text.rstrip("0").rstrip(".") if "." in text else text
+    else:
+        text = f"{value:.{digits}g}"
+    return text.replace("-", "−")
+
+
+def clock(seconds: float | None) -> str:
+    """A time on the recording's axis: seconds (one decimal, more below 10 s), from an hour on as h:mm:ss as well."""
+    if seconds is None or not isfinite(seconds):
+        return ABSENT
+    text = (f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s").replace("-", "−")
+    if abs(seconds) < 3600:
+        return text
+    whole = int(abs(seconds))
+    sign = "−" if seconds < 0 else ""
+    return f"{text} ({sign}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d})"
+
+
+def subject(diagnosis: DiagnosisLike) -> str:
+    """The file's name, or words for a recording that never was a file."""
+    return str(diagnosis.file) if diagnosis.file else "this recording"
+
+
+def headline(diagnosis: DiagnosisLike) -> str:
+    """What was found, in one line."""
+    said = {
+        "leak": "Leak: oil bypasses the piston",
+        "no leak": "No leak found across the piston",
+        "cannot tell": "Cannot tell whether oil bypasses the piston",
+    }.get(diagnosis.verdict, diagnosis.verdict)
+    other = cause(diagnosis)
+    if diagnosis.verdict == "leak" and other == "piston or pump leak":
+        return f"{said}, or the pump"
+    return f"{said}, but something changed: {other}" if other and diagnosis.verdict != "leak" else said
+
+
+def cause(diagnosis: DiagnosisLike) -> str | None:
+    """What the change is taken for; None where there is none, or it cannot be told."""
+    if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
+        return None
+    return diagnosis.cause
+
+
+def since(diagnosis: DiagnosisLike) -> str | None:
+    """Since when; None where there is no leak to date."""
+    if diagnosis.verdict != "leak":
+        return None
+    if diagnosis.onset_s is None:
+        return "not within this recording: as a whole it was compared with leak-free ones"
+    text = clock(diagnosis.onset_s)
+    if diagnosis.onset_interval_s is not None:
+        low, high = diagnosis.onset_interval_s
+        text += f", between {clock(low)} and {clock(high)}"
+    return text
+
+
+def how_much(diagnosis: DiagnosisLike) -> str | None:
+    """How much oil in L/min; where no leak was found, how much there can be at most. None where nothing is known."""
+    interval = diagnosis.leak_interval_lpm
+    if diagnosis.verdict == "no leak" and diagnosis.leak_lpm is not None and interval is not None and interval[1] > 0:
+        return f"none found; at most {number(interval[1], 2)} L/min (95 % interval)"
+    if diagnosis.verdict != "leak":
+        return None
+    if diagnosis.leak_lpm is None:
+        return "not stated: the channels do not allow it"
+    text = f"{number(diagnosis.leak_lpm)} L/min"
+    if interval is not None:
+        text += f", between {number(interval[0])} and {number(interval[1])} L/min"
+    return text
+
+
+def how_sure(diagnosis: DiagnosisLike) -> str:
+    """The score against its threshold, and what the threshold means."""
+    if diagnosis.score is None or diagnosis.threshold is None:
+        return "no score was formed"
+    relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
+    text = f"score {number(diagnosis.score)}, {relation} the threshold of {number(diagnosis.threshold)}"
+    judge = diagnosis.methods[0].name if diagnosis.methods else ""
+    by = f" of {judge}" if judge else ""
+    return f"{text}{by}; {false_alarms(diagnosis)}"
+
+
+def false_alarms(diagnosis: DiagnosisLike) -> str:
+    """What the threshold was set for."""
+    p = diagnosis.false_alarm_probability
+    if p is None:
+        return "no false-alarm rate is stated for the threshold"
+    if 0 < p < 1:
+        every = 1 / p
+        shown = f"{round(every)}" if every >= 10 else number(every)
+        share = f"{number(100 * p)} % (1 in {shown})"
+        return f"the threshold is set so that {share} of leak-free recordings raise a false alarm"
+    return f"the threshold is set for a false-alarm probability of {number(p)}"
+
+
+def _fault(finding: FindingLike) -> str:
+    name = finding.code.replace("_", " ")
+    return f"{name} ({finding.channel})" if finding.channel else name
+
+
+def next_steps(diagnosis: DiagnosisLike) -> tuple[str, ...]:
+    """What to check next, most useful first."""
+    trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
+    faults = ", ".join(dict.fromkeys(_fault(finding) for finding in trouble))
+    if diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS):
+        steps = [diagnosis.next_check]
+        if diagnosis.verdict == "leak":
+            steps += [
+                "Repeat the recording with the same command and oil temperature: a worn seal shows again.",
+                "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until "
+                "then.",
+            ]
+        else:
+            steps.append("Record again under the same command when that is settled: a leak may hide behind it.")
+        if trouble:
+            steps.insert(0, f"Rule out a fault of the data first: {faults}.")
+    elif diagnosis.verdict == "leak":
+        steps = [
+            "Repeat the recording with the same command and oil temperature: a worn seal shows again.",
+            "Make sure that the bypass needle valve is shut. The pressures cannot tell it from the piston seal.",
+            "Hold the piston against a load with the motor at rest and watch x: creep confirms the leak.",
+            "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until then.",
+        ]
+        if trouble:
+            steps.insert(0, f"Rule out a fault of the data first: {faults}.")
+    elif diagnosis.verdict == "no leak":
+        steps = [
+            "Keep this recording as the baseline for later ones of this actuator with the same command.",
+            "A leak too small to lift the score over its threshold stays unseen; a longer recording sees smaller ones.",
+        ]
+        if trouble:
+            steps.insert(0, f"Judge with care, the data have faults: {faults}.")
+    else:
+        steps = ["Remove the cause named above and record again; a verdict was not forced out of these data."]
+        if trouble:
+            steps.append(f"Findings on the data: {faults}.")
+        steps.append("Record p_A and p_B at 500 Hz or more for some minutes under one command, or give a baseline.")
+    return tuple(steps)

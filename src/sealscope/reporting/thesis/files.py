@@ -1,0 +1,89 @@
+"""Thesis products as files: figures as SVG and PNG with their numbers as CSV, tables and claims as CSV."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, fields
+from itertools import zip_longest
+from pathlib import Path
+
+from sealscope.recordings.atomic import whole_file
+from sealscope.reporting.thesis.plots import draw, visible
+from sealscope.thesis.items import Item
+from sealscope.thesis.products import Claim, Figure, Product, Table
+
+_NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
+
+
+def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tuple[str, ...]:
+    """Write an item's products into `folder`: `figures/ID.svg`, `figures/ID.png`, `tables/ID.csv`; claims go to
+    `tables/ID.csv` of their item (`tables/ID-claims.csv` where a table has that name).
+
+    Gives the files written, relative to the folder. Raises ValueError for an id that is no file name.
+    """
+    for name in ("figures", "tables"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    files: list[str] = []
+
+    def put(name: str, content: bytes) -> None:
+        with whole_file(folder / name) as temporary:
+            temporary.write_bytes(content)
+        files.append(name)
+
+    def put_rows(name: str, rows: Iterable[Sequence[object]]) -> None:
+        with whole_file(folder / name) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+        files.append(name)
+
+    for product in products:
+        if not isinstance(product, Claim) and not _NAME.fullmatch(product.id):
+            raise ValueError(f"an id must be of a-z, 0-9, '.' and '-', got {product.id!r} ({item.id})")
+        if isinstance(product, Figure):
+            svg, png = draw(product)
+            put(f"figures/{product.id}.svg", svg)
+            put(f"figures/{product.id}.png", png)
+            put_rows(f"tables/{product.id}.csv", figure_rows(product))
+        elif isinstance(product, Table):
+            put_rows(f"tables/{product.id}.csv", table_rows(product))
+    claims = [product for product in products if isinstance(product, Claim)]
+    if claims:
+        taken = f"tables/{item.id}.csv" in files
+        put_rows(f"tables/{item.id}{'-claims' if taken else ''}.csv", claim_rows(claims))
+    return tuple(files)
+
+
+def table_rows(table: Table) -> Iterable[Sequence[object]]:
+    """A table's head and rows; numbers in full, an empty cell for no value."""
+    yield table.columns
+    yield from table.rows
+
+
+def claim_rows(claims: Sequence[Claim]) -> Iterable[Sequence[object]]:
+    """The claims as a table."""
+    yield [field.name for field in fields(Claim)]
+    yield from (astuple(claim) for claim in claims)
+
+
+def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
+    """What a figure plots: a pair of columns (x, y) for each curve, three (x, y, value) for an image, as drawn."""
+    heads: list[str] = []
+    columns: list[list[str]] = []
+    for number, panel in enumerate(figure.panels, 1):
+        place = f"panel {number}" if len(figure.panels) > 1 else ""
+        for curve in panel.curves:
+            tail = ", ".join(word for word in (curve.label, place) if word)
+            heads += [f"{panel.x_label}; {tail}", f"{panel.y_label}; {tail}"]
+            columns += [[_short(value) for value in values] for values in visible(curve, panel.x_range)]
+        if panel.image is not None:
+            image = panel.image
+            heads += [f"{label}; {place}" for label in (panel.x_label, panel.y_label, image.label)]
+            cells = [(x, y, image.values[j, i]) for j, y in enumerate(image.y) for i, x in enumerate(image.x)]
+            columns += [[_short(cell[k]) for cell in cells] for k in range(3)]
+    yield [head.removesuffix("; ") for head in heads]
+    yield from zip_longest(*columns, fillvalue="")
+
+
+def _short(value: float) -> str:
+    return f"{value:.7g}"

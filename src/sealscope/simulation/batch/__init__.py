@@ -1,0 +1,1 @@
+"""Many experiments side by side, reduced to statistics as they run."""

@@ -1,0 +1,226 @@
+"""Many experiments at once: eight to a vector register, over all cores, reduced to statistics as they run.
+
+Memory does not grow with the number or the length of the runs but for what describes and what is reported of each:
+pressures, readings and details exist for a few seconds of each run only.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+from sealscope.simulation.batch.layout import LaneSet, sets_of, with_sizes
+from sealscope.simulation.batch.run import SetRun
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.faults.faults import LITRE_PER_MINUTE
+from sealscope.simulation.integrate import FINEST, LONGEST_STEP
+from sealscope.simulation.resolution import FIRST_WINDOW, PRESSURE_TOLERANCE
+from sealscope.simulation.sizing import scaled_size
+
+#: Told how far the batch is, 0..1.
+Progress = Callable[[float], None]
+#: What a batch runs on.
+DEVICES = ("cpu", "gpu")
+#: Members of a set on which its step is chosen, and for how long [s] each of them runs for that.
+_SCOUTS, _SCOUTED = 4, 2.0 * FIRST_WINDOW
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What is left of the runs: RMS of the details in segments, and the leaks as they were.
+
+    `rms`: (runs, 2, segments, 5) of d1, d2, d3, d4 [Pa] and d3 d4 [Pa^2] of p_A and p_B as recorded; `bounds`:
+    (segments + 1,) [s]; `mean_leak_lpm`: (runs,) mean |Q| while open; `coefficients`: (runs,) leaks' G or C; `steps`:
+    (runs,) [s].
+    """
+
+    rms: Array
+    bounds: Array
+    mean_leak_lpm: Array
+    coefficients: Array
+    steps: Array
+
+    def changes(self, before: int = 0, after: int = -1) -> Array:
+        """Change of each RMS from one segment to another, (runs, 2, 5) [%]: the thesis's statistic."""
+        return np.asarray(100.0 * (self.rms[:, :, after] / self.rms[:, :, before] - 1.0))
+
+
+def halves(experiment: Experiment) -> Array:
+    """Bounds [s] of the two halves of a record."""
+    return np.array([0.0, 0.5, 1.0]) * experiment.duration
+
+
+def simulate_batch(
+    experiments: Sequence[Experiment],
+    *,
+    bounds: Sequence[float] | Array | None = None,
+    error: float = PRESSURE_TOLERANCE,
+    threads: int | None = None,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> Batch:
+    """Run experiments side by side, record p_A and p_B as the instruments would, and keep the RMS of the db8 details.
+
+    `bounds` [s]: where the segments begin and end (default: both halves); what the transform's edges touch is left out.
+    The runs have one duration and one sampling rate; rigs, leaks (one each, opening at once or evenly), drifts and
+    faults of the machine may all differ. A run's step is its own `step`, or one that is chosen by its own or this
+    `error` [Pa] for all runs of its kind and command. Results do not depend on the order of the runs, their number or
+    `threads` (default: the machine's cores); the noise is another stream than that of `simulate.run`. `device`: cpu, or
+    gpu (extra `gpu` and an NVIDIA GPU), where the same laws run, one thread a run; results agree to rounding, and the
+    beginning of some runs is compared with the processor's.
+
+    Raises InputError for runs that cannot be side by side; SimulationFailed, naming the run, where one diverges or
+    falls below vacuum.
+    """
+    runner = runner_of(device)
+    experiments = list(experiments)
+    sets = sets_of(experiments)
+    first = experiments[0]
+    edges = np.asarray(halves(first) if bounds is None else bounds, dtype=np.float64)
+    inside = edges.ndim == 1 and edges.size >= 2 and np.all(np.isfinite(edges)) and np.all(np.diff(edges) > 0)
+    if not (inside and edges[0] >= 0 and edges[-1] <= first.duration):
+        raise InputError(f"bounds must rise within 0 .. {first.duration:g} s, got {edges.tolist()}")
+    workers = threads or os.cpu_count() or 1
+    n, segments = len(experiments), edges.size - 1
+    batch = Batch(np.empty((n, 2, segments, 5)), edges, np.empty(n), np.empty(n), np.empty(n))
+    done = 0.0
+    with ThreadPoolExecutor(workers) as pool:
+        for part in _split_by_step(sets):
+
+            def told(share: float, begun: float = done, size: int = len(part.members)) -> None:
+                if progress is not None:
+                    progress(min(1.0, begun + share * size / n))
+
+            own = part.experiment.error
+            _run(part, batch, error if own is None else own, pool, workers, told, runner)
+            done += len(part.members) / n
+    return batch
+
+
+def _split_by_step(sets: Sequence[LaneSet]) -> list[LaneSet]:
+    """The sets with a step or an error of their own apart from those without."""
+    found = []
+    for one in sets:
+        kinds: dict[tuple[float | None, float | None], list] = {}  # type: ignore[type-arg]
+        for member in one.members:
+            kinds.setdefault((member.experiment.step, member.experiment.error), []).append(member)
+        found += [LaneSet(tuple(members), one.shape) for members in kinds.values()]
+    return found
+
+
+def runner_of(device: str) -> type[SetRun]:
+    """What runs a set on a device: cpu, or gpu (extra `gpu`); raises InputError for one that is not there."""
+    if device not in DEVICES:
+        raise InputError(f"device must be one of {', '.join(DEVICES)}, got {device!r}")
+    if device == "cpu":
+        return SetRun
+    from numba.core import config
+
+    if importlib.util.find_spec("numba_cuda") is None and not config.ENABLE_CUDASIM:
+        raise InputError("device gpu needs numba-cuda, which is not installed: pip install 'sealscope[gpu]'")
+    from sealscope.simulation.batch.gpu import DeviceRun, require_device
+
+    require_device()
+    return DeviceRun
+
+
+def _run(
+    part: LaneSet,
+    batch: Batch,
+    error: float,
+    pool: ThreadPoolExecutor,
+    workers: int,
+    progress: Callable[[float], None],
+    runner: type[SetRun],
+) -> None:
+    places = [member.place for member in part.members]
+    sizes = np.array([member.leak.coefficient or 0.0 for member in part.members])
+    step = part.experiment.step or chosen_step(part, sizes, error)
+    asked = np.array([member.leak.mean or 0.0 for member in part.members])
+    if np.any(asked > 0):
+        sizes = _sized(part, step, sizes, asked, pool, workers, runner)
+        step = part.experiment.step or min(step, chosen_step(part, sizes, error))
+    run = runner(part, step, sizes, sizes, batch.bounds)
+    run.all(pool, workers, progress)
+    batch.rms[places] = run.rms()
+    batch.mean_leak_lpm[places] = run.mean_flow() / LITRE_PER_MINUTE
+    batch.coefficients[places] = sizes
+    batch.steps[places] = run.h
+
+
+def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
+    """The finest of the steps [s] that `integrate` chooses for some members of the set over its first seconds, and that
+    all members' numbers and leaks allow."""
+    from sealscope.simulation.inputs import RunInputs
+    from sealscope.simulation.integrate import integrate
+    from sealscope.simulation.simulate import oversampling
+
+    steps = [allowed_step(part, sizes)]
+    picked = np.unique(np.linspace(0, len(part.members) - 1, _SCOUTS).round().astype(int))
+    for k in picked:
+        one = with_sizes(part.members[k].experiment, float(sizes[k]))
+        rate = one.rate * oversampling(one)
+        run = integrate(
+            one.rig,
+            RunInputs(one, one.leaks),
+            min(one.duration, _SCOUTED),
+            rate,
+            x_0=one.x_0,
+            method=one.method,
+            error=error,
+            allow_unresolved=one.allow_unresolved,
+            effects=one.effects(),
+        )
+        steps.append(run.step)
+    return float(min(steps))
+
+
+def allowed_step(part: LaneSet, sizes: Array) -> float:
+    """The longest step [s] that all members' numbers and leaks allow, down to the finest that `integrate` takes."""
+    from sealscope.physics.solvers.limits import longest_step
+
+    limits = []
+    for member, size in zip(part.members, sizes, strict=True):
+        laminar = member.leak.law == "laminar"
+        limits.append(longest_step(member.numbers, size if laminar else 0.0, 0.0 if laminar else size))
+    return max(min(limits), LONGEST_STEP / FINEST)
+
+
+def _sized(
+    part: LaneSet,
+    step: float,
+    sizes: Array,
+    asked: Array,
+    pool: ThreadPoolExecutor,
+    workers: int,
+    runner: type[SetRun],
+) -> Array:
+    """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members at once."""
+    from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, refuse_unsettled
+
+    wanted = asked > 0
+    before = np.zeros((2, len(sizes)))
+    for _ in range(MOST_RUNS):
+        fine = part.experiment.step or min(step, allowed_step(part, sizes))
+        run = runner(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
+        run.all(pool, workers, None)
+        got = run.mean_flow()
+        if np.any(got[wanted] <= 0):
+            run_place = part.members[int(np.flatnonzero(wanted & (got <= 0))[0])].place
+            raise InputError(f"a leak with a mean flow must be open within the run (run {run_place})")
+        known = wanted & (sizes > 0)
+        if np.all(known[wanted]) and np.all(np.abs(got[wanted] / asked[wanted] - 1.0) <= TOLERANCE):
+            return sizes
+        following = sizes.copy()
+        for k in np.flatnonzero(wanted):
+            following[k] = scaled_size(asked[k], (before[0, k], before[1, k]), (sizes[k], got[k]))
+        before = np.where(known, np.stack([sizes, got]), 0.0)
+        sizes = following
+    raise refuse_unsettled([member.leak for member in part.members])

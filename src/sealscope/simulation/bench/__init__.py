@@ -1,0 +1,1 @@
+"""Healthy machines drawn from a profile of nuisances."""

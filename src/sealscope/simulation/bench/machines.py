@@ -1,0 +1,142 @@
+"""The bench: healthy machines drawn from a profile, each different and none constant, all from one seed."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.simulation.bench.profile import DriftRange, Nuisance, Profile, load_profile
+from sealscope.simulation.changes.drifts import Drift, Wander
+from sealscope.simulation.commands import Command, parse_command
+from sealscope.simulation.experiment import Experiment, make_experiment
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Terms of a wandering drift.
+WANDER_TERMS = 6
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One machine on one day: a rig as designed, what differs from it, what drifts, and what the machine is asked for.
+
+    `values`: parameters by dotted name, in SI, for `rig.with_values`, throttles among them (`closed`; open ones leave
+    `line.orifices` as the rig has it); `duration` [s] of the record over which the drifts have their sizes.
+    """
+
+    profile: str
+    seed: int
+    rig: Rig
+    duration: float
+    values: Mapping[str, float | str]
+    drifts: tuple[Drift, ...]
+    command: Command
+    closed: float
+
+    def experiment(self, **others: Any) -> Experiment:
+        """This machine on its duty, from a start that centres its strokes; `others` are `make_experiment`'s (leak,
+        fault), and the machine's own seed, duration and drifts where they are not among them."""
+        built = self.rig.with_values(self.values, source=f"drawn from profile {self.profile}, seed {self.seed}")
+        own = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
+        given = {**own, **others}
+        given.setdefault("x_0", centred_start(built, given["command"], given["duration"]))
+        return make_experiment(rig=built, **given)
+
+
+def centred_start(rig: Rig, command: Command | str, duration: float) -> float:
+    """Start [m] from which the strokes of a command lie evenly about mid-stroke, as far as that is possible.
+
+    The piston goes with the pump's flow, A v = q_b omega/(2 pi), and an unloaded motor without inertia follows its PI
+    loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5).
+    """
+    command = parse_command(command) if isinstance(command, str) else command
+    motor, cylinder = rig.motor, rig.cylinder
+    dt = 0.05
+    demand = motor.omega_per_volt * command.volts(np.arange(0.0, duration + dt, dt))
+    gain = motor.k_p + motor.C_e
+    integral = angle = lowest = highest = 0.0
+    for omega_d in map(float, demand):
+        omega = (motor.k_p * omega_d + motor.K_i * integral) / gain
+        integral += dt * (omega_d - omega)
+        angle += dt * omega
+        lowest, highest = min(lowest, angle), max(highest, angle)
+    stroke = rig.pump.q_b / (2.0 * np.pi) / (0.5 * (cylinder.A_A + cylinder.A_B))
+    half = 0.5 * cylinder.L
+    return float(np.clip(-0.5 * stroke * (lowest + highest), -half, half))
+
+
+def _random(seed: int, name: str) -> np.random.Generator:
+    """The stream of one nuisance: no other nuisance of the profile changes what it draws."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def _path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
+    """A path with a distance of 1 between its extremes: even, up or down, or wandering."""
+    shape = shapes[int(random.integers(len(shapes)))]
+    up = random.random() < 0.5 or warms
+    weights = random.standard_normal(WANDER_TERMS) / (np.arange(WANDER_TERMS) + 0.5)
+    if shape == "linear":
+        return Wander((), duration, 1.0 if up else -1.0)
+    return Wander(tuple(map(float, weights)), duration).scaled(1.0)
+
+
+def _drift(random: np.random.Generator, wanted: DriftRange, oil: Wander) -> Wander:
+    own = _path(random, wanted.shapes, oil.duration)
+    both = oil.times(wanted.oil).plus(own.times((1.0 - wanted.oil**2) ** 0.5)) if wanted.oil else own
+    return both.scaled(float(random.uniform(*wanted.size)))
+
+
+def _drawn(one: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[Drift]]:
+    """Values (or factors) and drifts of one nuisance."""
+    values: dict[str, float] = {}
+    drifts: list[Drift] = []
+    for group in [(name,) for name in one.parameters] if one.each else [one.parameters]:
+        random = _random(seed, f"{one.name}/{group[0]}" if one.each else one.name)
+        value = float(random.uniform(one.low, one.high)) if one.high > one.low else one.low
+        values |= dict.fromkeys(group, value)
+        if one.drift is not None:
+            shape = _drift(random, one.drift, oil)
+            drifts += [Drift(name, shape, one.drift.absolute) for name in group]
+    return values, drifts
+
+
+def draw(
+    profile: Profile | str = "bench", seed: int = 0, *, rig: Rig | str = "thesis", duration: float = 180.0
+) -> Machine:
+    """A healthy machine of a rig's kind, drawn from a profile (or its name, or its file); one seed, one machine.
+
+    `duration` [s] is the record over which the drifts have their sizes. Raises InputError for a seed below 0, and where
+    a drawn value is out of its parameter's range.
+    """
+    from sealscope.parameters import load_rig
+
+    found = load_profile(profile) if isinstance(profile, str) else profile
+    base = load_rig(rig) if isinstance(rig, str) else rig
+    if seed < 0:
+        raise InputError(f"seed must be >= 0, got {seed}")
+    if not (math.isfinite(duration) and duration > 0):
+        raise InputError(f"duration must be > 0 s and finite, got {duration}")
+    oil = _path(_random(seed, "temperature of the oil"), ("linear", "wander"), duration, warms=True)
+    settings: dict[str, float | str] = {}
+    drifts: list[Drift] = []
+    for one in found.nuisances:
+        values, drifting = _drawn(one, seed, oil)
+        settings |= {name: float(base[name]) * value for name, value in values.items()} if one.scales else values
+        drifts += drifting
+    random = _random(seed, "duty")
+    command = parse_command(found.duty.commands[int(random.integers(len(found.duty.commands)))])
+    closed = found.duty.closed[int(random.integers(len(found.duty.closed)))]
+    settings |= {"line.closed_A": closed, "line.closed_B": closed}
+    if closed > 0:
+        settings["line.orifices"] = "present"
+    amplitude = float(random.uniform(*found.duty.amplitude))
+    if amplitude != 1.0:
+        command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, attr-defined]
+    return Machine(found.name, seed, base, duration, settings, tuple(drifts), command, closed)

@@ -1,0 +1,1 @@
+"""What changes slowly within a run: the rig, its instruments."""

@@ -1,0 +1,1 @@
+"""Faults over time, as data and in words."""
