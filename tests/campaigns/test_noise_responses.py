@@ -11,11 +11,12 @@ from sealscope.campaigns.noise_responses import halves, instrument_noise, respon
 from sealscope.campaigns.prediction import ChangeDetector, Responses, predict
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.parameters import load_rig
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Leak
-from sealscope.simulation.sensitivity import CHAMBERS, clean_channels
+from sealscope.simulation.sensitivity import clean_channels
 
 DETECTORS = (
     ChangeDetector("d3", "p_A", "fell"),

@@ -7,8 +7,9 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import OUTPUTS
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.signals.details import details
-from sealscope.simulation.instruments import FILTER_REACH, PRESSURES, decimate, record
+from sealscope.simulation.instruments import FILTER_REACH, decimate, record
 from sealscope.simulation.integrate import Trajectory
 from sealscope.simulation.simulate import simulate
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from sealscope.parameters import load_rig
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis import appendix_c, simulated_sheet
 from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.context import Sheet
 from sealscope.thesis.products import Product, Table
-from sealscope.thesis.simulated_sheet import CHAMBERS, QUANTITIES, Drift, drift_of, log_change, sheet_of
+from sealscope.thesis.simulated_sheet import QUANTITIES, Drift, drift_of, log_change, sheet_of
 
 TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
 

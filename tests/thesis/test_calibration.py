@@ -13,10 +13,10 @@ import pytest
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.details import Transform, details
 from sealscope.thesis.calibration import ITEMS, Calibration, fit, leak_free, predict_leaks, residuals
 from sealscope.thesis.calibration_forward import (
-    CHAMBERS,
     QUANTITIES,
     best_noise,
     by_test,

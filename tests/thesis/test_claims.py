@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis import claims, claims_rates, claims_rig, claims_tests, claims_trends
 from sealscope.thesis.chapter5 import TESTS, test_of
 from sealscope.thesis.conditions import APPENDIX_C
@@ -16,7 +17,7 @@ from sealscope.thesis.context import Sheet
 from sealscope.thesis.evidence import NO_SHEET, Evidence, correlated
 from sealscope.thesis.products import Claim, Product
 from sealscope.thesis.shown_tests import Shown
-from sealscope.thesis.simulated_sheet import CHAMBERS, QUANTITIES, Row, table_of
+from sealscope.thesis.simulated_sheet import QUANTITIES, Row, table_of
 
 test_of.__test__ = False  # a function of the package, not a test
 

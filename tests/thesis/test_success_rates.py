@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.context import Sheet
 from sealscope.thesis.leak_size import (
     area_under_curve,
@@ -23,7 +24,7 @@ from sealscope.thesis.leak_size import (
     partial_correlation,
     told_by_levels,
 )
-from sealscope.thesis.simulated_sheet import CHAMBERS, QUANTITIES
+from sealscope.thesis.simulated_sheet import QUANTITIES
 from sealscope.thesis.success_rates import (
     CLAIMED,
     RATES,

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.faults import LITRE_PER_MINUTE
-from sealscope.simulation.sensitivity import CHAMBERS, REFERENCE_DP, leak_sensitivity, parameter_sensitivity
+from sealscope.simulation.sensitivity import REFERENCE_DP, leak_sensitivity, parameter_sensitivity
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -67,7 +68,7 @@ def noise_covariance(rig: Rig, channels: Sequence[str] = CHAMBERS) -> Array:
     sensors, daq = rig.sensors, rig.daq
     covariance = np.full((len(channels), len(channels)), sensors.common_noise**2)
     for k, name in enumerate(channels):
-        if name not in ("p_A", "p_B", "p_1", "p_2"):
+        if name not in PRESSURES:
             raise InputError(f"the bound is made from pressure channels (p_A, p_B, p_1, p_2), got {name}")
         sensor = getattr(sensors, name)
         step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)

@@ -12,14 +12,15 @@ from sealscope.campaigns.prediction import ChangeDetector, Responses
 from sealscope.diagnosis.calibration.scorers import side_bounds
 from sealscope.diagnosis.rms_change.blocks import QUANTITIES, mean_squares
 from sealscope.physics.rig import OUTPUTS
+from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import Details, details
 from sealscope.signals.filters import IntArray
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Leak
-from sealscope.simulation.instruments import PRESSURES, decimate, record
+from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import Trajectory
-from sealscope.simulation.sensitivity import CHAMBERS, clean_channels
+from sealscope.simulation.sensitivity import clean_channels
 from sealscope.simulation.simulate import oversampling, trajectory
 
 #: Blocks of a half over which the noise is taken as independent.

@@ -24,11 +24,11 @@ from sealscope.campaigns.outlook import BoundFigures, CommandRow, Outlook
 from sealscope.campaigns.prediction import THESIS_DETECTORS, ChangeDetector, Responses, predict
 from sealscope.errors import InputError, SealscopeError
 from sealscope.parameters import Rig
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.bench.machines import centred_start
 from sealscope.simulation.commands import Command, parse_command
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.sensitivity import CHAMBERS
 
 Progress = Callable[[str, float], None]
 _T = TypeVar("_T")

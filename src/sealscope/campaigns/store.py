@@ -12,7 +12,7 @@ from typing import IO, Any
 
 from sealscope.campaigns.work import Row
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 
 #: What rows of one folder must share, and how it is called.
 _SAME = {
@@ -80,7 +80,7 @@ def begin(folder: Path, made_from: Mapping[str, Any]) -> None:
                     f"a campaign goes on only with the same {words}: its rows would not belong together; choose "
                     f"another folder or remove this one ({folder})"
                 )
-    with whole_file(folder / HEAD) as temporary:
+    with atomic_write(folder / HEAD) as temporary:
         temporary.write_text(json.dumps(made_from, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 

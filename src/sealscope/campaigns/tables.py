@@ -12,7 +12,7 @@ from sealscope.campaigns.judge import Judgement
 from sealscope.campaigns.statement import Statement
 from sealscope.campaigns.work import Row
 from sealscope.evaluation.binomial import Rate
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 
 Cell = str | float | int | None
 
@@ -200,7 +200,7 @@ def write_sheets(folder: Path, found: Iterable[Sheet]) -> list[Path]:
         if not sheet.rows:
             path.unlink(missing_ok=True)
             continue
-        with whole_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(sheet.columns)
             writer.writerows([["" if value is None else value for value in row] for row in sheet.rows])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Recording
 
 if TYPE_CHECKING:
-    from sealscope.recordings.atomic import whole_file
+    from sealscope.recordings.atomic import atomic_write
     from sealscope.recordings.files import read, write
     from sealscope.recordings.formats.columns import split_map_option
     from sealscope.recordings.quality import Finding, inspect, uniform_segments
@@ -19,7 +19,7 @@ _HOMES = {
     "Finding": "quality",
     "inspect": "quality",
     "uniform_segments": "quality",
-    "whole_file": "atomic",
+    "atomic_write": "atomic",
 }
 
 __all__ = [
@@ -27,11 +27,11 @@ __all__ = [
     "COUNTS",
     "Finding",
     "Recording",
+    "atomic_write",
     "inspect",
     "read",
     "split_map_option",
     "uniform_segments",
-    "whole_file",
     "write",
 ]
 

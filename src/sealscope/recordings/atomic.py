@@ -12,7 +12,7 @@ from sealscope.errors import InputError
 
 
 @contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary name in the folder of `path`: renamed to `path` when the block ends well, removed when it does not.
 
     Raises InputError where the folder does not exist or cannot be written.

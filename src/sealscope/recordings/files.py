@@ -10,7 +10,7 @@ from math import isfinite
 from pathlib import Path
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.formats.columns import check_channel
 from sealscope.recordings.formats.table import Table, check_writable, recording_of
 from sealscope.recordings.recording import Recording
@@ -146,7 +146,7 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
     file = Path(path)
     kind = check_target(file)
     check_writable(recording)
-    with whole_file(file) as temporary:
+    with atomic_write(file) as temporary:
         if kind == "netcdf":
             from sealscope.recordings.formats.netcdf import write_netcdf
 

@@ -14,7 +14,6 @@ from sealscope.reporting.series import ordered_time
 
 Array = NDArray[np.float64]
 
-CHAMBERS = ("p_A", "p_B")
 LEVELS = 4
 PRODUCT = "d3d4"
 NAMES = (*(f"d{level}" for level in range(1, LEVELS + 1)), PRODUCT)

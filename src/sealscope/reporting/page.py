@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, features, messages
 from sealscope.reporting.contract import DiagnosisLike, Mark
@@ -50,7 +51,7 @@ def render_page(
     all_marks = list(marks)
     if truth_onset_s is not None:
         all_marks.append(Mark(float(truth_onset_s), "true onset", known=True))
-    found = [features.chamber_details(recording, name) for name in features.CHAMBERS]
+    found = [features.chamber_details(recording, name) for name in CHAMBERS]
     chambers = [chamber for chamber, _ in found if chamber is not None]
     shown = [
         *charts.course_charts(diagnosis.course),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.simulation.changes.readings import Readings
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from sealscope.parameters import Daq, PressureTransducer, Rig
     from sealscope.simulation.integrate import Trajectory
 
-PRESSURES = ("p_1", "p_2", "p_A", "p_B")
 #: Half length of the anti-alias filter, in samples of the recording.
 FILTER_REACH = 16
 _KAISER_BETA = 8.0

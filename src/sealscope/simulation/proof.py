@@ -7,8 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from sealscope.errors import SimulationFailed
+from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.instruments import PRESSURES, decimate
+from sealscope.simulation.instruments import decimate
 from sealscope.simulation.integrate import Trajectory
 from sealscope.simulation.simulate import Progress, oversampling, sized_leaks, trajectory
 
@@ -82,7 +83,7 @@ def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tup
         Difference(name, rms(coarse[name][: n * factor] - fine[name][: n * factor]), "Pa", PRESSURE_TOLERANCE)
         for name in PRESSURES
     ]
-    for name in ("p_A", "p_B"):
+    for name in CHAMBERS:
         one, other = (details(decimate(run[name], factor, n)) for run in (coarse, fine))
         sensor = getattr(experiment.rig.sensors, name)
         noise = math.hypot(sensor.noise, experiment.rig.sensors.common_noise)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ class Judge:
         """`rate` [Hz] of the outputs; `tolerance` [Pa] of a pressure."""
         self._tolerance = tolerance
         self._every = max(1, round(rate / rig.daq.sample_rate))
-        sensors = [getattr(rig.sensors, name) for name in ("p_A", "p_B")]
+        sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
         self._noise = np.repeat([one.noise**2 + rig.sensors.common_noise**2 for one in sensors], 2)
         self._squares, self._samples = np.zeros((LEVELS, 4)), 0
         self.found = 0.0

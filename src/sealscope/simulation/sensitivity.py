@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, Leak
@@ -29,7 +30,6 @@ FIRST_SHARE = 1e-3
 #: Largest rms difference between the derivatives at h and h/2, as a share of the derivative's rms.
 LINEARITY = 0.02
 _MOST_HALVINGS = 8
-CHAMBERS = ("p_A", "p_B")
 
 
 @dataclass(frozen=True, eq=False)

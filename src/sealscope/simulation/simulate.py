@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.changes.drifts import Drift
 from sealscope.simulation.experiment import Experiment, make_experiment
@@ -173,7 +173,7 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
         ]
     if truth.drifts:
         told["drifts"] = [_told_drift(drift, truth.t) for drift in truth.drifts]
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.evaluation.binomial import clopper_pearson
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.context import Context, Sheet
@@ -12,7 +13,6 @@ from sealscope.thesis.items import Item
 from sealscope.thesis.products import Curve, Figure, Number, Panel, Table
 from sealscope.thesis.simulated_sheet import (
     BULK_DRIFT,
-    CHAMBERS,
     FRICTION_DRIFT,
     NOISE_DRIFT,
     QUANTITIES,

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from sealscope.errors import SimulationFailed
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.calibration_forward import (
-    CHAMBERS,
     QUANTITIES,
     by_test,
     log_rms,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.conditions import APPENDIX_C, Condition, experiment_values
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.signals.details import Transform
 
-CHAMBERS = ("p_A", "p_B")
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: One pound per square inch [Pa], the unit the sheet is taken to be in.
 PSI = 6894.757293168361

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.thesis.calibration_forward import CHAMBERS, QUANTITIES, Group, log_rms, noise_of, simulated
+from sealscope.thesis.calibration_forward import QUANTITIES, Group, log_rms, noise_of, simulated
 from sealscope.thesis.conditions import APPENDIX_C, Condition
 from sealscope.thesis.context import Sheet
 

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.calibration import residuals
-from sealscope.thesis.calibration_forward import CHAMBERS, QUANTITIES, noise_of
+from sealscope.thesis.calibration_forward import QUANTITIES, noise_of
 from sealscope.thesis.calibration_hypotheses import HYPOTHESES, outcome
 from sealscope.thesis.conditions import APPENDIX_C, groups
 from sealscope.thesis.context import Context

@@ -7,8 +7,9 @@ import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.calibration import Calibration
-from sealscope.thesis.calibration_forward import CHAMBERS, own_noise
+from sealscope.thesis.calibration_forward import own_noise
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -51,9 +52,9 @@ def rig_toml(calibration: Calibration, base: Rig) -> str:
 
 def write_rig(calibration: Calibration, base: Rig, path: str | os.PathLike[str]) -> None:
     """Write `rig_toml`, whole or not at all."""
-    from sealscope.recordings.atomic import whole_file
+    from sealscope.recordings.atomic import atomic_write
 
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(rig_toml(calibration, base), encoding="utf-8")
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.calibration_forward import (
-    CHAMBERS,
     QUANTITIES,
     USED_IN_SEARCH,
     Group,

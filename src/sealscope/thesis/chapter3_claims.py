@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapter3 import RATE, TONES, amplitude_spectrum, two_tone_signal, vanishing_moments
 from sealscope.thesis.chapter4_cases import visible_pressure
 from sealscope.thesis.context import Context, RunSpec
@@ -110,7 +111,7 @@ def _leak(context: Context) -> Claim:
         return Claim("claim-3.6", where, claim, _ABSENT, text, "cannot be tested", "a run failed")
     visible = visible_pressure()
     told, drops = [], []
-    for name in ("p_A", "p_B"):
+    for name in CHAMBERS:
         one, other = without.outputs[name], leaking.outputs[name]
         late = without.t > 10.0
         change = [float(f(other[late]) - f(one[late])) for f in (np.mean, np.max, np.ptp)]

@@ -7,6 +7,7 @@ from dataclasses import fields
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.thesis.chapter4_cases import (
     AS_PRINTED,
     CASES,
@@ -79,7 +80,7 @@ def _without_orifice() -> list[Item]:
     found = []
     for first, case in zip((4, 6, 8), ("4.2-a", "4.2-b", "4.2-c"), strict=True):
         found.append(_figure(f"4.{first}", "Command, motor speed and displacement", case, ("u", "omega", "x")))
-        found.append(_figure(f"4.{first + 1}", "Chamber pressures", case, ("p_A", "p_B")))
+        found.append(_figure(f"4.{first + 1}", "Chamber pressures", case, CHAMBERS))
     return found
 
 
@@ -89,7 +90,7 @@ def _with_orifice() -> list[Item]:
     for letter, first in at.items():
         case = f"4.3-{letter}"
         found.append(_figure(f"4.{first}", "Pump pressures", case, ("p_1", "p_2")))
-        found.append(_figure(f"4.{first + 1}", "Chamber pressures", case, ("p_A", "p_B")))
+        found.append(_figure(f"4.{first + 1}", "Chamber pressures", case, CHAMBERS))
         if letter == "a":
             found.append(_figure("4.12", "Flows through the orifices", case, ("Q_A", "Q_B")))
             found += _both_ends("4.13", ("p_1", "p_A")) + _both_ends("4.14", ("p_2", "p_B"))
@@ -114,7 +115,7 @@ def _openings() -> list[Item]:
     found = []
     for number, name, where in zip(
         ("4.33", "4.34", "4.35", "4.36"),
-        ("p_1", "p_2", "p_A", "p_B"),
+        PRESSURES,
         ("pump inlet", "pump outlet", "chamber A", "chamber B"),
         strict=True,
     ):
@@ -181,7 +182,7 @@ def _notes(pair: Pair, case: Case, reading: Reading) -> str:
     if case.closed_pct is not None:
         words.append(f"Reading: {reading.title}.")
     for _, label, run in pair.runs():
-        lowest = min(float(run.outputs[name].min()) for name in ("p_1", "p_2", "p_A", "p_B")) * 1e-6
+        lowest = min(float(run.outputs[name].min()) for name in PRESSURES) * 1e-6
         if lowest < _VACUUM:
             words.append(f"With {label} a pressure falls to {lowest:.2f} MPa, below vacuum, which oil cannot.")
     words += [f"{run.diverged}." for run in (pair.literal, pair.converged) if run.diverged]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.thesis.chapter4_cases import WINDOW
 from sealscope.thesis.chapter4_orifice_claims import orifice_claims
 from sealscope.thesis.chapter4_plain_claims import plain_claims
 from sealscope.thesis.chapter4_variants import (
     COMMAND,
-    PRESSURES,
     SOLVER_TEXT,
     SOLVERS,
     Throttled,

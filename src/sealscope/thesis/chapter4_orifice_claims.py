@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.thesis.chapter4_cases import AS_PRINTED, CLOSINGS, COMMANDS, OURS, Reading, visible_pressure
 from sealscope.thesis.chapter4_variants import (
     COMMAND,
-    PRESSURES,
     SOLVER_TEXT,
     SOLVERS,
     Solver,
@@ -192,7 +192,7 @@ def _over_commands(context: Context) -> tuple[Claim, ...]:
         return rows[COMMANDS[2]].span[name] - rows[COMMANDS[0]].span[name]
 
     def raised(rows: Mapping[float, Throttled]) -> tuple[float, ...]:
-        return tuple(rows[c].peak[name] - rows[25.0].peak[name] for c in (50.0, 75.0) for name in ("p_A", "p_B"))
+        return tuple(rows[c].peak[name] - rows[25.0].peak[name] for c in (50.0, 75.0) for name in CHAMBERS)
 
     return (
         _judged(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.thesis.chapter4_cases import CASES, OURS, literal, pair, settled, span, spec, steady, visible_pressure
 from sealscope.thesis.chapter4_friction import falls_up_to, jumps_at_threshold
@@ -45,7 +46,7 @@ def _step(context: Context) -> Claim:
     tests = [run.resolved for run in (*plain, *throttled)]
 
     def worst(runs: list[SimulatedRun]) -> str:
-        moved = [run.proof[name] for run in runs for name in ("p_1", "p_2", "p_A", "p_B") if name in run.proof]
+        moved = [run.proof[name] for run in runs for name in PRESSURES if name in run.proof]
         return f"{max(moved):.3g} Pa rms" if moved else "diverged"
 
     return Claim(
@@ -195,7 +196,7 @@ def _level(context: Context) -> Claim:
 
     charge = load_rig("thesis").fluid.p_charge
     run = pair(context, CASES["4.3-a"]).converged
-    peaks = [float(settled(run, name).max()) for name in ("p_1", "p_2", "p_A", "p_B")]
+    peaks = [float(settled(run, name).max()) for name in PRESSURES]
     return Claim(
         "claim-4.7",
         "section 4.2.2 a), Figs. 4.10, 4.11",

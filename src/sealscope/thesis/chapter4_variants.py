@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.thesis.chapter4_cases import (
     AS_PRINTED,
     CLOSINGS,
@@ -25,7 +26,6 @@ from sealscope.thesis.context import Context, RunSpec, SimulatedRun
 Solver = Literal["converged", "literal"]
 SOLVERS: tuple[Solver, ...] = ("converged", "literal")
 SOLVER_TEXT: dict[Solver, str] = {"converged": "converged", "literal": "RK4 1e-4 s"}
-PRESSURES = ("p_1", "p_2", "p_A", "p_B")
 #: Command of section 4.3, and its period [s].
 COMMAND, PERIOD = "5 sin(2t)", math.pi
 #: Length [s] and sampling rate [Hz] of the runs that show drift of the piston.

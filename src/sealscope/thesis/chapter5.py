@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.conditions import APPENDIX_C, Condition, Level
 from sealscope.thesis.items import Item
 
@@ -69,7 +70,7 @@ def _shown(test: ShownTest) -> list[tuple[View, str, bool]]:
     """View, chamber and whether a close-up, in the order of the test's figures."""
     views: list[tuple[View, str, bool]] = [("input", "", closeup) for closeup in (False, True)[: test.inputs]]
     views += [("leak", "", False), ("leak", "", True)]
-    for chamber in ("p_A", "p_B"):
+    for chamber in CHAMBERS:
         views += [("details", chamber, False), ("details", chamber, True), ("rms", chamber, False)]
     return views
 

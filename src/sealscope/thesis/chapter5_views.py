@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.chapter5 import ShownTest, test_of
 from sealscope.thesis.conditions import experiment_values
 from sealscope.thesis.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.items import Item
 from sealscope.thesis.products import Curve, Figure, Number, Panel, thinned
-from sealscope.thesis.simulated_sheet import CHAMBERS, PSI, QUANTITIES, SETTLING, data_rig, detail_rms
+from sealscope.thesis.simulated_sheet import PSI, QUANTITIES, SETTLING, data_rig, detail_rms
 
 if TYPE_CHECKING:
     from sealscope.recordings.recording import Recording

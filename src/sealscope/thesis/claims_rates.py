@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sealscope.evaluation.binomial import at_least
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapter5 import NOMINAL_LPM
 from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.context import Sheet
@@ -25,7 +26,7 @@ from sealscope.thesis.leak_size import (
     told_by_levels,
 )
 from sealscope.thesis.products import Claim
-from sealscope.thesis.simulated_sheet import CHAMBERS, log_change
+from sealscope.thesis.simulated_sheet import log_change
 from sealscope.thesis.success_rates import CLAIMED, WAY, Rule, d1_threshold
 
 _N = len(APPENDIX_C)

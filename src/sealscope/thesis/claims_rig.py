@@ -7,12 +7,13 @@ import itertools
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.context import Sheet
 from sealscope.thesis.evidence import NO_SHEET, NOT_ON_SHEET, Evidence, by_simulation, fired, share
 from sealscope.thesis.judging import verdict_of
 from sealscope.thesis.products import Claim
-from sealscope.thesis.simulated_sheet import CHAMBERS, column, data_rig, log_change
+from sealscope.thesis.simulated_sheet import column, data_rig, log_change
 from sealscope.thesis.success_rates import CLAIMED
 
 #: How near an estimated onset must come [s].

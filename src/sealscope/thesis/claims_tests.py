@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapter5 import ShownTest, test_of
 from sealscope.thesis.context import Sheet
 from sealscope.thesis.evidence import NO_SHEET, Evidence, percent
@@ -31,7 +32,7 @@ CURVES: tuple[tuple[str, str, tuple[str, ...], Said], ...] = (
     *(
         (section, chamber, ("d3", "d4", "d3d4"), "change")
         for section in ("5.4a", "5.4b", "5.5a", "5.5b", "5.5c", "5.5d")
-        for chamber in ("p_A", "p_B")
+        for chamber in CHAMBERS
     ),
 )
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.context import Sheet
 from sealscope.thesis.evidence import Evidence, corrected_p, correlated, fired, moved, on_sheet, percent
 from sealscope.thesis.leak_size import change_columns, condition_columns, left_out_r2, mean_leaks, partial_correlation
 from sealscope.thesis.products import Claim
-from sealscope.thesis.simulated_sheet import CHAMBERS, log_change
+from sealscope.thesis.simulated_sheet import log_change
 from sealscope.thesis.success_rates import CLAIMED, UNCLAIMED, WAY
 
 _N = len(APPENDIX_C)

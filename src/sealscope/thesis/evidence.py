@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.appendix_c import simulated
 from sealscope.thesis.chapter5 import test_of
@@ -15,7 +16,7 @@ from sealscope.thesis.context import Context, Sheet
 from sealscope.thesis.judging import verdict_of
 from sealscope.thesis.products import Claim, Table
 from sealscope.thesis.shown_tests import Shown, all_shown, shown
-from sealscope.thesis.simulated_sheet import CHAMBERS, QUANTITIES, log_change
+from sealscope.thesis.simulated_sheet import QUANTITIES, log_change
 from sealscope.thesis.success_rates import WAY, Rule
 
 NO_SHEET = "the thesis's data sheet was not given"

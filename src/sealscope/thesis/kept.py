@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.recording import Recording
 from sealscope.thesis.context import SimulatedRun
 from sealscope.thesis.products import Claim, Curve, Figure, Image, Number, Panel, Table
@@ -30,7 +30,7 @@ def save(path: Path, value: Any, *, small: bool = False) -> None:
     arrays: dict[str, Any] = {}
     shape = json.dumps(_packed(value, arrays), separators=(",", ":"))
     arrays[_SHAPE] = np.frombuffer(shape.encode(), dtype=np.uint8)
-    with whole_file(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         (np.savez_compressed if small else np.savez)(file, **arrays)
 
 
@@ -46,7 +46,7 @@ def load(path: Path) -> Any | None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write plain values as JSON, whole or not at all."""
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 

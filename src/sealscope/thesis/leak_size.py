@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.conditions import APPENDIX_C, Condition, groups
 from sealscope.thesis.context import Sheet
-from sealscope.thesis.simulated_sheet import CHAMBERS, log_change
+from sealscope.thesis.simulated_sheet import log_change
 
 Groups = NDArray[np.int64]
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.windows import rms
 from sealscope.thesis.chapter5 import TESTS, ShownTest
 from sealscope.thesis.chapter5_views import Mask, changes, mean_slope, omega_of, recording_of, spec_of, windowed
 from sealscope.thesis.context import Context
-from sealscope.thesis.simulated_sheet import CHAMBERS, SETTLING
+from sealscope.thesis.simulated_sheet import SETTLING
 
 Pair = tuple[float, float]
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.thesis.conditions import APPENDIX_C, Condition, experiment_values
 from sealscope.thesis.context import Sheet
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import Trajectory
 
-CHAMBERS = ("p_A", "p_B")
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Pascals in a pound per square inch, the unit the sheet is read in.
 PSI = 6894.757293168361

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.appendix_c import simulated
 from sealscope.thesis.context import Context, Sheet
 from sealscope.thesis.items import Item
 from sealscope.thesis.products import Table
-from sealscope.thesis.simulated_sheet import CHAMBERS, QUANTITIES, log_change
+from sealscope.thesis.simulated_sheet import QUANTITIES, log_change
 
 #: The way each chamber's RMS is said to go when a leak opens, section 5.6.
 WAY: Mapping[str, int] = {"p_A": -1, "p_B": 1}

@@ -15,7 +15,7 @@ from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingP
 from sealscope.diagnosis.calibration.scorers import scorer, split_view
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 
 FORMAT = "sealscope calibration 1"
 #: How far outside the calibrated pressure levels a recording may lie: this share of their range, and this ratio.
@@ -217,7 +217,7 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
 
 def save(calibration: Calibration, path: str | os.PathLike[str]) -> None:
     """Write the calibration as JSON, whole or not at all; raises InputError where it cannot be written."""
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(as_dict(calibration), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -21,7 +21,6 @@ from sealscope.diagnosis.observer.against_baseline import compare
 from sealscope.diagnosis.observer.fit import misfit
 from sealscope.diagnosis.observer.model import G_UNIT
 from sealscope.diagnosis.observer.stream import (
-    CHAMBERS,
     Formulation,
     ObserverStream,
     channels_of,
@@ -29,6 +28,7 @@ from sealscope.diagnosis.observer.stream import (
     whole,
 )
 from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 

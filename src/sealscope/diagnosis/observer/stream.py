@@ -12,6 +12,7 @@ from sealscope.diagnosis.observer.model import assume, start_parameters
 from sealscope.diagnosis.observer.pressure_filter import SEARCH_SECONDS, PressureFilter, find_stiffness
 from sealscope.diagnosis.observer.volume_filter import VolumeFilter
 from sealscope.errors import InputError
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 #: What the observer rests on: `volume` on angle (or speed) and position, no friction in it; `speed` on the pressures
 #: and the angle or speed; `command` on the pressures and the command.
 Formulation = Literal["volume", "speed", "command"]
-CHAMBERS = ("p_A", "p_B")
 #: Least noise of a reading: a tenth of a step of 14 bits over 3000 psi [Pa], and the square of it in volume [m^3].
 _LEAST_PRESSURE, _LEAST_VOLUME = 100.0, 1e-10
 _SLOW_SECONDS = 0.02

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
@@ -72,7 +73,7 @@ class BalanceBlocks:
 
 def channels_needed(recording: Recording) -> str | None:
     """None where the recording has what the balance needs, else what is missing, in one line."""
-    missing = [name for name in ("p_A", "p_B", "x") if name not in recording]
+    missing = [name for name in (*CHAMBERS, "x") if name not in recording]
     if "theta" not in recording and "omega" not in recording:
         missing.append("theta or omega")
     return f"needs {', '.join(missing)} as well (both chamber pressures and both encoders)" if missing else None
@@ -81,7 +82,7 @@ def channels_needed(recording: Recording) -> str | None:
 def samples_of(recording: Recording) -> dict[str, Array]:
     """The channels of the balance: `x`, `theta` (or `omega` where it is not recorded), `p_A`, `p_B`, and `p_1`, `p_2`
     where both are recorded and move."""
-    names = ["x", "theta" if "theta" in recording else "omega", "p_A", "p_B"]
+    names = ["x", "theta" if "theta" in recording else "omega", *CHAMBERS]
     if all(name in recording and np.nanmax(recording[name]) > np.nanmin(recording[name]) for name in ("p_1", "p_2")):
         names += ["p_1", "p_2"]
     return {name: recording[name] for name in names}

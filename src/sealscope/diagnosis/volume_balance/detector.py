@@ -28,6 +28,7 @@ from sealscope.diagnosis.volume_balance.blocks import (
 from sealscope.diagnosis.volume_balance.evidence import describe_leak, no_step, trouble
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance
 from sealscope.diagnosis.volume_balance.search import search
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
 from sealscope.recordings.symptoms import clipped
 
@@ -44,7 +45,7 @@ class VolumeBalance:
     speed); the pressures at the pump's ports, where there are any, tell the pump's leakage from the piston's."""
 
     name = "volume balance"
-    reads = ("u", "theta", "omega", "x", "p_1", "p_2", "p_A", "p_B")
+    reads = ("u", "theta", "omega", "x", "p_1", "p_2", *CHAMBERS)
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -55,7 +56,7 @@ class VolumeBalance:
         missing = channels_needed(recording)
         if missing is not None:
             return missing
-        for name in ("p_A", "p_B", "x", "theta" if "theta" in recording else "omega"):
+        for name in (*CHAMBERS, "x", "theta" if "theta" in recording else "omega"):
             values = recording[name]
             if len(recording) < 2 * FEWEST or np.count_nonzero(np.isfinite(values)) < 2 * FEWEST:
                 return f"needs {2 * FEWEST} samples or more of {name}, got {np.count_nonzero(np.isfinite(values))}"
@@ -116,7 +117,7 @@ class VolumeBalance:
 
 def _at_the_rail(recording: Recording) -> str | None:
     """Which chamber pressure is cut off for so long that its integral is not known, in one line, or None."""
-    for name in ("p_A", "p_B"):
+    for name in CHAMBERS:
         values = recording[name]
         values = values[np.isfinite(values)]
         for rail in clipped(values, np.empty((0, 2), dtype=np.intp)):

@@ -20,7 +20,7 @@ from sealscope.campaigns.run import RUN_BY_RUN
 from sealscope.diagnosis.calibration.scorers import SCORERS
 from sealscope.diagnosis.registry import detectors
 from sealscope.evaluation.table import SummaryRow
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 from sealscope.reporting.campaign.curves import Curve, Drawing, draw
 from sealscope.reporting.campaign.tables import cause_tables, flow_lines, onset_lines, percent
 from sealscope.reporting.page import _packaged, _version
@@ -177,7 +177,7 @@ def write_campaign_page(result: Result, path: Path, files: Sequence[str] = ()) -
     """Write the page of a result; `files`: names of the tables beside it. Raises InputError where it cannot be
     written."""
     text = render_campaign_page(result, files)
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 

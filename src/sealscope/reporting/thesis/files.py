@@ -9,7 +9,7 @@ from dataclasses import astuple, fields
 from itertools import zip_longest
 from pathlib import Path
 
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 from sealscope.reporting.thesis.plots import draw, visible
 from sealscope.thesis.items import Item
 from sealscope.thesis.products import Claim, Figure, Product, Table
@@ -28,12 +28,12 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
     files: list[str] = []
 
     def put(name: str, content: bytes) -> None:
-        with whole_file(folder / name) as temporary:
+        with atomic_write(folder / name) as temporary:
             temporary.write_bytes(content)
         files.append(name)
 
     def put_rows(name: str, rows: Iterable[Sequence[object]]) -> None:
-        with whole_file(folder / name) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        with atomic_write(folder / name) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
         files.append(name)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from sealscope.recordings.atomic import whole_file
+from sealscope.recordings.atomic import atomic_write
 from sealscope.reporting.page import _hash, _packaged, _version
 from sealscope.reporting.thesis.plot_style import caption
 from sealscope.reporting.thesis.plots import UNRESOLVED
@@ -54,7 +54,7 @@ def write_thesis_page(
     written.
     """
     target = folder / "index.html"
-    with whole_file(target) as temporary:
+    with atomic_write(target) as temporary:
         temporary.write_text(render_thesis_page(folder, shown, quick=quick, sheet=sheet), encoding="utf-8")
     return target
 

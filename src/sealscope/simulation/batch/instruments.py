@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.batch.layout import CHAMBERS, Member
+from sealscope.simulation.batch.layout import Member
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.changes.rig import LONGEST_BLOCK, SHORTEST_BLOCK, Effect, values_of
 from sealscope.simulation.commands import Command, Sine
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 #: Slope [1/s] of an opening that is open at once.
 AT_ONCE = 1e15
-CHAMBERS = ("p_A", "p_B")
 
 
 @dataclass(frozen=True)

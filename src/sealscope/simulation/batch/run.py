@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from sealscope.errors import SimulationFailed
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.instruments import instrument_rows
-from sealscope.simulation.batch.layout import CHAMBERS, LaneSet, cells_of, in_lanes, leak_rows, out_of_lanes
+from sealscope.simulation.batch.layout import LaneSet, cells_of, in_lanes, leak_rows, out_of_lanes
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
 from sealscope.simulation.integrate import VACUUM, choose_method, refuse_long, refuse_unresolved, steps_per_output
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from sealscope.errors import InputError
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
 from sealscope.simulation.changes.readings import Adjustment, Hold
 from sealscope.simulation.commands import number_text
@@ -14,7 +15,7 @@ from sealscope.simulation.faults.faults import Fault, From, Opening
 
 #: Channels whose sensors can be faulty, and the parameter of each sensor that holds its relative error of gain.
 GAINS = {
-    **dict.fromkeys(("p_1", "p_2", "p_A", "p_B"), "gain_error"),
+    **dict.fromkeys(PRESSURES, "gain_error"),
     "x": "scale_error",
     "q_leak": "gain_error",
 }
