@@ -12,6 +12,7 @@ import math
 import re
 from fractions import Fraction
 from functools import cache, lru_cache
+from numbers import Real
 from typing import Any, NamedTuple, overload
 
 import numpy as np
@@ -20,6 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from sealscope.errors import InputError
 
 Array = NDArray[np.float64]
+#: One litre per minute [m^3/s].
+LITRE_PER_MINUTE = 1e-3 / 60.0
 _Powers = tuple[tuple[str, Fraction], ...]
 _Conversion = tuple[Fraction, float, Fraction, Fraction]
 
@@ -324,18 +327,21 @@ def from_si(
 
 
 def parse_quantity(
-    text: str, si_unit: str, *, name: str = "value", place: str | None = None, finite: bool = True
+    value: float | str, si_unit: str, *, name: str = "value", place: str | None = None, finite: bool = True
 ) -> float:
-    """The number that ``2[L/min]``, ``3 psi`` or ``5`` (already SI) stands for, in `si_unit`.
+    """The number that a text such as ``2[L/min]``, ``3 psi`` or ``5`` (already SI) stands for, in `si_unit`.
 
-    Raises InputError where there is no number, for another dimension, and, if `finite`, for an infinite one or NaN.
+    A number is taken as SI. Raises InputError where there is no number, for another dimension, and, if `finite`, for an
+    infinite one or NaN.
     """
     where = f" ({place})" if place else ""
+    text = value if isinstance(value, str) else ""
+    if isinstance(value, Real) and not isinstance(value, bool):
+        text = repr(float(value))
     match = _NUMBER.fullmatch(text) if len(text) <= _LONGEST_TEXT else None
     if match is None:
-        raise InputError(
-            f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {text[:60]!r}{where}"
-        )
+        shown = repr(value[:60] if isinstance(value, str) else value)
+        raise InputError(f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {shown}{where}")
     rest = match["rest"].strip()
     unit = (rest[1:-1] if rest.startswith("[") and rest.endswith("]") else rest) if rest else si_unit
     number = float(match["number"])

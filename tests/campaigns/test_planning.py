@@ -26,8 +26,9 @@ from sealscope.cli.plan import plan
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Leak
+from sealscope.simulation.faults.faults import From, Leak
 from sealscope.simulation.simulate import run
+from sealscope.units import LITRE_PER_MINUTE
 
 FELL, ROSE, CHANGED = (ChangeDetector("d3", "p_A", side) for side in ("fell", "rose", "changed"))
 

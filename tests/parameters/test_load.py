@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
+import sealscope.parameters
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 
-THESIS = (Path(load_rig.__code__.co_filename).parent / "rigs" / "thesis.toml").read_text(encoding="utf-8")
+THESIS = (Path(sealscope.parameters.__file__).parent / "rigs" / "thesis.toml").read_text(encoding="utf-8")
 EXTENDS = '[rig]\nextends = "thesis"\n'
 GOOD = 'V_1 = { value = 50, unit = "cm^3", source = "measured" }\n'
 
@@ -158,3 +159,12 @@ def test_an_unknown_name_lists_the_rigs() -> None:
     )
     assert refused("").startswith("'' is no packaged rig")
     assert "is no packaged rig" in refused("a\0b.toml")
+
+
+def test_a_rig_is_its_own_rig_and_another_type_is_refused():
+    rig = load_rig("thesis")
+    assert load_rig(rig) is rig
+    with pytest.raises(InputError, match="rig must be a Rig, the name of a rig or a path, got 5"):
+        load_rig(5)
+    with pytest.raises(InputError, match="load_rig has no argument 'rg'; did you mean 'rig'"):
+        load_rig(rg="thesis")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError
-from sealscope.units import from_si, parse_quantity, same_dimension, to_si
+from sealscope.units import LITRE_PER_MINUTE, from_si, parse_quantity, same_dimension, to_si
 
 KNOWN = [
     ("234 cm^3", "m^3", 2.34e-4),
@@ -141,3 +141,18 @@ def test_the_units_of_hydraulics_need_no_pint() -> None:
         "sys.exit('pint' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("value", [3, 3.0, np.float64(3.0), np.int64(3), "3", "3 s", "0.05[min]", "3000[ms]"])
+def test_a_quantity_may_be_a_number_or_a_text(value):
+    assert parse_quantity(value, "s") == 3.0
+
+
+@pytest.mark.parametrize("value", [None, True, [3.0], 3 + 0j, "three"])
+def test_what_is_no_quantity_is_refused_by_name(value):
+    with pytest.raises(InputError, match="duration must be a number with or without a unit"):
+        parse_quantity(value, "s", name="duration")
+
+
+def test_a_litre_per_minute_is_that_of_the_units():
+    assert parse_quantity("1[L/min]", "m^3/s") == LITRE_PER_MINUTE

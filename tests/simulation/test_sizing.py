@@ -7,8 +7,9 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Growing, Leak, Tabulated, parse_leak
+from sealscope.simulation.faults.faults import From, Growing, Leak, Tabulated, parse_leak
 from sealscope.simulation.simulate import run, sized_leaks, trajectory
+from sealscope.units import LITRE_PER_MINUTE
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 

@@ -50,7 +50,8 @@ def fault_of(words: str, onset_s: float) -> Fault:
 
 def leak_of(plan: Plan, case: Case) -> tuple[Leak, ...]:
     """The case's leak, open from the plan's onset on; its size still a mean flow."""
-    from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Leak
+    from sealscope.simulation.faults.faults import From, Leak
+    from sealscope.units import LITRE_PER_MINUTE
 
     if not case.leak_lpm:
         return ()

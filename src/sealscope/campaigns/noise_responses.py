@@ -17,11 +17,12 @@ from sealscope.recordings.recording import Array
 from sealscope.signals.details import Details, details
 from sealscope.signals.filters import IntArray
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, From, Leak
+from sealscope.simulation.faults.faults import From, Leak
 from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import Trajectory
 from sealscope.simulation.sensitivity import clean_channels
 from sealscope.simulation.simulate import oversampling, trajectory
+from sealscope.units import LITRE_PER_MINUTE
 
 #: Blocks of a half over which the noise is taken as independent.
 BLOCKS = 16

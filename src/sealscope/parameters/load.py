@@ -6,8 +6,8 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
+from sealscope.calls import checked_call, closest
 from sealscope.errors import InputError
-from sealscope.parameters.names import closest
 from sealscope.parameters.rig import Entry, Rig, flatten
 from sealscope.parameters.toml_file import read_toml
 
@@ -20,13 +20,41 @@ def rig_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _PACKAGED.glob("*.toml")))
 
 
-def load_rig(name_or_path: str | os.PathLike[str] = "thesis") -> Rig:
-    """The rig of that name, or of a TOML file with value, unit and source for each parameter.
+@checked_call
+def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
+    """Load the parameters of a rig.
 
-    A file may say `[rig] extends = "thesis"` (or a path beside it) and then needs only the values that differ. Raises
-    InputError where the file cannot be read, a name is unknown, or a value has no source, a wrong unit or a bad value.
+    Parameters
+    ----------
+    rig : Rig, str or path-like, optional
+        Name of a packaged rig (`sealscope parameters` lists one), or path of a TOML file with value, unit and source
+        for each parameter; a Rig is returned as it is. A file may say ``[rig] extends = "thesis"`` (or the path of
+        another file) and then states only the values that differ.
+
+    Returns
+    -------
+    Rig
+        The parameters, immutable, in SI units.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, a name is unknown, or a value has no source, a wrong unit or is out of its range.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> rig = ss.load_rig("thesis")
+    >>> rig["cylinder.L"]
+    0.6
+    >>> ss.load_rig(rig) is rig
+    True
     """
-    text = os.fspath(name_or_path)
+    if isinstance(rig, Rig):
+        return rig
+    if not isinstance(rig, str | os.PathLike):
+        raise InputError(f"rig must be a Rig, the name of a rig or a path, got {rig!r}")
+    text = os.fspath(rig)
     if text in rig_names():
         return _packaged(text)
     if "\0" in text or not _is_path(text):

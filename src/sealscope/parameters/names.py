@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 
+from sealscope.calls import closest
 from sealscope.errors import InputError
-
-
-def closest(word: str, known: Sequence[str]) -> str:
-    """`; did you mean ...?` with the known name nearest to `word`, or an empty string."""
-    folded = {name.casefold(): name for name in known}
-    near = difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.5)
-    return f"; did you mean {folded[near[0]]}?" if near else ""
 
 
 def resolve(name: str, dotted: Sequence[str]) -> str:

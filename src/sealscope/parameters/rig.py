@@ -11,12 +11,13 @@ import numpy as np
 from pydantic import PrivateAttr, model_validator
 from pydantic.fields import FieldInfo
 
+from sealscope.calls import closest
 from sealscope.errors import InputError
 from sealscope.parameters.actuator import Cylinder, Friction
 from sealscope.parameters.drive import Fluid, Line, MakeUp, Motor, Pump
 from sealscope.parameters.fields import Part, PartsDisagreeError, choices_of, leaves, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
-from sealscope.parameters.names import closest, resolve
+from sealscope.parameters.names import resolve
 from sealscope.units import parse_quantity, to_si
 
 Value = float | int | str

@@ -170,9 +170,9 @@ def make_experiment(
 
     Raises InputError for whatever breaks a rule, with rule, value and place.
     """
-    from sealscope.parameters import Rig, load_rig
+    from sealscope.parameters import load_rig
 
-    loaded = rig if isinstance(rig, Rig) else load_rig(rig)
+    loaded = load_rig(rig)
     if values:
         loaded = loaded.with_values(values)
     given = [] if leak is None else [leak] if isinstance(leak, (str, Leak)) else list(leak)

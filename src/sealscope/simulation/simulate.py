@@ -16,11 +16,12 @@ from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.changes.drifts import Drift
 from sealscope.simulation.experiment import Experiment, make_experiment
-from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, Fault, Leak
+from sealscope.simulation.faults.faults import Fault, Leak
 from sealscope.simulation.inputs import RunInputs
 from sealscope.simulation.instruments import FILTER_REACH, record
 from sealscope.simulation.integrate import DEFAULT_STEP, Trajectory, choose_method, integrate
 from sealscope.simulation.sizing import leak_flow, mean_while_open, sized
+from sealscope.units import LITRE_PER_MINUTE
 
 #: Told what is being done and how far it is, 0..1.
 Progress = Callable[[str, float], None]

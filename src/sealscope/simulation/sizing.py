@@ -10,8 +10,9 @@ import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
-from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, Leak
+from sealscope.simulation.faults.faults import Leak
 from sealscope.simulation.integrate import Trajectory
+from sealscope.units import LITRE_PER_MINUTE
 
 #: Relative distance from the mean asked for at which the search ends.
 TOLERANCE = 1e-3

@@ -19,10 +19,10 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.layout import LaneSet, sets_of, with_sizes
 from sealscope.simulation.batch.run import SetRun
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults.faults import LITRE_PER_MINUTE
 from sealscope.simulation.integrate import FINEST, LONGEST_STEP
 from sealscope.simulation.resolution import FIRST_WINDOW, PRESSURE_TOLERANCE
 from sealscope.simulation.sizing import scaled_size
+from sealscope.units import LITRE_PER_MINUTE
 
 #: Told how far the batch is, 0..1.
 Progress = Callable[[float], None]

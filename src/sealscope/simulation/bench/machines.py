@@ -118,7 +118,7 @@ def draw(
     from sealscope.parameters import load_rig
 
     found = load_profile(profile) if isinstance(profile, str) else profile
-    base = load_rig(rig) if isinstance(rig, str) else rig
+    base = load_rig(rig)
     if seed < 0:
         raise InputError(f"seed must be >= 0, got {seed}")
     if not (math.isfinite(duration) and duration > 0):

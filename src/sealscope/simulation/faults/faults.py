@@ -13,13 +13,11 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.changes.readings import Adjustment, Hold
 from sealscope.simulation.changes.rig import Effect
+from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.simulation.commands import Command
-
-#: One litre per minute [m^3/s].
-LITRE_PER_MINUTE = 1e-3 / 60.0
 
 
 class Opening(Protocol):
@@ -221,7 +219,5 @@ def parse_leak(text: str) -> Leak | None:
         if part["law"] not in (None, law):
             raise InputError(f"{part['letter']} is the coefficient of the {law} law, got law {part['law']} ({text!r})")
         return Leak(law, coefficient=float(part["coefficient"]), opening=opening)
-    from sealscope.units import parse_quantity
-
     mean = parse_quantity(f"{part['mean']}[{part['unit']}]", "m^3/s")
     return Leak(part["law"] or "laminar", mean=mean, opening=opening)  # type: ignore[arg-type]

@@ -11,7 +11,8 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.changes.drifts import GROUPS
 from sealscope.simulation.changes.rig import Effect
 from sealscope.simulation.commands import number_text
-from sealscope.simulation.faults.faults import LITRE_PER_MINUTE, SHARE_RESOLUTION, Fault, From, Opening, bends
+from sealscope.simulation.faults.faults import SHARE_RESOLUTION, Fault, From, Opening, bends
+from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig

@@ -1,0 +1,48 @@
+"""Calls of public functions: a wrong argument is refused by a message that names the nearest right one."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import inspect
+from collections.abc import Callable, Iterable
+from typing import ParamSpec, TypeVar
+
+from sealscope.errors import InputError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def closest(word: str, known: Iterable[str]) -> str:
+    """Return ``; did you mean NAME?`` with the known name nearest to `word`, or an empty text."""
+    folded = {name.casefold(): name for name in known}
+    near = difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.5)
+    return f"; did you mean {folded[near[0]]}?" if near else ""
+
+
+def checked_call(function: Callable[P, R]) -> Callable[P, R]:
+    """Make a call with wrong arguments raise InputError; signature and docstring stay those of `function`.
+
+    An unknown keyword is answered with the nearest known one: ``simulate has no argument 'comand'; did you mean
+    'command'?``. Missing and surplus arguments raise InputError too. What the function itself raises is not touched.
+    """
+    signature = inspect.signature(function)
+    names = [name for name, parameter in signature.parameters.items() if parameter.kind is not parameter.VAR_KEYWORD]
+    any_keyword = len(names) < len(signature.parameters)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not any_keyword:
+            for name in kwargs:
+                if name not in names:
+                    raise InputError(
+                        f"{function.__name__} has no argument {name!r}{closest(repr(name), map(repr, names))}"
+                    )
+        try:
+            signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise InputError(f"{function.__name__}: {error}") from None
+        return function(*args, **kwargs)
+
+    return call
