@@ -21,8 +21,8 @@ from sealscope.reporting.thesis.files import figure_rows, publish
 from sealscope.reporting.thesis.page import VERDICTS, cell, render_thesis_page, write_thesis_page
 from sealscope.reporting.thesis.plot_style import STYLES, caption, typeset
 from sealscope.reporting.thesis.plots import MOST_SVG_BYTES, UNRESOLVED, draw, grid_of, visible
-from sealscope.thesis.items import Entry, Item
-from sealscope.thesis.products import Claim, Curve, Figure, Image, Number, Panel, Role, Table
+from sealscope.thesis.engine.items import Entry, Item
+from sealscope.thesis.engine.products import Claim, Curve, Figure, Image, Number, Panel, Role, Table
 
 pytest.importorskip("matplotlib", reason="figures need the extra 'report'")
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.thesis import sources
 from sealscope.thesis.conditions import APPENDIX_C
+from sealscope.thesis.engine import sources
 from sealscope.thesis.sheet import FILES, QUANTITIES
 
 CHAPTER = """
 import os, time
 from pathlib import Path
-from sealscope.thesis.context import RunSpec
-from sealscope.thesis.products import Claim, Curve, Figure, Panel, Table
+from sealscope.thesis.engine.context import RunSpec
+from sealscope.thesis.engine.products import Claim, Curve, Figure, Panel, Table
 
 FACTOR = 1
 

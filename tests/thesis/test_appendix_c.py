@@ -7,11 +7,12 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis import appendix_c, simulated_sheet
+from sealscope.thesis.chapters.appendix_c import simulated_sheet
+from sealscope.thesis.chapters.appendix_c import tables as appendix_c
+from sealscope.thesis.chapters.appendix_c.simulated_sheet import QUANTITIES, Drift, drift_of, log_change, sheet_of
 from sealscope.thesis.conditions import APPENDIX_C
-from sealscope.thesis.context import Sheet
-from sealscope.thesis.products import Product, Table
-from sealscope.thesis.simulated_sheet import QUANTITIES, Drift, drift_of, log_change, sheet_of
+from sealscope.thesis.engine.products import Product, Table
+from sealscope.thesis.sheet import Sheet
 
 TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from sealscope.parameters import load_rig
-from sealscope.thesis import chapter3
-from sealscope.thesis.context import RunSpec, SimulatedRun
-from sealscope.thesis.continuous_wavelet import (
+from sealscope.thesis.chapters.chapter3 import figures as chapter3
+from sealscope.thesis.chapters.chapter3.continuous_wavelet import (
     continuous_transform,
     inverse_gain,
     scales_for,
     wavelet_centre,
     wavelet_spectrum,
 )
-from sealscope.thesis.judging import verdict_of
-from sealscope.thesis.products import Claim, Figure
-from sealscope.thesis.runs import experiment_of, simulated
+from sealscope.thesis.claims.judging import verdict_of
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun
+from sealscope.thesis.engine.products import Claim, Figure
+from sealscope.thesis.engine.runs import experiment_of, simulated
 
 
 class Kept:
@@ -45,7 +45,7 @@ def made() -> dict[str, tuple[Figure | Claim, ...]]:
     context, found = Kept(), {}
     for item in chapter3.ITEMS:
         module, name = item.make.split(":")
-        found[item.id] = getattr(importlib.import_module(f"sealscope.thesis.{module}"), name)(context, item)
+        found[item.id] = getattr(importlib.import_module(module), name)(context, item)
     return found
 
 
@@ -170,7 +170,7 @@ def test_claims_are_judged_by_their_numbers(made: dict) -> None:
 def test_a_pressure_that_drops_makes_claim_3_6_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     from dataclasses import replace
 
-    from sealscope.thesis.chapter3_claims import claims
+    from sealscope.thesis.claims.chapter3 import claims
 
     class Dropping(Kept):
         def run(self, spec: RunSpec) -> SimulatedRun:

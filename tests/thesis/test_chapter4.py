@@ -11,8 +11,8 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import throttle_coefficients
-from sealscope.thesis import chapter4, chapter4_claims
-from sealscope.thesis.chapter4_cases import (
+from sealscope.thesis.chapters.chapter4 import figures as chapter4
+from sealscope.thesis.chapters.chapter4.cases import (
     AS_PRINTED,
     CASES,
     OURS,
@@ -27,14 +27,15 @@ from sealscope.thesis.chapter4_cases import (
     spec,
     visible_pressure,
 )
-from sealscope.thesis.chapter4_friction import falls_up_to, jumps_at_threshold
-from sealscope.thesis.chapter4_plain_claims import ringing, sine_fit
-from sealscope.thesis.chapter4_variants import PERIOD, drift, throttled
-from sealscope.thesis.context import RunSpec, SimulatedRun
-from sealscope.thesis.items import Item
-from sealscope.thesis.products import Claim, Figure, Table
-from sealscope.thesis.registry import check
-from sealscope.thesis.runs import experiment_of, simulated
+from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold
+from sealscope.thesis.chapters.chapter4.variants import PERIOD, drift, throttled
+from sealscope.thesis.claims.chapter4 import summary as chapter4_claims
+from sealscope.thesis.claims.chapter4.plain import ringing, sine_fit
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun
+from sealscope.thesis.engine.items import Item
+from sealscope.thesis.engine.products import Claim, Figure, Table
+from sealscope.thesis.engine.registry import check
+from sealscope.thesis.engine.runs import experiment_of, simulated
 
 
 class Kept:
@@ -65,7 +66,7 @@ ALL = {item.id: item for item in (*chapter4.ITEMS, *chapter4_claims.ITEMS)}
 
 def make(context: Kept, item: Item) -> tuple[Figure | Table | Claim, ...]:
     module, name = item.make.split(":")
-    return getattr(importlib.import_module(f"sealscope.thesis.{module}"), name)(context, item)
+    return getattr(importlib.import_module(module), name)(context, item)
 
 
 @pytest.fixture(scope="module")

@@ -12,14 +12,14 @@ import pytest
 
 from sealscope.errors import SimulationFailed
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
-from sealscope.thesis.chapter5 import ITEMS, TESTS, test_of
-from sealscope.thesis.chapter5_views import figure, mean_slope, omega_of, spec_of, windowed
+from sealscope.thesis.chapters.appendix_c.simulated_sheet import PSI, detail_rms
+from sealscope.thesis.chapters.chapter5.shown_tests import best_step, shown
+from sealscope.thesis.chapters.chapter5.tests import ITEMS, TESTS, test_of
+from sealscope.thesis.chapters.chapter5.views import figure, mean_slope, omega_of, spec_of, windowed
 from sealscope.thesis.conditions import APPENDIX_C
-from sealscope.thesis.context import RunSpec, SimulatedRun
-from sealscope.thesis.items import Item
-from sealscope.thesis.products import Figure
-from sealscope.thesis.shown_tests import best_step, shown
-from sealscope.thesis.simulated_sheet import PSI, detail_rms
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun
+from sealscope.thesis.engine.items import Item
+from sealscope.thesis.engine.products import Figure
 
 test_of.__test__ = False  # a function of the package, not a test
 

@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis import claims, claims_rates, claims_rig, claims_tests, claims_trends
-from sealscope.thesis.chapter5 import TESTS, test_of
+from sealscope.thesis.chapters.appendix_c.simulated_sheet import QUANTITIES, Row, table_of
+from sealscope.thesis.chapters.chapter5.shown_tests import Shown
+from sealscope.thesis.chapters.chapter5.tests import TESTS, test_of
+from sealscope.thesis.claims import detection as claims
+from sealscope.thesis.claims import rates as claims_rates
+from sealscope.thesis.claims import rig as claims_rig
+from sealscope.thesis.claims import tests as claims_tests
+from sealscope.thesis.claims import trends as claims_trends
+from sealscope.thesis.claims.evidence import NO_SHEET, Evidence, correlated
 from sealscope.thesis.conditions import APPENDIX_C
-from sealscope.thesis.context import Sheet
-from sealscope.thesis.evidence import NO_SHEET, Evidence, correlated
-from sealscope.thesis.products import Claim, Product
-from sealscope.thesis.shown_tests import Shown
-from sealscope.thesis.simulated_sheet import QUANTITIES, Row, table_of
+from sealscope.thesis.engine.products import Claim, Product
+from sealscope.thesis.sheet import Sheet
 
 test_of.__test__ = False  # a function of the package, not a test
 
@@ -148,7 +152,7 @@ def test_verdicts_on_the_thesis_s_own_sheet(measured: dict[str, Claim]) -> None:
 
 
 def test_leak_sizes_are_judged_by_the_conditions() -> None:
-    from sealscope.thesis import claims_levels
+    from sealscope.thesis.claims import levels as claims_levels
 
     found = {claim.id: claim for claim in claims_levels.claims()}
     assert found["claim-5.1.2"].verdict == "does not hold"

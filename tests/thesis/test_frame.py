@@ -12,12 +12,12 @@ import pytest
 
 import sealscope.thesis
 from sealscope.errors import InputError
-from sealscope.thesis import kept, registry, sources
-from sealscope.thesis.items import Item
-from sealscope.thesis.products import Claim, Curve, Figure, Image, Number, Panel, Table
-from sealscope.thesis.reproduce import Outcome, reproduce
+from sealscope.thesis.engine import kept, registry, sources
+from sealscope.thesis.engine.items import Item
+from sealscope.thesis.engine.products import Claim, Curve, Figure, Image, Number, Panel, Table
+from sealscope.thesis.engine.reproduce import Outcome, reproduce
+from sealscope.thesis.engine.store import Store, held
 from sealscope.thesis.sheet import MISSING
-from sealscope.thesis.store import Store, held
 
 
 def item(name: str, make: str, *needs: str, needs_sheet: bool = False) -> Item:
@@ -77,15 +77,15 @@ def test_what_is_needed_comes_first() -> None:
 
 def test_the_real_registry_lists_every_module_and_every_maker_is_there() -> None:
     offering = set()
-    for module in pkgutil.iter_modules(sealscope.thesis.__path__):
-        if hasattr(importlib.import_module(f"sealscope.thesis.{module.name}"), "ITEMS"):
-            offering.add(module.name)
+    for module in pkgutil.walk_packages(sealscope.thesis.__path__, "sealscope.thesis."):
+        if hasattr(importlib.import_module(module.name), "ITEMS"):
+            offering.add(module.name.removeprefix("sealscope.thesis."))
     assert offering == set(registry.MODULES)
     items = registry.collect()
     assert {3, 4, 5} <= {one.chapter for one in items}
     for one in items:
         name, function = one.make.split(":")
-        assert callable(getattr(importlib.import_module(f"sealscope.thesis.{name}"), function)), one.make
+        assert callable(getattr(importlib.import_module(name), function)), one.make
 
 
 # kept results
@@ -186,14 +186,14 @@ def test_what_cannot_be_kept_is_refused_and_leaves_no_file(tmp_path: Path) -> No
 
 
 def test_the_sources_of_a_module_are_those_it_imports() -> None:
-    found = {path.name for path in sources.reached("sealscope.thesis.runs")}
+    found = {path.name for path in sources.reached("sealscope.thesis.engine.runs")}
     assert {"runs.py", "simulate.py", "experiment.py", "restrictors.py", "thesis.toml", "context.py"} <= found
     assert not {"chapter5.py", "page.py", "verdict.py"} & found
-    assert {path.name for path in sources.reached("sealscope.thesis.registry")} == {
+    assert {path.name for path in sources.reached("sealscope.thesis.engine.registry")} == {
         "registry.py",
         "errors.py",
         "items.py",
-    } | {path.name for path in sources.reached("sealscope.thesis.items")}
+    } | {path.name for path in sources.reached("sealscope.thesis.engine.items")}
 
 
 def test_without_the_sheet_items_that_need_it_are_left_out(
@@ -217,7 +217,7 @@ def test_without_the_sheet_items_that_need_it_are_left_out(
 def test_equal_runs_are_simulated_once_and_kept_exactly(
     fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sealscope.thesis import runs
+    from sealscope.thesis.engine import runs
 
     calls = []
     real = runs.simulated

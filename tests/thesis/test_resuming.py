@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.thesis.items import Item
-from sealscope.thesis.reproduce import Outcome, reproduce
+from sealscope.thesis.engine.items import Item
+from sealscope.thesis.engine.reproduce import Outcome, reproduce
 
 
 def item(name: str, make: str, *needs: str, needs_sheet: bool = False) -> Item:
@@ -44,7 +44,7 @@ def test_a_killed_call_is_taken_up_where_it_stopped(fakes: Path, tmp_path: Path,
     names = [f"t-{number}" for number in range(8)]
     script = tmp_path / "call.py"
     script.write_text(
-        "from sealscope.thesis.items import Item\nfrom sealscope.thesis.reproduce import reproduce\n"
+        "from sealscope.thesis.engine.items import Item\nfrom sealscope.thesis.engine.reproduce import reproduce\n"
         "if __name__ == '__main__':\n"
         f"    items = tuple(Item(n, 4, 'table', 'Item ' + n, 'fakes.chapter:slow') for n in {names!r})\n"
         "    reproduce(['all'], 'out', registry=items, jobs=2)\n"

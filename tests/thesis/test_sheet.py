@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sealscope.errors import InputError
-from sealscope.thesis import registry
+from sealscope.thesis.engine import registry
 from sealscope.thesis.sheet import FILES, MISSING, find_sheet, read_sheet
 
 WriteSheet = Callable[..., Path]

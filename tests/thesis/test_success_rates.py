@@ -13,19 +13,8 @@ from hypothesis import strategies as st
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.context import Sheet
-from sealscope.thesis.leak_size import (
-    area_under_curve,
-    change_columns,
-    condition_columns,
-    condition_groups,
-    left_out_r2,
-    mean_leaks,
-    partial_correlation,
-    told_by_levels,
-)
-from sealscope.thesis.simulated_sheet import QUANTITIES
-from sealscope.thesis.success_rates import (
+from sealscope.thesis.chapters.appendix_c.simulated_sheet import QUANTITIES
+from sealscope.thesis.chapters.appendix_c.success_rates import (
     CLAIMED,
     RATES,
     UNCLAIMED,
@@ -35,6 +24,17 @@ from sealscope.thesis.success_rates import (
     rates,
     thresholds,
 )
+from sealscope.thesis.claims.leak_size import (
+    area_under_curve,
+    change_columns,
+    condition_columns,
+    condition_groups,
+    left_out_r2,
+    mean_leaks,
+    partial_correlation,
+    told_by_levels,
+)
+from sealscope.thesis.sheet import Sheet
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
 needs_sheet = pytest.mark.skipif(

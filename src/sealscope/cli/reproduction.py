@@ -12,12 +12,12 @@ import typer
 from sealscope.cli.options import complain
 
 if TYPE_CHECKING:
-    from sealscope.thesis.reproduce import Outcome, Progress
+    from sealscope.thesis.engine.reproduce import Outcome, Progress
 
 
 def complete_items(incomplete: str) -> list[str]:
     """Ids that begin so."""
-    from sealscope.thesis.registry import collect
+    from sealscope.thesis.engine.registry import collect
 
     items = collect()
     words = ["all", *(f"chapter-{number}" for number in sorted({item.chapter for item in items}))]
@@ -56,7 +56,7 @@ def reproduce(
     from sealscope.reporting.thesis.files import publish
     from sealscope.reporting.thesis.page import write_thesis_page
     from sealscope.reporting.thesis.plots import require_drawing
-    from sealscope.thesis.reproduce import reproduce as carry_out
+    from sealscope.thesis.engine.reproduce import reproduce as carry_out
 
     if not ids:
         raise InputError("an item must be named: an id, chapter-N or all (sealscope reproduce --list)")
@@ -86,7 +86,7 @@ def _summarise(outcome: Outcome, page: Path) -> None:
 
 
 def _list(words: Sequence[str], sheet: Path | None) -> None:
-    from sealscope.thesis.registry import collect, select
+    from sealscope.thesis.engine.registry import collect, select
     from sealscope.thesis.sheet import MISSING, find_sheet
 
     given = find_sheet(sheet) is not None

@@ -6,6 +6,8 @@ import csv
 import hashlib
 import math
 import os
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +15,23 @@ import numpy as np
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.recording import Array
 from sealscope.thesis.conditions import APPENDIX_C, Condition
-from sealscope.thesis.context import Sheet
 
 FILES = {"p_A": "appendix_c_pa.csv", "p_B": "appendix_c_pb.csv"}
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 VARIABLE = "SEALSCOPE_SHEET"
 MISSING = "needs the data sheet: give --sheet"
 _CONDITION = ("mean_leak_lpm", "input_amplitude_v", "input_omega_rad_s", "orifice_closed_pct", "leakage_level")
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """The thesis's own data sheet (its Appendix C), read from the two files of it where they are given.
+
+    `rms[chamber][quantity]`: (41, 2) RMS without and with the leak, chambers "p_A", "p_B", quantities d1..d4, d3d4;
+    rows in the order of `conditions.APPENDIX_C`.
+    """
+
+    rms: Mapping[str, Mapping[str, Array]]
 
 
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:

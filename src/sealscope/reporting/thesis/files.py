@@ -11,8 +11,8 @@ from pathlib import Path
 
 from sealscope.recordings.atomic import atomic_write
 from sealscope.reporting.thesis.plots import draw, visible
-from sealscope.thesis.items import Item
-from sealscope.thesis.products import Claim, Figure, Product, Table
+from sealscope.thesis.engine.items import Item
+from sealscope.thesis.engine.products import Claim, Figure, Product, Table
 
 _NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
 

@@ -13,8 +13,8 @@ from sealscope.recordings.atomic import atomic_write
 from sealscope.reporting.page import _hash, _packaged, _version
 from sealscope.reporting.thesis.plot_style import caption
 from sealscope.reporting.thesis.plots import UNRESOLVED
-from sealscope.thesis.items import Entry
-from sealscope.thesis.products import Claim, Figure, Product, Table, Verdict
+from sealscope.thesis.engine.items import Entry
+from sealscope.thesis.engine.products import Claim, Figure, Product, Table, Verdict
 
 THESIS = "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems"
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from sealscope.thesis.products import Role
+from sealscope.thesis.engine.products import Role
 
 
 @dataclass(frozen=True)

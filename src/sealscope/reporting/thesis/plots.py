@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.errors import MissingExtra
 from sealscope.reporting.thesis.plot_style import SAME_ROLE, SETTINGS, STYLES, caption, typeset
-from sealscope.thesis.products import Curve, Figure, Panel, Role, thinned
+from sealscope.thesis.engine.products import Curve, Figure, Panel, Role, thinned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,0 +1,1 @@
+"""The cases, tables and figures of each chapter."""

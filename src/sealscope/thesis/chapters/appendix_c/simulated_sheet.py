@@ -1,0 +1,273 @@
+"""The 41 tests of Appendix C run on the simulated rig, reduced to the RMS of the details before and after, as on the
+thesis's own sheet; and the same tests with nothing leaking.
+
+Records are reduced at once and not kept: all of them would fill gigabytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.recording import Array, Recording
+from sealscope.thesis.conditions import APPENDIX_C, Condition, experiment_values
+from sealscope.thesis.engine.products import Table
+from sealscope.thesis.sheet import Sheet
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+    from sealscope.simulation.experiment import Experiment
+    from sealscope.simulation.integrate import Trajectory
+
+QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
+#: Pascals in a pound per square inch, the unit the sheet is read in.
+PSI = 6894.757293168361
+#: Length of the part without and of the part with the leak [s]; a quick reproduction takes the shorter one.
+HALF, QUICK_HALF = 90.0, 40.0
+#: What is left out of each record's beginning [s]: the rig starts at rest, the thesis's was running.
+SETTLING = 5.0
+#: How far friction, bulk modulus and noise drift between the halves of a leak-free test: least and greatest share.
+FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT = (0.04, 0.08), (0.03, 0.03), (0.04, 0.04)
+#: Length of the run that a leak is sized on [s]; the mean over the test itself differs from it by 0.2 % at most.
+_SIZING = 30.0
+_NO_LEAK_SEED, _DRIFT_SEED = 1000, 2000
+_DRAWS, _QUICK_DRAWS = 2, 1
+
+
+def data_rig() -> str:
+    """Name of the packaged rig that stands for the thesis's bench: the one fitted to Appendix C, where there is one."""
+    from sealscope.parameters import rig_names
+
+    return "thesis-calibrated" if "thesis-calibrated" in rig_names() else "thesis"
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Factors on friction, bulk modulus and noise of a rig that has drifted."""
+
+    friction: float
+    bulk: float
+    noise: float
+
+    def values(self, rig: Rig) -> dict[str, float]:
+        """The drifted parameters by name, SI."""
+        friction, sensors = rig.friction, rig.sensors
+        return {
+            "friction.F_pr": friction.F_pr * self.friction,
+            "friction.F_cfr": friction.F_cfr * self.friction,
+            "friction.F_v": friction.F_v * self.friction,
+            "fluid.K_oil": rig.fluid.K_oil * self.bulk,
+            "sensors.common_noise": sensors.common_noise * self.noise,
+            "sensors.p_A.noise": sensors.p_A.noise * self.noise,
+            "sensors.p_B.noise": sensors.p_B.noise * self.noise,
+        }
+
+
+def drift_of(number: int, draw: int = 0) -> Drift:
+    """The drift drawn for a test: each share uniform within its bounds, up or down with equal chance, independent."""
+    random = np.random.default_rng([_DRIFT_SEED, draw, number])
+    shares = [random.uniform(*bounds) for bounds in (FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT)]
+    signs = random.choice([-1.0, 1.0], size=3)
+    return Drift(*(float(1.0 + sign * share) for sign, share in zip(signs, shares, strict=True)))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One simulated test: RMS without and with what happened at half time, and what the run was."""
+
+    condition: Condition
+    rms: Mapping[str, Mapping[str, tuple[float, float]]]
+    mean_leak_lpm: float
+    range_MPa: tuple[float, float]
+    resolved: bool | None = None
+    happened: str = ""
+
+
+def detail_rms(recording: Recording, parts: tuple[tuple[float, float], ...]) -> dict[str, dict[str, tuple[float, ...]]]:
+    """RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers' pressures within each part (from, to) [s].
+
+    A part is narrowed by the transform's reach on both sides, so that no coefficient saw anything outside of it.
+    """
+    from sealscope.signals.details import details
+    from sealscope.signals.filters import reach
+
+    before, after = (int(samples) for samples in reach("db8", 4)[-1])
+    rate = recording.rate
+    slices = [slice(round(start * rate) + before, round(stop * rate) - after) for start, stop in parts]
+    found: dict[str, dict[str, tuple[float, ...]]] = {}
+    for chamber in CHAMBERS:
+        d = details(recording[chamber] / PSI)
+        series = {**{f"d{level}": d[level] for level in range(1, 5)}, "d3d4": d.product()}
+        found[chamber] = {
+            name: tuple(float(np.sqrt(np.mean(np.square(values[part])))) for part in slices)
+            for name, values in series.items()
+        }
+    return found
+
+
+def _range_MPa(t: Array, p_A: Array, p_B: Array, stop: float) -> tuple[float, float]:
+    """5 to 95 % range of both chambers' true pressures [MPa] from the settled start to `stop` [s]."""
+    part = (t >= SETTLING) & (t < stop)
+    low_high = [np.percentile(pressure[part], [5.0, 95.0]) for pressure in (p_A, p_B)]
+    return float(np.ptp(low_high[0]) / 1e6), float(np.ptp(low_high[1]) / 1e6)
+
+
+def _experiment(condition: Condition, duration: float, leak: str | None = None, **others: Any) -> Experiment:
+    from sealscope.simulation.experiment import make_experiment
+
+    return make_experiment(
+        rig=data_rig(),
+        command=condition.command,
+        values=experiment_values(condition),
+        leak=leak,
+        duration=duration,
+        **others,
+    )
+
+
+def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
+    """What the instruments make of a trajectory, with the noise of the experiment's seed."""
+    from sealscope.simulation.instruments import record
+    from sealscope.simulation.simulate import oversampling
+
+    volts = experiment.command.volts(experiment.sample_times())
+    return record(experiment.rig, path, volts, oversampling(experiment), experiment.seed)
+
+
+def _before_and_after(rms: Mapping[str, Mapping[str, tuple[float, ...]]]) -> dict[str, dict[str, tuple[float, float]]]:
+    return {chamber: {name: (pair[0], pair[1]) for name, pair in of.items()} for chamber, of in rms.items()}
+
+
+def with_leak(quick: bool = False) -> Iterator[Row]:
+    """The tests as they were: the leak opens at half time. The first test of each condition is proved by halving the
+    step, except in a quick reproduction."""
+    from sealscope.simulation.faults.faults import From
+    from sealscope.simulation.proof import prove
+    from sealscope.simulation.simulate import run, sized_leaks
+
+    half = QUICK_HALF if quick else HALF
+    proved: set[tuple[str, float]] = set()
+    for condition in APPENDIX_C:
+        asked = f"{condition.mean_leak_lpm:g} L/min from {SETTLING:g} s"
+        found = sized_leaks(_experiment(condition, SETTLING + _SIZING, asked))
+        leaks = tuple(replace(leak, opening=From(half)) for leak in found)
+        experiment = replace(_experiment(condition, 2 * half, seed=condition.number), leaks=leaks)
+        made = run(experiment)
+        resolved = None
+        if not quick and condition.group not in proved:
+            proved.add(condition.group)
+            resolved = prove(replace(experiment, allow_unresolved=True)).resolved
+        rms = detail_rms(made.recording, ((SETTLING, half), (half, 2 * half)))
+        yield Row(
+            condition,
+            _before_and_after(rms),
+            made.truth.mean_leak_lpm,
+            _range_MPa(made.truth.t, made.truth.outputs["p_A"], made.truth.outputs["p_B"], half),
+            resolved,
+            "leak opened",
+        )
+
+
+def without_leak(quick: bool = False) -> Iterator[Row]:
+    """The same tests with no leak: nothing happens at half time; the noise alone differs."""
+    from sealscope.simulation.simulate import trajectory
+
+    half = QUICK_HALF if quick else HALF
+    paths: dict[tuple[str, float], Trajectory] = {}
+    for condition in APPENDIX_C:
+        experiment = _experiment(condition, 2 * half, seed=_NO_LEAK_SEED + condition.number)
+        if condition.group not in paths:
+            paths[condition.group] = trajectory(experiment, ())
+        path = paths[condition.group]
+        rms = detail_rms(_recorded(experiment, path), ((SETTLING, half), (half, 2 * half)))
+        yield Row(
+            condition, _before_and_after(rms), 0.0, _range_MPa(path.t, path["p_A"], path["p_B"], half), None, "nothing"
+        )
+
+
+def with_drift(quick: bool = False) -> Iterator[Row]:
+    """The same tests with no leak on a rig that drifts: the second half comes from a rig with other friction, bulk
+    modulus and noise (`drift_of`), several draws of each test."""
+    from sealscope.simulation.simulate import trajectory
+
+    half = QUICK_HALF if quick else HALF
+    paths: dict[tuple[str, float], Trajectory] = {}
+    for draw in range(_QUICK_DRAWS if quick else _DRAWS):
+        for condition in APPENDIX_C:
+            seed = _DRIFT_SEED + 100 * draw + condition.number
+            first = _experiment(condition, SETTLING + half, seed=seed)
+            if condition.group not in paths:
+                paths[condition.group] = trajectory(first, ())
+            path = paths[condition.group]
+            drift = drift_of(condition.number, draw)
+            rig = first.rig.with_values(drift.values(first.rig), source="drifted")
+            second = replace(first, rig=rig, seed=seed + 50_000)
+            part = ((SETTLING, SETTLING + half),)
+            before = detail_rms(_recorded(first, path), part)
+            after = detail_rms(_recorded(second, trajectory(second, ())), part)
+            rms = {c: {name: (before[c][name][0], after[c][name][0]) for name in QUANTITIES} for c in CHAMBERS}
+            told = f"friction x {drift.friction:.3f}, K x {drift.bulk:.3f}, noise x {drift.noise:.3f}"
+            yield Row(condition, rms, 0.0, _range_MPa(path.t, path["p_A"], path["p_B"], SETTLING + half), None, told)
+
+
+def _rms_columns() -> list[tuple[str, str, int, str]]:
+    return [
+        (chamber, name, k, f"{chamber} {name} {when} [{'psi^2' if name == 'd3d4' else 'psi'}]")
+        for chamber in CHAMBERS
+        for name in QUANTITIES
+        for k, when in enumerate(("no leak", "leak"))
+    ]
+
+
+def table_of(rows: list[Row], item: str, title: str, notes: str = "") -> Table:
+    """The rows as a table; `sheet_of` reads it back. It is resolved when every run that was proved is."""
+    heads = (
+        "test",
+        "input",
+        "closed [%]",
+        "at half time",
+        "mean leak [L/min]",
+        "p_A range [MPa]",
+        "p_B range [MPa]",
+        *(head for *_, head in _rms_columns()),
+    )
+    body: tuple[tuple[float | int | str | None, ...], ...] = tuple(
+        (
+            row.condition.number,
+            row.condition.command,
+            row.condition.closed_pct,
+            row.happened,
+            row.mean_leak_lpm,
+            *row.range_MPa,
+            *(row.rms[chamber][name][k] for chamber, name, k, _ in _rms_columns()),
+        )
+        for row in rows
+    )
+    outcomes = [row.resolved for row in rows if row.resolved is not None]
+    return Table(item, title, heads, body, resolved=all(outcomes) if outcomes else None, notes=notes)
+
+
+def column(table: Table, head: str) -> Array:
+    """The numbers of one column of a table, NaN where there is none."""
+    place = table.columns.index(head)
+    return np.array([np.nan if row[place] is None else float(row[place]) for row in table.rows])  # type: ignore[arg-type]
+
+
+def sheet_of(table: Table) -> Sheet:
+    """The RMS columns of a table made by `table_of` as a sheet, in the table's order of rows."""
+    rms: dict[str, dict[str, Array]] = {
+        chamber: {name: np.empty((len(table.rows), 2)) for name in QUANTITIES} for chamber in CHAMBERS
+    }
+    for chamber, name, k, head in _rms_columns():
+        rms[chamber][name][:, k] = column(table, head)
+    return Sheet(rms)
+
+
+def log_change(sheet: Sheet, chamber: str, quantity: str) -> Array:
+    """log(RMS with leak / RMS without) of each test, (n,)."""
+    pairs = sheet.rms[chamber][quantity]
+    return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))

@@ -1,0 +1,223 @@
+"""Table 5.1 counted anew, from the sheet and from simulation, with what the thesis's rule says where nothing leaks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.thesis.chapters.appendix_c.simulated_sheet import QUANTITIES, log_change
+from sealscope.thesis.chapters.appendix_c.tables import simulated
+from sealscope.thesis.engine.context import Context
+from sealscope.thesis.engine.items import Item
+from sealscope.thesis.engine.products import Table
+from sealscope.thesis.sheet import Sheet
+
+#: The way each chamber's RMS is said to go when a leak opens, section 5.6.
+WAY: Mapping[str, int] = {"p_A": -1, "p_B": 1}
+#: False-alarm probability at which the rules with a threshold are set.
+FALSE_ALARMS = 0.05
+#: Normal quantiles that are passed with probability FALSE_ALARMS, to one side and to either.
+_ONE_SIDED, _EITHER_SIDE = 1.6448536269514722, 1.959963984540054
+
+Cell = float | int | str | None
+Fires = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule of Table 5.1: it fires when every named detail goes its chamber's way. `printed` [%]: as the thesis has
+    it (with its variants), empty for one it does not claim."""
+
+    name: str
+    details: tuple[tuple[str, str], ...]
+    printed: str = ""
+
+    def fires(self, sheet: Sheet) -> Fires:
+        """Which tests it fires in, (n,)."""
+        went = [log_change(sheet, chamber, detail) * WAY[chamber] > 0 for chamber, detail in self.details]
+        return np.asarray(np.all(went, axis=0))
+
+
+#: The six cells of Table 5.1 and the cumulative one.
+CLAIMED: tuple[Rule, ...] = (
+    Rule("P_A d3 down", (("p_A", "d3"),), "100"),
+    Rule("P_A d4 down", (("p_A", "d4"),), "64 (65 in the text)"),
+    Rule("P_A d3d4 down", (("p_A", "d3d4"),), "85"),
+    Rule("P_B d3 up", (("p_B", "d3"),), "48"),
+    Rule("P_B d4 up", (("p_B", "d4"),), "76"),
+    Rule("P_B d3d4 up", (("p_B", "d3d4"),), "76"),
+    Rule("both d3d4", (("p_A", "d3d4"), ("p_B", "d3d4")), "65"),
+)
+#: The columns of Appendix C that Table 5.1 leaves out.
+UNCLAIMED: tuple[Rule, ...] = (
+    Rule("P_A d1 down", (("p_A", "d1"),)),
+    Rule("P_A d2 down", (("p_A", "d2"),)),
+    Rule("P_B d1 up", (("p_B", "d1"),)),
+    Rule("P_B d2 up", (("p_B", "d2"),)),
+)
+
+
+def _rate(fired: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
+    """Count as "k/n", rate and interval [%]."""
+    if fired is None:
+        return None, None, None, None
+    k, n = int(fired.sum()), fired.size
+    low, high = clopper_pearson(k, n)
+    return f"{k}/{n}", 100.0 * k / n, 100.0 * low, 100.0 * high
+
+
+def rates(measured: Sheet | None, leak: Sheet, still: Sheet, drift: Sheet) -> list[tuple[Cell, ...]]:
+    """Rows of Table 5.1: each rule on the sheet, in simulation with leak, with none, and with drift but no leak; then
+    the rules that always and never fire."""
+    sources = (measured, leak, still, drift)
+
+    def row(name: str, printed: str, fired: list[Fires | None]) -> tuple[Cell, ...]:
+        with_leak, with_drift = fired[1], fired[3]
+        assert with_leak is not None and with_drift is not None
+        gain = 100.0 * float(with_leak.mean() - with_drift.mean())
+        return (name, printed or None, *(cell for one in fired for cell in _rate(one)), gain)
+
+    rows = [
+        row(rule.name, rule.printed, [None if one is None else rule.fires(one) for one in sources])
+        for rule in (*CLAIMED, *UNCLAIMED)
+    ]
+    for name, value in (("always fires", True), ("never fires", False)):
+        sizes = [None if one is None else one.rms["p_A"]["d3"].shape[0] for one in sources]
+        rows.append(row(name, "", [None if n is None else np.full(n, value) for n in sizes]))
+    return rows
+
+
+RATES = (
+    "rule",
+    "printed [%]",
+    *(
+        f"{of}{what}"
+        for of in ("sheet: ", "simulated leak: ", "simulated, no leak: ", "simulated, drift only: ")
+        for what in ("fires", "rate [%]", "95 % low [%]", "95 % high [%]")
+    ),
+    "simulated leak less drift [points]",
+)
+
+
+def column_tests(sheet: Sheet) -> list[tuple[Cell, ...]]:
+    """Every column of a sheet: how many tests fell and rose, the sign test's p, and p corrected (Holm) for all ten
+    columns that were there to choose from."""
+    found = []
+    for chamber in CHAMBERS:
+        for name in QUANTITIES:
+            change = log_change(sheet, chamber, name)
+            down, up = int(np.sum(change < 0)), int(np.sum(change > 0))
+            found.append((chamber, name, down, up, float(100 * np.expm1(change.mean())), sign_test(down, down + up)))
+    corrected = holm([row[-1] for row in found])
+    return [(*row, value, (value < 0.05 and "yes") or "no") for row, value in zip(found, corrected, strict=True)]
+
+
+COLUMNS = (
+    "source",
+    "chamber",
+    "detail",
+    "down",
+    "up",
+    "geometric mean change [%]",
+    "sign test p",
+    "p, Holm over ten columns",
+    "moves (p < 0.05)",
+)
+
+
+def d1_threshold(sheet: Sheet, chamber: str, either_side: bool = False) -> float:
+    """The log change that noise alone passes with probability `FALSE_ALARMS`, one way or to either side, from the
+    scatter of d1 about zero: ``1.645 rms(log change of d1)``, or 1.960 times it.
+
+    d1 is noise: no leak moves it, so its changes between the halves are those of a leak-free rig. The other details
+    can only scatter more.
+    """
+    change = log_change(sheet, chamber, "d1")
+    return float((_EITHER_SIDE if either_side else _ONE_SIDED) * np.sqrt(np.mean(change**2)))
+
+
+def drift_threshold(drift: Sheet, chamber: str, detail: str) -> float:
+    """The log change, in the chamber's way, that the drift-only tests pass with probability `FALSE_ALARMS`."""
+    return float(np.quantile(log_change(drift, chamber, detail) * WAY[chamber], 1.0 - FALSE_ALARMS))
+
+
+def thresholds(measured: Sheet | None, leak: Sheet, drift: Sheet) -> list[tuple[Cell, ...]]:
+    """Each single-detail rule with a threshold instead of the bare sign: how many leaks it still finds."""
+    rows: list[tuple[Cell, ...]] = []
+    for rule in (*CLAIMED[:6], *UNCLAIMED):
+        ((chamber, detail),) = rule.details
+        limit = drift_threshold(drift, chamber, detail)
+        found = _rate(log_change(leak, chamber, detail) * WAY[chamber] > limit)
+        real: tuple[Cell, ...] = (None, None, None, None, None)
+        if measured is not None:
+            bench = d1_threshold(measured, chamber)
+            change = log_change(measured, chamber, detail) * WAY[chamber]
+            real = (100.0 * float(np.expm1(WAY[chamber] * bench)), *_rate(change > bench))
+        rows.append((rule.name, *real, 100.0 * float(np.expm1(WAY[chamber] * limit)), *found))
+    return rows
+
+
+THRESHOLDS = (
+    "rule",
+    "sheet: threshold from d1's scatter [%]",
+    *(f"sheet: {what}" for what in ("finds", "rate [%]", "95 % low [%]", "95 % high [%]")),
+    "simulated: threshold from drift only [%]",
+    *(f"simulated leak: {what}" for what in ("finds", "rate [%]", "95 % low [%]", "95 % high [%]")),
+)
+
+
+def table(context: Context, item: Item) -> tuple[Table, ...]:
+    """Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
+    made, leak = simulated(context, "appendix-c-leak")
+    _, still = simulated(context, "appendix-c-no-leak")
+    _, drift = simulated(context, "appendix-c-drift")
+    measured = context.sheet
+    none = "" if measured else " No measured sheet was given."
+    success = Table(
+        item.id,
+        item.title,
+        RATES,
+        tuple(rates(measured, leak, still, drift)),
+        resolved=made.resolved,
+        notes=f"A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
+        f"(Clopper-Pearson) and take the tests as independent, which repeats of one condition are not.{none} The bench "
+        f"had no leak-free test, so its own false-alarm rate is unknown. {made.notes}",
+    )
+    sources = [("sheet", measured), ("simulated leak", leak), ("simulated, no leak", still)]
+    sources.append(("simulated, drift only", drift))
+    columns = Table(
+        f"{item.id}-columns",
+        "Sign tests of every column of Appendix C",
+        COLUMNS,
+        tuple((name, *row) for name, one in sources if one is not None for row in column_tests(one)),
+        resolved=made.resolved,
+        notes="Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the "
+        "leak always came second.",
+    )
+    limits = Table(
+        f"{item.id}-thresholds",
+        f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms",
+        THRESHOLDS,
+        tuple(thresholds(measured, leak, drift)),
+        resolved=made.resolved,
+        notes="On the sheet the threshold is 1.645 times the scatter of d1's changes about zero in the same chamber: "
+        "they are the only leak-free ones; in simulation it is the 95 % point of the drift-only tests.",
+    )
+    return success, columns, limits
+
+
+ITEMS: tuple[Item, ...] = (
+    Item(
+        "table-5.1",
+        5,
+        "table",
+        "Success rates of Table 5.1, counted anew, with intervals and false alarms",
+        f"{__name__}:table",
+        needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
+    ),
+)

@@ -1,0 +1,123 @@
+"""Figs. 4.2 and 4.3: friction models and the Stribeck curve of the rig, under both bracketings of eq. (4.22)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sealscope.recordings.recording import Array
+from sealscope.thesis.engine.context import Context
+from sealscope.thesis.engine.items import Item
+from sealscope.thesis.engine.products import Curve, Figure, Number, Panel
+
+
+def stribeck(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
+    """Friction [N] of the thesis's rig at the velocities `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs.
+    (4.21), (4.22)."""
+    from sealscope.parameters import load_rig
+    from sealscope.physics.friction import stribeck_friction
+
+    f = load_rig("thesis").friction
+    plain = getattr(stribeck_friction, "py_func", stribeck_friction)
+    return np.array([plain(float(one), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for one in v])
+
+
+def jumps_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
+    """Friction [N] just below and just above v_th for both bracketings of eq. (4.22), "continuous" and "literal"."""
+    from sealscope.parameters import load_rig
+
+    v_th = load_rig("thesis").friction.v_th
+    sides = np.array([v_th, math.nextafter(v_th, 1.0)])
+    return {
+        name: (float(below), float(above))
+        for name, (below, above) in (
+            ("continuous", stribeck(sides, F_C)),
+            ("literal", stribeck(sides, F_C, literal_bracket=True)),
+        )
+    }
+
+
+def falls_up_to(F_C: float) -> float:
+    """Velocity [m/s] up to which friction falls with velocity: where F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
+    from sealscope.parameters import load_rig
+
+    f = load_rig("thesis").friction
+    return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
+
+
+def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
+    """Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with Table 4.1's numbers."""
+    from sealscope.parameters import load_rig
+
+    f = load_rig("thesis").friction
+    v = np.linspace(-0.1, 0.1, 801)
+    break_away = f.F_pr * f.K_brk
+    step = np.array([-0.1, 0.0, 0.0, 0.1])
+    coulomb = np.array([-f.F_pr, -f.F_pr, f.F_pr, f.F_pr])
+    static_v = np.array([-0.1, 0.0, 0.0, 0.0, 0.0, 0.1])
+    static = np.array([-f.F_pr, -f.F_pr, -break_away, break_away, f.F_pr, f.F_pr])
+    slip_v = np.array([-0.1, -f.v_th, f.v_th, 0.1])
+    slip = np.array([-f.F_pr, -break_away, break_away, f.F_pr])
+    axes = ("v [m/s]", "F_f [N]")
+    panels = (
+        Panel(*axes, (Curve(step, coulomb, "F_C sign(v)", "reference"),), "(a) Coulomb"),
+        Panel(*axes, (Curve(static_v, static, "F_C K_brk at rest", "reference"),), "(b) Static"),
+        Panel(*axes, (Curve(slip_v, slip, "linear below v_th", "reference"),), "(c) Stick-slip"),
+        Panel(*axes, (Curve(v, stribeck(v, f.F_pr), "eqs. 4.21, 4.22", "reference"),), "(d) Stribeck"),
+    )
+    numbers = (
+        Number("Coulomb force without pressure", f.F_pr, "N"),
+        Number("breakaway force", break_away, "N"),
+        Number("threshold velocity", f.v_th, "m/s"),
+    )
+    notes = "Sketches (a) to (c) hold the rig's own forces without pressure; the rig is simulated with (d)."
+    return (Figure(item.id, item.title, panels, numbers, ("claim-4.20",), None, notes),)
+
+
+def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
+    """Fig. 4.3: friction against velocity, near rest under both bracketings, and its slope."""
+    from sealscope.parameters import load_rig
+
+    rig = load_rig("thesis")
+    f = rig.friction
+    charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
+    v = np.linspace(-0.2, 0.2, 1601)
+    near = np.linspace(-2.0 * f.v_th, 2.0 * f.v_th, 1601)
+    ahead = np.linspace(f.v_th, 0.2, 800)
+    slope = np.gradient(stribeck(ahead, f.F_pr), ahead)
+    panels = (
+        Panel(
+            "v [m/s]",
+            "F_f [N]",
+            (
+                Curve(v, stribeck(v, f.F_pr), "no pressure", "reference"),
+                Curve(v, stribeck(v, charged), f"both chambers at {rig.fluid.p_charge / 1e6:g} MPa", "other"),
+            ),
+            "(a) Stribeck curve",
+        ),
+        Panel(
+            "v [m/s]",
+            "F_f [N]",
+            (
+                Curve(near, stribeck(near, f.F_pr), "bracket closed: continuous", "converged"),
+                Curve(near, stribeck(near, f.F_pr, literal_bracket=True), "bracket over all", "literal"),
+            ),
+            "(b) Both bracketings of eq. 4.22",
+        ),
+        Panel("v [m/s]", "slope of F_f [N s/m]", (Curve(ahead, slope, "slope above v_th", "reference"),), "(c) Slope"),
+    )
+    jumps = jumps_at_threshold(f.F_pr)
+    numbers = (
+        *(
+            Number(f"friction {side} v_th, {name}", value, "N")
+            for name, both in jumps.items()
+            for side, value in zip(("at", "above"), both, strict=True)
+        ),
+        Number("friction falls up to", falls_up_to(f.F_pr), "m/s"),
+    )
+    notes = (
+        "Without pressure unless said. Below the velocity where the slope changes sign friction feeds the oscillation "
+        "of the piston between its oil columns: each reversal rings."
+    )
+    return (Figure(item.id, item.title, panels, numbers, ("claim-4.20",), None, notes),)

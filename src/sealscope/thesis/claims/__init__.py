@@ -1,0 +1,1 @@
+"""The testable sentences of the thesis and their verdicts."""

@@ -1,0 +1,81 @@
+"""Every testable sentence of the thesis with its verdict: the chapters' own claims and those on detection."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from typing import get_args
+
+from sealscope.thesis.claims import levels, rates, rig, tests, trends
+from sealscope.thesis.claims.evidence import gather
+from sealscope.thesis.engine.context import Context
+from sealscope.thesis.engine.items import Item
+from sealscope.thesis.engine.products import Claim, Table, Verdict
+
+#: Items that judge the claims of the earlier chapters.
+EARLIER = ("chapter-3-claims", "chapter-4-claims")
+
+
+def detection(context: Context, item: Item) -> tuple[Claim, ...]:
+    """Claims of the abstract and of chapters 1, 5 and 6, in the thesis's order."""
+    evidence = gather(context)
+    made = (
+        *levels.claims(),
+        *rates.claims(evidence),
+        *trends.claims(evidence),
+        *tests.curves(evidence),
+        tests.consistent(evidence),
+        *rig.claims(evidence),
+    )
+    return tuple(sorted(made, key=_place))
+
+
+def _place(claim: Claim) -> tuple[int, ...]:
+    """Where a claim stands: the abstract first, then by the numbers of its id."""
+    return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
+
+
+def table(context: Context, item: Item) -> tuple[Table, ...]:
+    """Every claim of every chapter as a table, and how many have each verdict."""
+    found = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
+    found.sort(key=_place)
+    verdicts = Counter(claim.verdict for claim in found)
+    rows = tuple((c.id, c.where, c.claim, c.sheet, c.simulation, c.verdict, c.why) for c in found)
+    heads = ("id", "where", "claim", "what the sheet says", "what the simulation says", "verdict", "why")
+    missing = "" if context.sheet else " The data sheet was not given: claims that rest on it could not be tested."
+    return (
+        Table(
+            item.id,
+            item.title,
+            heads,
+            rows,
+            claims=tuple(claim.id for claim in found),
+            notes=f"Claims in our own words. A claim holds where every part of it does.{missing}",
+        ),
+        Table(
+            f"{item.id}-verdicts",
+            "How many claims have each verdict",
+            ("verdict", "claims"),
+            tuple((verdict, verdicts.get(verdict, 0)) for verdict in get_args(Verdict)),
+        ),
+    )
+
+
+ITEMS: tuple[Item, ...] = (
+    Item(
+        "detection-claims",
+        6,
+        "claims",
+        "What the abstract and chapters 1, 5 and 6 claim",
+        f"{__name__}:detection",
+        needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
+    ),
+    Item(
+        "claims",
+        6,
+        "table",
+        "Every claim of the thesis and its verdict",
+        f"{__name__}:table",
+        needs=(*EARLIER, "detection-claims"),
+    ),
+)

@@ -1,0 +1,1 @@
+"""What can be reproduced, and how items are made, kept and made anew."""

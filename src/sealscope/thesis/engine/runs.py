@@ -1,0 +1,42 @@
+"""Simulate what a RunSpec says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sealscope.errors import SimulationFailed
+from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.proof import prove
+from sealscope.simulation.simulate import run, sized_leaks
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun
+
+
+def experiment_of(spec: RunSpec) -> Experiment:
+    """The experiment that a spec describes; raises InputError for one that cannot be."""
+    return make_experiment(
+        rig=spec.rig,
+        command=spec.command,
+        leak=spec.leaks,
+        values=dict(spec.values),
+        duration=spec.duration,
+        seed=spec.seed,
+        x_0=spec.x_0,
+        method=spec.method,
+        step=spec.step,
+        allow_unresolved=True,
+    )
+
+
+def simulated(spec: RunSpec, experiment: Experiment) -> SimulatedRun:
+    """The run of a spec, its leaks sized once for the run and for its halving test."""
+    try:
+        experiment = replace(experiment, leaks=sized_leaks(experiment))
+        made = run(experiment)
+        proof = prove(experiment) if spec.prove else None
+    except SimulationFailed as error:
+        return SimulatedRun(None, np.empty(0), {}, 0.0, False if spec.prove else None, diverged=str(error))
+    moved = {} if proof is None else {one.name: one.difference for one in proof.differences}
+    resolved = None if proof is None else proof.resolved
+    return SimulatedRun(made.recording, made.truth.t, made.truth.outputs, made.truth.mean_leak_lpm, resolved, moved)
