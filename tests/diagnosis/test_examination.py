@@ -10,9 +10,9 @@ import pytest
 from sealscope.diagnosis import registry
 from sealscope.diagnosis.calibration.scorers import Look, scorer
 from sealscope.diagnosis.examination import Examination, assumed_rig
-from sealscope.diagnosis.trust import does_not_move
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
+from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
 seen: list[tuple[tuple[str, ...], int]] = []
@@ -102,8 +102,8 @@ def test_a_pressure_that_rests_cannot_be_its_own_baseline() -> None:
     assert found() is None
     assert found(x=np.zeros(20000)) is None
     assert found(p_B=holding(750)) is None
-    assert found(p_B=holding(752)) == "the pressures cannot be trusted: p_B does not move from 10 s to 11.5 s"
-    assert found(p_B=holding(15000)) == "the pressures cannot be trusted: p_B does not move from 10 s to 40 s"
+    assert found(p_B=holding(752)) == "p_B does not move from 10 s to 11.5 s"
+    assert found(p_B=holding(15000)) == "p_B does not move from 10 s to 40 s"
     assert "straight line" in str(found(p_A=3.0 * t - 5.0))
     assert found(p_A=np.rint(2.0 * noise["p_A"])) is None  # whole numbers of a converter
     with_rest = Recording(t, {**noise, "p_B": holding(1000)}, {"p_A": "Pa", "p_B": "Pa"}, 500.0)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import gc
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.baseline import memo as module
-from sealscope.diagnosis.baseline.memo import remembered
+from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.observer.detector import Observer
 from sealscope.parameters import load_rig
-from sealscope.recordings.recording import Recording
+from sealscope.recordings import cycle
+from sealscope.recordings.cycle import cycle_of
+from sealscope.recordings.recording import Array, Recording, remembered
 from sealscope.simulation.simulate import simulate
 
 
@@ -33,23 +35,53 @@ def test_asked_once_for_a_recording_a_detector_and_a_rig() -> None:
         load_rig("thesis"),
         load_rig("thesis").with_values({"pump.q_b": 5e-6}),
     )
-    assert [remembered(first, "one", rig, find) for _ in range(3)] == [1, 1, 1]
-    assert remembered(second, "one", rig, find) == 2
-    assert remembered(first, "another", rig, find) == 3
+    assert [remembered(first, ("one", rig), find) for _ in range(3)] == [1, 1, 1]
+    assert remembered(second, ("one", rig), find) == 2
+    assert remembered(first, ("another", rig), find) == 3
     assert other is not rig
-    assert remembered(first, "one", other, find) == 4
+    assert remembered(first, ("one", other), find) == 4
     assert asked[:3] == [first, second, first]
 
 
+def test_views_share_what_depends_on_the_channels_they_keep() -> None:
+    t = np.arange(4.0)
+    recording = Recording(t, {"u": t, "p_A": t, "p_B": t}, {"u": "V", "p_A": "Pa", "p_B": "Pa"}, 1.0)
+    asked: list[tuple[str, ...]] = []
+
+    def find(recording: Recording) -> int:
+        asked.append(tuple(recording.channels))
+        return len(asked)
+
+    view = recording.only(["p_A", "p_B"])
+    views = (recording, view, view.only(["p_B", "p_A"]))
+    assert [remembered(one, "pair", find, ("p_A", "p_B")) for one in views] == [1, 1, 1]
+    assert [remembered(one, "all", find) for one in (recording, view, recording)] == [2, 3, 2]
+    assert remembered(recording.between(0.0, 9.0), "pair", find, ("p_A", "p_B")) == 4
+    assert asked == [("u", "p_A", "p_B"), ("u", "p_A", "p_B"), ("p_A", "p_B"), ("u", "p_A", "p_B")]
+
+
+@pytest.mark.parametrize("names", [None, ("p_A", "p_B"), ("p_A",)], ids=str)
+def test_the_cycle_is_computed_once_a_diagnosis(monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...] | None) -> None:
+    recording = simulate(command="3 sin(4t)", duration=60.0)
+    recording = recording.only(recording.channels if names is None else names)
+    lengths: list[float | None] = []
+
+    def counted(signal: Array, rate: float) -> float | None:
+        lengths.append(cycle_of(signal, rate))
+        return lengths[-1]
+
+    monkeypatch.setattr(cycle, "cycle_of", counted)
+    diagnose(recording)
+    assert lengths == [pytest.approx(np.pi / 2, rel=2e-3)]
+
+
 def test_nothing_is_kept_of_a_recording_that_is_gone() -> None:
-    recording, rig = _recording(), load_rig("thesis")
-    held = weakref.ref(recording)
-    remembered(recording, "one", rig, len)
-    before = len(module._found)
+    recording = _recording()
+    held = weakref.ref(recording), weakref.ref(remembered(recording, "itself", lambda one: one.only(one.channels)))
+    assert held[1]() is not None
     del recording
     gc.collect()
-    assert held() is None
-    assert len(module._found) == before - 1
+    assert [reference() for reference in held] == [None, None]
 
 
 def test_a_baseline_is_followed_once_for_many_files(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,4 +105,4 @@ def test_a_baseline_is_followed_once_for_many_files(monkeypatch: pytest.MonkeyPa
 
 def replace_of(recording: Recording) -> Recording:
     """The same recording as another object."""
-    return recording.only(recording.channels)
+    return replace(recording)

@@ -11,9 +11,9 @@ import numpy as np
 
 from sealscope.diagnosis.detector import Detector
 from sealscope.diagnosis.registry import detectors
-from sealscope.diagnosis.trust import does_not_move
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.verdict.fusion import ORDER, Fused, Said, fuse
+from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Examination:
     detectors may assume of the machine.
 
     `untrusted`: why the pressures cannot be trusted, None where they can; then no detector is run. A recording that is
-    to be its own baseline needs pressures that move throughout (`trust`).
+    to be its own baseline needs pressures that move throughout.
     """
 
     def __init__(
@@ -52,7 +52,8 @@ class Examination:
         self.recording, self.baseline = recording, tuple(baseline)
         self.untrusted = untrusted
         if untrusted is None and not self.baseline:
-            self.untrusted = does_not_move(recording)
+            still = does_not_move(recording)
+            self.untrusted = None if still is None else f"the pressures cannot be trusted: {still}"
         self.false_alarm_probability = false_alarm_probability
         self._rig = rig
         self._made: dict[str, Detector] = {}

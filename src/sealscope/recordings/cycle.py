@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.motion import moves
+from sealscope.recordings.recording import Array, Recording, remembered
 
 _LONGEST_CYCLE = 20.0
 _CYCLE_CORRELATION = 0.6
@@ -13,18 +14,27 @@ _ANALYSIS_RATE = 50.0
 
 
 def find_cycle(recording: Recording) -> float | None:
-    """Length of the duty's cycle [s] from the command, or else from the pressure difference; None when nothing repeats.
+    """Return the length of the duty's cycle [s], from the command or else from the pressures; None without a cycle.
+
+    Computed once for a recording and what `Recording.only` makes of it. The command is used where it moves, else the
+    pressure difference, else the only chamber pressure.
+    """
+    names = ("u",) if "u" in recording and moves(recording["u"]) else chambers_of(recording)
+
+    def cycle(recording: Recording) -> float | None:
+        signals = [recording[name] for name in names]
+        return cycle_of(signals[0] - signals[1] if len(signals) == 2 else signals[0], recording.rate)
+
+    return remembered(recording, "cycle", cycle, names) if names else None
+
+
+def cycle_of(signal: Array, rate: float) -> float | None:
+    """Return the period [s] of a signal (n,) sampled at `rate` [Hz]; None when nothing repeats.
 
     The first maximum of the autocorrelation after its first zero, at least 0.6 high, between 0.2 s and 20 s and
     repeated five times or more; refined by a parabola.
     """
-    if "u" in recording and np.ptp(recording["u"]) > 0:
-        signal = recording["u"]
-    elif all(name in recording for name in CHAMBERS):
-        signal = recording["p_A"] - recording["p_B"]
-    else:
-        signal = recording[next(name for name in CHAMBERS if name in recording)]
-    stride = max(1, int(recording.rate / _ANALYSIS_RATE))
+    stride = max(1, int(rate / _ANALYSIS_RATE))
     usable = signal[: signal.size // stride * stride]
     slow = usable.reshape(-1, stride).mean(axis=1)
     slow = slow - slow.mean()
@@ -34,7 +44,7 @@ def find_cycle(recording: Recording) -> float | None:
     spectrum = np.abs(np.fft.rfft(slow, 2 * n)) ** 2
     correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)
     correlation = correlation / correlation[0]
-    longest = min(n // 5, int(_LONGEST_CYCLE * recording.rate / stride))
+    longest = min(n // 5, int(_LONGEST_CYCLE * rate / stride))
     below = np.flatnonzero(correlation[:longest] < 0)
     if below.size == 0:
         return None
@@ -47,5 +57,5 @@ def find_cycle(recording: Recording) -> float | None:
     best = peaks[inner[peaks] >= inner[peaks].max() - 0.05][0]
     k = int(first + 1 + best)
     a, b, c = correlation[k - 1 : k + 2]
-    lag = (k + 0.5 * (a - c) / (a - 2 * b + c)) * stride / recording.rate
+    lag = (k + 0.5 * (a - c) / (a - 2 * b + c)) * stride / rate
     return float(lag) if lag >= 0.2 else None

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from sealscope.recordings.motion import constant, stuck
 from sealscope.recordings.recording import Array, Recording
-from sealscope.recordings.symptoms import clipped, constant, hum, infinite, missing, stuck
+from sealscope.recordings.symptoms import clipped, hum, infinite, missing
 
 Severity = Literal["note", "warning", "fatal"]
 

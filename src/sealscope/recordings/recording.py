@@ -6,10 +6,11 @@ by its provenance and by nothing else; the truth of a simulation is never part o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from threading import Lock
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError
 
 Array = NDArray[np.float64]
+_T = TypeVar("_T")
 
 #: Channel names (the thesis's symbols) and the unit each has inside Sealscope; `docs/nomenclature.md` explains them.
 CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
@@ -43,6 +45,15 @@ def _frozen(values: Any) -> Array:
     return array
 
 
+@dataclass
+class _Result:
+    """A result that is computed once, whichever thread is first."""
+
+    lock: Lock = field(default_factory=Lock)
+    value: Any = None
+    known: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """Channels sampled on one time base.
@@ -60,6 +71,7 @@ class Recording:
     rate: float
     provenance: Mapping[str, Any] = field(default_factory=dict)
     history: tuple[str, ...] = ()
+    _results: dict[Hashable, _Result] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         t = _frozen(self.t)
@@ -119,4 +131,23 @@ class Recording:
 
     def only(self, names: Iterable[str]) -> Recording:
         """The same recording with the named channels alone."""
-        return replace(self, channels={name: self[name] for name in names})
+        part = replace(self, channels={name: self[name] for name in names})
+        object.__setattr__(part, "_results", self._results)
+        return part
+
+
+def remembered(
+    recording: Recording, key: Hashable, compute: Callable[[Recording], _T], channels: Iterable[str] | None = None
+) -> _T:
+    """Return `compute(recording)`, computed once for a recording and a `key`, and kept as long as the recording is.
+
+    `channels`: those that the result depends on (default: all that the recording has). The views that
+    `Recording.only` makes share results which depend on the same channels.
+    """
+    names = frozenset(recording.channels if channels is None else channels)
+    result = recording._results.setdefault((key, names), _Result())
+    with result.lock:
+        if not result.known:
+            result.value, result.known = compute(recording), True
+        value: _T = result.value
+    return value

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.recordings.motion import runs_of, spacing
 from sealscope.recordings.recording import Array
 
 _FEWEST_AT_RAIL = 5
 _LONG_RUN = 20
-_SHORTEST_STUCK = 5
-_NEIGHBOURHOOD = 100
-_STUCK_CHANCE = 1e-6
 _HUM_BAND = 5.0
 _HUM_POWER_FROM = 20.0
 _HUM_OVER_REST = 4.0
@@ -47,12 +45,6 @@ class Line(NamedTuple):
     share: float
 
 
-def runs_of(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """(k, 2) first index and length of each run of True."""
-    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
-    return np.column_stack([edges[::2], edges[1::2] - edges[::2]])
-
-
 def missing(values: Array) -> Holes | None:
     """NaN samples, and whether they are a slower channel's rows in between."""
     absent = np.isnan(values)
@@ -74,18 +66,6 @@ def infinite(values: Array) -> NDArray[np.intp]:
     return np.flatnonzero(np.isinf(values))
 
 
-def constant(values: Array) -> bool:
-    """Whether all (finite) values are one."""
-    return bool((values == values[0]).all())
-
-
-def _spacing(levels: Array) -> float:
-    """The finest step between the values a channel takes; rounding of a conversion is no step."""
-    steps = np.diff(levels)
-    steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
-    return float(steps.min()) if steps.size else 0.0
-
-
 def clipped(values: Array, still: NDArray[np.intp], low: bool = True) -> list[Rail]:
     """The ends at which values are cut off.
 
@@ -98,7 +78,7 @@ def clipped(values: Array, still: NDArray[np.intp], low: bool = True) -> list[Ra
     levels, counts = np.unique(values, return_counts=True)
     if levels.size < 3:
         return []
-    fine = _spacing(levels)
+    fine = spacing(levels)
     found = []
     for side, top, others in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
         if side == "low" and not low:
@@ -113,42 +93,6 @@ def clipped(values: Array, still: NDArray[np.intp], low: bool = True) -> list[Ra
         ).any():
             found.append(Rail(side, float(levels[top]), int(counts[top]), int(runs[0, 0])))
     return found
-
-
-def stuck(values: Array) -> NDArray[np.intp]:
-    """(k, 2) first index and length of the runs of equal values that the signal around them makes incredible.
-
-    With p the share of unchanged samples in the 100 samples on either side (the larger of both), a run of length m has
-    the chance p^(m-1) to begin at a given sample; it is stuck where fewer than 1e-6 such runs are expected in the whole
-    channel, and where the value jumps by more than three quantisation steps when it begins or ends: a slow quantised
-    signal at a turning point stands still too, but moves off in single steps.
-    """
-    nothing = np.empty((0, 2), dtype=np.intp)
-    if values.size < 2 * _NEIGHBOURHOOD:
-        return nothing
-    same = np.diff(values) == 0
-    runs = runs_of(same)
-    runs = runs[runs[:, 1] >= _SHORTEST_STUCK - 1]
-    if not runs.size:
-        return nothing
-    levels = np.unique(values)
-    fine = _spacing(levels)
-    first, last = runs[:, 0], runs.sum(axis=1)  # the samples first..last are equal
-    inner = (first >= _NEIGHBOURHOOD // 5) & (last < values.size - 1 - _NEIGHBOURHOOD // 5)
-    runs, first, last = runs[inner], first[inner], last[inner]
-    if not runs.size:
-        return nothing
-    unchanged = np.r_[0, np.cumsum(same)]
-
-    def share(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        begin, end = np.maximum(begin, 0), np.minimum(end, same.size)
-        return np.asarray((unchanged[end] - unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
-
-    likely = np.maximum(share(first - _NEIGHBOURHOOD, first), share(last, last + _NEIGHBOURHOOD))
-    expected = np.log(values.size) + (runs[:, 1]) * np.log(likely)
-    jump = np.maximum(np.abs(values[first] - values[first - 1]), np.abs(values[last + 1] - values[last]))
-    chosen = (expected < np.log(_STUCK_CHANCE)) & (jump > 3.5 * fine)
-    return np.column_stack([first[chosen], runs[chosen, 1] + 1])
 
 
 def hum(values: Array, rate: float) -> list[Line]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Recording
 
 #: A stroke goes one way when its net way is more than this share of the whole way (or of the pressure difference's
@@ -38,7 +39,7 @@ class OperatingPoint:
 
 def _direction(recording: Recording) -> Literal[-1, 0, 1]:
     share = 0.0
-    if "x" in recording and np.ptp(recording["x"]) > 0:
+    if "x" in recording and moves(recording["x"]):
         stride = max(1, int(recording.rate / _SLOW_RATE))
         x = recording["x"][::stride]
         way = float(np.abs(np.diff(x)).sum())

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from sealscope.diagnosis.fleet.run_length import cusum_threshold, glr_threshold
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.motion import ROUNDING
 from sealscope.signals.filters import Array, IntArray
 from sealscope.signals.fleet import FleetRms, saved_array
 from sealscope.signals.windows import WindowedRms
@@ -25,8 +26,6 @@ from sealscope.signals.windows import WindowedRms
 LEARNING, WATCHED, MISSING, STILL = range(4)
 STATUS = ("learning", "watched", "paused: missing samples", "paused: a reading does not move")
 DETECTORS = ("CUSUM", "likelihood ratio")
-#: Details below this share of the signal's RMS are rounding: the reading does not move.
-_STILL = 1e-9
 
 
 class Alarms(NamedTuple):
@@ -186,7 +185,7 @@ class Fleet:
         np.isfinite(means[:, levels], out=self._lost)
         np.logical_not(self._lost, out=self._lost)
         least = np.min(means[:, :levels], axis=1)
-        np.less_equal(least, _STILL**2 * means[:, -1], out=self._still)
+        np.less_equal(least, ROUNDING**2 * means[:, -1], out=self._still)
         sound = ~(self._still | self._lost)
         learning = sound & (self._summed <= self._learn)
         np.add(self._sums, means, out=self._sums, where=learning[:, None])

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.memo import remembered
 from sealscope.diagnosis.changepoint.step_in_walk import FEWEST, Step, find_leak_step
 from sealscope.diagnosis.observer.accumulator import Estimates
 from sealscope.diagnosis.observer.against_baseline import compare
@@ -30,7 +29,7 @@ from sealscope.diagnosis.observer.stream import (
 from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Array, Recording, remembered
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -123,7 +122,7 @@ class Observer:
         step = self._step(series, false_alarm_probability)
         if baseline:
             alike = [one for one in baseline if formulation_of(one) == series.formulation]
-            others = [remembered(one, self.name, self.rig, self.follow) for one in alike]
+            others = [remembered(one, (self.name, self.rig), self.follow) for one in alike]
             return compare(recording, series, baseline, others, step, false_alarm_probability)
         return within(series, step)
 

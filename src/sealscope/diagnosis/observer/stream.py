@@ -13,6 +13,7 @@ from sealscope.diagnosis.observer.pressure_filter import SEARCH_SECONDS, Pressur
 from sealscope.diagnosis.observer.volume_filter import VolumeFilter
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
@@ -30,8 +31,7 @@ def whole(recording: Recording, name: str) -> bool:
     """Whether a channel is there in SI units, without a gap, and moves."""
     if name not in recording or recording.units[name] == "count":
         return False
-    values = recording[name]
-    return bool(np.all(np.isfinite(values)) and values.size > 1 and np.ptp(values) > 0)
+    return moves(recording[name])
 
 
 def formulation_of(recording: Recording) -> Formulation | None:

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.memo import remembered
 from sealscope.diagnosis.changepoint.abrupt import ONSET_CUT, upper_quantile
 from sealscope.diagnosis.pressure_model.against_baseline import Level, against_levels
 from sealscope.diagnosis.verdict.evidence import LITRE_PER_MINUTE, Cause, Evidence, LeakCourse, MethodResult
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.motion import constant
+from sealscope.recordings.recording import Array, Recording, remembered
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.pressure_model.follow import Followed
@@ -60,7 +60,7 @@ class PressureModel:
         if recording.duration < SHORTEST:
             return f"needs {SHORTEST:g} s or more, got {recording.duration:.4g} s"
         for name in ("u", *CHAMBERS):
-            if np.ptp(recording[name]) == 0:
+            if constant(recording[name]):
                 return f"{name} is constant"
         return None
 
@@ -72,7 +72,7 @@ class PressureModel:
         within = _within(followed, recording, probability)
         if not baseline:
             return within
-        others = [remembered(other, self.name, self.rig, self._follow) for other in baseline]
+        others = [remembered(other, (self.name, self.rig), self._follow) for other in baseline]
         known = [one for one in others if not isinstance(one, str)]
         levels = [Level(one.level, one.level_deviation, one.command_rms) for one in known]
         own = Level(followed.level, followed.level_deviation, followed.command_rms)

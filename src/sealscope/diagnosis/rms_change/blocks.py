@@ -12,6 +12,7 @@ import numpy as np
 
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.motion import ROUNDING
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import Details, details
 
@@ -23,8 +24,6 @@ BLOCK_SECONDS = 1.5
 #: ... and fewest samples it should have: two periods of the slowest oscillation in d4, whose memory then ends in the
 #: next block. It counts at sampling rates under 43 Hz.
 BLOCK_SAMPLES = 64
-#: Details below this share of the pressure's largest value are rounding of the transform: the reading does not move.
-_STILL = 1e-9
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ def _still(recording: Recording, chambers: tuple[str, ...], log_rms: Array, edge
     """The first block in which a chamber's details are mere rounding, or no number, in words."""
     for chamber, name in enumerate(chambers):
         levels = log_rms[:, chamber * len(QUANTITIES) : chamber * len(QUANTITIES) + LEVELS]
-        floor = np.log(_STILL * np.abs(recording[name]).max())
+        floor = np.log(ROUNDING * np.abs(recording[name]).max())
         found = np.flatnonzero(~np.all(np.isfinite(levels) & (levels > floor), axis=1))
         if found.size:
             first = int(found[0])

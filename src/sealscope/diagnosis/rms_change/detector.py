@@ -27,6 +27,7 @@ from sealscope.diagnosis.rms_change.drift import drift_beyond_noise, drift_of, s
 from sealscope.diagnosis.rms_change.results import JUDGED, describe_change, excess, largest_changes, method_result
 from sealscope.diagnosis.verdict.evidence import Evidence, MethodResult
 from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import shortest
 
@@ -47,7 +48,7 @@ class RmsChange:
         if len(recording) < shortest():
             return f"needs {shortest()} samples or more without a gap, got {len(recording)}"
         for chamber in chambers:
-            if np.ptp(recording[chamber]) == 0:
+            if constant(recording[chamber]):
                 return f"{chamber} is constant"
         return None
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.memo import remembered
 from sealscope.diagnosis.changepoint.step_in_drift import FEWEST
 from sealscope.diagnosis.verdict.evidence import Evidence, MethodResult
 from sealscope.diagnosis.volume_balance.against_baseline import against_baseline
@@ -29,7 +28,7 @@ from sealscope.diagnosis.volume_balance.evidence import describe_leak, no_step, 
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance
 from sealscope.diagnosis.volume_balance.search import search
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import Recording, remembered
 from sealscope.recordings.symptoms import clipped
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ class VolumeBalance:
         within = self._within(fit, probability, metres)
         if not baseline:
             return within
-        fits = (remembered(other, self.name, self.rig, self.fit) for other in baseline)
+        fits = (remembered(other, (self.name, self.rig), self.fit) for other in baseline)
         others = [one for one, _ in fits if one is not None]
         return against_baseline(fit, others, within, probability, metres=metres)
 
