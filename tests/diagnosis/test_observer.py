@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 
 from sealscope.diagnosis.observer import pressure_filter
 from sealscope.diagnosis.observer.detector import LEAST_SECONDS, Observer, block_length
-from sealscope.diagnosis.observer.model import G_UNIT, PARAMETERS, assume, start_parameters
+from sealscope.diagnosis.observer.model import (
+    G_UNIT,
+    PARAMETERS,
+    assume,
+    compliance,
+    displacement,
+    mean_area,
+    start_parameters,
+)
 from sealscope.diagnosis.observer.stream import ObserverStream, channels_of, formulation_of
 from sealscope.diagnosis.observer.volume_filter import VolumeFilter
 from sealscope.errors import InputError
@@ -109,11 +117,11 @@ def test_volume_filter_is_consistent_on_its_own_model(thesis: Rig) -> None:
     x = 0.02 * (1.0 - np.cos(2.1 * t))
     true, noise = 1.7, 4e-9
     flow = 0.5 * G_UNIT * true * (dp[1:] + dp[:-1]) / rate
-    clean = np.concatenate([[0.0], np.cumsum(flow)]) + 0.03 * a.area * x + 1.2 * a.compliance * dp
+    clean = np.concatenate([[0.0], np.cumsum(flow)]) + 0.03 * mean_area(a) * x + 1.2 * compliance(a) * dp
     nis, nees, overconfident = [], [], []
     for seed in range(40):
         volume = clean + noise * np.random.default_rng(seed).standard_normal(t.size)
-        theta = (volume + a.area * x) / a.D
+        theta = (volume + mean_area(a) * x) / displacement(a)
         for stated, into in ((noise, nees), (0.5 * noise, overconfident)):
             one = VolumeFilter(a, rate, block, stated**2)
             one.update(theta, x, dp)

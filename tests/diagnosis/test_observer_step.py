@@ -16,7 +16,7 @@ def _null_rate(make, count: int, probability: float, **options) -> float:  # typ
     for seed in range(count):
         random = np.random.default_rng(seed)
         g = make(random)
-        alarms += find_leak_step(g, np.ones(g.size), probability, seed=seed, **options).found
+        alarms += find_leak_step(g, np.ones(g.size), probability, seed=seed, **options).alarm
     return alarms / count
 
 
@@ -55,7 +55,7 @@ def test_a_step_is_found_with_its_size_and_onset() -> None:
         random = np.random.default_rng(seed)
         g = _walk(0.17)(random) + 4.0 * np.clip(np.arange(1, 51) - 24.6, 0.0, 1.0)
         found = find_leak_step(g, np.ones(50), 0.01, 0.03)
-        hits += found.found
+        hits += found.alarm
         covered += abs(found.size - 4.0) < 2.0 * found.size_sd
         dated += found.onset_interval[0] <= 24.6 <= found.onset_interval[1]
     assert hits >= 57
@@ -65,7 +65,7 @@ def test_a_step_is_found_with_its_size_and_onset() -> None:
 
 def test_a_fall_is_no_leak() -> None:
     g = np.random.default_rng(1).standard_normal(50) - 8.0 * (np.arange(50) > 25)
-    assert not find_leak_step(g, np.ones(50), 0.01, 0.03).found
+    assert not find_leak_step(g, np.ones(50), 0.01, 0.03).alarm
 
 
 def test_step_needs_blocks_and_finite_values() -> None:

@@ -38,7 +38,7 @@ _WARM_UPS = (0.03, 0.06, 0.12, 0.25, 0.5)
 
 
 @dataclass(frozen=True)
-class Step:
+class WalkStep:
     """The best step. `score`, `threshold`; `onset`, `onset_interval` (95 %): in blocks from the beginning of the first;
     `size`, `size_sd`: in the unit of the series; `freedom`: degrees of freedom of `size_sd`; `scale`: of the noise
     over the stated deviations; `walk`: variance of a block's walk over the noise's; `warms_up`: an exponential
@@ -56,12 +56,12 @@ class Step:
     warms_up: bool
 
     @property
-    def found(self) -> bool:
+    def alarm(self) -> bool:
         """Whether the score is over the threshold and no warm-up explains the series better."""
         return self.score > self.threshold and not self.warms_up
 
-    def spread_over(self, merge: int) -> Step:
-        """The same step, counted in blocks of which `merge` make one of this series."""
+    def spread_over(self, merge: int) -> WalkStep:
+        """Return the same step, counted in blocks of which `merge` make one of this series."""
         first, last = self.onset_interval
         return replace(self, onset=self.onset * merge, onset_interval=(first * merge, last * merge))
 
@@ -145,7 +145,7 @@ def find_leak_step(
     wary: bool = False,
     spread: float = 1.0,
     seed: int = 0,
-) -> Step:
+) -> WalkStep:
     """Look for a rise in a series g (n,) whose blocks have the deviations sd (n,), of unknown common scale.
 
     `expected_walk`: variance of a block's walk over that of a block's noise; `spread`: deviation of its logarithm;
@@ -185,7 +185,7 @@ def find_leak_step(
     moved, rest, lengths = _Walk(settled, strength).fit(y, shapes_of(np.array([onset]), g.size))
     freedom = scan.freedom - 2
     scale = float(np.sqrt(rest[0, 0] / freedom))
-    return Step(
+    return WalkStep(
         score=float(t[best]),
         threshold=threshold,
         onset=onset,

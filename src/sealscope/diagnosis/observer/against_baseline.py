@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.baseline.operating_point import difference, operating_point
+from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, within
 from sealscope.diagnosis.observer.model import G_UNIT
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.recording import Recording
+from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.changepoint.step_in_walk import Step
-    from sealscope.diagnosis.observer.detector import Series
+    from sealscope.diagnosis.changepoint.step_in_walk import WalkStep
 
 #: Least scatter of the level from one recording to the next, as a share of the pump's own leakage (8 %: two kelvin of
 #: oil) and, by the ringing, in units of `G_UNIT`: what friction alone may seem to change.
@@ -25,10 +26,10 @@ _FEWEST = 3
 
 def compare(
     recording: Recording,
-    series: Series,
+    series: ConductanceSeries,
     baseline: Sequence[Recording],
-    others: Sequence[Series],
-    step: Step,
+    others: Sequence[ConductanceSeries],
+    step: WalkStep,
     probability: float,
 ) -> Evidence:
     """Evidence from the mean conductance against that of the baselines that can be compared.
@@ -38,8 +39,6 @@ def compare(
     least scatter alone, and the normal law.
     """
     from scipy.special import ndtri, stdtrit
-
-    from sealscope.diagnosis.observer.detector import LPM, course, within
 
     here = operating_point(recording)
     reasons = [difference(here, operating_point(one)) for one in baseline]
@@ -57,7 +56,7 @@ def compare(
     spread = scatter * float(np.sqrt(1.0 + 1.0 / b))
     score = (level - expected) / spread
     threshold = float(-stdtrit(b - 1, probability) if enough else -ndtri(probability))
-    lpm = (level - expected) * G_UNIT * float(np.mean(series.dp[late])) * LPM
+    lpm = (level - expected) * G_UNIT * float(np.mean(series.dp[late])) / LITRE_PER_MINUTE
     half = float(stdtrit(b - 1, 0.975) if enough else ndtri(0.975)) * spread * lpm / (level - expected)
     told = f"score {score:.2f}, threshold {threshold:.2f}; {b} baseline recordings" + (
         "" if enough else ", too few to tell their own scatter"

@@ -1,4 +1,4 @@
-"""The extended Kalman filter over the pressures: what the leak's damping and flow do to p_A and p_B.
+"""The extended Kalman filter over the pressures, which sees the leak by its damping and flow in p_A and p_B.
 
 Machine (the equations of the rig without throttles, thesis eqs. (4.1)-(4.5), (4.13)-(4.22), with the leak in them):
 
@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from sealscope.compiled import kernel, law
-from sealscope.diagnosis.observer.accumulator import Blocks, close_block, new_tally
+from sealscope.diagnosis.observer.estimates import BlockRows, close_block, new_sums
 from sealscope.diagnosis.observer.model import (
     FLOW_NOISE,
     FORCE_NOISE,
@@ -27,13 +27,13 @@ from sealscope.diagnosis.observer.model import (
     REVERSAL_NOISE,
     REVERSAL_SPEED,
     STIFFNESS,
-    Assumed,
     walks,
 )
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
+from sealscope.physics.rig import RigNumbers
 from sealscope.recordings.recording import Array
 
 #: Order of the means: drive (integral, current, speed), then the four states that have a covariance.
@@ -43,15 +43,19 @@ _ALL = _STATES + len(PARAMETERS)
 _LONGEST_STEP = 1.0e-3
 #: Uncertainty of velocity [m/s] and position [m] at the start.
 _VELOCITY, _POSITION = 0.01, 0.05
-#: The search of the stiffness: after so many seconds so many candidates go on.
+#: The search of the stiffness: after these seconds this number of candidates goes on.
 _ROUNDS = ((6.3, 6), (12.6, 1))
+#: Length [s] of the beginning that `find_stiffness` reads.
+SEARCH_SECONDS = _ROUNDS[-1][0]
 _NEVER = 1 << 62
 
 
 @law
-def friction_slopes(v: float, F_C: float, breakaway: float, a: Assumed) -> tuple[float, float, float]:
-    """Slopes of Coulomb and Stribeck friction F_C (1 + b (K_brk - 1) e) sign(v) in v, its value, and its slope in b;
-    e = exp(-C_c |v|), as `physics.friction.stribeck_friction` has it with F_v = 0."""
+def friction_slopes(v: float, F_C: float, breakaway: float, a: RigNumbers) -> tuple[float, float, float]:
+    """Return slope in v, value and slope in b of the friction F_C (1 + b (K_brk - 1) e) sign(v).
+
+    e = exp(-C_c |v|); `physics.friction.stribeck_friction` without the viscous part, F_v = 0.
+    """
     speed = abs(v)
     stribeck = a.K_brk - 1.0
     e = math.exp(-a.C_c * max(speed, a.v_th))
@@ -62,14 +66,14 @@ def friction_slopes(v: float, F_C: float, breakaway: float, a: Assumed) -> tuple
 
 
 @law
-def _flow(z: np.ndarray, q: np.ndarray, omega: float, a: Assumed) -> float:
-    """Flow [m^3/s] into chamber A: what the pump delivers less what leaks."""
-    return pump_flow(omega, z[3] - z[4], 2.0 * math.pi * q[4] * a.D, q[0] * G_UNIT)
+def _flow(z: np.ndarray, q: np.ndarray, omega: float, a: RigNumbers) -> float:
+    """Return the flow [m^3/s] into chamber A: pump flow less leakage."""
+    return pump_flow(omega, z[3] - z[4], q[4] * a.q_b, q[0] * G_UNIT)
 
 
 @law
-def _rates(z: np.ndarray, q: np.ndarray, drive: float, commanded: bool, a: Assumed, dz: np.ndarray) -> None:
-    """Rates of the means `z` with parameters `q`; `drive`: the command [V], or the speed [rad/s]."""
+def _rates(z: np.ndarray, q: np.ndarray, drive: float, commanded: bool, a: RigNumbers, dz: np.ndarray) -> None:
+    """Write the rates of the means `z` with parameters `q` to `dz`; `drive`: the command [V], or the speed [rad/s]."""
     dp = z[3] - z[4]
     omega = drive
     if commanded:
@@ -78,13 +82,13 @@ def _rates(z: np.ndarray, q: np.ndarray, drive: float, commanded: bool, a: Assum
         voltage = controller_voltage(error, z[0], a.k_p, a.K_i, a.V_max)
         dz[0] = error
         dz[1] = winding_current_rate(voltage, z[1], omega, a.R_c, a.L_c, a.C_e, a.i_max)
-        dz[2] = shaft_acceleration(z[1], omega, pump_torque(dp, 2.0 * math.pi * a.D), a.C_m, a.B_M, a.J_M)
+        dz[2] = shaft_acceleration(z[1], omega, pump_torque(dp, a.q_b), a.C_m, a.B_M, a.J_M)
     else:
         dz[0] = 0.0
         dz[1] = 0.0
         dz[2] = 0.0
     flow = _flow(z, q, omega, a)
-    change = q[6] * a.slope / a.V * z[6]
+    change = 0.5 * q[6] * (a.A_A + a.A_B) / a.V * z[6]
     dz[3] = pressure_rate(flow - a.A_A * z[5], a.V * (1.0 + change), q[3] * a.K_oil)
     dz[4] = pressure_rate(a.A_B * z[5] - flow, a.V * (1.0 - change), q[3] * a.K_oil)
     F_C = q[1] * coulomb_friction(z[3], z[4], a.F_pr, a.F_cfr, False)
@@ -94,12 +98,13 @@ def _rates(z: np.ndarray, q: np.ndarray, drive: float, commanded: bool, a: Assum
 
 
 @law
-def _slopes(z: np.ndarray, q: np.ndarray, omega: float, a: Assumed, J: np.ndarray, B: np.ndarray) -> None:
-    """Jacobians of the rates of (p_A, p_B, v, x): J (4, 4) in themselves, B (3, 8) in the parameters."""
+def _slopes(z: np.ndarray, q: np.ndarray, omega: float, a: RigNumbers, J: np.ndarray, B: np.ndarray) -> None:
+    """Write the Jacobians of the rates of (p_A, p_B, v, x): J (4, 4) in themselves, B (3, 8) in the parameters."""
     dp = z[3] - z[4]
     flow = _flow(z, q, omega, a)
+    pumped = a.q_b / (2.0 * math.pi) * omega
     stiffness = q[3] * a.K_oil / a.V
-    c = a.slope / a.V
+    c = 0.5 * (a.A_A + a.A_B) / a.V
     share_A = 1.0 / (1.0 + q[6] * c * z[6])
     share_B = 1.0 / (1.0 - q[6] * c * z[6])
     k_A = stiffness * share_A
@@ -126,8 +131,8 @@ def _slopes(z: np.ndarray, q: np.ndarray, omega: float, a: Assumed, J: np.ndarra
     B[2, 2] = -a.F_v * z[5] / a.M_eq
     B[0, 3] = rate_A / q[3]
     B[1, 3] = rate_B / q[3]
-    B[0, 4] = k_A * a.D * omega
-    B[1, 4] = -k_B * a.D * omega
+    B[0, 4] = k_A * pumped
+    B[1, 4] = -k_B * pumped
     B[2, 5] = -1.0 / a.M_eq
     B[0, 6] = -rate_A * share_A * c * z[6]
     B[1, 6] = rate_B * share_B * c * z[6]
@@ -171,21 +176,21 @@ def advance(
     commanded: bool,
     h: float,
     steps: int,
-    a: Assumed,
+    a: RigNumbers,
     z: np.ndarray,
     q: np.ndarray,
     P: np.ndarray,
-    tally: np.ndarray,
+    sums: np.ndarray,
     noise: np.ndarray,
     walk: np.ndarray,
     block: int,
     rows: np.ndarray,
 ) -> int:
-    """Advance the filter over samples `drive`, `p_A`, `p_B` (n,) of spacing h; returns how many `rows` it wrote.
+    """Advance the filter over samples `drive`, `p_A`, `p_B` (n,) of spacing h; return the number of `rows` written.
 
     `drive`: command [V] if `commanded`, else the mean speed [rad/s] since the sample before. Means `z` (7,), parameters
-    `q` (8,), covariance `P` (12, 12) and `tally` (see `observer_tally`) are the filter's memory and are changed in
-    place. `noise` (2,): variances of the readings [Pa^2]; `walk` (8,): variances gained from block to block.
+    `q` (8,), covariance `P` (12, 12) and `sums` (see `estimates`) are the filter's memory and are changed in place.
+    `noise` (2,): variances of the readings [Pa^2]; `walk` (8,): variances gained from block to block.
     """
     J, E, T = np.zeros((_STATES, _STATES)), np.zeros((_STATES, _STATES)), np.zeros((_STATES, _STATES))
     B, S, W = np.zeros((_STATES, len(PARAMETERS))), np.zeros((_STATES, _ALL)), np.zeros((_STATES, _ALL))
@@ -194,20 +199,20 @@ def advance(
     step = h / steps
     written = 0
     for n in range(drive.size):
-        if tally[5] == 0.0:
-            tally[5] = 1.0
-            tally[6] = drive[n]
+        if sums[5] == 0.0:
+            sums[5] = 1.0
+            sums[6] = drive[n]
             z[3] = p_A[n]
             z[4] = p_B[n]
             continue
-        before, after = (tally[6], drive[n]) if commanded else (drive[n], drive[n])
-        tally[6] = drive[n]
+        before, after = (sums[6], drive[n]) if commanded else (drive[n], drive[n])
+        sums[6] = drive[n]
         for i in range(_STATES):
             for j in range(_ALL):
                 S[i, j] = 1.0 if i == j else 0.0
-        for one in range(steps):
-            left = before + (after - before) * one / steps
-            right = before + (after - before) * (one + 1) / steps
+        for part in range(steps):
+            left = before + (after - before) * part / steps
+            right = before + (after - before) * (part + 1) / steps
             half = 0.5 * (left + right)
             _rates(z, q, left, commanded, a, k1)
             for i in range(_MEANS):
@@ -250,10 +255,10 @@ def advance(
             innovation = (p_A[n] if c == 0 else p_B[n]) - z[3 + c]
             variance = P[c, c] + noise[c]
             white = innovation / math.sqrt(variance)
-            tally[1] -= 0.5 * (white * white + math.log(variance))
-            tally[2] += 0.5 * white * white
-            tally[8] += 0.5 * white * tally[9 + c]
-            tally[9 + c] = white
+            sums[1] -= 0.5 * (white * white + math.log(variance))
+            sums[2] += 0.5 * white * white
+            sums[8] += 0.5 * white * sums[9 + c]
+            sums[9 + c] = white
             for i in range(_ALL):
                 gain[i] = P[i, c] / variance
             for i in range(_STATES):
@@ -264,55 +269,64 @@ def advance(
                 share = gain[i] * variance
                 for j in range(_ALL):
                     P[i, j] -= share * gain[j]
-        tally[7] += abs(p_A[n] - p_B[n])
-        tally[0] += 1.0
-        if tally[0] >= block:
-            close_block(q, P, _STATES, 0, tally, walk, G_PRIOR, rows[written])
+        sums[7] += abs(p_A[n] - p_B[n])
+        sums[0] += 1.0
+        if sums[0] >= block:
+            close_block(q, P, _STATES, 0, sums, walk, G_PRIOR, rows[written])
             written += 1
     return written
 
 
 class PressureFilter:
-    """The filter with its memory: `update` takes samples as they come; `blocks` are its estimates so far."""
+    """The filter with its memory: `update` takes samples in order; `blocks` are its estimates so far.
+
+    `start`: parameters (8,) and their deviations (8,); `noise` (2,): variances of the readings [Pa^2]; `block`: its
+    length [samples]; `longest_step` of the integration [s].
+    """
 
     def __init__(
-        self, a: Assumed, commanded: bool, rate: float, block: int, start: tuple[Array, Array], noise: Array
+        self,
+        a: RigNumbers,
+        commanded: bool,
+        rate: float,
+        block: int,
+        start: tuple[Array, Array],
+        noise: Array,
+        longest_step: float = _LONGEST_STEP,
     ) -> None:
         self.a, self.commanded, self.h, self.block, self.noise = a, commanded, 1.0 / rate, block, noise
-        self.steps = max(1, math.ceil(self.h / _LONGEST_STEP - 1e-9))
+        self.steps = max(1, math.ceil(self.h / longest_step - 1e-9))
         self.walk = walks(block * self.h)
-        self.blocks = Blocks(len(PARAMETERS))
-        self._begin(*start)
-
-    def _begin(self, q: Array, deviations: Array) -> None:
+        self.blocks = BlockRows(len(PARAMETERS))
+        q, deviations = start
         self.q = q.copy()
         self.z = np.zeros(_MEANS)
-        self.P = np.diag(np.concatenate([self.noise, [_VELOCITY**2, _POSITION**2], deviations**2]))
-        self.tally = new_tally(q[0], deviations[0])
+        self.P = np.diag(np.concatenate([noise, [_VELOCITY**2, _POSITION**2], deviations**2]))
+        self.sums = new_sums(q[0], deviations[0])
 
     def update(self, drive: Array, p_A: Array, p_B: Array) -> None:
         """Take more samples, (n,) each."""
-        rows = self.blocks.room(drive.size // self.block + 1)
+        rows = self.blocks.buffer(drive.size // self.block + 1)
         written = advance(
             drive, p_A, p_B, self.commanded, self.h, self.steps, self.a,
-            self.z, self.q, self.P, self.tally, self.noise, self.walk, self.block, rows,
+            self.z, self.q, self.P, self.sums, self.noise, self.walk, self.block, rows,
         )  # fmt: skip
         self.blocks.add(rows[:written])
 
     @property
     def log_likelihood(self) -> float:
-        """Of all samples so far; minus infinity where the filter has lost them."""
-        found = float(self.tally[1])
-        return found if math.isfinite(found) else -math.inf
+        """Log likelihood of all samples so far; minus infinity where the filter has diverged."""
+        value = float(self.sums[1])
+        return value if math.isfinite(value) else -math.inf
 
 
 def find_stiffness(
-    a: Assumed, commanded: bool, rate: float, start: tuple[Array, Array], noise: Array, samples: tuple[Array, ...]
+    a: RigNumbers, commanded: bool, rate: float, start: tuple[Array, Array], noise: Array, samples: tuple[Array, ...]
 ) -> float:
-    """Factor on the rig's stiffness under which the first samples are likeliest.
+    """Return the factor on the rig's stiffness under which the first samples are likeliest.
 
-    The ringing's frequency must be right within a few per cent before the filter can lock on to it; so a bank of
-    filters runs over the beginning, each with a stiffness of its own, and the likeliest go on.
+    The filter locks on to the ringing only where its frequency is right within a few per cent; so a bank of filters
+    runs over the beginning, each with another stiffness, and the likeliest go on.
     """
     q, deviations = start
     number = PARAMETERS.index("stiffness")
@@ -321,18 +335,12 @@ def find_stiffness(
         begin, spread = q.copy(), deviations.copy()
         begin[number] = factor
         spread[number] = deviations[number] * factor
-        one = PressureFilter(a, commanded, rate, _NEVER, (begin, spread), noise)
-        one.steps = max(1, math.ceil(one.h / (2.0 * _LONGEST_STEP) - 1e-9))
-        bank.append(one)
+        bank.append(PressureFilter(a, commanded, rate, _NEVER, (begin, spread), noise, 2.0 * _LONGEST_STEP))
     first = 0
     for seconds, left in _ROUNDS:
         stop = round(seconds * rate)
-        for one in bank:
-            one.update(*(channel[first:stop] for channel in samples))
-        bank = sorted(bank, key=lambda one: one.log_likelihood, reverse=True)[:left]
+        for candidate in bank:
+            candidate.update(*(channel[first:stop] for channel in samples))
+        bank = sorted(bank, key=lambda candidate: candidate.log_likelihood, reverse=True)[:left]
         first = stop
     return float(bank[0].q[number])
-
-
-#: Length [s] of the beginning that `find_stiffness` reads.
-SEARCH_SECONDS = _ROUNDS[-1][0]

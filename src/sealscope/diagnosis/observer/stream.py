@@ -1,4 +1,4 @@
-"""The observer block by block: the same filter whether a recording comes at once or in pieces of any size."""
+"""The observer on a stream of samples: estimates do not depend on how a recording is divided into pieces."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sealscope.diagnosis.observer.accumulator import Estimates
-from sealscope.diagnosis.observer.model import assume, start_parameters
+from sealscope.diagnosis.observer.estimates import BlockRows, Estimates
+from sealscope.diagnosis.observer.model import assume, compliance, displacement, mean_area, start_parameters
 from sealscope.diagnosis.observer.pressure_filter import SEARCH_SECONDS, PressureFilter, find_stiffness
 from sealscope.diagnosis.observer.volume_filter import VolumeFilter
 from sealscope.errors import InputError
@@ -19,7 +19,7 @@ from sealscope.recordings.recording import Array, Recording
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: What the observer rests on: `volume` on angle (or speed) and position, no friction in it; `speed` on the pressures
+#: What the observer reads: `volume` angle (or speed) and position, no friction in it; `speed` on the pressures
 #: and the angle or speed; `command` on the pressures and the command.
 Formulation = Literal["volume", "speed", "command"]
 #: Least noise of a reading: a tenth of a step of 14 bits over 3000 psi [Pa], and the square of it in volume [m^3].
@@ -28,14 +28,14 @@ _SLOW_SECONDS = 0.02
 
 
 def whole(recording: Recording, name: str) -> bool:
-    """Whether a channel is there in SI units, without a gap, and moves."""
+    """Return whether a channel is recorded in SI units, without a gap, and moves."""
     if name not in recording or recording.units[name] == "count":
         return False
     return moves(recording[name])
 
 
 def formulation_of(recording: Recording) -> Formulation | None:
-    """The formulation that a recording's channels allow; None where there is neither command nor speed."""
+    """Return the formulation that a recording's channels allow; None where there is neither command nor speed."""
     turned = whole(recording, "theta") or whole(recording, "omega")
     if turned and whole(recording, "x"):
         return "volume"
@@ -45,7 +45,7 @@ def formulation_of(recording: Recording) -> Formulation | None:
 
 
 def channels_of(formulation: Formulation, recording: Recording) -> tuple[str, ...]:
-    """The channels that a formulation reads, of those that a recording has."""
+    """Return the channels that a formulation reads, of those that a recording has."""
     turning = "theta" if whole(recording, "theta") else "omega"
     return {
         "volume": (*CHAMBERS, turning, "x"),
@@ -55,11 +55,11 @@ def channels_of(formulation: Formulation, recording: Recording) -> tuple[str, ..
 
 
 class ObserverStream:
-    """The observer on a stream: `update` takes the next samples, `estimates` is all it knows so far.
+    """The observer on a stream: `update` takes the next samples, `estimates` are those of all blocks so far.
 
-    `channels`: as `channels_of` gives them; `rate` [Hz]; `block_s` [s]: what one estimate covers, best a whole number
-    of the duty's cycles. The first seconds (`SEARCH_SECONDS`) are kept until the readings' noise, the senses of the
-    channels and the oil's stiffness are found; after that memory is bounded but for five numbers a block.
+    `channels`: as `channels_of` gives them; `rate` [Hz]; `block_s` [s]: length of a block, best a whole number of the
+    duty's cycles. The first seconds (`SEARCH_SECONDS`) are stored until the readings' noise, the senses of the channels
+    and the oil's stiffness are estimated; after that memory grows by one row a block.
 
     Raises InputError for a rate or a block length that is not positive.
     """
@@ -67,11 +67,11 @@ class ObserverStream:
     def __init__(self, rig: Rig, channels: Sequence[str], rate: float, block_s: float) -> None:
         if not (rate > 0 and block_s > 0):
             raise InputError(f"rate and block length must be > 0, got {rate} Hz and {block_s} s")
-        self.rig, self.assumed, self.rate = rig, assume(rig), float(rate)
+        self.rig, self._numbers, self.rate = rig, assume(rig), float(rate)
         self.channels = tuple(channels)
         self.block = max(2, round(block_s * rate))
         self.block_s = self.block / self.rate
-        self._kept: list[dict[str, Array]] = []
+        self._stored: list[dict[str, Array]] = []
         self._count = 0
         self._last: dict[str, float] = {}
         self._filter: PressureFilter | VolumeFilter | None = None
@@ -91,24 +91,23 @@ class ObserverStream:
 
     @property
     def estimates(self) -> Estimates:
-        """All blocks so far."""
-        from sealscope.diagnosis.observer.accumulator import Blocks
-
-        return Blocks(1).estimates() if self._filter is None else self._filter.blocks.estimates()
+        """Estimates of all blocks so far."""
+        return BlockRows(1).estimates() if self._filter is None else self._filter.blocks.estimates()
 
     def _take(self, samples: dict[str, Array]) -> None:
         if self._filter is None:
-            self._kept.append(samples)
+            self._stored.append(samples)
             self._count += samples["p_A"].size
             if self._count < round(SEARCH_SECONDS * self.rate):
                 return
-            samples = {name: np.concatenate([one[name] for one in self._kept]) for name in self.channels}
-            self._kept = []
+            samples = {name: np.concatenate([piece[name] for piece in self._stored]) for name in self.channels}
+            self._stored = []
             self._begin(samples)
         self._run(samples)
 
     def _begin(self, samples: dict[str, Array]) -> None:
-        """Find noise, senses and stiffness from the first seconds, whatever more there is."""
+        """Estimate noise, senses and stiffness from the first seconds alone."""
+        a = self._numbers
         first = {name: values[: round(SEARCH_SECONDS * self.rate)] for name, values in samples.items()}
         stride = max(1, round(_SLOW_SECONDS * self.rate))
         slow = {name: values[::stride] for name, values in first.items()}
@@ -119,9 +118,9 @@ class ObserverStream:
             self._push = _sense(dp, forward)
             self._origin = {name: float(first[name][0]) for name in ("theta", "x") if name in first}
             theta, x, drop = self._volumes(first, remember=False)
-            volume = self.assumed.D * theta - self.assumed.area * x - self.assumed.compliance * drop
+            volume = displacement(a) * theta - mean_area(a) * x - compliance(a) * drop
             noise = max(_fine_rms(volume), _LEAST_VOLUME) ** 2
-            self._filter = VolumeFilter(self.assumed, self.rate, self.block, noise)
+            self._filter = VolumeFilter(a, self.rate, self.block, noise)
             return
         self._turn = _sense(slow["u"][1:] if "u" in slow else _speed(slow), dp)
         variances = np.array([max(_fine_rms(first[name]), _LEAST_PRESSURE) ** 2 for name in CHAMBERS])
@@ -129,9 +128,9 @@ class ObserverStream:
         drive = self._drive(first, remember=False)
         commanded = "u" in self.channels
         q, deviations = start[0].copy(), start[1].copy()
-        q[3] = find_stiffness(self.assumed, commanded, self.rate, start, variances, (drive, first["p_A"], first["p_B"]))
+        q[3] = find_stiffness(a, commanded, self.rate, start, variances, (drive, first["p_A"], first["p_B"]))
         deviations[3] *= q[3]
-        self._filter = PressureFilter(self.assumed, commanded, self.rate, self.block, (q, deviations), variances)
+        self._filter = PressureFilter(a, commanded, self.rate, self.block, (q, deviations), variances)
 
     def _run(self, samples: dict[str, Array]) -> None:
         if isinstance(self._filter, VolumeFilter):
@@ -140,7 +139,7 @@ class ObserverStream:
             self._filter.update(self._drive(samples), samples["p_A"], samples["p_B"])
 
     def _volumes(self, samples: dict[str, Array], remember: bool = True) -> tuple[Array, Array, Array]:
-        """Angle, position and pressure difference, counted from the start and in one sense."""
+        """Return angle, position and pressure difference, counted from the start and in one sense."""
         dp = self._push * (samples["p_A"] - samples["p_B"])
         x = samples["x"] - self._origin["x"]
         if "theta" in samples:
@@ -156,8 +155,8 @@ class ObserverStream:
         return self._turn * theta, x, dp
 
     def _drive(self, samples: dict[str, Array], remember: bool = True) -> Array:
-        """The command, or the mean speed since the sample before, in the pressures' sense."""
-        name = next(one for one in ("u", "theta", "omega") if one in samples)
+        """Return the command, or the mean speed since the sample before, in the pressures' sense."""
+        name = next(channel for channel in ("u", "theta", "omega") if channel in samples)
         values = samples[name]
         if name == "u":
             return np.asarray(self._turn * values)
@@ -171,13 +170,13 @@ def _speed(slow: dict[str, Array]) -> Array:
     return np.diff(slow["theta"]) if "theta" in slow else slow["omega"][1:]
 
 
-def _sense(one: Array, other: Array) -> float:
-    """+1, or -1 where two channels count against each other."""
-    return -1.0 if float(np.dot(one - one.mean(), other - other.mean())) < 0 else 1.0
+def _sense(a: Array, b: Array) -> float:
+    """Return 1, or -1 where two channels count against each other."""
+    return -1.0 if float(np.dot(a - a.mean(), b - b.mean())) < 0 else 1.0
 
 
 def _fine_rms(values: Array) -> float:
-    """RMS of d1, the finest detail: a reading's white noise."""
+    """Return the RMS of d1, the finest detail: a reading's white noise."""
     from sealscope.signals.filters import decomposition_filters
 
     high = decomposition_filters()[1]

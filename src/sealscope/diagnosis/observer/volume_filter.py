@@ -1,13 +1,12 @@
-"""The Kalman filter over volumes: no model of friction or drive where angle and position are both recorded.
+"""The Kalman filter over volumes, for recorded angle and position: it needs no model of friction or drive.
 
-What the pump has moved less what the piston has taken up is what leaked and what is stored:
+The volume that the pump has moved less that of the piston has leaked or is stored:
 
     z = D theta - A x = s + scale A x + (compliance + x slope) (p_A - p_B),   ds/dt = G (p_A - p_B) + bias_flow
 
-with the states s, bias_flow, G, scale, compliance and slope. z is measured; its innovation is the volume balance. The
-pump's own leakage cannot be told from the piston's here: G holds both. `scale` takes the ratio of displacement to area,
-known within some per cent; `bias_flow` a zero error of the pressures, which leaks do multiply, so that it starts anew
-in every block as G does.
+with the states s, bias_flow, G, scale, compliance and slope. z is measured; its innovation is the volume balance. G
+is the leakage of pump and piston together. `scale` is the error of the ratio of displacement to area, known within some
+per cent; `bias_flow` comes from a zero error of the pressures times a leak, and walks from block to block.
 """
 
 from __future__ import annotations
@@ -17,8 +16,9 @@ import math
 import numpy as np
 
 from sealscope.compiled import kernel
-from sealscope.diagnosis.observer.accumulator import Blocks, close_block, new_tally
-from sealscope.diagnosis.observer.model import G_UNIT, Assumed
+from sealscope.diagnosis.observer.estimates import BlockRows, close_block, new_sums
+from sealscope.diagnosis.observer.model import G_UNIT, compliance, displacement, mean_area
+from sealscope.physics.rig import RigNumbers
 from sealscope.recordings.recording import Array
 
 VOLUME_STATES = ("s", "bias_flow", "G", "scale", "compliance", "slope")
@@ -47,24 +47,27 @@ def advance_volume(
     area: float,
     y: np.ndarray,
     P: np.ndarray,
-    tally: np.ndarray,
+    sums: np.ndarray,
     noise: float,
     walk: np.ndarray,
     block: int,
     rows: np.ndarray,
 ) -> int:
-    """Advance the filter over samples of spacing h, (n,) each: `volume` z [m^3], `swept` A x [m^3], `dp` [Pa]; returns
-    how many `rows` it wrote. `y` (6,), `P` (6, 6) and `tally` are its memory; `noise`: variance of z [m^6]."""
+    """Advance the filter over samples of spacing h, (n,) each; return the number of `rows` written.
+
+    `volume`: z [m^3]; `swept`: A x [m^3]; `dp`: p_A - p_B [Pa]; `y` (6,), `P` (6, 6) and `sums` are the filter's
+    memory; `noise`: variance of z [m^6].
+    """
     H, PH = np.zeros(_M), np.zeros(_M)
     written = 0
     for n in range(volume.size):
-        if tally[5] == 0.0:
-            tally[5] = 1.0
-            tally[6] = dp[n]
+        if sums[5] == 0.0:
+            sums[5] = 1.0
+            sums[6] = dp[n]
             y[_S] = volume[n]
             continue
-        leaks = h * G_UNIT * 0.5 * (dp[n] + tally[6])
-        tally[6] = dp[n]
+        leaks = h * G_UNIT * 0.5 * (dp[n] + sums[6])
+        sums[6] = dp[n]
         y[_S] += h * y[_BIAS] + leaks * y[_G]
         for j in range(_M):
             P[_S, j] += h * P[_BIAS, j] + leaks * P[_G, j]
@@ -85,46 +88,47 @@ def advance_volume(
             variance += H[i] * total
             innovation -= H[i] * y[i]
         white = innovation / math.sqrt(variance)
-        tally[1] -= 0.5 * (white * white + math.log(variance))
-        tally[2] += white * white
-        tally[8] += white * tally[9]
-        tally[9] = white
+        sums[1] -= 0.5 * (white * white + math.log(variance))
+        sums[2] += white * white
+        sums[8] += white * sums[9]
+        sums[9] = white
         for i in range(_M):
             y[i] += PH[i] / variance * innovation
             for j in range(_M):
                 P[i, j] -= PH[i] * PH[j] / variance
-        tally[7] += abs(dp[n])
-        tally[0] += 1.0
-        if tally[0] >= block:
-            close_block(y, P, 0, _G, tally, walk, _G_PRIOR, rows[written])
+        sums[7] += abs(dp[n])
+        sums[0] += 1.0
+        if sums[0] >= block:
+            close_block(y, P, 0, _G, sums, walk, _G_PRIOR, rows[written])
             written += 1
     return written
 
 
 class VolumeFilter:
-    """The filter with its memory: `update` takes samples as they come; `blocks` are its estimates so far."""
+    """The filter with its memory: `update` takes samples in order; `blocks` are its estimates so far."""
 
-    def __init__(self, a: Assumed, rate: float, block: int, noise: float) -> None:
-        self.a, self.h, self.block, self.noise = a, 1.0 / rate, block, noise
-        self.blocks = Blocks(_M)
+    def __init__(self, a: RigNumbers, rate: float, block: int, noise: float) -> None:
+        self.displacement, self.area = displacement(a), mean_area(a)
+        self.h, self.block, self.noise = 1.0 / rate, block, noise
+        self.blocks = BlockRows(_M)
         self.y = np.zeros(_M)
-        self.y[_G], self.y[_COMPLIANCE] = 0.5, a.compliance
-        spread = np.array([*_START, _COMPLIANCE_SHARE * a.compliance, a.area / a.K_oil])
+        self.y[_G], self.y[_COMPLIANCE] = 0.5, compliance(a)
+        spread = np.array([*_START, _COMPLIANCE_SHARE * compliance(a), self.area / a.K_oil])
         self.P = np.diag(spread**2)
-        self.tally = new_tally(self.y[_G], spread[_G])
+        self.sums = new_sums(self.y[_G], spread[_G])
         share = block * self.h / 60.0
         self.walk = np.zeros(_M)
         self.walk[_BIAS] = _BIAS_FLOW**2
         self.walk[_SCALE] = 1e-14 * share
-        self.walk[_COMPLIANCE] = (_COMPLIANCE_WALK * a.compliance) ** 2 * share
-        self.walk[_SLOPE] = (_COMPLIANCE_WALK * a.area / a.K_oil) ** 2 * share
+        self.walk[_COMPLIANCE] = (_COMPLIANCE_WALK * compliance(a)) ** 2 * share
+        self.walk[_SLOPE] = (_COMPLIANCE_WALK * self.area / a.K_oil) ** 2 * share
 
     def update(self, theta: Array, x: Array, dp: Array) -> None:
         """Take more samples, (n,) each: angle [rad] and position [m] since the start, p_A - p_B [Pa]."""
-        swept = self.a.area * x
-        rows = self.blocks.room(theta.size // self.block + 1)
+        swept = self.area * x
+        rows = self.blocks.buffer(theta.size // self.block + 1)
         written = advance_volume(
-            self.a.D * theta - swept, swept, dp, self.h, self.a.area,
-            self.y, self.P, self.tally, self.noise, self.walk, self.block, rows,
+            self.displacement * theta - swept, swept, dp, self.h, self.area,
+            self.y, self.P, self.sums, self.noise, self.walk, self.block, rows,
         )  # fmt: skip
         self.blocks.add(rows[:written])

@@ -1,12 +1,11 @@
-"""The observers' bookkeeping: what a block of samples says of the conductance by itself, and how white the innovations
-were.
+"""Estimates of the conductance from each block of samples, and the sums from which they are closed.
 
-Tally (11,): 0 samples in this block, 1 log likelihood so far, 2 sum of the squared normalised innovations, 3, 4 mean
+`sums` (11,): 0 samples in this block, 1 log likelihood so far, 2 sum of the squared normalised innovations, 3, 4 mean
 and variance of G before this block, 5 whether a first sample was seen, 6 the sample before, 7 sum of |p_A - p_B|, 8
 sum of the products of successive innovations, 9, 10 the innovations before.
 
-Row of a block (5 + 2 m,): G by itself, its deviation, mean squared innovation, correlation of successive ones, mean
-|p_A - p_B|, then the m parameters and their deviations.
+Row of a block (5 + 2 m,): G from the block alone, its deviation, mean squared innovation, correlation of successive
+innovations, mean |p_A - p_B|, then the m parameters and their deviations.
 """
 
 from __future__ import annotations
@@ -23,10 +22,13 @@ _LEAD = 5
 
 
 class Estimates(NamedTuple):
-    """What blocks of equal length say, k of them: `G`, `sd` (k,) the conductance from each alone and its deviation by
-    the filter's covariance, in units of `observer_model.G_UNIT`; `square` (k,) mean square of the normalised
-    innovations, 1 where the model describes the recording; `correlation` (k,) of successive ones, 0 there; `dp` (k,)
-    mean |p_A - p_B| [Pa]; `parameters`, `deviations` (k, m)."""
+    """Estimates from k blocks of equal length.
+
+    `G`, `sd` (k,): conductance from each block alone and its deviation by the filter's covariance, in units of
+    `model.G_UNIT`; `square` (k,): mean square of the normalised innovations, 1 where the model describes the recording;
+    `correlation` (k,): of successive innovations, 0 there; `dp` (k,): mean |p_A - p_B| [Pa]; `parameters`,
+    `deviations` (k, m).
+    """
 
     G: Array
     sd: Array
@@ -37,11 +39,11 @@ class Estimates(NamedTuple):
     deviations: Array
 
 
-def new_tally(G: float, deviation: float) -> Array:
-    """An empty tally before a first sample."""
-    tally = np.zeros(11)
-    tally[3], tally[4] = G, deviation**2
-    return tally
+def new_sums(G: float, deviation: float) -> Array:
+    """Return the sums before a first sample, with the prior of G."""
+    sums = np.zeros(11)
+    sums[3], sums[4] = G, deviation**2
+    return sums
 
 
 @law
@@ -50,25 +52,25 @@ def close_block(
     P: np.ndarray,
     offset: int,
     number: int,
-    tally: np.ndarray,
+    sums: np.ndarray,
     walk: np.ndarray,
     G_prior: float,
     row: np.ndarray,
 ) -> None:
     """Write a block's row and begin the next: G starts anew, the other parameters walk by `walk`.
 
-    With the block's prior N(m_0, P_0) and posterior N(m_1, P_1) of G, the block by itself says G = (m_1/P_1 -
+    With the block's prior N(m_0, P_0) and posterior N(m_1, P_1) of G, the block alone gives G = (m_1/P_1 -
     m_0/P_0)/(1/P_1 - 1/P_0), of variance 1/(1/P_1 - 1/P_0): information adds. `offset`: row of the first parameter in
     P; `number`: G's number among the parameters.
     """
     g = offset + number
     m = q.size
-    information = 1.0 / P[g, g] - 1.0 / tally[4]
-    row[0] = (q[number] / P[g, g] - tally[3] / tally[4]) / information
+    information = 1.0 / P[g, g] - 1.0 / sums[4]
+    row[0] = (q[number] / P[g, g] - sums[3] / sums[4]) / information
     row[1] = math.sqrt(1.0 / information) if information > 0.0 else math.inf
-    row[2] = tally[2] / tally[0]
-    row[3] = tally[8] / tally[2] if tally[2] > 0.0 else 0.0
-    row[4] = tally[7] / tally[0]
+    row[2] = sums[2] / sums[0]
+    row[3] = sums[8] / sums[2] if sums[2] > 0.0 else 0.0
+    row[4] = sums[7] / sums[0]
     for j in range(m):
         row[_LEAD + j] = q[j]
         row[_LEAD + m + j] = math.sqrt(max(P[offset + j, offset + j], 0.0))
@@ -77,32 +79,32 @@ def close_block(
         P[g, j] = 0.0
         P[j, g] = 0.0
     P[g, g] = G_prior**2
-    tally[0] = 0.0
-    tally[2] = 0.0
-    tally[3] = q[number]
-    tally[4] = P[g, g]
-    tally[7] = 0.0
-    tally[8] = 0.0
+    sums[0] = 0.0
+    sums[2] = 0.0
+    sums[3] = q[number]
+    sums[4] = P[g, g]
+    sums[7] = 0.0
+    sums[8] = 0.0
 
 
-class Blocks:
-    """Rows of blocks, in the order they were closed."""
+class BlockRows:
+    """Rows of closed blocks, in order."""
 
     def __init__(self, parameters: int) -> None:
         self._m = parameters
         self._rows: list[Array] = []
 
-    def room(self, most: int) -> Array:
-        """Empty rows for at most so many blocks."""
+    def buffer(self, most: int) -> Array:
+        """Return empty rows for at most `most` blocks."""
         return np.empty((most, _LEAD + 2 * self._m))
 
     def add(self, rows: Array) -> None:
-        """Keep rows that were written."""
+        """Append a copy of written rows."""
         if len(rows):
             self._rows.append(rows.copy())
 
     def estimates(self) -> Estimates:
-        """All blocks so far."""
-        rows = np.concatenate(self._rows) if self._rows else self.room(0)
+        """Return the estimates of all blocks so far."""
+        rows = np.concatenate(self._rows) if self._rows else self.buffer(0)
         G, sd, square, correlation, dp = rows[:, :_LEAD].T
         return Estimates(G, sd, square, correlation, dp, rows[:, _LEAD : _LEAD + self._m], rows[:, _LEAD + self._m :])

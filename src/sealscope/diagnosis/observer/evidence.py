@@ -1,0 +1,143 @@
+"""The observer's evidence from a series of conductances: whether they can be trusted, and a step in L/min."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sealscope.diagnosis.observer.estimates import Estimates
+from sealscope.diagnosis.observer.model import G_UNIT, PARAMETERS, STIFFNESS
+from sealscope.diagnosis.observer.stream import Formulation
+from sealscope.diagnosis.observer.volume_filter import VOLUME_STATES
+from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
+from sealscope.recordings.recording import Array
+from sealscope.units import LITRE_PER_MINUTE
+
+if TYPE_CHECKING:
+    from sealscope.diagnosis.changepoint.step_in_walk import WalkStep
+    from sealscope.parameters import Rig
+
+#: Error of the size itself, as a share: scales of the transducers; the model of friction and ringing.
+SIZE_ERROR: dict[Formulation, float] = {"volume": 0.01, "speed": 0.15, "command": 0.15}
+#: What each formulation rests on, in words.
+MEANS: dict[Formulation, str] = {
+    "volume": "volume balance of angle and position",
+    "speed": "ringing and mean of the pressures, with the speed",
+    "command": "ringing and mean of the pressures, with the command",
+}
+#: Mean square of the normalised innovations, and correlation of successive ones, within which the model describes the
+#: recording. Encoders that count seldom make those of the volume large for a while.
+_SQUARE: dict[Formulation, tuple[float, float]] = {"volume": (0.1, 8.0), "speed": (0.7, 1.4), "command": (0.7, 1.4)}
+_CORRELATION = 0.25
+#: Mean square in a single block: a slipping encoder, a stuck reading.
+_WORST: dict[Formulation, float] = {"volume": 400.0, "speed": 4.0, "command": 4.0}
+#: Largest deviation of a block's conductance at which a leak can be seen at all, in units of `G_UNIT`.
+_BLIND = 12.0
+#: Range of the factors that a machine of the rig's kind may have.
+_FACTORS = {"coulomb": (0.3, 3.0), "viscous": (0.0, 4.0), "gain": (0.6, 1.6), "breakaway": (0.0, 3.0)}
+_SCALE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class ConductanceSeries:
+    """The conductance over a recording, without the warm-up.
+
+    `t` (k,): middles of the blocks [s]; `G`, `sd` (k,) in `G_UNIT`; `dp` (k,): mean |p_A - p_B| [Pa]; `block_s`: length
+    of a block [s]; `estimates`: those of all blocks, warm-up included.
+    """
+
+    t: Array
+    G: Array
+    sd: Array
+    dp: Array
+    block_s: float
+    formulation: Formulation
+    estimates: Estimates
+
+
+def misfit(estimates: Estimates, formulation: Formulation, rig: Rig) -> str | None:
+    """Return why the estimates cannot be trusted, in one line, by innovations and parameters; None where they can."""
+    if not all(np.all(np.isfinite(values)) for values in (estimates.G, estimates.sd, estimates.parameters)):
+        return "the observer lost the recording: its model does not describe it"
+    if float(np.median(estimates.sd)) > _BLIND:
+        return "the piston hardly moves or carries no pressure: a leak cannot be seen by the observer"
+    first = estimates.G.size // 5
+    square, correlation = (float(np.mean(values[first:])) for values in (estimates.square, estimates.correlation))
+    low, high = _SQUARE[formulation]
+    if not low <= square <= high:
+        return (
+            f"the model ({rig.name}) does not describe the recording: mean square of its innovations {square:.3g}, "
+            f"{low:g} to {high:g} expected"
+        )
+    if formulation != "volume" and abs(correlation) > _CORRELATION:
+        return (
+            f"the model ({rig.name}) does not describe the recording: successive innovations are correlated by "
+            f"{correlation:.2f}"
+        )
+    worst = first + int(np.argmax(estimates.square[first:]))
+    if estimates.square[worst] > _WORST[formulation]:
+        return f"the model ({rig.name}) loses the recording in block {worst + 1}: a channel jumps or sticks there"
+    if formulation == "volume":
+        scale = float(estimates.parameters[-1, VOLUME_STATES.index("scale")])
+        if abs(scale) <= _SCALE:
+            return None
+        return f"angle and position do not fit the rig: pump and piston move volumes that differ by {100 * scale:.0f} %"
+    last = dict(zip(PARAMETERS, estimates.parameters[-1], strict=True))
+    ranges = {**_FACTORS, "stiffness": (0.9 * STIFFNESS[0], 1.1 * STIFFNESS[1])}
+    for name, (low, high) in ranges.items():
+        if not low <= last[name] <= high:
+            return f"the rig does not fit the recording: {name} would have to be {last[name]:.2g} times what is assumed"
+    return None
+
+
+def within(series: ConductanceSeries, step: WalkStep) -> Evidence:
+    """Return the evidence from the step within a recording."""
+    from scipy.special import stdtrit
+
+    edges = np.array([step.onset, *step.onset_interval]) * series.block_s + series.t[0] - 0.5 * series.block_s
+    onset, interval = float(edges[0]), (float(edges[1]), float(edges[2]))
+    after = series.t > onset
+    dp = float(np.mean(series.dp[after])) if np.any(after) else float(np.mean(series.dp))
+    unit = G_UNIT * dp / LITRE_PER_MINUTE
+    lpm = step.size * unit
+    half = float(stdtrit(step.freedom, 0.975)) * float(
+        np.hypot(step.size_sd * unit, SIZE_ERROR[series.formulation] * lpm)
+    )
+    figures = f"score {step.score:.2f}, threshold {step.threshold:.2f}; {MEANS[series.formulation]}"
+    if step.alarm:
+        before = series.t < onset - series.block_s
+        return Evidence(
+            "leak",
+            f"what passes between the chambers rose by {lpm:.4f} L/min at {onset:.1f} s ({figures}), past the piston "
+            "or in the pump",
+            step.score,
+            step.threshold,
+            onset,
+            interval,
+            lpm,
+            (max(0.0, lpm - half), lpm + half),
+            cause="piston or pump leak",
+            course=course(series, step, float(np.mean(series.G[before])) if np.any(before) else 0.0),
+        )
+    if step.score > step.threshold:
+        reason = f"what passes between the chambers rose evenly from the beginning on, as in a warm-up ({figures})"
+        return Evidence("cannot tell", reason, step.score, step.threshold, course=course(series, step, None))
+    reason = f"what passes between the chambers did not rise within the recording ({figures})"
+    if series.formulation == "volume":
+        reason += f"; pump and piston together let {float(np.median(series.G)) * unit:.4f} L/min pass"
+    return Evidence("no leak", reason, step.score, step.threshold, course=course(series, step, None))
+
+
+def course(series: ConductanceSeries, step: WalkStep, level: float | None) -> LeakCourse:
+    """Return the leak over the recording beyond a `level` of the conductance, by default the recording's median.
+
+    Deviations are the filter's, scaled to the scatter of its estimates.
+    """
+    factor = G_UNIT * series.dp / LITRE_PER_MINUTE
+    base = float(np.median(series.G)) if level is None else level
+    stated = np.ones(series.t.size) if series.formulation == "volume" else series.sd
+    half = 1.96 * step.scale * stated * factor
+    lpm = (series.G - base) * factor
+    return LeakCourse(series.t, lpm, lpm - half, lpm + half)
