@@ -86,7 +86,7 @@ def judge(records: Iterator[Recording], detector: str, probability: float, onset
     count = Count()
     for one in records:
         seen = Examination(one, false_alarm_probability=probability)
-        found = seen.fused().evidence if detector == "diagnose" else seen.evidence(detector)
+        found = seen.fused() if detector == "diagnose" else seen.evidence(detector)
         count.records += 1
         count.leak += found.verdict == "leak"
         count.no_leak += found.verdict == "no leak"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.diagnose import diagnose
-    from sealscope.diagnosis.verdict.evidence import Diagnosis
+    from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.parameters import Rig, load_rig
     from sealscope.recordings import Recording, inspect, read, write
     from sealscope.reporting import write_page
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sealscope.simulation.simulate import run, simulate
 
 _HOMES = {
-    "Diagnosis": "diagnosis.verdict.evidence",
+    "Diagnosis": "diagnosis.verdict.diagnosis",
     "Experiment": "simulation.experiment",
     "Recording": "recordings.recording",
     "Rig": "parameters",

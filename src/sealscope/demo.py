@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict.evidence import Diagnosis
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings import read, write
 from sealscope.reporting import write_page
 from sealscope.simulation.experiment import make_experiment

@@ -180,7 +180,7 @@ def test_a_calibration_of_a_view_is_used_through_it(plan, done, tmp_path):
     assert known.views == {"pressures": ("u", "p_A", "p_B")}
     recording = read(next(iter((done / "recordings").glob("*.nc"))))
     found = diagnose_calibrated(recording, known)
-    assert found.methods[0].name == "rms change, calibrated @ pressures"
+    assert found.methods[0].detector == "rms change, calibrated @ pressures"
     assert found.score is not None
     assert found.threshold is not None
 

@@ -186,7 +186,7 @@ def test_a_sound_recording_and_a_leaky_one(records, calibration):
     assert leaky.verdict == "leak"
     assert leaky.score > leaky.threshold
     assert leaky.false_alarm_probability == RATE
-    assert [method.name for method in leaky.methods] == list(DETECTORS)
+    assert [method.detector for method in leaky.methods] == list(DETECTORS)
     assert "set from 12 leak-free recordings" in leaky.reason
 
 
@@ -194,7 +194,7 @@ def test_the_first_detector_makes_the_verdict(records, calibration):
     recording = records(97, duration=20.0, leak="0.1 L/min from 10 s", throttled=True)
     for name in DETECTORS:
         found = diagnose_calibrated(recording, with_judge(calibration, name))
-        assert found.methods[0].name == name
+        assert found.methods[0].detector == name
         assert (found.verdict, found.score) == (found.methods[0].verdict, found.methods[0].score)
     with pytest.raises(InputError, match="the judging detector must be one of"):
         with_judge(calibration, "rms change")

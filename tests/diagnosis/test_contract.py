@@ -212,11 +212,11 @@ def test_a_smaller_false_alarm_probability_asks_for_more(detector, leaky: Record
 def test_methods_state_their_own_evidence(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
     found = examined(detector, leaky)
     if detector.name == "rms change":
-        assert found.methods
-    for method in found.methods:
+        assert found.parts
+    for method in found.parts:
         assert method.verdict in VERDICTS
         assert method.score is not None
         assert method.threshold is not None
         assert (method.verdict == "no leak") == (method.score <= method.threshold)
-        if method.name.startswith("RMS of d1 "):
+        if method.detector.startswith("RMS of d1 "):
             assert method.verdict != "leak"  # noise alone never is a leak

@@ -75,8 +75,8 @@ def test_with_a_baseline_every_view_is_another(recording: Recording) -> None:
 
 def test_who_cannot_look_does_not(recording: Recording) -> None:
     def said(examination: Examination) -> tuple[str, bool]:
-        found = examination.said("looker")
-        return found.evidence.reason, found.usable
+        found = examination.evidence("looker")
+        return found.reason, found.usable
 
     assert said(Examination(recording.only(["u"]), false_alarm_probability=0.05)) == ("needs p_A", False)
     assert said(Examination(recording, false_alarm_probability=0.05, untrusted="stuck")) == ("stuck", False)
@@ -145,6 +145,6 @@ def test_two_at_a_time_and_as_each_by_itself(recording: Recording, monkeypatch: 
     monkeypatch.setattr(registry, "DETECTORS", {"second": Second, "first": First})
     whole = Examination(recording, false_alarm_probability=0.05)
     fused = whole.fused()
-    assert [one.name for one in fused.methods] == ["second", "first"]
+    assert [one.detector for one in fused.parts] == ["second", "first"]
     assert len(seen) == 2
     assert whole.evidence("first").score == 0.05

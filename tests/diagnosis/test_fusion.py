@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse, MethodResult, Verdict
-from sealscope.diagnosis.verdict.fusion import ORDER, Said, alarmed, fuse, passes
-from sealscope.diagnosis.verdict.next_check import next_check
+from sealscope.diagnosis.verdict.diagnosis import next_check
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse, Verdict
+from sealscope.diagnosis.verdict.fusion import ORDER, fuse
 
 LEAK = Evidence("leak", "it leaks", 9.0, 3.0)
 NONE = Evidence("no leak", "it does not", 1.0, 3.0)
@@ -23,80 +23,95 @@ COURSE = LeakCourse(np.arange(3.0), np.ones(3), np.zeros(3), np.full(3, 2.0))
 BALANCE, MODEL, OBSERVER, RMS = ORDER
 
 
-def fused(**said: Evidence):  # type: ignore[no-untyped-def]
-    """Of detectors named by keyword, `_` for a blank, in the order given."""
-    return fuse([Said(name.replace("_", " "), one) for name, one in said.items()])
+def fused(**evidences: Evidence) -> Evidence:
+    """Fused evidence of detectors named by keyword, `_` for a blank, in the order given."""
+    return fuse([replace(own, detector=name.replace("_", " ")) for name, own in evidences.items()])
+
+
+def unusable(name: str, reason: str) -> Evidence:
+    return Evidence("cannot tell", reason, detector=name, usable=False)
 
 
 def test_the_most_specific_with_a_verdict_judges_whatever_the_order() -> None:
-    said = [Said(RMS, LEAK), Said("my own", LEAK), Said(OBSERVER, LEAK), Said(BALANCE, NONE), Said(MODEL, LEAK)]
-    for turn in (said, said[::-1]):
+    evidences = [replace(LEAK, detector=name) for name in (RMS, "my own", OBSERVER, MODEL)]
+    evidences.insert(3, replace(NONE, detector=BALANCE))
+    for turn in (evidences, evidences[::-1]):
         found = fuse(turn)
-        assert (found.judge, found.evidence.verdict, found.evidence.score) == (BALANCE, "no leak", 1.0)
-        assert [one.name for one in found.methods][:4] == [BALANCE, MODEL, OBSERVER, RMS]
-    assert fused(my_own=LEAK, rms_change=UNFIT).judge == "my own"
+        assert (found.detector, found.verdict, found.score) == (BALANCE, "no leak", 1.0)
+        assert [own.detector for own in found.parts][:4] == [BALANCE, MODEL, OBSERVER, RMS]
+    assert fused(my_own=LEAK, rms_change=UNFIT).detector == "my own"
 
 
-def test_the_word_is_passed_where_nothing_was_seen_and_kept_where_something_was() -> None:
-    assert fused(volume_balance=UNFIT, rms_change=LEAK).judge == RMS
+def test_a_detector_abstains_where_nothing_was_seen_and_judges_where_something_was() -> None:
+    assert fused(volume_balance=UNFIT, rms_change=LEAK).detector == RMS
     kept = fused(volume_balance=DRIFT, rms_change=LEAK)
-    assert (kept.judge, kept.evidence.verdict) == (BALANCE, "cannot tell")
+    assert (kept.detector, kept.verdict) == (BALANCE, "cannot tell")
     named = replace(UNFIT, cause="sensor fault")
-    assert fused(volume_balance=named, rms_change=LEAK).evidence.cause == "sensor fault"
-    assert passes(UNFIT)
-    assert passes(replace(DRIFT, score=2.0))
-    assert not passes(NONE)
-    assert alarmed(DRIFT)
+    assert fused(volume_balance=named, rms_change=LEAK).cause == "sensor fault"
+    assert UNFIT.abstains
+    assert replace(DRIFT, score=2.0).abstains
+    assert not NONE.abstains
+    assert DRIFT.alarmed
 
 
 def test_a_detector_that_could_not_look_is_told_and_never_judges() -> None:
-    found = fuse([Said(BALANCE, Evidence("cannot tell", "needs theta"), usable=False), Said(RMS, NONE)])
-    assert (found.judge, found.evidence.reason) == (RMS, "it does not")
-    assert MethodResult(BALANCE, None, None, "cannot tell", "needs theta") in found.methods
+    needs = unusable(BALANCE, "needs theta")
+    found = fuse([needs, replace(NONE, detector=RMS)])
+    assert (found.detector, found.reason) == (RMS, "it does not")
+    assert needs in found.parts
 
 
 def test_nobody_judges() -> None:
-    needs = [Said(name, Evidence("cannot tell", f"{name} needs more"), usable=False) for name in ORDER]
-    assert fuse(needs).judge is None
-    assert fuse(needs).evidence == Evidence("cannot tell", "rms change needs more")
+    needs = tuple(unusable(name, f"{name} needs more") for name in ORDER)
+    assert fuse(needs) == Evidence("cannot tell", "rms change needs more", parts=needs)
     both = fused(volume_balance=UNFIT, rms_change=Evidence("cannot tell", "too short"))
-    assert both.evidence.reason == "volume balance: the model does not fit; rms change: too short"
-    assert fused(rms_change=UNFIT).evidence == UNFIT
-    assert fuse([]).evidence.verdict == "cannot tell"
+    assert both.reason == "volume balance: the model does not fit; rms change: too short"
+    assert fused(rms_change=UNFIT) == replace(UNFIT, parts=(replace(UNFIT, detector=RMS),))
+    assert fuse([]).verdict == "cannot tell"
 
 
 def test_a_leak_gets_from_others_what_the_judge_lacks() -> None:
     timed = replace(LEAK, onset_s=90.0, onset_interval_s=(88.0, 92.0))
     sized = replace(LEAK, leak_lpm=0.004, leak_interval_lpm=(0.003, 0.005), course=COURSE)
-    found = fused(pressure_model=LEAK, observer=sized, rms_change=timed).evidence
+    found = fused(pressure_model=LEAK, observer=sized, rms_change=timed)
     assert (found.onset_s, found.onset_interval_s) == (90.0, (88.0, 92.0))
     assert (found.leak_lpm, found.leak_interval_lpm, found.course) == (0.004, (0.003, 0.005), COURSE)
     assert found.reason == "it leaks; onset from rms change; L/min from observer"
     assert (found.score, found.threshold) == (LEAK.score, LEAK.threshold)
     own = replace(timed, onset_s=70.0, onset_interval_s=None)
-    assert fused(volume_balance=own, rms_change=timed).evidence.onset_interval_s is None  # not another's interval
+    assert fused(volume_balance=own, rms_change=timed).onset_interval_s is None  # not another's interval
     disagreeing = replace(NONE, leak_lpm=0.001, onset_s=3.0)
-    assert fused(pressure_model=LEAK, rms_change=disagreeing).evidence.leak_lpm is None
+    assert fused(pressure_model=LEAK, rms_change=disagreeing).leak_lpm is None
+
+
+def test_a_figure_that_is_refused_is_not_lent() -> None:
+    """The balance measured another geometry: nobody knows the flow better."""
+    lent = replace(LEAK, onset_s=90.0, leak_lpm=0.031, leak_interval_lpm=(0.03, 0.032), course=COURSE)
+    for figure, other in (("leak_lpm", "onset_s"), ("onset_s", "leak_lpm")):
+        found = fused(volume_balance=replace(LEAK, refuses=frozenset({figure})), observer=lent)
+        assert getattr(found, figure) is None
+        assert getattr(found, other) is not None
+    assert fused(volume_balance=replace(LEAK, refuses=frozenset({"leak_lpm"})), observer=lent).course is None
 
 
 def test_no_leak_keeps_its_own_bound_and_dates_nothing() -> None:
     bound = replace(NONE, leak_lpm=1e-5, leak_interval_lpm=(-1e-4, 1e-4), onset_s=5.0, onset_interval_s=(4.0, 6.0))
-    found = fused(volume_balance=bound, rms_change=replace(LEAK, onset_s=90.0, leak_lpm=0.1)).evidence
+    found = fused(volume_balance=bound, rms_change=replace(LEAK, onset_s=90.0, leak_lpm=0.1))
     assert (found.leak_lpm, found.onset_s, found.onset_interval_s) == (1e-5, None, None)
 
 
 def test_disagreement_is_said() -> None:
-    assert fused(volume_balance=LEAK, rms_change=NONE).evidence.reason == (
+    assert fused(volume_balance=LEAK, rms_change=NONE).reason == (
         "it leaks; rms change sees no leak (score 1, threshold 3)"
     )
-    assert "rms change sees a change like a leak's" in fused(volume_balance=NONE, rms_change=LEAK).evidence.reason
+    assert "rms change sees a change like a leak's" in fused(volume_balance=NONE, rms_change=LEAK).reason
     rubbing = replace(NONE, cause="friction change", score=5.0)
-    found = fused(volume_balance=NONE, pressure_model=rubbing, rms_change=LEAK).evidence
+    found = fused(volume_balance=NONE, pressure_model=rubbing, rms_change=LEAK)
     assert (found.verdict, found.cause) == ("no leak", "friction change")
     assert "pressure model takes the change for friction change" in found.reason
-    leaking = fused(volume_balance=LEAK, pressure_model=rubbing).evidence
+    leaking = fused(volume_balance=LEAK, pressure_model=rubbing)
     assert (leaking.verdict, leaking.cause) == ("leak", None)  # the judge's word stands
-    assert fused(volume_balance=LEAK, rms_change=LEAK).evidence.reason == "it leaks"
+    assert fused(volume_balance=LEAK, rms_change=LEAK).reason == "it leaks"
 
 
 EVIDENCE = st.builds(
@@ -115,20 +130,22 @@ NAMES = st.lists(st.sampled_from([*ORDER, "mine", "yours"]), unique=True, max_si
 @given(data=st.data())
 def test_the_verdict_is_one_detector_s_own(data: st.DataObject) -> None:
     """Whatever the evidence: verdict, score and threshold are the judge's, so that the rate is; one line; all told."""
-    said = [Said(name, data.draw(EVIDENCE), data.draw(st.booleans())) for name in data.draw(NAMES)]
-    found = fuse(said)
-    assert "\n" not in found.evidence.reason
-    assert sorted(one.name for one in found.methods) == sorted(one.name for one in said)
-    if found.judge is None:
-        assert found.evidence.verdict == "cannot tell"
-        assert all(passes(one.evidence) for one in said if one.usable)
+    evidences = [
+        replace(data.draw(EVIDENCE), detector=name, usable=data.draw(st.booleans())) for name in data.draw(NAMES)
+    ]
+    found = fuse(evidences)
+    assert "\n" not in found.reason
+    assert sorted(own.detector for own in found.parts) == sorted(own.detector for own in evidences)
+    if not found.detector:
+        assert found.verdict == "cannot tell"
+        assert all(own.abstains for own in evidences if own.usable)
         return
-    judge = next(one for one in said if one.name == found.judge)
+    judge = next(own for own in evidences if own.detector == found.detector)
     for name in ("verdict", "score", "threshold"):
-        assert getattr(found.evidence, name) == getattr(judge.evidence, name)
-    assert found.methods[0].name == found.judge
-    if found.evidence.verdict != "leak":
-        assert found.evidence.onset_s is None
+        assert getattr(found, name) == getattr(judge, name)
+    assert found.parts[0] == judge
+    if found.verdict != "leak":
+        assert found.onset_s is None
 
 
 def test_all_detectors_together_on_the_thesis_s_smallest_leak(records) -> None:  # type: ignore[no-untyped-def]

@@ -11,9 +11,9 @@ import pytest
 from sealscope.diagnosis import registry
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.examination import Examination
+from sealscope.diagnosis.verdict.diagnosis import next_check
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.verdict.isolation import isolated, other_cause, signatures, unasked
-from sealscope.diagnosis.verdict.next_check import next_check
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 
 ONSET, RATE = 61.3, 500.0
@@ -148,12 +148,12 @@ def test_the_fused_verdict_heeds_it_and_a_volume_balance_does_not_need_it(monkey
         monkeypatch.setattr(registry, "DETECTORS", {name: lambda rig, name=name: Says(name)})
         whole = Examination(recording, false_alarm_probability=0.05)
         fused = whole.fused()
-        assert (fused.judge, fused.evidence.verdict, fused.evidence.cause) == (name, "cannot tell", "friction change")
+        assert (fused.detector, fused.verdict, fused.cause) == (name, "cannot tell", "friction change")
         # the thesis's rule alone stays what it is: it names no cause
         assert whole.evidence(name).verdict == ("leak" if name == "rms change" else "cannot tell")
-        assert Examination(made(), false_alarm_probability=0.05).fused().evidence.verdict == "leak"
+        assert Examination(made(), false_alarm_probability=0.05).fused().verdict == "leak"
     monkeypatch.setattr(registry, "DETECTORS", {"volume balance": lambda rig: Says("volume balance")})
-    assert Examination(recording, false_alarm_probability=0.05).fused().evidence.verdict == "leak"
+    assert Examination(recording, false_alarm_probability=0.05).fused().verdict == "leak"
 
 
 def test_unasked_it_names_what_stepped_plainly_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,7 +181,7 @@ def test_unasked_it_names_what_stepped_plainly_and_nothing_else(monkeypatch: pyt
         found = unasked(seen)
         assert (None if found is None else found[1].cause) == cause
         assert found is None or abs(found[0] - ONSET) < 20.0
-        fused = Examination(recording, false_alarm_probability=0.05).fused().evidence
+        fused = Examination(recording, false_alarm_probability=0.05).fused()
         assert (fused.verdict, fused.cause, fused.score) == ("no leak", cause, 1.0)
         assert ("near" in fused.reason) == (cause is not None)
     assert cause_of(made(strokes=1.09)) == "friction change"

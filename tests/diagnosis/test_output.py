@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.registry import detectors
-from sealscope.diagnosis.verdict.evidence import Cause, Diagnosis
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 
@@ -112,7 +113,9 @@ def test_contract_of_the_other_verdicts(sound: Recording) -> None:
 
 
 def test_numbers_that_json_does_not_know_become_null() -> None:
-    found = Diagnosis("f", "leak", "r", math.inf, (-math.inf, 3.0), None, None, 0.01, math.nan, math.inf, (), ())
+    found = Diagnosis(
+        "leak", "r", math.nan, math.inf, math.inf, (-math.inf, 3.0), file="f", false_alarm_probability=0.01
+    )
     told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert told["onset_s"] is told["score"] is told["threshold"] is None
     assert told["onset_interval_s"] == [None, 3.0]

@@ -65,7 +65,7 @@ def test_the_documented_example_is_found_and_heard(install: Install, leaky: Reco
     assert points == {"ringing energy": "ringing_energy:RingingEnergy"}
     install("ringing_energy", (EXAMPLE / "ringing_energy.py").read_text(encoding="utf-8"), points)
     assert list(detectors()) == ["rms change", "ringing energy"]
-    found = {one.name: one for one in diagnose(leaky).methods}
+    found = {one.detector: one for one in diagnose(leaky).methods}
     own = found["ringing energy"]
     assert own.verdict == "leak"
     assert own.score is not None
@@ -80,7 +80,7 @@ def test_it_is_made_for_the_rig_that_is_assumed(install: Install, sound: Recordi
     install("fine", GOOD, {"good": "fine:Good"})
     for name in ("thesis", "thesis-calibrated"):
         rig = load_rig(name)
-        methods = {one.name: one for one in diagnose(sound, rig=rig).methods}
+        methods = {one.detector: one for one in diagnose(sound, rig=rig).methods}
         assert methods["good"].reason == f"assumed {rig.name}"
 
 

@@ -45,7 +45,7 @@ class TestBaseline:
         assert found.onset_s is None
         assert found.leak_interval_lpm is not None
         assert found.leak_interval_lpm[0] <= flow_of(leaky, 4.0e-13, 0.0) <= found.leak_interval_lpm[1]
-        assert [one.name for one in found.methods] == ["step of the conductance", "conductance against the baseline"]
+        assert [one.detector for one in found.parts] == ["step of the conductance", "conductance against the baseline"]
 
     def test_a_sound_one_is_sound(self, detector: VolumeBalance) -> None:
         assert all(self.examine(detector, self.record(seed), 3).verdict == "no leak" for seed in range(30, 36))

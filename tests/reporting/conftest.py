@@ -1,12 +1,15 @@
-"""A recording and a diagnosis to report; the diagnosis is any object with the attributes of the output contract."""
+"""A recording and a diagnosis to report."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
 
@@ -32,14 +35,10 @@ def _recording(seconds: float = 40.0, rate: float = 500.0, seed: int = 7) -> Rec
     return Recording(t, channels, units, rate, {"rig": {"name": "bench 4"}, "day": 3}, ("converted with 14 bits",))
 
 
-def _diagnosis(**changed):
-    finding = SimpleNamespace(
-        code="clipped", channel="p_1", count=12, first_t=3.25, text="12 samples stand at the rail", severity="warning"
-    )
-    method = SimpleNamespace(
-        name="details", score=5.4375, threshold=3.21875, verdict="leak", reason="the RMS of d3 of p_A fell by 31 %"
-    )
-    values = {
+def _diagnosis(**changed: Any) -> Diagnosis:
+    finding = Finding("clipped", "warning", "p_1", 12, 3.25, "12 samples stand at the rail")
+    method = Evidence("leak", "the RMS of d3 of p_A fell by 31 %", 5.4375, 3.21875, detector="details")
+    values: dict[str, Any] = {
         "file": "bench/log_17.csv",
         "verdict": "leak",
         "reason": "d3 fell in both chambers",
@@ -51,12 +50,9 @@ def _diagnosis(**changed):
         "score": 5.4375,
         "threshold": 3.21875,
         "quality": (finding,),
-        "methods": (method,),
-        "cause": None,
-        "next_check": "repeat the recording",
-        "course": None,
+        "parts": (method,),
     }
-    return SimpleNamespace(**(values | changed))
+    return Diagnosis(**(values | changed))
 
 
 @pytest.fixture(scope="session")
@@ -78,18 +74,14 @@ def make_diagnosis():
 def no_verdict():
     """A diagnosis in which all that may be None is None."""
     return _diagnosis(
-        file=None,
         verdict="cannot tell",
         reason="the recording is too short",
         onset_s=None,
         onset_interval_s=None,
         leak_lpm=None,
         leak_interval_lpm=None,
-        false_alarm_probability=None,
         score=None,
         threshold=None,
-        quality=(
-            SimpleNamespace(code="short", channel=None, count=None, first_t=None, text="30 samples", severity="fatal"),
-        ),
-        methods=(SimpleNamespace(name="details", score=None, threshold=None, verdict="cannot tell", reason=""),),
+        quality=(Finding("short", "fatal", None, 0, None, "30 samples"),),
+        parts=(Evidence("cannot tell", "", detector="details"),),
     )

@@ -13,7 +13,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
 from sealscope.errors import InputError
+from sealscope.recordings.quality import Finding
 from sealscope.reporting import Mark, render_page, write_page
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
@@ -161,10 +163,10 @@ def test_counts_stay_counts(recording, make_diagnosis):
 
 
 def test_names_that_try_to_be_markup_are_text(recording, make_diagnosis):
-    bad = SimpleNamespace(code=EVIL, channel=EVIL, count=1, first_t=0.0, text=EVIL, severity="warning")
-    method = SimpleNamespace(name=EVIL, score=1.0, threshold=2.0, verdict=EVIL, reason=EVIL)
+    bad = Finding(EVIL, "warning", EVIL, 1, 0.0, EVIL)
+    method = Evidence("leak", EVIL, 1.0, 2.0, detector=EVIL)
     hostile = replace(recording, provenance={EVIL: EVIL, "deep": {"er": [EVIL]}}, history=(EVIL,))
-    diagnosis = make_diagnosis(file=EVIL, reason=EVIL, quality=(bad,), methods=(method,))
+    diagnosis = make_diagnosis(file=EVIL, reason=EVIL, quality=(bad,), parts=(method,))
     read = Reader(render_page(hostile, diagnosis, marks=[Mark(1.0, EVIL)], rig=SimpleNamespace(title=EVIL)))
     assert len(read.scripts) == 3 and read.handlers == []
     assert read.text.count(EVIL) > 5  # in full and as it is: not run, not filled in
@@ -271,7 +273,7 @@ def test_a_mark_must_stand_at_a_time():
 def course(**changed):
     values = {"t": np.linspace(2.0, 38.0, 19), "lpm": np.linspace(0.0, 0.004, 19)}
     values |= {"low": values["lpm"] - 0.001, "high": values["lpm"] + 0.001}
-    return SimpleNamespace(**(values | changed))
+    return LeakCourse(**(values | changed))
 
 
 def test_the_leak_is_drawn_over_time_with_its_band(recording, make_diagnosis):

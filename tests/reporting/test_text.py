@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from sealscope.diagnosis.verdict.diagnosis import next_check
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.reporting import diagnosis_text, messages
 
 
@@ -59,27 +61,23 @@ def test_no_leak_says_how_large_one_could_be(make_diagnosis):
 
 
 def test_another_cause_is_told_with_what_to_check(make_diagnosis):
-    check = "look at rod, guides and load"
+    check = next_check("no leak", "friction change")
     found = make_diagnosis(
-        verdict="no leak", score=1.5, onset_s=None, leak_lpm=None, cause="friction change", next_check=check, quality=()
+        verdict="no leak", score=1.5, onset_s=None, leak_lpm=None, cause="friction change", quality=()
     )
     text = " ".join(diagnosis_text(found).split())
     assert "cause friction change" in text
     assert f"next {check}" in text
     assert messages.headline(found) == "No leak found across the piston, but something changed: friction change"
-    leak = make_diagnosis(cause="piston leak", next_check="hold the piston against a load", quality=())
+    leak = make_diagnosis(cause="piston leak", quality=())
     assert messages.headline(leak) == "Leak: oil bypasses the piston"
-    assert messages.next_steps(leak)[0] == "hold the piston against a load"
-    assert messages.next_steps(make_diagnosis(cause="friction change", next_check=check, quality=()))[0] != check
+    assert messages.next_steps(leak)[0] == next_check("leak", "piston leak")
+    assert messages.next_steps(make_diagnosis(cause="friction change", quality=()))[0] != check
 
 
 def test_a_method_without_a_score_says_why(no_verdict, make_diagnosis):
-    from types import SimpleNamespace
-
-    balance = SimpleNamespace(
-        name="volume balance", score=None, threshold=None, verdict="cannot tell", reason="needs theta"
-    )
-    text = diagnosis_text(make_diagnosis(methods=(balance,)))
+    balance = Evidence("cannot tell", "needs theta", detector="volume balance")
+    text = diagnosis_text(make_diagnosis(parts=(balance,)))
     assert "volume balance: cannot tell (needs theta)" in text
 
 
@@ -90,7 +88,7 @@ def test_a_leak_since_before_the_recording_and_of_unknown_size(make_diagnosis):
 
 def test_all_that_may_be_none_may_be_none(no_verdict):
     text = diagnosis_text(no_verdict)
-    assert text.startswith("this recording: cannot tell")
+    assert text.startswith("bench/log_17.csv: cannot tell")
     assert "no score was formed" in text and "None" not in text and "nan" not in text
 
 

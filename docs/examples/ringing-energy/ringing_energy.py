@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import stdtrit
 
-from sealscope.diagnosis.verdict.evidence import Evidence, MethodResult
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import Rig
 from sealscope.recordings import Recording
 from sealscope.signals.details import details
@@ -76,6 +76,6 @@ class RingingEnergy:
             change = 100 * math.expm1(after.mean() - before.mean())
             reason = f"the energy of the ringing of {chamber} changed by {change:+.1f} %"
             verdict = "leak" if score > threshold else "no leak"
-            parts.append(MethodResult(f"ringing of {chamber}", score, threshold, verdict, reason))
+            parts.append(Evidence(verdict, reason, score, threshold, detector=f"ringing of {chamber}"))
         strongest = max(parts, key=lambda part: part.score / part.threshold)
-        return Evidence(strongest.verdict, strongest.reason, strongest.score, strongest.threshold, methods=tuple(parts))
+        return Evidence(strongest.verdict, strongest.reason, strongest.score, strongest.threshold, parts=tuple(parts))

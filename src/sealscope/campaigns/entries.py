@@ -114,8 +114,9 @@ def stated(
     for one in entries:
         through = seen[one.view]
         if one.detector and one.key not in statements:
-            fused = through.examination.fused() if one.of == DIAGNOSE else None
-            statements[one.key] = Statement.of(fused.evidence if fused else through.evidence(one.of))
+            examination = through.examination
+            evidence = examination.fused() if one.of == DIAGNOSE else examination.evidence(one.of)
+            statements[one.key] = Statement.of(evidence)
         if one.own:
             said = statements[one.key]
             scores[one.name] = (_share(said) if one.of == DIAGNOSE else said.rank, said.onset_s)

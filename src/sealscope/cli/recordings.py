@@ -26,7 +26,7 @@ from sealscope.cli.options import (
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.verdict.evidence import Diagnosis
+    from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
 

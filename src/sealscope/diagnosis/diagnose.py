@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.examination import Examination
-from sealscope.diagnosis.verdict.evidence import Diagnosis
-from sealscope.diagnosis.verdict.fusion import Fused
-from sealscope.diagnosis.verdict.next_check import next_check
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.quality import Finding, inspect, uniform_segments
@@ -81,37 +79,18 @@ def diagnose(
     if cut_down is not None:
         quality.append(cut_down)
     whole = [analysable(one)[0] for one in baseline]
-    found = Examination(
+    fused = Examination(
         part,
         whole,
         false_alarm_probability=false_alarm_probability,
         rig=rig,
         untrusted=why_untrusted(part, quality),
     ).fused()
-    return diagnosis_of(
-        found, file or str(recording.provenance.get("file", "recording")), false_alarm_probability, quality
-    )
-
-
-def diagnosis_of(found: Fused, file: str, false_alarm_probability: float, quality: Sequence[Finding]) -> Diagnosis:
-    """The diagnosis that a fused verdict makes."""
-    own = found.evidence
     return Diagnosis(
-        file=file,
-        verdict=own.verdict,
-        reason=own.reason,
-        onset_s=own.onset_s,
-        onset_interval_s=own.onset_interval_s,
-        leak_lpm=own.leak_lpm,
-        leak_interval_lpm=own.leak_interval_lpm,
+        **vars(fused),
+        file=file or str(recording.provenance.get("file", "recording")),
         false_alarm_probability=false_alarm_probability,
-        score=own.score,
-        threshold=own.threshold,
-        methods=found.methods,
         quality=tuple(quality),
-        cause=own.cause,
-        next_check=next_check(own.verdict, own.cause),
-        course=own.course,
     )
 
 

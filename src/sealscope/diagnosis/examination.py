@@ -12,7 +12,7 @@ import numpy as np
 from sealscope.diagnosis.detector import Detector
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.verdict.fusion import ORDER, Fused, Said, fuse
+from sealscope.diagnosis.verdict.fusion import ORDER, fuse
 from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
@@ -57,7 +57,7 @@ class Examination:
         self.false_alarm_probability = false_alarm_probability
         self._rig = rig
         self._made: dict[str, Detector] = {}
-        self._known: dict[tuple[str, frozenset[str]], Said] = {}
+        self._known: dict[tuple[str, frozenset[str]], Evidence] = {}
 
     def through(self, channels: Iterable[str]) -> Examination:
         """The same recording with these of its channels alone; a detector that reads no other is not run again."""
@@ -77,8 +77,11 @@ class Examination:
             self._made[name] = detectors()[name](assumed_rig() if self._rig is None else self._rig)
         return self._made[name]
 
-    def said(self, name: str) -> Said:
-        """What that detector says; raises KeyError for one that is not registered."""
+    def evidence(self, name: str) -> Evidence:
+        """Return that detector's evidence, `cannot tell` where the recording lacks what it needs.
+
+        Raises KeyError for a detector that is not registered.
+        """
         detector = self._detector(name)
         # a detector may state the channels that it `reads` where there is no baseline: another view differs in no other
         visible = frozenset(self.recording.channels)
@@ -88,20 +91,20 @@ class Examination:
             self._known[key] = self._examined(detector)
         return self._known[key]
 
-    def evidence(self, name: str) -> Evidence:
-        """That detector's evidence, `cannot tell` where the recording lacks what it needs."""
-        return self.said(name).evidence
+    def fused(self) -> Evidence:
+        """Return one verdict from all registered detectors.
 
-    def fused(self) -> Fused:
-        """One verdict from all registered detectors; what sees a change in the pressures and cannot name its cause is
-        believed where nothing else stepped with it (`isolation`)."""
-        said = self._all()
-        found = fuse([one if one.name == ORDER[0] else replace(one, evidence=self._isolated(one)) for one in said])
-        return self._named(found)
+        A detector that sees a change in the pressures and cannot name its cause is believed where nothing else stepped
+        with it (`isolation`).
+        """
+        evidences = self._all()
+        return self._named(fuse([own if own.detector == ORDER[0] else self._isolated(own) for own in evidences]))
 
-    def _all(self) -> list[Said]:
-        """What every registered detector says, two at a time: compiled code runs beside the interpreter, and what a
-        detector says does not depend on the others."""
+    def _all(self) -> list[Evidence]:
+        """Return the evidence of every registered detector, two run at a time.
+
+        Compiled code runs beside the interpreter, and a detector's evidence does not depend on the others.
+        """
         from concurrent.futures import ThreadPoolExecutor
 
         from threadpoolctl import threadpool_limits
@@ -109,28 +112,27 @@ class Examination:
         names = list(detectors())
         # the limit is the process's: set here, it does not change while detectors come and go
         with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
-            return list(pool.map(self.said, names))
+            return list(pool.map(self.evidence, names))
 
-    def _named(self, found: Fused) -> Fused:
-        """A verdict other than `leak` that names no cause, with that of a step which no detector asked about."""
+    def _named(self, fused: Evidence) -> Evidence:
+        """Return a verdict other than `leak` that names no cause with that of a step which no detector asked about."""
         from sealscope.diagnosis.verdict.isolation import unasked
 
-        own = found.evidence
-        if own.verdict == "leak" or own.cause is not None or self.untrusted is not None or self._signatures is None:
-            return found
+        if fused.verdict == "leak" or fused.cause is not None or self.untrusted is not None or self._signatures is None:
+            return fused
         with np.errstate(all="ignore"):
             stepped = unasked(self._signatures)
         if stepped is None:
-            return found
-        words = f"{own.reason}; near {stepped[0]:.0f} s {stepped[1].words}: {stepped[1].cause}"
-        return replace(found, evidence=replace(own, cause=stepped[1].cause, reason=words))
+            return fused
+        reason = f"{fused.reason}; near {stepped[0]:.0f} s {stepped[1].words}: {stepped[1].cause}"
+        return replace(fused, cause=stepped[1].cause, reason=reason)
 
-    def _isolated(self, said: Said) -> Evidence:
+    def _isolated(self, evidence: Evidence) -> Evidence:
         from sealscope.diagnosis.verdict.isolation import isolated
 
-        if said.evidence.verdict != "leak" or self._signatures is None:
-            return said.evidence
-        return isolated(said.evidence, self._signatures)
+        if evidence.verdict != "leak" or self._signatures is None:
+            return evidence
+        return isolated(evidence, self._signatures)
 
     @cached_property
     def _signatures(self) -> Signatures | None:
@@ -139,9 +141,9 @@ class Examination:
         with np.errstate(all="ignore"):
             return signatures(self.recording)
 
-    def _examined(self, detector: Detector) -> Said:
-        def not_usable(reason: str) -> Said:
-            return Said(detector.name, Evidence("cannot tell", reason), usable=False)
+    def _examined(self, detector: Detector) -> Evidence:
+        def not_usable(reason: str) -> Evidence:
+            return Evidence("cannot tell", reason, detector=detector.name, usable=False)
 
         from threadpoolctl import threadpool_limits
 
@@ -156,6 +158,6 @@ class Examination:
             usable = [one for one, reason in zip(self.baseline, reasons, strict=True) if reason is None]
             if self.baseline and not usable:
                 return not_usable(f"no baseline recording can be used: {reasons[0]}")
-            found = detector.examine(self.recording, usable, self.false_alarm_probability)
-        said = Said(detector.name, found)
-        return replace(said, evidence=self._isolated(said)) if detector.name in _ISOLATED else said
+            evidence = detector.examine(self.recording, usable, self.false_alarm_probability)
+        evidence = replace(evidence, detector=detector.name)
+        return self._isolated(evidence) if detector.name in _ISOLATED else evidence

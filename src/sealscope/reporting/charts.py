@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Recording
-from sealscope.reporting.contract import CourseLike, DiagnosisLike, Mark
+from sealscope.reporting.contract import Mark
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
 from sealscope.reporting.series import Base, coded, coded_times, time_base
 
@@ -127,7 +129,7 @@ def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart
 COURSE = "course"
 
 
-def course_charts(course: CourseLike | None) -> list[Chart]:
+def course_charts(course: LeakCourse | None) -> list[Chart]:
     """The leak over the recording with its interval, where a detector follows it."""
     if course is None or not np.isfinite(course.lpm).any():
         return []
@@ -164,7 +166,7 @@ def draw(
     recording: Recording,
     chambers: list[ChamberDetails],
     charts: list[Chart],
-    diagnosis: DiagnosisLike,
+    diagnosis: Diagnosis,
     marks: list[Mark],
 ) -> Drawing:
     """Decimate and code every chart's series, and lay out the still picture of each.
@@ -211,9 +213,7 @@ def draw(
     return Drawing(data, still, base)
 
 
-def onset_within(
-    diagnosis: DiagnosisLike, span: tuple[float, float]
-) -> tuple[float | None, tuple[float, float] | None]:
+def onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
     """The onset and its interval [s] as drawn: an end that lies outside the recording, or is unbounded, is cut."""
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not np.isfinite(onset):

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
-from sealscope.reporting.contract import DiagnosisLike
 from sealscope.reporting.series import ordered_time
 
 Array = NDArray[np.float64]
@@ -126,7 +126,7 @@ class Parts:
     text: str
 
 
-def parts_to_compare(diagnosis: DiagnosisLike, recording: Recording) -> Parts:
+def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
     """Before and after the onset's interval; without an onset the halves, or the whole of a short recording alone.
 
     A half of fewer than `HALF_WINDOWS` windows is not compared: it would show the stroke and not the seal.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from math import floor, isfinite, isnan, log10
 
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS
-from sealscope.reporting.contract import DiagnosisLike, FindingLike
+from sealscope.recordings.quality import Finding
 
 ABSENT = "–"
 
@@ -37,12 +38,7 @@ def clock(seconds: float | None) -> str:
     return f"{text} ({sign}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d})"
 
 
-def subject(diagnosis: DiagnosisLike) -> str:
-    """The file's name, or words for a recording that never was a file."""
-    return str(diagnosis.file) if diagnosis.file else "this recording"
-
-
-def headline(diagnosis: DiagnosisLike) -> str:
+def headline(diagnosis: Diagnosis) -> str:
     """What was found, in one line."""
     said = {
         "leak": "Leak: oil bypasses the piston",
@@ -55,14 +51,14 @@ def headline(diagnosis: DiagnosisLike) -> str:
     return f"{said}, but something changed: {other}" if other and diagnosis.verdict != "leak" else said
 
 
-def cause(diagnosis: DiagnosisLike) -> str | None:
+def cause(diagnosis: Diagnosis) -> str | None:
     """What the change is taken for; None where there is none, or it cannot be told."""
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
 
 
-def since(diagnosis: DiagnosisLike) -> str | None:
+def since(diagnosis: Diagnosis) -> str | None:
     """Since when; None where there is no leak to date."""
     if diagnosis.verdict != "leak":
         return None
@@ -75,7 +71,7 @@ def since(diagnosis: DiagnosisLike) -> str | None:
     return text
 
 
-def how_much(diagnosis: DiagnosisLike) -> str | None:
+def how_much(diagnosis: Diagnosis) -> str | None:
     """How much oil in L/min; where no leak was found, how much there can be at most. None where nothing is known."""
     interval = diagnosis.leak_interval_lpm
     if diagnosis.verdict == "no leak" and diagnosis.leak_lpm is not None and interval is not None and interval[1] > 0:
@@ -90,22 +86,20 @@ def how_much(diagnosis: DiagnosisLike) -> str | None:
     return text
 
 
-def how_sure(diagnosis: DiagnosisLike) -> str:
+def how_sure(diagnosis: Diagnosis) -> str:
     """The score against its threshold, and what the threshold means."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return "no score was formed"
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     text = f"score {number(diagnosis.score)}, {relation} the threshold of {number(diagnosis.threshold)}"
-    judge = diagnosis.methods[0].name if diagnosis.methods else ""
+    judge = diagnosis.methods[0].detector if diagnosis.methods else ""
     by = f" of {judge}" if judge else ""
     return f"{text}{by}; {false_alarms(diagnosis)}"
 
 
-def false_alarms(diagnosis: DiagnosisLike) -> str:
+def false_alarms(diagnosis: Diagnosis) -> str:
     """What the threshold was set for."""
     p = diagnosis.false_alarm_probability
-    if p is None:
-        return "no false-alarm rate is stated for the threshold"
     if 0 < p < 1:
         every = 1 / p
         shown = f"{round(every)}" if every >= 10 else number(every)
@@ -114,12 +108,12 @@ def false_alarms(diagnosis: DiagnosisLike) -> str:
     return f"the threshold is set for a false-alarm probability of {number(p)}"
 
 
-def _fault(finding: FindingLike) -> str:
+def _fault(finding: Finding) -> str:
     name = finding.code.replace("_", " ")
     return f"{name} ({finding.channel})" if finding.channel else name
 
 
-def next_steps(diagnosis: DiagnosisLike) -> tuple[str, ...]:
+def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """What to check next, most useful first."""
     trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
     faults = ", ".join(dict.fromkeys(_fault(finding) for finding in trouble))

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, features, messages
-from sealscope.reporting.contract import DiagnosisLike, Mark
+from sealscope.reporting.contract import Mark
 from sealscope.reporting.schematic import schematic_context
 
 __all__ = ["Mark", "render_page", "write_page"]
@@ -26,7 +27,7 @@ __all__ = ["Mark", "render_page", "write_page"]
 
 def render_page(
     recording: Recording,
-    diagnosis: DiagnosisLike,
+    diagnosis: Diagnosis,
     *,
     rig: Any | None = None,
     marks: Sequence[Mark] = (),
@@ -69,12 +70,11 @@ def render_page(
     )
     uplot_js, charts_js = _packaged("vendor/uPlot.iife.min.js"), _packaged("templates/charts.js")
     schematic = environment.get_template("schematic.svg.j2").render(schematic_context(recording, diagnosis, rig))
-    name = messages.subject(diagnosis)
     return environment.get_template("page.html.j2").render(
         **_verdict(diagnosis, all_marks, truth_onset_s, truth_leak_lpm),
         **_evidence(recording, diagnosis, drawing, shown, all_marks),
         **_numbers(recording, diagnosis, chambers, pressure_unit),
-        title=title or (Path(name).name if diagnosis.file else "Diagnosis of a recording"),
+        title=title or Path(diagnosis.file).name,
         subtitle=_subtitle(recording, diagnosis),
         notes=[note for _, note in found if note],
         schematic=Markup(schematic),
@@ -91,7 +91,7 @@ def render_page(
     )
 
 
-def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: DiagnosisLike, **options: Any) -> Path:
+def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path:
     """Write `render_page(recording, diagnosis, **options)` to `path` (UTF-8) and return it.
 
     The page is complete under its name or not there at all. Raises InputError where the folder cannot be written.
@@ -150,9 +150,9 @@ def _version() -> str:
         return "(not installed)"
 
 
-def _subtitle(recording: Recording, diagnosis: DiagnosisLike) -> str:
+def _subtitle(recording: Recording, diagnosis: Diagnosis) -> str:
     facts = f"{len(recording)} samples at {recording.rate:g} Hz, {messages.clock(recording.duration)}"
-    return f"{diagnosis.file} · {facts}" if diagnosis.file else facts
+    return f"{diagnosis.file} · {facts}"
 
 
 def _schematic_note(rig: Any | None) -> str:
@@ -166,7 +166,7 @@ def _schematic_note(rig: Any | None) -> str:
 
 
 def _verdict(
-    diagnosis: DiagnosisLike, marks: list[Mark], truth_onset_s: float | None, truth_leak_lpm: float | None
+    diagnosis: Diagnosis, marks: list[Mark], truth_onset_s: float | None, truth_leak_lpm: float | None
 ) -> dict[str, Any]:
     known = []
     if truth_onset_s is not None:
@@ -197,7 +197,7 @@ def _verdict(
 
 def _evidence(
     recording: Recording,
-    diagnosis: DiagnosisLike,
+    diagnosis: Diagnosis,
     drawing: charts.Drawing,
     shown: list[charts.Chart],
     marks: list[Mark],
@@ -252,7 +252,7 @@ def _evidence(
 
 
 def _numbers(
-    recording: Recording, diagnosis: DiagnosisLike, chambers: list[features.ChamberDetails], pressure_unit: str
+    recording: Recording, diagnosis: Diagnosis, chambers: list[features.ChamberDetails], pressure_unit: str
 ) -> dict[str, Any]:
     parts = features.parts_to_compare(diagnosis, recording)
     rows: list[dict[str, Any]] = []

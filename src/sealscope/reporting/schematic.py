@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.reporting import messages
-from sealscope.reporting.contract import DiagnosisLike
 
 #: parameter of the rig -> label, unit shown, SI per unit
 _VALUES = {
@@ -20,7 +20,7 @@ _VALUES = {
 }
 
 
-def schematic_context(recording: Recording, diagnosis: DiagnosisLike, rig: Any | None) -> dict[str, Any]:
+def schematic_context(recording: Recording, diagnosis: Diagnosis, rig: Any | None) -> dict[str, Any]:
     """What the schematic's template needs: which sensors recorded, whether oil bypasses the piston, values of the rig.
 
     `rig`: anything with the attributes of a Rig (`rig.cylinder.A_A` [m^2], `rig.pump.q_b` [m^3/rev]); a value

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from textwrap import fill
 
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.reporting import messages
-from sealscope.reporting.contract import DiagnosisLike
 
 
 def _printable(text: str) -> str:
@@ -19,12 +19,12 @@ def _row(label: str, text: str, width: int) -> str:
     )
 
 
-def diagnosis_text(diagnosis: DiagnosisLike, *, width: int = 100) -> str:
+def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     """The verdict and the figures behind it as plain text of a few lines, the first being `FILE: verdict`.
 
     `width`: columns [1]. No colours: those are the caller's matter.
     """
-    lines = [f"{_printable(messages.subject(diagnosis))}: {diagnosis.verdict}"]
+    lines = [f"{_printable(diagnosis.file)}: {diagnosis.verdict}"]
     rows = [
         ("since", messages.since(diagnosis)),
         ("how much", messages.how_much(diagnosis)),
@@ -39,7 +39,7 @@ def diagnosis_text(diagnosis: DiagnosisLike, *, width: int = 100) -> str:
         )
         if method.score is None and method.reason:
             figures = f"{method.verdict} ({method.reason})"
-        lines.append(_row("method", f"{method.name}: {figures}", width))
+        lines.append(_row("method", f"{method.detector}: {figures}", width))
     lines += [_row(finding.severity, finding.text, width) for finding in diagnosis.quality]
     lines += [_row("next" if i == 0 else "", step, width) for i, step in enumerate(messages.next_steps(diagnosis)[:2])]
     return "\n".join(lines)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from sealscope.diagnosis.baseline.operating_point import operating_point
 from sealscope.diagnosis.calibration.scorers import Look, Score, scorer, split_view
 from sealscope.diagnosis.calibration.thresholds import Calibration, Group, Place, calibrate
 from sealscope.diagnosis.diagnose import analysable, why_untrusted
-from sealscope.diagnosis.verdict.evidence import Diagnosis, MethodResult, Verdict
-from sealscope.diagnosis.verdict.next_check import next_check
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.quality import Finding, inspect
@@ -100,44 +101,32 @@ def diagnose_calibrated(
     found: Group | str = reason if reason is not None else calibration.find(place_of(part))
     look = look_at(part, calibration.split_share, calibration.rate, rig) if isinstance(found, Group) else None
     methods = []
-    onset = None
     for name in calibration.detectors:
         if look is None or not isinstance(found, Group):
-            methods.append(MethodResult(name, None, None, "cannot tell", str(found)))
+            methods.append(Evidence("cannot tell", str(found), detector=name))
             continue
         detector, view = split_view(name)
         score = scorer(detector).score(look.through(calibration.views[view]) if view else look)
         methods.append(_result(name, score, found, calibration))
-        if len(methods) == 1 and methods[0].verdict == "leak":
-            onset = score.onset_s
     judge = methods[0]
     return Diagnosis(
+        **vars(replace(judge, parts=tuple(methods))),
         file=file or str(recording.provenance.get("file", "recording")),
-        verdict=judge.verdict,
-        reason=judge.reason,
-        onset_s=onset,
-        onset_interval_s=None,
-        leak_lpm=None,
-        leak_interval_lpm=None,
         false_alarm_probability=calibration.rate,
-        score=judge.score,
-        threshold=judge.threshold,
-        methods=tuple(methods),
         quality=quality,
-        next_check=next_check(judge.verdict, None),
     )
 
 
-def _result(name: str, score: Score, group: Group, calibration: Calibration) -> MethodResult:
+def _result(name: str, score: Score, group: Group, calibration: Calibration) -> Evidence:
     threshold = group.thresholds.get(name)
     if threshold is None:
         reason = (
             f"calibrated with {group.records} leak-free recordings at this operating point, too few for a false-alarm "
             f"rate of {calibration.rate:g}"
         )
-        return MethodResult(name, score.value, None, "cannot tell", reason)
+        return Evidence("cannot tell", reason, score.value, detector=name)
     if score.value is None or not math.isfinite(score.value):
-        return MethodResult(name, None, threshold.value, "cannot tell", score.reason or "no score")
+        return Evidence("cannot tell", score.reason or "no score", None, threshold.value, detector=name)
     verdict: Verdict = "leak" if score.value > threshold.value else "no leak"
     sign = "over" if verdict == "leak" else "not over"
     reason = (
@@ -145,4 +134,5 @@ def _result(name: str, score: Score, group: Group, calibration: Calibration) -> 
         f"recordings for a false-alarm rate of {calibration.rate:g} (truly {threshold.low:.2g} to {threshold.high:.2g} "
         f"at {100 * threshold.confidence:g} % confidence)"
     )
-    return MethodResult(name, score.value, threshold.value, verdict, reason)
+    onset = score.onset_s if verdict == "leak" else None
+    return Evidence(verdict, reason, score.value, threshold.value, onset, detector=name)

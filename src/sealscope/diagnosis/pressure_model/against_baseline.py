@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sealscope.diagnosis.verdict.evidence import LITRE_PER_MINUTE, Evidence, MethodResult
+from sealscope.diagnosis.verdict.evidence import LITRE_PER_MINUTE, Evidence
 from sealscope.recordings.recording import Array
 
 #: Commands are alike within this ratio of their rms.
@@ -52,12 +52,12 @@ def against_levels(
     size = own.value - float(values.mean())
     score = size / np.sqrt(variance)
     threshold = float(t.ppf(1.0 - probability, k - 1) if k > 2 else norm.ppf(1.0 - probability))
-    method = MethodResult("level of G", float(score), threshold, "leak" if score > threshold else "no leak")
+    part = Evidence("leak" if score > threshold else "no leak", "", float(score), threshold, detector="level of G")
     figures = f"z {score:.2f}, threshold {threshold:.2f}, {k} baseline record{'s' if k > 1 else ''}"
-    methods = (*within.methods, method)
+    parts = (*within.parts, part)
     if score <= threshold:
         reason = f"the leakage conductance is not above the baseline's ({figures}), and does not rise within the record"
-        return Evidence("no leak", reason, float(score), threshold, methods=methods)
+        return Evidence("no leak", reason, float(score), threshold, parts=parts)
     per = mean_drop / LITRE_PER_MINUTE
     reach = 1.96 * float(np.sqrt(variance))
     return Evidence(
@@ -67,6 +67,6 @@ def against_levels(
         threshold,
         leak_lpm=size * per,
         leak_interval_lpm=(max(0.0, (size - reach) * per), (size + reach) * per),
-        methods=methods,
+        parts=parts,
         cause="piston or pump leak",
     )

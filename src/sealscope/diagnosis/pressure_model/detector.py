@@ -16,7 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.changepoint.abrupt import ONSET_CUT, upper_quantile
 from sealscope.diagnosis.pressure_model.against_baseline import Level, against_levels
-from sealscope.diagnosis.verdict.evidence import LITRE_PER_MINUTE, Cause, Evidence, LeakCourse, MethodResult
+from sealscope.diagnosis.verdict.evidence import LITRE_PER_MINUTE, Cause, Evidence, LeakCourse
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import constant
@@ -139,7 +139,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     size, deviation = float(steps.size[inner][best]), scatter * float(steps.deviation[inner][best])
     figures = f"z {score:.2f}, threshold {threshold:.2f}"
     found = score > threshold
-    method = MethodResult("rise of G", score, threshold, "leak" if found else "no leak")
+    part = Evidence("leak" if found else "no leak", "", score, threshold, detector="rise of G")
     if not found:
         words = {
             None: f"no rise of the leakage conductance beyond its scatter ({figures}); a leak that was there from the "
@@ -147,7 +147,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
             "friction change": f"the friction changed, the leakage conductance did not ({figures})",
             "air in the oil": f"the oil became softer, the leakage conductance did not change ({figures})",
         }[cause]
-        return Evidence("no leak", words, score, threshold, methods=(method,), cause=cause)
+        return Evidence("no leak", words, score, threshold, parts=(part,), cause=cause)
     near = np.flatnonzero(z * np.abs(z) >= z[best] ** 2 - scatter**2 * ONSET_CUT)
     interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
     lpm = _mean_drop(recording, onset) / LITRE_PER_MINUTE
@@ -165,7 +165,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
             f"{reason}, but {why} changed more than it does in a sound machine",
             score,
             threshold,
-            methods=(method,),
+            parts=(part,),
             cause=cause,
         )
     return Evidence(
@@ -177,7 +177,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
         interval,
         size * lpm,
         limits,
-        methods=(method,),
+        parts=(part,),
         cause="piston or pump leak",
         course=course,
     )

@@ -144,7 +144,7 @@ def _by_recordings(
     reason = f"{told} {against_what}" if verdict == "leak" else f"no change of the details' RMS {against_what}"
     if noisy:
         reason += "; the noise (d1) changed too, and was taken out of the other details"
-    return Evidence(verdict, reason, score, threshold, methods=methods)
+    return Evidence(verdict, reason, score, threshold, parts=methods)
 
 
 def _without_noise(known: Array, measured: Array, expected: Prediction, judged: list[int]) -> Array:
@@ -215,4 +215,4 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
     )
     if noisy:
         reason += "; the noise (d1) changed too, and was taken out of the other details"
-    return Evidence(verdict, reason, score, threshold, methods=methods)
+    return Evidence(verdict, reason, score, threshold, parts=methods)

@@ -25,7 +25,7 @@ from sealscope.diagnosis.rms_change.against_baseline import against
 from sealscope.diagnosis.rms_change.blocks import Blocks, cut
 from sealscope.diagnosis.rms_change.drift import drift_beyond_noise, drift_of, settled
 from sealscope.diagnosis.rms_change.results import JUDGED, describe_change, excess, largest_changes, method_result
-from sealscope.diagnosis.verdict.evidence import Evidence, MethodResult
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Array, Recording
@@ -96,7 +96,7 @@ class RmsChange:
                     "the noise (d1) changed, and the other details by no more than it: a sensor or its "
                     "wiring changed, or the leak is hidden"
                 )
-                return Evidence("cannot tell", reason, float(found.joint[step]), threshold, methods=methods)
+                return Evidence("cannot tell", reason, float(found.joint[step]), threshold, parts=methods)
         score = float(found.joint[step])
         if not even.step_wins() and (score > threshold or even.trend > most_even or even is noisy):
             what = "the noise (d1) changed" if even is noisy else told
@@ -104,18 +104,18 @@ class RmsChange:
                 f"{what}, evenly over the recording (trend T2 {even.trend:.1f}, step {even.joint.max():.1f}): a drift "
                 "and a growing leak look alike"
             )
-            return Evidence("cannot tell", reason, score, threshold, methods=methods)
+            return Evidence("cannot tell", reason, score, threshold, parts=methods)
         if score <= threshold:
             reason = (
                 f"no change of the details' RMS within the recording beyond its scatter and a sound machine's drift "
                 f"(T2 {score:.1f}, threshold {threshold:.1f}); "
                 "a leak that was there from the start would need a --baseline to be seen"
             )
-            return Evidence("no leak", reason, score, threshold, methods=methods)
+            return Evidence("no leak", reason, score, threshold, parts=methods)
         first, last = onset_interval(found.joint)
         onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
         reason = f"{told} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"
-        return Evidence("leak", reason, score, threshold, onset, interval, methods=methods)
+        return Evidence("leak", reason, score, threshold, onset, interval, parts=methods)
 
     @staticmethod
     def _without_noise(blocks: Blocks, split: int, probability: float) -> tuple[Scan, float]:
@@ -125,7 +125,7 @@ class RmsChange:
         return scan.found(), float(upper_quantile(null, probability))
 
     @staticmethod
-    def _methods(blocks: Blocks, single: Array, thresholds: Array) -> tuple[MethodResult, ...]:
+    def _methods(blocks: Blocks, single: Array, thresholds: Array) -> tuple[Evidence, ...]:
         results = []
         for k, name in enumerate(blocks.names):
             step = int(np.argmax(np.abs(single[:, k])))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.diagnosis.rms_change.blocks import QUANTITIES
-from sealscope.diagnosis.verdict.evidence import MethodResult, Verdict
+from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.recordings.recording import Array
 
 #: Quantities that make the verdict; d1 holds noise alone, d3d4 follows from d3 and d4.
@@ -49,9 +49,9 @@ def largest_changes(names: list[str], single: Array, changes: Array, thresholds:
     return ", ".join(describe_change(names[k], float(changes[k])) for k in told)
 
 
-def method_result(name: str, score: float, threshold: float, reason: str) -> MethodResult:
+def method_result(name: str, score: float, threshold: float, reason: str) -> Evidence:
     """One quantity's evidence; a change of d1 alone is a change of the noise, never a leak."""
     verdict: Verdict = "no leak"
     if score > threshold:
         verdict = "cannot tell" if name.startswith("d1 ") else "leak"
-    return MethodResult(f"RMS of {name}", score, threshold, verdict, reason)
+    return Evidence(verdict, reason, score, threshold, detector=f"RMS of {name}")

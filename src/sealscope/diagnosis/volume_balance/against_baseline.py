@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.verdict.evidence import Evidence, MethodResult
-from sealscope.diagnosis.volume_balance.evidence import LPM, geometry_fits, level_interval, t_quantile
+from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.volume_balance.evidence import LPM, geometry_fits, level_interval, refused, t_quantile
 from sealscope.diagnosis.volume_balance.fit import BalanceFit
 
 BASELINE = "conductance against the baseline"
@@ -43,13 +43,13 @@ def against_baseline(
     variance = max(between, float(np.mean(own[1:] ** 2))) * (1.0 / len(same) + 1.0)
     score = float((mean - levels.mean()) / np.sqrt(variance))
     threshold = float(stdtrit(freedom, 1.0 - probability))
-    method = MethodResult(BASELINE, score, threshold, "leak" if score > threshold else "no leak")
-    methods = (*within.methods, method)
+    part = Evidence("leak" if score > threshold else "no leak", "", score, threshold, detector=BASELINE)
+    parts = (*within.parts, part)
     told = f"score {score:.1f}, threshold {threshold:.1f}"
     if within.verdict == "leak" or score <= threshold:
         more = "higher than" if score > threshold else "that of"
         reason = f"{within.reason}; on the whole the conductance is {more} the baseline's ({told})"
-        return replace(within, reason=reason, methods=methods)
+        return replace(within, reason=reason, parts=parts)
     lpm, interval, words = None, None, ""
     if metres and geometry_fits(fit):
         flow = float(fit.blocks.abs_dp.mean()) * LPM
@@ -61,7 +61,7 @@ def against_baseline(
         f"the leakage conductance is higher than in {len(same)} leak-free recording{'s' * (len(same) > 1)}{words}, "
         f"from the start ({told}); within the recording: {within.reason}"
     )
-    return Evidence("leak", reason, score, threshold, None, None, lpm, interval, methods)
+    return Evidence("leak", reason, score, threshold, None, None, lpm, interval, parts, refuses=refused(fit, metres))
 
 
 def _deviation(fit: BalanceFit) -> float:

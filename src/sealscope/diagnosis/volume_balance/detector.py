@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.changepoint.step_in_drift import FEWEST
-from sealscope.diagnosis.verdict.evidence import Evidence, MethodResult
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.against_baseline import against_baseline
 from sealscope.diagnosis.volume_balance.blocks import (
     BalanceBlocks,
@@ -108,10 +108,10 @@ class VolumeBalance:
     @staticmethod
     def _within(fit: BalanceFit, probability: float, metres: bool) -> Evidence:
         found = search(fit, probability)
-        method = MethodResult(STEP, found.score, found.threshold, "leak" if found.found else "no leak")
+        part = Evidence("leak" if found.found else "no leak", "", found.score, found.threshold, detector=STEP)
         if found.found:
-            return describe_leak(fit, found, method, metres=metres)
-        return no_step(fit, found, search(fit, probability, sign=-1), method, metres=metres)
+            return describe_leak(fit, found, part, metres=metres)
+        return no_step(fit, found, search(fit, probability, sign=-1), part, metres=metres)
 
 
 def _at_the_rail(recording: Recording) -> str | None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.changepoint.step_in_drift import FEWEST, StepFound
-from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, LeakCourse, MethodResult
+from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Figure, LeakCourse
 from sealscope.diagnosis.volume_balance.blocks import Y
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, told_apart
 from sealscope.recordings.recording import Array
@@ -81,6 +81,11 @@ def geometry_fits(fit: BalanceFit) -> bool:
     return abs(abs(fit.scale) - 1.0) <= GEOMETRY
 
 
+def refused(fit: BalanceFit, metres: bool) -> frozenset[Figure]:
+    """L/min where another geometry is the reason not to state it: no other detector knows the geometry better."""
+    return frozenset({"leak_lpm"}) if metres and not geometry_fits(fit) else frozenset()
+
+
 def _geometry_words(fit: BalanceFit) -> str:
     return (
         f"; L/min is not stated: displacement over area is {abs(fit.scale):.3g} times the assumed one, so the geometry "
@@ -104,9 +109,7 @@ def lpm_words(conductance: float, fit: BalanceFit, metres: bool) -> str:
     return f"{conductance / max(abs(level_interval(fit)[0]), np.finfo(float).tiny):.0%} of the conductance"
 
 
-def no_step(
-    fit: BalanceFit, found: StepFound, fall: StepFound | None, method: MethodResult, *, metres: bool
-) -> Evidence:
+def no_step(fit: BalanceFit, found: StepFound, fall: StepFound | None, part: Evidence, *, metres: bool) -> Evidence:
     """Evidence where no rise of the conductance stands out from its drift."""
     told = f"score {found.score:.1f}, threshold {found.threshold:.1f}"
     mean, low, high = level_interval(fit)
@@ -124,15 +127,15 @@ def no_step(
             f"the conductance rises smoothly by {lpm_words(rise, fit, metres)} over the recording, more than oil that "
             f"warms up explains: a growing leak would look alike ({told}){_left_out_words(fit)}"
         )
-        return Evidence("cannot tell", reason, found.score, found.threshold, methods=(method,))
+        return Evidence("cannot tell", reason, found.score, found.threshold, parts=(part,))
     if fall is not None and fall.found:
         fell = (
             f"the conductance falls at {fall.onset:.1f} s by {lpm_words(-float(fall.size[0]), fit, metres)}, which no "
             f"leak does, and never rises beyond its drift ({told})"
         )
-        return Evidence("no leak", fell + total + _left_out_words(fit), found.score, found.threshold, methods=(method,))
+        return Evidence("no leak", fell + total + _left_out_words(fit), found.score, found.threshold, parts=(part,))
     reason = f"the leakage conductance does not rise beyond its smooth drift ({told}){total}{_left_out_words(fit)}"
-    return Evidence("no leak", reason, found.score, found.threshold, methods=(method,))
+    return Evidence("no leak", reason, found.score, found.threshold, parts=(part,))
 
 
 def _shape(fit: BalanceFit, found: StepFound) -> Array:
@@ -141,7 +144,7 @@ def _shape(fit: BalanceFit, found: StepFound) -> Array:
     return np.clip((fit.blocks.t + lead - found.onset) / width, 0.0, 1.0)
 
 
-def describe_leak(fit: BalanceFit, found: StepFound, method: MethodResult, *, metres: bool) -> Evidence:
+def describe_leak(fit: BalanceFit, found: StepFound, part: Evidence, *, metres: bool) -> Evidence:
     """Evidence where the conductance rises: where the oil goes, since when, how much."""
     shape = _shape(fit, found)
     near = told_apart(fit, found.onset, found.rise, within=max(_REACH, 12.0 * fit.blocks.seconds))
@@ -173,9 +176,10 @@ def describe_leak(fit: BalanceFit, found: StepFound, method: MethodResult, *, me
         found.onset_interval,
         lpm,
         interval,
-        (method,),
+        (part,),
         cause,
         course,
+        refused(fit, metres),
     )
     if evidence.verdict == "leak":
         return evidence

@@ -13,13 +13,13 @@ overlap, so false alarms come in clusters, which leaves the true rate some 2 to 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.changepoint.step_in_drift import FEWEST
-from sealscope.diagnosis.verdict.evidence import Evidence, MethodResult
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import (
     BLOCK_SECONDS,
     BalanceBlocks,
@@ -178,11 +178,11 @@ class SequentialBalance:
         if problem is not None:
             return Evidence("cannot tell", problem), None
         found = search(fit, self.alarms_per_hour * blocks.seconds / 3600.0)
-        method = MethodResult("step of the conductance", found.score, found.threshold, "no leak")
+        part = Evidence("no leak", "", found.score, found.threshold, detector="step of the conductance")
         total = None
         if metres and geometry_fits(fit):
             total = level_interval(fit)[0] * float(fit.blocks.abs_dp.mean()) * LPM
         if not found.found:
-            return no_step(fit, found, None, method, metres=metres), total
-        method = MethodResult(method.name, found.score, found.threshold, "leak")
-        return describe_leak(fit, found, method, metres=metres), total
+            return no_step(fit, found, None, part, metres=metres), total
+        part = replace(part, verdict="leak")
+        return describe_leak(fit, found, part, metres=metres), total

@@ -1,0 +1,173 @@
+"""Diagnosis: the fused evidence on one recording with what its reader needs beside it, as in the output contract."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Verdict
+from sealscope.recordings.quality import Finding
+
+_CHECKS: Mapping[Cause, str] = {
+    "piston leak": (
+        "Make sure that the bypass valve across the cylinder is shut; then hold the piston against a load with the "
+        "motor at rest and watch x: creep confirms a worn piston seal."
+    ),
+    "piston or pump leak": (
+        "Tell the seal from the pump: shut the valves between pump and cylinder and hold the piston against a load; "
+        "creep is the seal's. Make sure before that the bypass valve across the cylinder is shut."
+    ),
+    "pump leak": (
+        "Block the cylinder lines and turn the pump slowly against the closed ports: flow or pressure that is lost "
+        "there is lost in the pump; check its case drain."
+    ),
+    "external leak": (
+        "Look for oil at the rod seals, fittings and hoses, and compare the charge pressure with its set value; fill "
+        "up only after the spot is found."
+    ),
+    "friction change": (
+        "Compare oil and seal temperature with earlier recordings, and look at rod, guides and load for binding or "
+        "side force; repeat when the machine is warm."
+    ),
+    "air in the oil": (
+        "Bleed the circuit, check the charge pressure and the suction side for drawn-in air, and record again."
+    ),
+    "sensor fault": (
+        "Compare the pressure sensors with one another at rest, and the encoders at a stop; check cables, supply and "
+        "range before any seal is changed."
+    ),
+    "changed duty": (
+        "Record again under the command, load and oil temperature of the earlier recordings; a changed duty cannot be "
+        "compared with them."
+    ),
+}
+
+
+def next_check(verdict: Verdict, cause: Cause | None) -> str:
+    """Return what to check next on the machine, in one or two sentences."""
+    if cause is not None:
+        return _CHECKS[cause]
+    if verdict == "leak":
+        return (
+            "Repeat the recording with the same command and oil temperature, with the bypass valve shut: a worn seal "
+            "shows again. What was recorded does not tell the seal from an open bypass, and maybe not from a worn pump."
+        )
+    if verdict == "no leak":
+        return "Nothing needs a check; keep this recording as a baseline for later ones with the same command."
+    return "Remove the cause that the reason names and record again; a verdict was not forced out of these data."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis(Evidence):
+    """Verdict on one recording: the fused evidence of all detectors.
+
+    Beside the fields of `Evidence`, `parts` of which holds every detector's own, that of the judge first:
+
+    Parameters
+    ----------
+    file : str
+        Name of the recording.
+    false_alarm_probability : float
+        Probability of `leak` on a leak-free recording for which `threshold` was set.
+    quality : tuple of Finding
+        Findings on the data.
+    """
+
+    file: str = "recording"
+    false_alarm_probability: float
+    quality: tuple[Finding, ...] = ()
+
+    @property
+    def methods(self) -> tuple[Evidence, ...]:
+        """Evidence of every detector, each followed by its parts."""
+        return tuple(evidence for detector in self.parts for evidence in (detector, *detector.parts))
+
+    @property
+    def next_check(self) -> str:
+        """What to check next on the machine, in one or two sentences."""
+        return next_check(self.verdict, self.cause)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the diagnosis as plain JSON values, keys in the order of the output contract.
+
+        A number that is not finite becomes null.
+        """
+        return {
+            "file": self.file,
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "onset_s": _plain(self.onset_s),
+            "onset_interval_s": _pair(self.onset_interval_s),
+            "leak_lpm": _plain(self.leak_lpm),
+            "leak_interval_lpm": _pair(self.leak_interval_lpm),
+            "false_alarm_probability": self.false_alarm_probability,
+            "score": _plain(self.score),
+            "threshold": _plain(self.threshold),
+            "methods": [
+                {
+                    "name": method.detector,
+                    "score": _plain(method.score),
+                    "threshold": _plain(method.threshold),
+                    "verdict": method.verdict,
+                    "reason": method.reason,
+                }
+                for method in self.methods
+            ],
+            "quality": [
+                {
+                    "code": finding.code,
+                    "channel": finding.channel,
+                    "count": finding.count,
+                    "first_t": _plain(finding.first_t),
+                    "severity": finding.severity,
+                    "text": finding.text,
+                }
+                for finding in self.quality
+            ],
+            "cause": self.cause,
+            "next_check": self.next_check,
+        }
+
+    def __str__(self) -> str:
+        since = "" if self.onset_s is None else f" since {self.onset_s:.1f} s"
+        return f"{self.file}: {self.verdict}{since} ({self.reason})"
+
+    def __repr__(self) -> str:
+        figures = {"onset_s": self.onset_s, "leak_lpm": self.leak_lpm, "score": self.score, "threshold": self.threshold}
+        stated = "".join(f", {name}={value:.4g}" for name, value in figures.items() if value is not None)
+        return f"Diagnosis({self.verdict!r}, file={self.file!r}{stated})"
+
+    def _repr_html_(self) -> str:
+        """Return the diagnosis as a table for notebooks."""
+        rows = [
+            ("reason", self.reason),
+            ("onset [s]", _shown(self.onset_s, self.onset_interval_s)),
+            ("leak [L/min]", _shown(self.leak_lpm, self.leak_interval_lpm)),
+            ("cause", self.cause),
+            ("score", _shown(self.score)),
+            ("threshold", _shown(self.threshold)),
+            ("false-alarm probability", f"{self.false_alarm_probability:g}"),
+            *((finding.severity, finding.text) for finding in self.quality),
+            ("next check", self.next_check),
+        ]
+        body = "".join(
+            f"<tr><th>{escape(label)}</th><td>{escape(text)}</td></tr>" for label, text in rows if text is not None
+        )
+        return f"<table><caption>{escape(self.file)}: {escape(self.verdict)}</caption>{body}</table>"
+
+
+def _plain(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _pair(pair: tuple[float, float] | None) -> list[float | None] | None:
+    return None if pair is None else [_plain(pair[0]), _plain(pair[1])]
+
+
+def _shown(value: float | None, interval: tuple[float, float] | None = None) -> str | None:
+    if value is None or interval is None:
+        return None if value is None else f"{value:.4g}"
+    return f"{value:.4g} ({interval[0]:.4g} to {interval[1]:.4g})"
