@@ -2,8 +2,8 @@
 
 import os
 
-from sealscope.campaigns.cases import cases_of
-from sealscope.campaigns.work import work
+from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.work import work
 
 
 def die_on_one(plan, case, keep=None):

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sealscope.campaigns import batches
-from sealscope.campaigns import run as campaign
-from sealscope.campaigns.cases import cases_of
-from sealscope.campaigns.entries import stated
-from sealscope.campaigns.machines import sized_once, unsized
-from sealscope.campaigns.plan import read_plan
+from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.machines import sized_once, unsized
+from sealscope.campaigns.cases.scoring import stated
+from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.execution import batches, store
+from sealscope.campaigns.execution import run as campaign
+from sealscope.campaigns.execution.batches import StepChooser, place_of_run
+from sealscope.campaigns.plans.reader import read_plan
 from sealscope.campaigns.results import simulated_result, write_result
-from sealscope.campaigns.short_runs import Steps, place_of_run
-from sealscope.campaigns.work import work
 from sealscope.diagnosis.calibration.calibrated import place_of
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
@@ -59,7 +59,7 @@ def rows_of(plan, cases, device="cpu"):
 def alone(plan, case):
     """Scores and place of a case's whole recording, at the step that it has in a batch."""
     experiment = unsized(plan, case)
-    experiment = replace(experiment, step=Steps(plan).of(case, experiment))
+    experiment = replace(experiment, step=StepChooser(plan).of(case, experiment))
     made = run(replace(experiment, leaks=sized_once(experiment)))
     look = Look(made.recording, plan.onset_s, plan.false_alarm, plan.rig)
     return stated(look, plan.detectors, plan.views)[0], place_of(made.recording), made.truth
@@ -133,7 +133,7 @@ def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, monkeypatch, tmp_pa
 
     with pytest.raises(KeyboardInterrupt):
         campaign.run(plan, tmp_path / "twice", batch=True, progress=stop)
-    assert campaign.standing(plan, tmp_path / "twice").done == 11
+    assert store.progress_of(plan, tmp_path / "twice").done == 11
     assert campaign.run(plan, tmp_path / "twice", batch=True, progress=lambda done, *_: told.append(done)).complete
     assert told[12:] == list(range(11, 27))
     again = {
@@ -147,12 +147,12 @@ def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, monkeypatch, tmp_pa
 def test_rows_of_both_ways_are_not_mixed(plan_with, tmp_path):
     plan = plan_with()
     campaign.run(plan, tmp_path / "batch", batch=True)
-    with pytest.raises(InputError, match="goes on only with the same way of making rows"):
+    with pytest.raises(InputError, match="continues only with the same mode of making rows"):
         campaign.run(plan, tmp_path / "batch", jobs=1)
     campaign.run(plan, tmp_path / "runs", jobs=1)
-    with pytest.raises(InputError, match="goes on only with the same way of making rows"):
+    with pytest.raises(InputError, match="continues only with the same mode of making rows"):
         campaign.run(plan, tmp_path / "runs", batch=True)
-    ways = [simulated_result(plan, tmp_path / name).way for name in ("batch", "runs")]
+    ways = [simulated_result(plan, tmp_path / name).mode for name in ("batch", "runs")]
     assert ways == ["in batches on the cpu", "run by run"]
 
 

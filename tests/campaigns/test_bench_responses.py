@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.campaigns import bench_responses as room
-from sealscope.campaigns.bench_responses import bench_responses, stated
-from sealscope.campaigns.noise_responses import instrument_noise, responses
-from sealscope.campaigns.planning import experiment_for
-from sealscope.campaigns.prediction import ChangeDetector, Responses
+from sealscope.campaigns.prediction import bench_responses as room
+from sealscope.campaigns.prediction.bench_responses import bench_responses, stated
+from sealscope.campaigns.prediction.detection import ChangeDetector, Responses
+from sealscope.campaigns.prediction.noise_responses import instrument_noise, responses
+from sealscope.campaigns.prediction.predict import experiment_for
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.bench.machines import Machine

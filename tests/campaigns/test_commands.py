@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from sealscope import cli
-from sealscope.campaigns.plan import load_plan
+from sealscope.campaigns.plans.reader import load_plan
 from sealscope.recordings import write
 from sealscope.simulation.experiment import make_experiment
 from sealscope.simulation.simulate import run
@@ -56,13 +56,13 @@ def test_in_batches_it_says_so_and_goes_on(call, tiny, tmp_path):
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "<dt>simulated</dt><dd>in batches on the cpu</dd>" in re.sub(r"\s*\n\s*", "", page)
     made_from = json.loads((folder / "calibration.json").read_text())["made_from"]["campaign"]
-    assert made_from["way"] == "in batches on the cpu"
+    assert made_from["mode"] == "in batches on the cpu"
     rows = (folder / "rows.jsonl").read_bytes()
     assert call("campaign", "run", tiny, "-o", folder, "--device", "cpu", "--batch")[0] == 0
     assert (folder / "rows.jsonl").read_bytes() == rows
     status, _, err = call("campaign", "run", tiny, "-o", folder)
     assert (status, len(err.splitlines())) == (2, 1)
-    assert "the same way of making rows" in err
+    assert "the same mode of making rows" in err
 
 
 def test_without_a_device_it_is_one_line(call, tiny, tmp_path):

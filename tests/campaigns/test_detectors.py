@@ -11,14 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.campaigns import run as campaign
-from sealscope.campaigns.entries import check_entry, entry
-from sealscope.campaigns.judge import calibration_of, judge
-from sealscope.campaigns.plan import load_plan
+from sealscope.campaigns.cases.row import CaseRow, Statement, cause_of
+from sealscope.campaigns.execution import run as campaign
+from sealscope.campaigns.execution.store import read_rows
+from sealscope.campaigns.judging.judge import calibration_of, judge
+from sealscope.campaigns.plans.detectors import check_detector, plan_detector
+from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
-from sealscope.campaigns.statement import Statement, cause_of
-from sealscope.campaigns.store import read_rows
-from sealscope.campaigns.work import Row
 from sealscope.diagnosis import plugins, registry
 from sealscope.diagnosis.calibration.calibrated import diagnose_calibrated
 from sealscope.diagnosis.calibration.thresholds import load
@@ -88,7 +87,7 @@ def plan(tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "DETECTORS", {**quick, "watcher": Watcher})
     monkeypatch.setattr(plugins, "_found", lambda: ())
     plugins.plug_ins.cache_clear()
-    entry.cache_clear()
+    plan_detector.cache_clear()
     examined.clear()
     path = tmp_path / "seen.toml"
     path.write_text(PLAN, encoding="utf-8")
@@ -121,10 +120,10 @@ def test_rows_keep_what_was_stated_and_come_back_from_disk(plan, done):
     assert (said.leak_lpm, said.leak_interval_lpm) == (plan.rig.pump.q_b, (0.0, 1.0))
     assert row.statements["watcher @ pressures"].cause == "friction change"
     assert row.scores["watcher @ pressures"] == (None, 21.0)  # another cause: the lowest of scores
-    assert Row.from_dict(json.loads(json.dumps(row.as_dict(), allow_nan=False))) == row
+    assert CaseRow.from_dict(json.loads(json.dumps(row.as_dict(), allow_nan=False))) == row
     line = json.loads((done / "rows.jsonl").read_text().splitlines()[0])
     del line["statements"]
-    assert Row.from_dict(line).statements == {}
+    assert CaseRow.from_dict(line).statements == {}
 
 
 def test_the_fused_verdict_is_that_of_diagnose(plan, done):
@@ -190,7 +189,7 @@ def test_a_calibration_of_a_view_is_used_through_it(plan, done, tmp_path):
     [
         (('assume_set = { "pump.q_b" = 1e-7 }', ""), "rig that its detectors assume"),
         (("", ('pressures = ["u", "p_A", "p_B"]', 'pressures = ["p_A", "p_B"]')), "channels that its detectors see"),
-        (("", ("false_alarm = 0.2", "false_alarm = 0.19")), "false-alarm rate"),
+        (("", ("false_alarm = 0.2", "false_alarm = 0.19")), "false-alarm probability"),
     ],
 )
 def test_rows_of_other_assumptions_are_not_mixed_in(plan, done, tmp_path, change, told):
@@ -225,13 +224,17 @@ def test_detectors_may_assume_another_rig(plan, done, tmp_path):
 
 
 def test_what_names_stand_for(plan):
-    assert entry("watcher, calibrated @ pressures").key == entry("watcher @ pressures").key == "watcher @ pressures"
-    assert entry("watcher").own
-    assert entry("watcher, own threshold").key == "watcher"
-    assert not entry("rms change").own  # the scorer of that name, as ever
-    assert entry("rms change").needs_calibration
-    assert entry("rms change, own threshold").own
-    assert not entry("sign rule: d3 of p_A fell").needs_calibration
+    assert (
+        plan_detector("watcher, calibrated @ pressures").key
+        == plan_detector("watcher @ pressures").key
+        == "watcher @ pressures"
+    )
+    assert plan_detector("watcher").own
+    assert plan_detector("watcher, own threshold").key == "watcher"
+    assert not plan_detector("rms change").own  # the scorer of that name, as ever
+    assert plan_detector("rms change").needs_calibration
+    assert plan_detector("rms change, own threshold").own
+    assert not plan_detector("sign rule: d3 of p_A fell").needs_calibration
     for name, told in (
         ("watchr", "did you mean 'watcher'"),
         ("watchr, calibrated", "did you mean 'watcher, calibrated'"),
@@ -239,7 +242,7 @@ def test_what_names_stand_for(plan):
         ("watcher @ nowhere", "must be one of"),
     ):
         with pytest.raises(InputError, match=told):
-            check_entry(name, plan.views)
+            check_detector(name, plan.views)
 
 
 @pytest.mark.parametrize(
@@ -252,7 +255,7 @@ def test_what_names_stand_for(plan):
         ("seed = 3", 'seed = 3\nassume = "nowhere"', "campaign.assume"),
         ("seed = 3", "seed = 3\nassume_set = 3", "assume_set must be a table"),
         ("seed = 3", 'seed = 3\nassume_set = { "V_9" = 1.0 }', "campaign.assume"),
-        ('"watcher",', '"watcher", 3,', "must be names"),
+        ('"watcher",', '"watcher", 3,', "must be a list of names"),
     ],
 )
 def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, told):
@@ -274,7 +277,7 @@ def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
 def row(number, verdict, leak=0.0, fault="", cause=None, use="judge", **stated):
     said = Statement(verdict, 4.0 if verdict == "leak" else 1.0, 3.0, cause=cause, **stated)
     scores = {"watcher": (said.rank, said.onset_s)}
-    return Row(f"{number:04x}", use, leak, fault, {}, number, leak, scores=scores, statements={"watcher": said})
+    return CaseRow(f"{number:04x}", use, leak, fault, {}, number, leak, scores=scores, statements={"watcher": said})
 
 
 def test_flows_onsets_and_causes_by_hand():
@@ -334,5 +337,5 @@ def test_the_documented_plan_is_sound_where_the_example_is_installed(monkeypatch
         load_plan(example / "judge.toml")
     monkeypatch.setattr(registry, "DETECTORS", {**registry.DETECTORS, "ringing energy": made})
     plan = load_plan(example / "judge.toml")
-    assert [name for name in plan.detectors if entry(name).needs_calibration] == ["ringing energy, calibrated"]
+    assert [name for name in plan.detectors if plan_detector(name).needs_calibration] == ["ringing energy, calibrated"]
     assert plan.views == {"pressures": ("u", "p_A", "p_B")}

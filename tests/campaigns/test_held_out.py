@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from sealscope.campaigns.held_out import Samples, chosen_candidates, fit_logistic, fold_log_odds, held_out_scores
-from sealscope.campaigns.held_out_checks import checks_of, clustered_area, swapped_areas
-from sealscope.campaigns.held_out_plan import Chosen, HeldOutPlan, Logistic
-from sealscope.campaigns.plan import load_plan
+from sealscope.campaigns.held_out.checks import checks_of, clustered_area, swapped_areas
+from sealscope.campaigns.held_out.classifiers import (
+    Samples,
+    chosen_candidates,
+    fit_logistic,
+    fold_log_odds,
+    held_out_scores,
+)
+from sealscope.campaigns.plans.model import ChosenClassifier, HeldOutPlan, LogisticClassifier
+from sealscope.campaigns.plans.reader import load_plan
 from sealscope.cli import campaign as words
 from sealscope.errors import InputError
 from sealscope.evaluation.auc import auc
@@ -73,7 +79,7 @@ def test_a_held_out_test_is_not_seen():
     leaks = np.tile([0.0, 1.0], 20)
     noise = random.normal(size=40)
     samples = Samples({"noise": noise}, leaks, list(tests), [{"condition": int(k % 4)} for k in tests])
-    plan = Logistic("noise", ("noise",), 1.0)
+    plan = LogisticClassifier("noise", ("noise",), 1.0)
     scores = held_out_scores(samples, plan, "test")
     moved = noise.copy()
     moved[0] += 100.0  # the first sample's own feature moves its own score and, through the fit, the other tests' ...
@@ -89,7 +95,7 @@ def test_a_held_out_test_is_not_seen():
 def test_an_unknown_feature_is_named():
     samples = Samples({"a": np.zeros(4)}, np.array([0.0, 1.0, 0.0, 1.0]), [1, 1, 2, 2], [{}] * 4)
     with pytest.raises(InputError, match="a feature must be one of a, got 'b'"):
-        held_out_scores(samples, Logistic("x", ("b",), 1.0), "test")
+        held_out_scores(samples, LogisticClassifier("x", ("b",), 1.0), "test")
 
 
 @pytest.mark.parametrize("ridge", [0.01, 1.0])
@@ -123,7 +129,7 @@ def paired(seed, tests=24, effect=1.5):
     return Samples(features, leaks, list(number), [{"condition": int(k % 6)} for k in number])
 
 
-CHOSEN = Chosen("chosen", (("good",), ("self",), ("noise",)), (0.1, 1.0))
+CHOSEN = ChosenClassifier("chosen", (("good",), ("self",), ("noise",)), (0.1, 1.0))
 
 
 def test_what_is_held_out_takes_no_part_in_the_choice():
@@ -154,7 +160,7 @@ def test_choosing_from_noise_alone_finds_nothing():
 
 
 def test_swapped_labels_show_what_chance_reaches():
-    samples, detector = paired(2), Logistic("good", ("good", "self"), 1.0)
+    samples, detector = paired(2), LogisticClassifier("good", ("good", "self"), 1.0)
     swapped = swapped_areas(samples, detector, "test", 60, seed=5)
     assert np.array_equal(swapped, swapped_areas(samples, detector, "test", 60, seed=5))
     assert 0.3 < np.mean(swapped) < 0.55  # held out, what is not there is found less often than by guessing
@@ -166,7 +172,7 @@ def test_swapped_labels_show_what_chance_reaches():
     assert sum(times for _, times in second.picks) == 24
     assert "0 reach" in first.words()
     assert "good" in second.words()
-    useless = checks_of(HeldOutPlan("x", "x", "appendix-c", "test", (Logistic("n", ("noise",), 1.0),), 0.95,
+    useless = checks_of(HeldOutPlan("x", "x", "appendix-c", "test", (LogisticClassifier("n", ("noise",), 1.0),), 0.95,
                                     permutations=60), paired(3))  # fmt: skip
     assert useless[0].reached > 1
     assert checks_of(HeldOutPlan("x", "x", "appendix-c", "test", (detector,), 0.95), samples) == []

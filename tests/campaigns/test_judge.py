@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sealscope.campaigns.judge import calibration_of, judge
-from sealscope.campaigns.work import Row
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.judging.judge import calibration_of, judge
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import clopper_pearson
 
@@ -25,7 +25,7 @@ CHANGED, SIGN = "d3 of p_A changed", "sign rule: d3 of p_A fell"
 
 
 def row(number, score, use="judge", leak=0.0, fault="", **point):
-    return Row(
+    return CaseRow(
         id=f"{number:016x}",
         use=use,
         leak_lpm=leak,

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.campaigns.cases import cases_of
-from sealscope.campaigns.machines import SIZING_SECONDS, closing_values, experiment_of, fault_of, profile_key
-from sealscope.campaigns.plan import load_plan
-from sealscope.campaigns.work import work
+from sealscope.campaigns.cases.case import cases_of, profile_key
+from sealscope.campaigns.cases.machines import SIZING_SECONDS, experiment_of
+from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.plans.duty import closing_values, fault_of
+from sealscope.campaigns.plans.reader import load_plan
 from sealscope.errors import InputError
 from sealscope.simulation.bench import profile
 from sealscope.simulation.simulate import run

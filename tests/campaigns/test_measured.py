@@ -7,9 +7,9 @@ import re
 
 import pytest
 
-from sealscope.campaigns.measured import hydraulic_samples, needs_folder
-from sealscope.campaigns.plan import load_plan
-from sealscope.campaigns.recorded import recorded_rows
+from sealscope.campaigns.cases.recordings import recorded_rows
+from sealscope.campaigns.held_out.data_sets import hydraulic_samples, needs_folder
+from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import held_out_result, recorded_result, write_result
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings import write

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sealscope.campaigns.noise_responses import halves, instrument_noise, responses
-from sealscope.campaigns.prediction import ChangeDetector, Responses, predict
+from sealscope.campaigns.prediction.detection import ChangeDetector, Responses, predict
+from sealscope.campaigns.prediction.noise_responses import halves, instrument_noise, responses
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS

@@ -8,8 +8,9 @@ import sys
 
 import pytest
 
-from sealscope.campaigns.cases import cases_of
-from sealscope.campaigns.plan import Plan, load_plan, plan_names
+from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.campaigns.plans.reader import load_plan, plan_names
 from sealscope.errors import InputError
 
 
@@ -118,10 +119,11 @@ def test_detectors_do_not_change_the_records(tmp_path, text):
 
 def test_names_and_seeds_are_the_same_in_another_process(tiny):
     code = (
-        "import sys; from sealscope.campaigns.plan import load_plan; from sealscope.campaigns.cases import cases_of\n"
+        "import sys\nfrom sealscope.campaigns.plans.reader import load_plan\n"
+        "from sealscope.campaigns.cases.case import cases_of\n"
         "print([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(load_plan(sys.argv[1]))])"
     )
     found = subprocess.run([sys.executable, "-c", code, str(tiny)], capture_output=True, text=True, check=True)
     plan = load_plan(tiny)
-    assert isinstance(plan, Plan)
+    assert isinstance(plan, SimulatedPlan)
     assert found.stdout.strip() == str([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(plan)])

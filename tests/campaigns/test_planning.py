@@ -11,17 +11,14 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from sealscope.campaigns.cases import cases_of
-from sealscope.campaigns.judge import calibration_of, judge
-from sealscope.campaigns.noise_responses import instrument_noise, responses
-from sealscope.campaigns.outlook import Outlook
-from sealscope.campaigns.plan import Plan, Records
-from sealscope.campaigns.planning import Wish, closing_words, experiment_for, outlook, with_closing
-from sealscope.campaigns.prediction import (
-    THESIS_DETECTORS,
-    ChangeDetector,
-)
-from sealscope.campaigns.work import work
+from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.judging.judge import calibration_of, judge
+from sealscope.campaigns.plans.model import RecordGroup, SimulatedPlan
+from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, ChangeDetector
+from sealscope.campaigns.prediction.noise_responses import instrument_noise, responses
+from sealscope.campaigns.prediction.predict import Wish, closing_words, experiment_for, outlook, with_closing
+from sealscope.campaigns.prediction.report import Outlook
 from sealscope.cli.plan import plan
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
@@ -232,7 +229,7 @@ def test_prediction_agrees_with_a_campaigns_a90(rig: Rig) -> None:
     (predicted,) = outlook(experiment, wish, commands=()).detectors
     assert predicted.smallest is not None and predicted.low is not None
     sizes = [round(share * predicted.smallest, 5) for share in (0.3, 0.6, 1.0, 1.5)]
-    campaign = Plan(
+    campaign = SimulatedPlan(
         name="check",
         title="check of a plan",
         rig=rig,
@@ -245,7 +242,11 @@ def test_prediction_agrees_with_a_campaigns_a90(rig: Rig) -> None:
         seed=0,
         detectors=(detector.name,),
         keep_recordings=False,
-        records=(Records("calibrate", 300), Records("judge", 60), *(Records("judge", 60, size) for size in sizes)),
+        records=(
+            RecordGroup("calibrate", 300),
+            RecordGroup("judge", 60),
+            *(RecordGroup("judge", 60, size) for size in sizes),
+        ),
         factors={"command": ("7 sin(4t)",)},
     )
     rows = [work(campaign, case) for case in cases_of(campaign)]

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.campaigns.measured_responses import measured_responses
-from sealscope.campaigns.planning import Wish, with_closing
-from sealscope.campaigns.prediction import (
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.prediction.detection import (
     THESIS_DETECTORS,
     ChangeDetector,
     Prediction,
@@ -20,7 +19,8 @@ from sealscope.campaigns.prediction import (
     predict,
     probability,
 )
-from sealscope.campaigns.work import Row
+from sealscope.campaigns.prediction.measured_responses import measured_responses
+from sealscope.campaigns.prediction.predict import Wish, with_closing
 from sealscope.diagnosis.calibration.scorers import SCORERS
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
@@ -128,7 +128,7 @@ def rows_of(folder: Path, command: str, closed: str, seed: int) -> list[str]:
     for size in (0.0, 0.001, 0.1):
         for k in range(60):
             change = -2.0 * size + 0.01 * random.standard_normal()
-            row = Row(
+            row = CaseRow(
                 id=f"{command}{closed}{size}{k}",
                 use="judge",
                 leak_lpm=size,

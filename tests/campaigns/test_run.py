@@ -14,15 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.campaigns import run as campaign
-from sealscope.campaigns import store
-from sealscope.campaigns.cases import cases_of
-from sealscope.campaigns.plan import load_plan
+from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.execution import run as campaign
+from sealscope.campaigns.execution import store
+from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
-from sealscope.campaigns.work import failed, work
 from sealscope.errors import InputError, MissingExtra, SimulationFailed, UnreadableFile
 
-SOURCES = Path(campaign.__file__).resolve().parents[2]
+SOURCES = Path(campaign.__file__).resolve().parents[3]
 
 
 def files_of(plan, folder):
@@ -35,8 +36,8 @@ def once(tiny, tmp_path):
     """The plan, and the files of a campaign that ran through in this process."""
     plan = load_plan(tiny)
     folder = tmp_path / "once"
-    standing = campaign.run(plan, folder, jobs=1)
-    assert (standing.done, standing.failed, standing.complete) == (26, 0, True)
+    state = campaign.run(plan, folder, jobs=1)
+    assert (state.done, state.failed, state.complete) == (26, 0, True)
     return plan, files_of(plan, folder)
 
 
@@ -76,7 +77,7 @@ def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
         process.wait()
         with (folder / store.ROWS).open("ab") as file:  # the line that was being written when it died
             file.write(b'{"id": "0123", "sco')
-    before = campaign.standing(plan, folder)
+    before = store.progress_of(plan, folder)
     assert 12 <= before.done < 26
     told = []
     assert campaign.run(plan, folder, jobs=2, progress=lambda *words: told.append(words)).complete
@@ -126,7 +127,7 @@ def test_an_interrupt_ends_it_and_keeps_the_rows(tiny, tmp_path):
     wait_for_rows(tmp_path / "stopped", 3, process)
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=60) == 130
-    assert campaign.standing(load_plan(tiny), tmp_path / "stopped").done >= 3
+    assert store.progress_of(load_plan(tiny), tmp_path / "stopped").done >= 3
 
 
 def test_on_a_cluster_the_same_bytes(once, tmp_path):
@@ -158,7 +159,7 @@ def doomed(case):
 def break_some(plan, case, keep=None):
     """A task that fails on a third of the records to judge."""
     if doomed(case):
-        return failed(case, str(SimulationFailed("the run diverged")))
+        return CaseRow.of(case, error=str(SimulationFailed("the run diverged")))
     return work(plan, case, keep)
 
 
@@ -166,8 +167,8 @@ def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     plan = load_plan(tiny)
     bad = sum(doomed(case) for case in cases_of(plan))
     assert 0 < bad < 16
-    standing = campaign.run(plan, tmp_path / "bad", jobs=1, task=break_some)
-    assert (standing.done, standing.failed) == (26, bad)
+    state = campaign.run(plan, tmp_path / "bad", jobs=1, task=break_some)
+    assert (state.done, state.failed) == (26, bad)
     again = campaign.run(plan, tmp_path / "bad", jobs=1)
     assert again.failed == bad
     result = simulated_result(plan, tmp_path / "bad")
@@ -183,9 +184,9 @@ def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path, monkeypatc
     monkeypatch.syspath_prepend(Path(__file__).parent)
     die_on_one = import_module("dying_task").die_on_one
     plan, _ = once
-    standing = campaign.run(plan, tmp_path / "dead", jobs=2, task=die_on_one)
-    assert (standing.done, standing.failed) == (26, 1)
-    rows = campaign.kept_rows(plan, tmp_path / "dead")
+    state = campaign.run(plan, tmp_path / "dead", jobs=2, task=die_on_one)
+    assert (state.done, state.failed) == (26, 1)
+    rows = store.rows_of(plan, tmp_path / "dead")
     assert [row.error for row in rows.values() if row.error] == ["the process that carried it out died"]
 
 
@@ -196,7 +197,7 @@ def test_a_fault_of_the_program_is_told_in_the_row(tiny, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("by nought")
 
-    monkeypatch.setattr("sealscope.campaigns.machines.experiment_of", broken)
+    monkeypatch.setattr("sealscope.campaigns.cases.work.experiment_of", broken)
     assert work(plan, case).error == "ZeroDivisionError: by nought"
 
 
@@ -205,7 +206,7 @@ def test_rows_of_another_campaign_are_not_mixed_in(tiny, text, tmp_path):
     campaign.run(load_plan(tiny), folder, jobs=1)
     other = tmp_path / "other.toml"
     other.write_text(text.replace("seed = 3", "seed = 4"), encoding="utf-8")
-    with pytest.raises(InputError, match="goes on only with the same rig, bench, length, onset or seed"):
+    with pytest.raises(InputError, match="continues only with the same rig, bench, length, onset or seed"):
         campaign.run(load_plan(other), folder, jobs=1)
 
 
@@ -218,25 +219,24 @@ def test_more_records_and_detectors_are_added_to_what_is_there(tiny, text, tmp_p
     campaign.run(load_plan(more), folder, jobs=1, progress=lambda *words: told.append(words))
     assert told[0] == (26, 28, 0)
     more.write_text(text.replace('"d3 of p_A changed"', '"d4 of p_A changed"'), encoding="utf-8")
-    assert campaign.standing(load_plan(more), folder).done == 0
+    assert store.progress_of(load_plan(more), folder).done == 0
     campaign.run(load_plan(more), folder, jobs=1)
-    assert campaign.standing(load_plan(more), folder).complete
+    assert store.progress_of(load_plan(more), folder).complete
 
 
-@pytest.mark.skipif(os.name == "nt", reason="no lock of this kind")
 def test_two_at_once_are_refused(tiny, tmp_path):
     plan = load_plan(tiny)
-    store.begin(tmp_path / "mine", campaign.made_from(plan))
-    with store.alone_in(tmp_path / "mine"), pytest.raises(InputError, match="by one process at a time"):
+    store.begin(tmp_path / "mine", store.made_from(plan))
+    with store.locked(tmp_path / "mine"), pytest.raises(InputError, match="by one process at a time"):
         campaign.run(plan, tmp_path / "mine", jobs=1)
 
 
 def test_a_spoilt_line_is_refused_with_its_place(tiny, tmp_path):
     plan = load_plan(tiny)
-    store.begin(tmp_path, campaign.made_from(plan))
+    store.begin(tmp_path, store.made_from(plan))
     (tmp_path / store.ROWS).write_bytes(b'{"id": 3}\n')
     with pytest.raises(UnreadableFile, match=r"rows.jsonl, line 1"):
-        campaign.standing(plan, tmp_path)
+        store.progress_of(plan, tmp_path)
 
 
 def test_recordings_are_kept_only_where_asked(tiny, text, tmp_path):

@@ -6,16 +6,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sealscope.campaigns import store
-from sealscope.campaigns.held_out import Samples, held_out_rows
-from sealscope.campaigns.held_out_checks import HeldOutCheck, check_sheet, checks_of
-from sealscope.campaigns.held_out_plan import HeldOutPlan
-from sealscope.campaigns.judge import Judgement, calibration_of, judge
-from sealscope.campaigns.plan import AnyPlan, Plan
-from sealscope.campaigns.recorded import Progress, RecordedPlan, recorded_rows
-from sealscope.campaigns.run import RUN_BY_RUN, kept_rows, made_from
-from sealscope.campaigns.tables import rows_sheet, sheets, write_sheets
-from sealscope.campaigns.work import Row
+from sealscope.campaigns.cases.recordings import ProgressCallback, recorded_rows
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.execution import store
+from sealscope.campaigns.held_out.checks import HeldOutCheck, check_sheet, checks_of
+from sealscope.campaigns.held_out.classifiers import Samples, held_out_rows
+from sealscope.campaigns.judging.judge import Judgement, calibration_of, judge
+from sealscope.campaigns.judging.tables import rows_sheet, sheets, write_sheets
+from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, SimulatedPlan
 from sealscope.diagnosis.calibration.thresholds import save
 from sealscope.errors import InputError
 
@@ -25,22 +23,22 @@ CALIBRATION = "calibration.json"
 @dataclass(frozen=True)
 class Result:
     """A campaign and what it shows; `missing`: records of the plan that have no row yet; `checks`: of classifiers that
-    were held out; `way`: how the rows of a simulated one were made, "" for another."""
+    were held out; `mode`: how the rows of a simulated one were made, "" for another."""
 
     plan: AnyPlan
-    rows: tuple[Row, ...]
+    rows: tuple[CaseRow, ...]
     missing: int
     judgement: Judgement
     checks: tuple[HeldOutCheck, ...] = ()
-    way: str = ""
+    mode: str = ""
 
 
-def simulated_result(plan: Plan, folder: Path) -> Result:
+def simulated_result(plan: SimulatedPlan, folder: Path) -> Result:
     """The result of a simulated campaign, complete or not; raises InputError where its rows do not suffice for one."""
-    rows = kept_rows(plan, folder)
+    rows = store.rows_of(plan, folder)
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
-    head = store.head(folder) or made_from(plan)
+    head = store.head(folder) or store.made_from(plan)
     calibration = calibration_of(
         list(rows.values()),
         plan.detectors,
@@ -59,7 +57,9 @@ def simulated_result(plan: Plan, folder: Path) -> Result:
         hours=plan.duration_s / 3600.0,
         confidence=plan.confidence,
     )
-    return Result(plan, tuple(rows.values()), plan.size - len(rows), judgement, way=str(head.get("way", RUN_BY_RUN)))
+    return Result(
+        plan, tuple(rows.values()), plan.size - len(rows), judgement, mode=str(head.get("mode", store.RUN_BY_RUN))
+    )
 
 
 def held_out_result(plan: HeldOutPlan, samples: Samples) -> Result:
@@ -70,7 +70,7 @@ def held_out_result(plan: HeldOutPlan, samples: Samples) -> Result:
     return Result(plan, tuple(rows), 0, judgement, tuple(checks_of(plan, samples)))
 
 
-def recorded_result(plan: RecordedPlan, folder: Path, progress: Progress | None = None) -> Result:
+def recorded_result(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> Result:
     """The result of a campaign over the recordings in a folder."""
     rows = recorded_rows(plan, folder, progress)
     calibration = calibration_of(

@@ -21,10 +21,10 @@ from sealscope.cli.options import (
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
-    from sealscope.campaigns.held_out import Samples
-    from sealscope.campaigns.plan import AnyPlan
+    from sealscope.campaigns.execution.store import CampaignProgress
+    from sealscope.campaigns.held_out.classifiers import Samples
+    from sealscope.campaigns.plans.model import AnyPlan
     from sealscope.campaigns.results import Result
-    from sealscope.campaigns.run import Standing
 
 campaign = typer.Typer(
     name="campaign",
@@ -35,7 +35,7 @@ campaign = typer.Typer(
 
 def complete_plans(incomplete: str) -> list[str]:
     """Names of packaged plans that begin so."""
-    from sealscope.campaigns.plan import plan_names
+    from sealscope.campaigns.plans.reader import plan_names
 
     return [name for name in plan_names() if name.startswith(incomplete)]
 
@@ -50,7 +50,7 @@ def complete_detectors(incomplete: str) -> list[str]:
 
 
 PlanArgument = Annotated[
-    str, typer.Argument(metavar="PLAN", help="Plan by name, or a TOML file.", autocompletion=complete_plans)
+    str, typer.Argument(metavar="PLAN", help="SimulatedPlan by name, or a TOML file.", autocompletion=complete_plans)
 ]
 FolderOption = Annotated[
     Path | None,
@@ -90,41 +90,43 @@ def run(
 ) -> None:
     """Carry out what is missing of a plan, then report. Interrupted, the same call goes on. Exit status 1 where a
     record failed."""
-    from sealscope.campaigns.plan import Plan, load_plan
-    from sealscope.campaigns.run import run as carry_out
+    from sealscope.campaigns.execution.run import run as carry_out
+    from sealscope.campaigns.plans.model import SimulatedPlan
+    from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
     place = _folder(loaded, folder)
-    if (batch or device != "cpu") and not isinstance(loaded, Plan):
+    if (batch or device != "cpu") and not isinstance(loaded, SimulatedPlan):
         raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
-    if isinstance(loaded, Plan):
+    if isinstance(loaded, SimulatedPlan):
         with bar() as told:
-            standing = carry_out(
+            state = carry_out(
                 loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=told, batch=batch, device=device
             )
-        typer.echo(_standing(standing))
+        typer.echo(_progress_text(state))
     _report(loaded, place, sheet, data)
-    if isinstance(loaded, Plan) and standing.failed:
+    if isinstance(loaded, SimulatedPlan) and state.failed:
         raise typer.Exit(1)
 
 
 @campaign.command()
 def status(plan: PlanArgument, folder: FolderOption = None) -> None:
     """Say how far a campaign is, and what is left."""
-    from sealscope.campaigns.plan import Plan, load_plan
-    from sealscope.campaigns.run import standing
+    from sealscope.campaigns.execution.store import progress_of
+    from sealscope.campaigns.plans.model import SimulatedPlan
+    from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
-    if not isinstance(loaded, Plan):
+    if not isinstance(loaded, SimulatedPlan):
         typer.echo("a campaign over measured data has nothing to wait for; report it")
         return
-    typer.echo(_standing(standing(loaded, _folder(loaded, folder))))
+    typer.echo(_progress_text(progress_of(loaded, _folder(loaded, folder))))
 
 
 @campaign.command()
 def report(plan: PlanArgument, folder: FolderOption = None, sheet: SheetOption = None, data: DataOption = None) -> None:
     """Judge the rows that are there; write tables, calibration and page."""
-    from sealscope.campaigns.plan import load_plan
+    from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
     _report(loaded, _folder(loaded, folder), sheet, data)
@@ -134,13 +136,13 @@ def _folder(plan: AnyPlan, given: Path | None) -> Path:
     return given if given is not None else Path("sealscope-campaigns") / plan.name
 
 
-def _standing(standing: Standing) -> str:
-    words = f"records: {standing.done} of {standing.records} done"
-    if standing.failed:
-        words += f", {standing.failed} of them failed"
-    if standing.seconds is not None:
-        left = (standing.records - standing.done) * standing.seconds
-        words += f"; {standing.seconds:.2f} s of one core each"
+def _progress_text(state: CampaignProgress) -> str:
+    words = f"records: {state.done} of {state.records} done"
+    if state.failed:
+        words += f", {state.failed} of them failed"
+    if state.seconds is not None:
+        left = (state.records - state.done) * state.seconds
+        words += f"; {state.seconds:.2f} s of one core each"
         words += f", about {span(left)} of one core left" if left else ""
     return words
 
@@ -161,12 +163,11 @@ def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
 
 def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> Result:
     """The plan's result: from the rows in its folder, or from the measured data that it is about."""
-    from sealscope.campaigns.measured import hydraulic_samples, needs_folder
-    from sealscope.campaigns.plan import Plan
-    from sealscope.campaigns.recorded import RecordedPlan
+    from sealscope.campaigns.held_out.data_sets import hydraulic_samples, needs_folder
+    from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
     from sealscope.campaigns.results import held_out_result, recorded_result, simulated_result
 
-    if isinstance(plan, Plan):
+    if isinstance(plan, SimulatedPlan):
         return simulated_result(plan, folder)
     if isinstance(plan, RecordedPlan):
         with bar() as told:
@@ -180,7 +181,7 @@ def _sheet_samples(folder: Path | None) -> Samples:
     """The thesis's data sheet as samples: log RMS of each detail, each test without and with its leak."""
     import numpy as np
 
-    from sealscope.campaigns.held_out import Samples
+    from sealscope.campaigns.held_out.classifiers import Samples
     from sealscope.thesis.conditions import APPENDIX_C
     from sealscope.thesis.sheet import MISSING, find_sheet, read_sheet
 

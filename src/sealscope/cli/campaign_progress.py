@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
-    from sealscope.campaigns.run import Progress
+    from sealscope.campaigns.cases.recordings import ProgressCallback
 
 
 def span(seconds: float) -> str:
@@ -25,7 +25,7 @@ def span(seconds: float) -> str:
 
 
 @contextmanager
-def bar() -> Iterator[Progress]:
+def bar() -> Iterator[ProgressCallback]:
     """One bar on standard error with the records, failures and the time left; without a terminal a line a minute."""
     from rich.console import Console
     from rich.progress import (

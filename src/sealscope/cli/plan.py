@@ -56,8 +56,8 @@ def plan(
     output: Annotated[PlanFormat, typer.Option("--format", help="Text, or one JSON object.")] = PlanFormat.text,
 ) -> None:
     """Predict the smallest leak that each detector finds, with the Cramer-Rao bound beside it."""
-    from sealscope.campaigns.planning import STANDARD_COMMANDS, Wish, experiment_for, outlook
-    from sealscope.campaigns.prediction import THESIS_DETECTORS, change_detector
+    from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, change_detector
+    from sealscope.campaigns.prediction.predict import STANDARD_COMMANDS, Wish, experiment_for, outlook
     from sealscope.units import parse_quantity
 
     wish = Wish(

@@ -10,13 +10,11 @@ from typing import Literal
 
 import numpy as np
 
-from sealscope.campaigns.entries import DIAGNOSE, entry
-from sealscope.campaigns.held_out_plan import HeldOutPlan
-from sealscope.campaigns.judge import Judgement, Pod, SizeRoc
-from sealscope.campaigns.plan import Plan
-from sealscope.campaigns.recorded import RecordedPlan
+from sealscope.campaigns.execution.store import RUN_BY_RUN
+from sealscope.campaigns.judging.judge import Judgement, Pod, SizeRoc
+from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
+from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, SimulatedPlan
 from sealscope.campaigns.results import Result, detectors_of
-from sealscope.campaigns.run import RUN_BY_RUN
 from sealscope.diagnosis.calibration.scorers import SCORERS
 from sealscope.diagnosis.registry import detectors
 from sealscope.evaluation.table import SummaryRow
@@ -136,7 +134,7 @@ def _notes(result: Result) -> list[str]:
         f"Rates with their {100 * plan.confidence:g} % intervals; a90, a90/95 in {plan.unit} from the curve through "
         "hits and misses."
     ]
-    if isinstance(plan, Plan) and judgement.calibration is not None:
+    if isinstance(plan, SimulatedPlan) and judgement.calibration is not None:
         notes.append(
             f"Thresholds for {100 * plan.false_alarm:g} % false alarms from {judgement.calibrated_on} leak-free "
             f"records; judged on {judgement.judged} others, each with seeds of its own."
@@ -148,7 +146,7 @@ def _notes(result: Result) -> list[str]:
         )
     elif isinstance(plan, HeldOutPlan):
         notes.append(f"Each {plan.leave_out} was held out whole in turn; an alarm is a probability over 50 %.")
-    own = [one for one in detectors_of(plan) if entry(one).own] if not isinstance(plan, HeldOutPlan) else []
+    own = [one for one in detectors_of(plan) if plan_detector(one).own] if not isinstance(plan, HeldOutPlan) else []
     if own and not isinstance(plan, HeldOutPlan):
         notes.append(
             f"By thresholds of their own, set for {100 * plan.false_alarm:g} % false alarms: {', '.join(own)}. What "
@@ -156,7 +154,7 @@ def _notes(result: Result) -> list[str]:
         )
     if _batched(result):
         notes.append(
-            f"Simulated {result.way}: of each record only the RMS of the details on both sides of the onset was kept. "
+            f"Simulated {result.mode}: of each record only the RMS of the details on both sides of the onset was kept. "
             "Seeds draw the same machines as run by run, and other noise of the same law."
         )
     notes += [one.words() for one in result.checks]
@@ -170,7 +168,7 @@ def _notes(result: Result) -> list[str]:
 
 
 def _batched(result: Result) -> bool:
-    return result.way not in ("", RUN_BY_RUN)
+    return result.mode not in ("", RUN_BY_RUN)
 
 
 def write_campaign_page(result: Result, path: Path, files: Sequence[str] = ()) -> Path:
@@ -238,10 +236,10 @@ def _facts(result: Result) -> list[tuple[str, str]]:
         ("records", f"{plan.duration_s:g} s at {plan.rig.daq.sample_rate:g} Hz, leaks open at {plan.onset_s:g} s"),
         *((name, ", ".join(str(level) for level in levels)) for name, levels in plan.factors.items()),
         ("base seed", str(plan.seed)),
-        *([("simulated", result.way)] if _batched(result) else []),
+        *([("simulated", result.mode)] if _batched(result) else []),
         *((f"seen by @ {name}" if name else "seen", ", ".join(channels)) for name, channels in plan.views.items()),
     ]
-    if any(entry(one).detector for one in plan.detectors):
+    if any(plan_detector(one).detector for one in plan.detectors):
         facts.append(("assumed by detectors", _assumed(plan)))
     for size, (mean, spread) in judgement.realised.items():
         told = "" if math.isnan(spread) else f" ± {spread:.2g}"
@@ -251,7 +249,7 @@ def _facts(result: Result) -> list[tuple[str, str]]:
     return facts
 
 
-def _assumed(plan: Plan) -> str:
+def _assumed(plan: SimulatedPlan) -> str:
     """What the detectors assume of the machine, in words."""
     if plan.assumed is None or plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
@@ -290,7 +288,7 @@ def _section(name: str, judgement: Judgement, unit: str) -> Section:
 
 def _about(name: str) -> str:
     """What a detector's score is, "" for one that is known here by its name alone."""
-    one = entry(name)
+    one = plan_detector(name)
     through = f", given the channels of {one.view} alone" if one.view else ""
     if one.of in SCORERS and not one.detector:
         return SCORERS[one.of].about + through

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sealscope.campaigns.judge import Judgement
+from sealscope.campaigns.judging.judge import Judgement
 from sealscope.evaluation.binomial import Rate
 from sealscope.evaluation.quantiles import Quantile
 

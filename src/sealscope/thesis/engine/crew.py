@@ -9,7 +9,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from sealscope.campaigns.crew import one_thread_each
+from sealscope.campaigns.execution.workers import one_thread_each
 from sealscope.thesis.engine.bench import Bench, Job
 from sealscope.thesis.engine.items import Entry
 

@@ -18,10 +18,17 @@ from typing import TypeVar
 
 import numpy as np
 
-from sealscope.campaigns.bound import UNKNOWN, LeakBound, in_lpm, leak_bound, noise_covariance, smallest_found
-from sealscope.campaigns.noise_responses import instrument_noise, responses
-from sealscope.campaigns.outlook import BoundFigures, CommandRow, Outlook
-from sealscope.campaigns.prediction import THESIS_DETECTORS, ChangeDetector, Responses, predict
+from sealscope.campaigns.prediction.bound import (
+    UNKNOWN,
+    LeakBound,
+    in_lpm,
+    leak_bound,
+    noise_covariance,
+    smallest_found,
+)
+from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, ChangeDetector, Responses, predict
+from sealscope.campaigns.prediction.noise_responses import instrument_noise, responses
+from sealscope.campaigns.prediction.report import BoundFigures, CommandRow, Outlook
 from sealscope.errors import InputError, SealscopeError
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS
@@ -217,13 +224,13 @@ def _elsewhere(
 ) -> Responses | None:
     """Responses from a campaign's rows or from machines of a bench; None where instrument noise alone shall tell."""
     if results is not None:
-        from sealscope.campaigns.measured_responses import measured_responses
+        from sealscope.campaigns.prediction.measured_responses import measured_responses
 
         command = str(experiment.command)
         return measured_responses(results, command, experiment.rig, experiment.duration, wish.detectors)
     if not bench:
         return None
-    from sealscope.campaigns.bench_responses import bench_responses
+    from sealscope.campaigns.prediction.bench_responses import bench_responses
 
     def spread(jobs: Sequence[Callable[[], _T]]) -> list[_T]:
         return _in_parallel(jobs, f"{draws} machines of the bench", progress)

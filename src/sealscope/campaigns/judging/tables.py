@@ -8,9 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sealscope.campaigns.judge import Judgement
-from sealscope.campaigns.statement import Statement
-from sealscope.campaigns.work import Row
+from sealscope.campaigns.cases.row import CaseRow, Statement
+from sealscope.campaigns.judging.judge import Judgement
 from sealscope.evaluation.binomial import Rate
 from sealscope.recordings.atomic import atomic_write
 
@@ -172,7 +171,7 @@ def _stated(statement: Statement | None) -> tuple[Cell, ...]:
     return (statement.verdict, statement.threshold, *timed, statement.leak_lpm, *flow, statement.cause)
 
 
-def rows_sheet(rows: Iterable[Row], detectors: Sequence[str], unit: str = "L/min") -> Sheet:
+def rows_sheet(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> Sheet:
     """Every record of a campaign in the order of its id, without what differs from run to run."""
     found = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in found for name in sorted(row.levels)))

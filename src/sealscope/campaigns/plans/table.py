@@ -1,4 +1,4 @@
-"""One table of a plan as it is read: each entry by its rule, in one line with its place where it breaks it."""
+"""One TOML table of a plan: each entry checked by its rule, and none left over."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sealscope.campaigns.plans.detectors import check_detector
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-class Table:
-    """One table of a plan as it is read: each entry by its rule, then none left over."""
+class PlanTable:
+    """The entries of one table; each is taken by a method that checks it, `end` refuses what is left over."""
 
     def __init__(self, given: Any, name: str, place: str) -> None:
         if not isinstance(given, Mapping):
@@ -23,11 +24,15 @@ class Table:
         self.left, self.name, self.place = dict(given), name, place
 
     def fail(self, rule: str) -> InputError:
-        """The error that says the rule and the place."""
+        """Return the error that names the rule and the place."""
         return InputError(f"{self.name}.{rule} ({self.place})")
 
+    def beside(self, name: str) -> str:
+        """Return the path of a file named in the plan, which lies beside the plan; another name as it is."""
+        return os.fspath(Path(self.place).parent / name) if name.endswith(".toml") else name
+
     def take(self, key: str, default: Any = None) -> Any:
-        """The entry, or the default; InputError where there is neither."""
+        """Take the entry, or the default; raise InputError where there is neither."""
         if key in self.left:
             return self.left.pop(key)
         if default is None:
@@ -35,14 +40,14 @@ class Table:
         return default
 
     def text(self, key: str, default: str | None = None) -> str:
-        """An entry that is a text of one line."""
+        """Take a text of one line."""
         value = self.take(key, default)
         if not isinstance(value, str) or "\n" in value or (default is None and not value.strip()):
             raise self.fail(f"{key} must be a text, got {value!r}")
         return value
 
     def number(self, key: str, default: float | None = None, unit: str = "") -> float:
-        """An entry that is a finite number, or a text of a number with a unit of the dimension of `unit`."""
+        """Take a finite number, or a text of a number with a unit of the dimension of `unit`."""
         value = self.take(key, default)
         if isinstance(value, str) and unit:
             from sealscope.units import parse_quantity
@@ -57,78 +62,97 @@ class Table:
         return float(value)
 
     def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
-        """An entry that is a whole number of at least `least`."""
+        """Take a whole number of at least `least`."""
         value = self.take(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise self.fail(f"{key} must be a whole number >= {least}, got {value!r}")
         return value
 
-    def choice(self, key: str, words: tuple[str, ...], default: str | None = None) -> str:
-        """An entry that is one of the words."""
+    def flag(self, key: str) -> bool:
+        """Take a truth value, false by default."""
+        value = self.left.pop(key, False)
+        if not isinstance(value, bool):
+            raise self.fail(f"{key} must be true or false, got {value!r}")
+        return value
+
+    def choice(self, key: str, choices: tuple[str, ...], default: str | None = None) -> Any:
+        """Take one of the `choices`."""
         value = self.take(key, default)
-        if value not in words:
-            raise self.fail(f"{key} must be one of {', '.join(words)}, got {value!r}")
-        return str(value)
+        if value not in choices:
+            raise self.fail(f"{key} must be one of {', '.join(choices)}, got {value!r}")
+        return value
 
     def share(self, key: str, default: float | None = None) -> float:
-        """An entry that is a number between 0 and 1."""
+        """Take a number between 0 and 1."""
         value = self.number(key, default)
         if not 0.0 < value < 1.0:
             raise self.fail(f"{key} must be between 0 and 1, got {value:g}")
         return value
 
-    def detectors(self, views: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-        """The entry `detectors`: what `entries.entry` knows, each once."""
-        from sealscope.campaigns.entries import check_entry
+    def texts(self, key: str) -> tuple[str, ...]:
+        """Take a list of one text or more."""
+        return self.checked_texts(self.take(key), f"{key} must be a list of names")
 
-        given = self.take("detectors")
-        if not isinstance(given, list) or not given:
-            raise self.fail(f"detectors must be a list of names, got {given!r}")
-        for name in given:
-            if not isinstance(name, str):
-                raise self.fail(f"detectors must be names, got {name!r}")
-            try:
-                check_entry(name, views)
-            except InputError as error:
-                raise self.fail(f"detectors: {error}") from None
-        if len(set(given)) < len(given):
-            raise self.fail("detectors must be named once each")
+    def checked_texts(self, given: Any, rule: str) -> tuple[str, ...]:
+        """Return `given` as texts; raise InputError with the rule where it is no list of one text or more."""
+        if not isinstance(given, list) or not given or not all(isinstance(text, str) for text in given):
+            raise self.fail(f"{rule}, got {given!r}")
         return tuple(given)
 
+    def tables(self, key: str) -> list[PlanTable]:
+        """Take a list of one table or more."""
+        given = self.take(key)
+        if not isinstance(given, list) or not given:
+            raise self.fail(f"{key} must be a list of tables, got {given!r}")
+        return [PlanTable(entries, f"{self.name}.{key}[{k}]", self.place) for k, entries in enumerate(given, 1)]
+
+    def detectors(self, views: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+        """Take the entry `detectors`: names that `plan_detector` knows, each once."""
+        names = self.texts("detectors")
+        for name in names:
+            try:
+                check_detector(name, views)
+            except InputError as error:
+                raise self.fail(f"detectors: {error}") from None
+        if len(set(names)) < len(names):
+            raise self.fail("detectors must be named once each")
+        return names
+
     def views(self, given: Any) -> dict[str, tuple[str, ...]]:
-        """The plan's table [views], name -> channels, and under "" the entry `channels` where there is one."""
-        table = Table(given, "views", self.place)
-        found = {}
+        """Read the plan's table [views], name -> channels, and under "" the entry `channels` where there is one."""
+        table = PlanTable(given, "views", self.place)
+        views = {}
         if "channels" in self.left:
-            found[""] = self._channels("channels", self.left.pop("channels"))
+            views[""] = self._channels("channels", self.left.pop("channels"))
         for name, channels in table.left.items():
             if not name.strip() or name != name.strip() or "@" in name:
                 raise table.fail(f"{name} must be a plain name without '@'")
-            found[name] = table._channels(name, channels)
-        return found
+            views[name] = table._channels(name, channels)
+        return views
 
     def _channels(self, key: str, given: Any) -> tuple[str, ...]:
         from sealscope.recordings.recording import CHANNEL_UNITS
 
-        if not isinstance(given, list) or not given or len({repr(one) for one in given}) < len(given):
+        if not isinstance(given, list) or not given or len({repr(channel) for channel in given}) < len(given):
             raise self.fail(f"{key} must be a list of channels, each once, got {given!r}")
-        for one in given:
-            if one not in CHANNEL_UNITS:
-                raise self.fail(f"{key} must be channels such as 'p_A', got {one!r}")
-            if one == "q_leak":
+        for channel in given:
+            if channel not in CHANNEL_UNITS:
+                raise self.fail(f"{key} must be channels such as 'p_A', got {channel!r}")
+            if channel == "q_leak":
                 raise self.fail(f"{key} must not hold q_leak: it measures what detectors are to find")
         return tuple(given)
 
     def assumed(self, rig: Rig | None) -> Rig | None:
-        """What the detectors may assume: the entries `assume`, a rig's name or file, and `assume_set`, values of its
-        parameters; `rig` where there are none."""
+        """Take the rig that detectors may assume.
+
+        The entries are `assume`, a rig's name or file, and `assume_set`, values of its parameters; `rig` is returned
+        where there are none.
+        """
         from sealscope.parameters import load_rig
 
         try:
             if "assume" in self.left:
-                name = self.text("assume")
-                beside = os.fspath(Path(self.place).parent / name) if name.endswith(".toml") else name
-                rig = load_rig(beside)
+                rig = load_rig(self.beside(self.text("assume")))
             given = self.left.pop("assume_set", None)
             if given is None:
                 return rig
@@ -141,6 +165,6 @@ class Table:
             raise InputError(f"{self.name}.assume: {error} ({self.place})") from None
 
     def end(self) -> None:
-        """Refuse what is left over."""
+        """Raise InputError for an entry that no method took."""
         if self.left:
             raise self.fail(f"{next(iter(self.left))} is not known")

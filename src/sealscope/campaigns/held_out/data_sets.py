@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.campaigns.held_out import Samples
+from sealscope.campaigns.held_out.classifiers import Samples
 from sealscope.errors import InputError, UnreadableFile
 
 #: Channels of the hydraulic set and their files; the means of each second over cycles of 60 s.

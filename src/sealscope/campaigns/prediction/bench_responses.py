@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.campaigns.cases import Case
-from sealscope.campaigns.machines import experiment_of
-from sealscope.campaigns.plan import Plan
-from sealscope.campaigns.prediction import ChangeDetector, Responses, counted
+from sealscope.campaigns.cases.case import Case
+from sealscope.campaigns.cases.machines import experiment_of
+from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.campaigns.prediction.detection import ChangeDetector, Responses, counted
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError, SealscopeError, SimulationFailed
 from sealscope.recordings.recording import Array
@@ -24,9 +24,9 @@ BENCH_SIZES = (0.002, 0.008, 0.032, 0.128)
 FEWEST, MOST_FAILED = 8, 0.25
 
 
-def bench_plan(experiment: Experiment, profile: str, false_alarm: float) -> Plan:
+def bench_plan(experiment: Experiment, profile: str, false_alarm: float) -> SimulatedPlan:
     """The campaign that the draws belong to: the experiment's rig on that bench, the leak from the middle on."""
-    return Plan(
+    return SimulatedPlan(
         name="plan",
         title="records of a plan",
         rig=experiment.rig,
@@ -62,7 +62,7 @@ def _signed(experiment: Experiment, detectors: Sequence[ChangeDetector]) -> tupl
 
 
 def one_draw(
-    plan: Plan,
+    plan: SimulatedPlan,
     experiment: Experiment,
     seed: tuple[int, int],
     sizes: Sequence[float],

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.entries import Views, entry
-from sealscope.campaigns.estimates import Estimate, Named, Onset, estimates_of, named_of, onsets_of
-from sealscope.campaigns.work import Row
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.judging.estimates import Estimate, Named, Onset, estimates_of, named_of, onsets_of
+from sealscope.campaigns.plans.detectors import Views, plan_detector
 from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.calibration.scorers import scorer
 from sealscope.diagnosis.calibration.thresholds import Calibration, Place, calibrate
@@ -81,7 +81,7 @@ class Judgement:
     calibration: Calibration | None
     calibrated_on: int
     judged: int
-    failed: tuple[Row, ...]
+    failed: tuple[CaseRow, ...]
     table: tuple[SummaryRow, ...]
     overall: tuple[SummaryRow, ...]
     onsets: tuple[Onset, ...]
@@ -104,7 +104,7 @@ def place_from(tree: Mapping[str, Any]) -> Place:
 
 
 def calibration_of(
-    rows: Sequence[Row],
+    rows: Sequence[CaseRow],
     detectors: Sequence[str],
     *,
     rate: float,
@@ -116,7 +116,7 @@ def calibration_of(
 ) -> Calibration | None:
     """Thresholds of the detectors that need them, from the rows that are there to calibrate; None where none needs
     any."""
-    wanted = [name for name in detectors if entry(name).needs_calibration]
+    wanted = [name for name in detectors if plan_detector(name).needs_calibration]
     known = [row for row in rows if row.use == "calibrate" and row.error is None]
     if not wanted:
         return None
@@ -134,17 +134,17 @@ def calibration_of(
 
 def own_threshold(name: str) -> float | None:
     """The threshold that a scorer has of its own; None where records must set it, or a detector's verdict counts."""
-    found = entry(name)
+    found = plan_detector(name)
     return None if found.detector else scorer(found.of).threshold
 
 
-def verdict_on(row: Row, detector: str, calibration: Calibration | None, own: float | None) -> str:
+def verdict_on(row: CaseRow, detector: str, calibration: Calibration | None, own: float | None) -> str:
     """What a detector says of a row: its own verdict, or by its own threshold, else by the calibration's at the row's
     operating point."""
     if row.error is not None:
         return CANNOT_TELL
-    if row.statements and entry(detector).own:
-        return row.statements[entry(detector).key].verdict
+    if row.statements and plan_detector(detector).own:
+        return row.statements[plan_detector(detector).key].verdict
     value = row.scores[detector][0]
     threshold = own
     if threshold is None and calibration is not None:
@@ -158,7 +158,7 @@ def verdict_on(row: Row, detector: str, calibration: Calibration | None, own: fl
 
 
 def judge(
-    rows: Sequence[Row],
+    rows: Sequence[CaseRow],
     detectors: Sequence[str],
     calibration: Calibration | None,
     *,
@@ -199,7 +199,7 @@ def judge(
 
 
 def _outcomes(
-    rows: Sequence[Row], detectors: Sequence[str], said: Mapping[tuple[str, str], str], hours: float | None
+    rows: Sequence[CaseRow], detectors: Sequence[str], said: Mapping[tuple[str, str], str], hours: float | None
 ) -> list[Outcome]:
     return [Outcome(name, row.id, row.leak_lpm, said[name, row.id], hours) for name in detectors for row in rows]
 
@@ -211,7 +211,7 @@ def _any_size(outcomes: Sequence[Outcome], confidence: float) -> list[SummaryRow
 
 
 def _pods(
-    rows: Sequence[Row], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
+    rows: Sequence[CaseRow], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
 ) -> list[Pod]:
     leaky = [row for row in rows if row.leak_lpm > 0]
     found = []
@@ -228,7 +228,7 @@ def _pods(
     return found
 
 
-def _rocs(rows: Sequence[Row], detectors: Sequence[str], confidence: float) -> list[SizeRoc]:
+def _rocs(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[SizeRoc]:
     """Over the scores, so that no threshold comes in; a record that cannot be told counts as the lowest score."""
     found = []
     sizes = sorted({row.leak_lpm for row in rows if row.leak_lpm > 0})
@@ -252,9 +252,9 @@ def _rocs(rows: Sequence[Row], detectors: Sequence[str], confidence: float) -> l
 
 
 def _cells(
-    rows: Sequence[Row], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
+    rows: Sequence[CaseRow], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
 ) -> list[Cell]:
-    groups: dict[tuple[float, tuple[tuple[str, str | float], ...]], list[Row]] = {}
+    groups: dict[tuple[float, tuple[tuple[str, str | float], ...]], list[CaseRow]] = {}
     for row in rows:
         groups.setdefault((row.leak_lpm, tuple(row.levels.items())), []).append(row)
     order = sorted(groups, key=lambda key: (key[0], repr(key[1])))
@@ -269,10 +269,10 @@ def _cells(
 
 
 def _faults(
-    rows: Sequence[Row], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
+    rows: Sequence[CaseRow], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
 ) -> list[FaultAlarms]:
     found = []
-    by_fault: dict[str, list[Row]] = {}
+    by_fault: dict[str, list[CaseRow]] = {}
     for row in sorted(rows, key=lambda row: row.fault):
         if row.fault and row.leak_lpm == 0:
             by_fault.setdefault(row.fault, []).append(row)
@@ -285,7 +285,7 @@ def _faults(
     return found
 
 
-def _realised(rows: Sequence[Row]) -> dict[float, tuple[float, float]]:
+def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
     found = {}
     for size in sorted({row.leak_lpm for row in rows if row.leak_lpm > 0}):
         flows = [row.flow_lpm for row in rows if row.leak_lpm == size and row.flow_lpm is not None]

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.campaigns.machines import closing_values
-from sealscope.campaigns.prediction import ChangeDetector, Responses, counted
-from sealscope.campaigns.store import read_rows
-from sealscope.campaigns.work import Row
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.execution.store import read_rows
+from sealscope.campaigns.plans.duty import closing_values
+from sealscope.campaigns.prediction.detection import ChangeDetector, Responses, counted
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array
@@ -20,7 +20,7 @@ from sealscope.simulation.commands import parse_command
 FEWEST = 8
 
 
-def same_duty(row: Row, command: str, rig: Rig) -> bool:
+def same_duty(row: CaseRow, command: str, rig: Rig) -> bool:
     """Whether a row was run with this command and the rig's throttles; what its plan did not vary counts as equal."""
     levels = row.levels
     if "command" in levels and str(parse_command(str(levels["command"]))) != command:
@@ -36,7 +36,7 @@ def same_duty(row: Row, command: str, rig: Rig) -> bool:
     return all(abs(float(there[name]) - value) < 1e-9 for name, value in here.items())
 
 
-def signed_change(row: Row, detector: ChangeDetector) -> float | None:
+def signed_change(row: CaseRow, detector: ChangeDetector) -> float | None:
     """The change of the log RMS behind a row's scores, whichever side was scored; None where none was."""
     for side, sign in (("fell", -1.0), ("rose", 1.0)):
         found = row.scores.get(f"{detector.quantity} of {detector.chamber} {side}")
@@ -45,7 +45,7 @@ def signed_change(row: Row, detector: ChangeDetector) -> float | None:
     return None
 
 
-def _judged(rows: Iterable[Row], detectors: Sequence[ChangeDetector]) -> Array:
+def _judged(rows: Iterable[CaseRow], detectors: Sequence[ChangeDetector]) -> Array:
     made = [[signed_change(row, detector) for detector in detectors] for row in rows]
     return np.array([[np.nan if value is None else value for value in line] for line in made], dtype=np.float64)
 
@@ -66,7 +66,7 @@ def measured_responses(
         and abs(float(row.place.get("duration_s", duration)) - duration) < 1.0
         and same_duty(row, command, rig)
     ]
-    groups: dict[float, list[Row]] = {}
+    groups: dict[float, list[CaseRow]] = {}
     for row in rows:
         groups.setdefault(row.leak_lpm, []).append(row)
     free = groups.pop(0.0, [])

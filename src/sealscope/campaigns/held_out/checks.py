@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sealscope.campaigns.held_out import Samples, chosen_candidates, held_out_scores, places_of
-from sealscope.campaigns.held_out_plan import Chosen, Classifier, HeldOutPlan
-from sealscope.campaigns.tables import Sheet
+from sealscope.campaigns.held_out.classifiers import Samples, chosen_candidates, held_out_scores, places_of
+from sealscope.campaigns.judging.tables import Sheet
+from sealscope.campaigns.plans.model import ChosenClassifier, Classifier, HeldOutPlan
 from sealscope.evaluation.auc import auc
 
 Array = npt.NDArray[np.float64]
@@ -102,7 +102,7 @@ def _check(plan: HeldOutPlan, samples: Samples, one: Classifier) -> HeldOutCheck
         clustered_area(held_out_scores(samples, one, leave_out), leaks, tests, plan.confidence)
         for leave_out in ("test", "condition")
     )
-    if isinstance(one, Chosen):
+    if isinstance(one, ChosenClassifier):
         chosen = chosen_candidates(samples, one, plan.leave_out)
         picks = Counter(f"{_short(pick.features)}, ridge {pick.ridge:g}" for pick in chosen).most_common()
         return HeldOutCheck(one.name, by_test, by_condition, picks=tuple(picks))

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sealscope.campaigns.bound import in_lpm
-from sealscope.campaigns.prediction import ChangeDetector, Responses
+from sealscope.campaigns.prediction.bound import in_lpm
+from sealscope.campaigns.prediction.detection import ChangeDetector, Responses
 from sealscope.diagnosis.calibration.scorers import side_bounds
 from sealscope.diagnosis.rms_change.blocks import QUANTITIES, mean_squares
 from sealscope.physics.rig import OUTPUTS

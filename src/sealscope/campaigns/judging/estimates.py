@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sealscope.campaigns.entries import entry
-from sealscope.campaigns.statement import NONE, PISTON_LEAK, Statement, cause_of
-from sealscope.campaigns.work import Row
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, Statement, cause_of
+from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.evaluation.confusion import CANNOT_TELL, Confusion, confusion_matrix
 from sealscope.evaluation.quantiles import Quantile, quantile_of
 from sealscope.evaluation.rates import EstimateError, OnsetErrors, estimate_error, onset_errors
@@ -47,9 +46,9 @@ class Named:
     confusion: Confusion
 
 
-def statement(row: Row, detector: str) -> Statement | None:
+def statement(row: CaseRow, detector: str) -> Statement | None:
     """What a detector stated on a row; None where it states nothing, or the record failed."""
-    return row.statements.get(entry(detector).key) if row.statements and row.error is None else None
+    return row.statements.get(plan_detector(detector).key) if row.statements and row.error is None else None
 
 
 def _pairs(pairs: Sequence[tuple[float, float] | None]) -> tuple[list[float], list[float]]:
@@ -58,7 +57,7 @@ def _pairs(pairs: Sequence[tuple[float, float] | None]) -> tuple[list[float], li
 
 
 def onsets_of(
-    rows: Sequence[Row], detectors: Sequence[str], said: Said, onset_s: float | None, confidence: float
+    rows: Sequence[CaseRow], detectors: Sequence[str], said: Said, onset_s: float | None, confidence: float
 ) -> list[Onset]:
     """For detectors that search for the onset: its error over the alarms, by size."""
     found = []
@@ -75,7 +74,7 @@ def onsets_of(
     return found
 
 
-def estimates_of(rows: Sequence[Row], detectors: Sequence[str], confidence: float) -> list[Estimate]:
+def estimates_of(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[Estimate]:
     """For detectors that state a flow: its errors against the flow that the record really had, by size."""
     found = []
     for name in _stating(rows, detectors):
@@ -100,18 +99,18 @@ def estimates_of(rows: Sequence[Row], detectors: Sequence[str], confidence: floa
     return found
 
 
-def named_of(rows: Sequence[Row], detectors: Sequence[str], confidence: float) -> list[Named]:
+def named_of(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[Named]:
     """For detectors judged by their own verdict, where there are faults: the causes they name. A record with a leak and
     another fault is left out; one that failed is `cannot tell`."""
     mine = [row for row in rows if not (row.leak_lpm > 0 and row.fault)]
     if not any(row.fault for row in mine):
         return []
     order = sorted({cause_of(row.fault) for row in mine if row.fault})
-    truth = [PISTON_LEAK if row.leak_lpm > 0 else cause_of(row.fault) if row.fault else NONE for row in mine]
-    faults = [one for one in (NONE, PISTON_LEAK) if one in truth] + order
+    truth = [PISTON_LEAK if row.leak_lpm > 0 else cause_of(row.fault) if row.fault else NO_CAUSE for row in mine]
+    faults = [one for one in (NO_CAUSE, PISTON_LEAK) if one in truth] + order
     found = []
     for name in _stating(rows, detectors):
-        if not entry(name).own:
+        if not plan_detector(name).own:
             continue
         stated = [statement(row, name) for row in mine]
         verdicts = [CANNOT_TELL if one is None else one.named for one in stated]
@@ -120,12 +119,12 @@ def named_of(rows: Sequence[Row], detectors: Sequence[str], confidence: float) -
     return found
 
 
-def _stating(rows: Sequence[Row], detectors: Sequence[str]) -> list[str]:
+def _stating(rows: Sequence[CaseRow], detectors: Sequence[str]) -> list[str]:
     """The detectors that state evidence, each once under whichever threshold; a calibrated one states the same."""
     keys = {key for row in rows for key in row.statements}
     found: dict[str, str] = {}
     for name in detectors if keys else ():
-        one = entry(name)
+        one = plan_detector(name)
         if one.key in keys and (one.own or one.key not in found):
             found[one.key] = name
     return list(found.values())

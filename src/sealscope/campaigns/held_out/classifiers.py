@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sealscope.campaigns.held_out_plan import Chosen, Classifier, HeldOutPlan, Logistic
-from sealscope.campaigns.work import Row
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.plans.model import ChosenClassifier, Classifier, HeldOutPlan, LogisticClassifier
 from sealscope.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -56,7 +56,7 @@ class LogisticFit:
 
 
 def fit_logistic(x: Array, leaks: npt.NDArray[np.bool_], ridge: float) -> LogisticFit:
-    """Logistic regression by Newton's method, maximising ``sum ln P(y|x) - ridge/2 |weights|^2``.
+    """LogisticClassifier regression by Newton's method, maximising ``sum ln P(y|x) - ridge/2 |weights|^2``.
 
     `x` (n, f), each feature standardised to mean 0 and standard deviation 1 of these samples; the intercept is not
     penalised. Raises InputError for a single class, a constant feature, or where no finite maximum is reached (no
@@ -154,7 +154,7 @@ def held_out_scores(
     if of.max() < 1:
         raise InputError(f"tests to leave out in turn must be at least 2, got {of.max() + 1}")
     folds = of[None, :] != np.arange(of.max() + 1)[:, None]
-    if isinstance(detector, Logistic):
+    if isinstance(detector, LogisticClassifier):
         found = fold_log_odds(samples.matrix(detector.features), leaks, folds, detector.ridge)
     else:
         candidates = detector.candidates()
@@ -166,7 +166,7 @@ def held_out_scores(
     return np.asarray(found[of, np.arange(of.size)])
 
 
-def chosen_candidates(samples: Samples, detector: Chosen, leave_out: str) -> list[Logistic]:
+def chosen_candidates(samples: Samples, detector: ChosenClassifier, leave_out: str) -> list[LogisticClassifier]:
     """What the training samples of each fold chose, one for each test or condition held out."""
     of = places_of(samples, leave_out)
     folds = of[None, :] != np.arange(of.max() + 1)[:, None]
@@ -176,7 +176,7 @@ def chosen_candidates(samples: Samples, detector: Chosen, leave_out: str) -> lis
 
 def _choices(
     samples: Samples,
-    detector: Chosen,
+    detector: ChosenClassifier,
     of: npt.NDArray[np.intp],
     leaks: npt.NDArray[np.bool_],
     folds: npt.NDArray[np.bool_],
@@ -198,7 +198,7 @@ def _choices(
     return np.asarray(np.argmin(np.array(losses), axis=0))
 
 
-def held_out_rows(plan: HeldOutPlan, samples: Samples) -> list[Row]:
+def held_out_rows(plan: HeldOutPlan, samples: Samples) -> list[CaseRow]:
     """A row for each sample, with the log odds that each detector gave it while it was held out, in the order of their
     ids."""
     scores = {one.name: held_out_scores(samples, one, plan.leave_out) for one in plan.detectors}
@@ -206,7 +206,7 @@ def held_out_rows(plan: HeldOutPlan, samples: Samples) -> list[Row]:
     for k, leak in enumerate(samples.leak_lpm):
         name = hashlib.sha256(f"{plan.data} {k}".encode()).hexdigest()
         rows.append(
-            Row(
+            CaseRow(
                 id=name[:16],
                 use="judge",
                 leak_lpm=float(leak),

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sealscope.campaigns.prediction import CONFIDENCE, Prediction
+from sealscope.campaigns.prediction.detection import CONFIDENCE, Prediction
 
 #: Size [L/min] whose probability of detection the text shows: the thesis's smallest leak; one of `CURVE_SIZES`.
 SHOWN = 0.0042

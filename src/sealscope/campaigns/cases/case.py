@@ -1,0 +1,110 @@
+"""The cases of a plan: each one record, with a name and seeds that derive from its content."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sealscope.campaigns.plans.model import SimulatedPlan, Use
+
+_PACKAGE = Path(__file__).resolve().parents[2]
+#: Parts of the package that no row depends on; the sources of all others are in the code key.
+_NOT_IN_ROWS = (
+    "cli",
+    "reporting",
+    "thesis",
+    "campaigns/plans/packaged",
+    "campaigns/judging",
+    "campaigns/held_out",
+    "campaigns/prediction",
+    "campaigns/results.py",
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One record to make and judge; `id` and seeds derive from its content alone, so they are the same anywhere.
+
+    `levels`: factor -> level; `leak_lpm` [L/min] and `fault`: what is put in at the plan's onset; `replicate` counts
+    within the cell.
+    """
+
+    id: str
+    machine_seed: int
+    noise_seed: int
+    use: Use
+    leak_lpm: float
+    law: str
+    fault: str
+    levels: Mapping[str, str | float]
+    replicate: int
+
+
+def digest(value: Any) -> str:
+    """Return a SHA-256 of plain values: it differs wherever they do."""
+    text = json.dumps(value, sort_keys=True, ensure_ascii=True, allow_nan=False, default=repr)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def profile_key(name: str) -> str:
+    """Return a digest of what a bench profile says, the same wherever its file lies."""
+    from sealscope.simulation.bench.profile import load_profile
+
+    return digest(repr(replace(load_profile(name), place="")))
+
+
+def world(plan: SimulatedPlan) -> dict[str, Any]:
+    """Return what all cases of a plan share and a record depends on: rig, bench, length, onset and base seed."""
+    return {
+        "rig": digest({row.name: repr(row.value) for row in plan.rig.table()}),
+        "profile": profile_key(plan.profile) if plan.profile else "",
+        "duration_s": plan.duration_s,
+        "onset_s": plan.onset_s,
+        "seed": plan.seed,
+    }
+
+
+def cases_of(plan: SimulatedPlan) -> list[Case]:
+    """Return all cases of a plan: records of each kind go round the cells one by one, the last round may be short."""
+    cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
+    shared = world(plan)
+    cases = []
+    for group in plan.records:
+        for number in range(group.count):
+            replicate, k = divmod(number, len(cells))
+            content: dict[str, Any] = {
+                "use": group.use,
+                "leak_lpm": group.leak_lpm,
+                "law": group.law,
+                "fault": group.fault,
+                "levels": cells[k],
+                "replicate": replicate,
+            }
+            name = digest({"world": shared, **content})
+            machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
+            cases.append(Case(name[:16], int(machine >> np.uint64(1)), int(noise >> np.uint64(1)), **content))
+    return cases
+
+
+def sources() -> Iterator[Path]:
+    """Yield the files of the package that a row may depend on."""
+    for path in sorted(_PACKAGE.rglob("*")):
+        name = path.relative_to(_PACKAGE).as_posix()
+        if path.suffix in (".py", ".toml") and not f"{name}/".startswith(tuple(f"{part}/" for part in _NOT_IN_ROWS)):
+            yield path
+
+
+def code_key() -> str:
+    """Return a hash of the sources that a row depends on: rows of other sources must not stand in the same table."""
+    found = hashlib.sha256()
+    for path in sources():
+        found.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
+        found.update(path.read_bytes())
+    return found.hexdigest()[:16]

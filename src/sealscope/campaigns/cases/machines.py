@@ -1,0 +1,95 @@
+"""From a case to the machine it is run on: the bench's draw, the case's duty on it, the leak sized for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from sealscope.campaigns.cases.case import Case
+from sealscope.campaigns.plans.duty import closing_values, fault_of
+from sealscope.campaigns.plans.model import SimulatedPlan
+
+if TYPE_CHECKING:
+    from sealscope.simulation.bench.profile import Profile
+    from sealscope.simulation.experiment import Experiment
+    from sealscope.simulation.faults.faults import Leak
+
+#: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
+SIZING_SECONDS = 13.0
+
+
+def leak_of(plan: SimulatedPlan, case: Case) -> tuple[Leak, ...]:
+    """Return the case's leak, open from the plan's onset on; its size still a mean flow."""
+    from sealscope.simulation.faults.faults import From, Leak
+    from sealscope.units import LITRE_PER_MINUTE
+
+    if not case.leak_lpm:
+        return ()
+    law: Any = case.law
+    return (Leak(law, mean=case.leak_lpm * LITRE_PER_MINUTE, opening=From(plan.onset_s)),)
+
+
+def unsized(plan: SimulatedPlan, case: Case, profile: Profile | None = None) -> Experiment:
+    """Return the experiment of a case with the size of its leak still a mean flow.
+
+    The machine is the one that the case's seed draws from the bench (or the plan's rig), with the case's levels on
+    top. `profile`: the plan's bench, where it has been loaded.
+    """
+    from sealscope.simulation.bench.machines import Machine, draw
+    from sealscope.simulation.commands import Sine, parse_command
+
+    if plan.profile:
+        machine = draw(profile or plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s)
+    else:
+        machine = Machine("none", case.machine_seed, plan.rig, plan.duration_s, {}, (), Sine(3.0, 4.0), 0.0)
+    values = dict(machine.values)
+    for name, level in case.levels.items():
+        if name == "command":
+            machine = replace(machine, command=parse_command(str(level)))
+        elif name == "closed":
+            values |= {"line.orifices": str(plan.rig["line.orifices"])} | closing_values(level)
+        else:
+            values[name] = level
+    machine = replace(machine, values=_by_full_name(values))
+    fault = fault_of(case.fault, plan.onset_s) if case.fault else None
+    return machine.experiment(seed=case.noise_seed, fault=fault, leak=leak_of(plan, case))
+
+
+def experiment_of(plan: SimulatedPlan, case: Case) -> Experiment:
+    """Return the experiment of a case (`unsized`) with its leak sized on its machine."""
+    experiment = unsized(plan, case)
+    return replace(experiment, leaks=sized_once(experiment))
+
+
+def _by_full_name(values: Mapping[str, str | float]) -> dict[str, str | float]:
+    """Return the values by their full names, a later one in place of an earlier."""
+    from sealscope.parameters import declared_names
+    from sealscope.parameters.names import resolve
+
+    return {resolve(name, declared_names()): value for name, value in values.items()}
+
+
+def sizing_run(experiment: Experiment) -> Experiment:
+    """Return the short run on which an experiment's leaks are sized, open from its start."""
+    from sealscope.simulation.faults.faults import From
+
+    return replace(
+        experiment,
+        duration=min(experiment.duration, SIZING_SECONDS),
+        leaks=tuple(replace(leak, opening=From(0.0)) for leak in experiment.leaks),
+    )
+
+
+def sized_once(experiment: Experiment) -> tuple[Leak, ...]:
+    """Return the experiment's leaks with coefficients that give their means on this machine over a short run.
+
+    Sizing on the whole record would cost it two or three times over; the mean that the record really had is in its
+    row.
+    """
+    from sealscope.simulation.simulate import sized_leaks
+
+    if not experiment.leaks:
+        return ()
+    sized = sized_leaks(sizing_run(experiment))
+    return tuple(replace(leak, opening=asked.opening) for leak, asked in zip(sized, experiment.leaks, strict=True))

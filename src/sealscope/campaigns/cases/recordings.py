@@ -1,0 +1,71 @@
+"""Rows from recordings of real machines: the same scorers as over simulated records."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.scoring import stated
+from sealscope.campaigns.plans.model import RecordedPlan, RecordingSet
+from sealscope.errors import InputError, SealscopeError
+
+#: Called with how many records have their row, how many there are, and how many of those failed.
+ProgressCallback = Callable[[int, int, int], None]
+
+
+def _natural(path: Path) -> list[str | int]:
+    """Return a key that orders names as people count: stroke 2 before stroke 10."""
+    return [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", path.name)]
+
+
+def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
+    for recordings in plan.sets:
+        paths = sorted((path for path in folder.glob(recordings.files) if path.is_file()), key=_natural)
+        chosen = paths[recordings.first - 1 : recordings.end - 1]
+        if not chosen:
+            raise InputError(f"a set's files must be there, got none for {recordings.files!r} ({folder})")
+        yield from ((recordings, path) for path in chosen)
+
+
+def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:
+    """Return a row for each recording, in the order of their ids; one that cannot be judged has its error."""
+    files = list(_files(plan, folder))
+    rows: dict[str, CaseRow] = {}
+    for number, (recordings, path) in enumerate(files, 1):
+        row = _row(plan, recordings, path, path.relative_to(folder).as_posix())
+        if row.id in rows:
+            raise InputError(f"a recording must be in one set, got it in two ({path})")
+        rows[row.id] = row
+        if progress is not None:
+            progress(number, len(files), sum(row.error is not None for row in rows.values()))
+    return [rows[name] for name in sorted(rows)]
+
+
+def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
+    from sealscope.diagnosis.calibration.calibrated import look_at, looked_at, place_of
+    from sealscope.recordings import read
+
+    row = partial(
+        CaseRow,
+        id=hashlib.sha256(name.encode()).hexdigest()[:16],
+        use=recordings.use,
+        leak_lpm=recordings.size,
+        fault="",
+        levels={"set": recordings.label or recordings.files},
+        replicate=0,
+    )
+    try:
+        recording = read(path, channel_map=plan.channel_map or None, rate=plan.rate_hz)
+        part, _, reason = looked_at(recording)
+        if reason is not None:
+            return row(error=f"{name}: {reason}")
+        look = look_at(part, 0.5, plan.false_alarm, plan.assumed)
+        scores, statements = stated(look, plan.detectors, plan.views)
+        return row(place=asdict(place_of(part)), scores=scores, statements=statements)
+    except SealscopeError as error:
+        return row(error=str(error))

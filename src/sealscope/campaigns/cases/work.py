@@ -1,0 +1,60 @@
+"""Carry out one case: simulate, record, let every detector score."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from sealscope.campaigns.cases.case import Case
+from sealscope.campaigns.cases.machines import experiment_of
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.errors import InputError, SealscopeError
+
+#: Channels that are inspected for findings: those that can spoil a verdict.
+INSPECTED = ("u", "x", "p_A", "p_B")
+
+
+def error_text(error: Exception) -> str:
+    """Return what a row says of an error, in one line."""
+    if isinstance(error, SealscopeError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "out of memory"
+    return f"{type(error).__name__}: {error}".splitlines()[0]
+
+
+def work(plan: SimulatedPlan, case: Case, keep: Path | None = None) -> CaseRow:
+    """Carry out one case; an error of any kind becomes the row's error. `keep`: folder to write the recording into."""
+    started = time.process_time()
+    try:
+        row = _work(plan, case, keep)
+    except Exception as error:  # a defect of the program must not end ten thousand other cases; the table says it
+        row = CaseRow.of(case, error=error_text(error))
+    return replace(row, seconds=round(time.process_time() - started, 4))
+
+
+def _work(plan: SimulatedPlan, case: Case, keep: Path | None) -> CaseRow:
+    from sealscope.campaigns.cases.scoring import stated
+    from sealscope.diagnosis.calibration.calibrated import looked_at, place_of
+    from sealscope.diagnosis.calibration.scorers import Look
+    from sealscope.simulation.simulate import run
+
+    simulated = run(experiment_of(plan, case))
+    if keep is not None:
+        from sealscope.recordings import write
+
+        write(simulated.recording, keep / f"{case.id}.nc")
+    part, _, reason = looked_at(simulated.recording, INSPECTED)
+    if reason is not None:
+        raise InputError(f"the record cannot be judged: {reason}")
+    look = Look(part, plan.onset_s, plan.false_alarm, plan.assumed or plan.rig)
+    scores, statements = stated(look, plan.detectors, plan.views)
+    return CaseRow.of(
+        case,
+        flow_lpm=simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0,
+        place=asdict(place_of(part)),
+        scores=scores,
+        statements=statements,
+    )

@@ -1,0 +1,297 @@
+"""A plan's cases many at a time: simulated side by side, scored from the RMS of the details on both sides of the onset.
+
+The scores are the same functions of the same samples as those of a recording (`scorers.Sides`); nothing else of a
+record is there, so that a plan is refused where something asks for more. The solver's step and the operating point
+of a case come from a few seconds of its machine.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sealscope.campaigns.cases.case import Case, digest, world
+from sealscope.campaigns.cases.machines import sized_once, sizing_run, unsized
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.scoring import scored
+from sealscope.campaigns.cases.work import error_text
+from sealscope.campaigns.plans.detectors import plan_detector
+from sealscope.campaigns.plans.duty import fault_of
+from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.diagnosis.baseline.operating_point import operating_point
+from sealscope.diagnosis.calibration.scorers import Sides, scorer, side_bounds
+from sealscope.diagnosis.calibration.thresholds import Place
+from sealscope.errors import InputError, SealscopeError
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.recording import CHANNEL_UNITS, Recording
+from sealscope.signals.filters import IntArray
+from sealscope.simulation.commands import Sine
+from sealscope.simulation.simulate import oversampling, trajectory
+
+if TYPE_CHECKING:
+    from sealscope.simulation.bench.profile import Profile
+    from sealscope.simulation.experiment import Experiment
+
+#: Runs of a batch, after each of which the rows are on disk.
+RUNS = {"cpu": 256, "gpu": 4096}
+#: Machines of a cell on which its step is chosen, and how long [s] each of them runs for that: the first window that
+#: `integrate` checks, and two more.
+SCOUTS, SCOUTED = 4, 4.0
+#: Shortest run [s] that tells an operating point, and the periods of a sine that it holds; the later half is looked at.
+LEAST_SECONDS, PERIODS = 4.0, 2
+
+
+def mode_of(device: str) -> str:
+    """Return the mode of rows of batches: they are not mixed with those of another mode, whose noise differs."""
+    return f"in batches on the {device}"
+
+
+def bounds_of(plan: SimulatedPlan) -> IntArray:
+    """Return the samples (2, 2) of a record that the scorers compare."""
+    rate = plan.rig.daq.sample_rate
+    return side_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
+
+
+def check_plan(plan: SimulatedPlan, cases: Sequence[Case]) -> None:
+    """Raise InputError for what a plan asks that no batch can do, naming it."""
+    from sealscope.simulation.batch.layout import refuse
+
+    def no(rule: str) -> InputError:
+        return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
+
+    for name in plan.detectors:
+        detector = plan_detector(name)
+        if detector.detector or scorer(detector.of).of_sides is None:
+            raise no(
+                f"detectors of the RMS on both sides of the onset alone, got {name!r}, which needs whole recordings"
+            )
+    if plan.keep_recordings:
+        raise no("keep_recordings = false, got true")
+    if np.diff(bounds_of(plan)).min() < 1:
+        raise no(f"records with details on both sides of the onset, got {plan.duration_s:g} s with {plan.onset_s:g} s")
+    for group in plan.records:
+        fault = fault_of(group.fault, plan.onset_s) if group.fault else None
+        if fault is not None and (fault.adjustments() or fault.holds()):
+            raise no(f"no fault of a sensor, got {group.fault!r}")
+    for case in {repr(case.levels): case for case in reversed(cases)}.values():  # one of each cell
+        try:
+            experiment = unsized(plan, case)
+        except SealscopeError:  # then its row says so
+            continue
+        if experiment.rate != plan.rig.daq.sample_rate:
+            raise no(f"one sampling rate, {plan.rig.daq.sample_rate:g} Hz, got {experiment.rate:g} Hz by a factor")
+        try:
+            refuse(experiment, 0)
+        except InputError as error:
+            raise no(f"runs that can stand side by side, got: {error}") from None
+
+
+def check_device(plan: SimulatedPlan, device: str) -> None:
+    """Raise InputError for a device that is not there: before the work, not as the error of every row."""
+    from sealscope.simulation.batch.batch import runner_of
+
+    if device not in RUNS:
+        raise InputError(f"--device must be {' or '.join(RUNS)}, got {device}")
+    runner_of(device)
+
+
+def in_batches(
+    plan: SimulatedPlan, cases: Sequence[Case], threads: int, device: str = "cpu"
+) -> Generator[CaseRow, None, None]:
+    """Yield the rows of the cases, batch by batch; a case that cannot be carried out costs no other.
+
+    A row derives from its case alone, whatever stands beside it.
+    """
+    batches = _Batches(plan, threads, device)
+    for start in range(0, len(cases), RUNS[device]):
+        yield from batches.rows(cases[start : start + RUNS[device]])
+
+
+class _Batches:
+    """Carries out the cases of one plan."""
+
+    def __init__(self, plan: SimulatedPlan, threads: int, device: str) -> None:
+        from sealscope.simulation.bench.profile import load_profile
+
+        self._plan, self._threads, self._device = plan, threads, device
+        self._profile = load_profile(plan.profile) if plan.profile else None
+        self._steps = StepChooser(plan, self._profile)
+        self._bounds = bounds_of(plan)
+
+    def rows(self, cases: Sequence[Case]) -> list[CaseRow]:
+        started = time.process_time()
+        drawn: list[tuple[Case, Experiment]] = []
+        rows: list[CaseRow] = []
+        for case in cases:
+            try:
+                experiment = unsized(self._plan, case, self._profile)
+                drawn.append((case, replace(experiment, step=self._steps.of(case, experiment))))
+            except Exception as error:
+                rows.append(CaseRow.of(case, error=error_text(error)))
+        rows += self._carried_out(drawn)
+        seconds = round((time.process_time() - started) / max(1, len(cases)), 4)
+        return [replace(row, seconds=seconds) for row in rows]
+
+    def _carried_out(self, drawn: Sequence[tuple[Case, Experiment]]) -> list[CaseRow]:
+        """Return the rows of one batch; where it fails, of its halves, down to the run that is to blame."""
+        try:
+            return self._made(drawn) if drawn else []
+        except Exception as error:
+            if len(drawn) == 1:
+                return [CaseRow.of(drawn[0][0], error=error_text(error))]
+        middle = len(drawn) // 2
+        return self._carried_out(drawn[:middle]) + self._carried_out(drawn[middle:])
+
+    def _made(self, drawn: Sequence[tuple[Case, Experiment]]) -> list[CaseRow]:
+        from sealscope.simulation.batch.batch import simulate_batch
+
+        cases = [case for case, _ in drawn]
+        experiments = self._sized([experiment for _, experiment in drawn])
+        places = [asdict(place_of_run(experiment)) for experiment in experiments]
+        edges = self._bounds.ravel() / self._plan.rig.daq.sample_rate
+        batch = simulate_batch(experiments, bounds=edges, threads=self._threads, device=self._device)
+        squares = batch.rms[:, :, [0, 2]] ** 2
+        rows = []
+        for k, case in enumerate(cases):
+            sides = Sides.of_squares(dict(zip(CHAMBERS, squares[k], strict=True)), self._bounds)
+            rows.append(
+                CaseRow.of(
+                    case,
+                    flow_lpm=float(batch.mean_leak_lpm[k]) if case.leak_lpm else 0.0,
+                    place=places[k],
+                    scores=scored(sides, self._plan.detectors, self._plan.views),
+                )
+            )
+        return rows
+
+    def _sized(self, experiments: Sequence[Experiment]) -> list[Experiment]:
+        """Return the experiments with steps that resolve their leaks, sized side by side as `sized_once` does."""
+        from sealscope.physics.rig import rig_numbers
+        from sealscope.physics.solvers.limits import longest_step
+        from sealscope.simulation.batch.batch import simulate_batch
+        from sealscope.simulation.batch.layout import with_sizes
+
+        sized = list(experiments)
+        leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
+        if not leaky:
+            return sized
+        short = [sizing_run(experiments[k]) for k in leaky]
+        try:
+            sizes = simulate_batch(short, threads=self._threads, device=self._device).coefficients.tolist()
+        except SealscopeError:
+            if len(experiments) > 1:  # halving finds the one that is to blame
+                raise
+            sizes = [leak.coefficient for leak in sized_once(replace(experiments[0], step=None))]
+        for k, size in zip(leaky, sizes, strict=True):
+            experiment = with_sizes(experiments[k], size)
+            laminar = experiment.leaks[0].law == "laminar"
+            limit = longest_step(rig_numbers(experiment.rig), size if laminar else 0.0, 0.0 if laminar else size)
+            if experiment.step is not None and experiment.step > limit:
+                experiment = replace(experiment, step=stepped(experiment.rate * oversampling(experiment), limit))
+            sized[k] = experiment
+        return sized
+
+
+class StepChooser:
+    """Chooses the steps [s] of a plan's cases, each from what the case is, so that no other case can change it."""
+
+    def __init__(self, plan: SimulatedPlan, profile: Profile | None = None) -> None:
+        self._plan, self._profile = plan, profile
+        self._world = digest(world(plan))
+        self._cells: dict[str, dict[str, float]] = {}
+
+    def of(self, case: Case, experiment: Experiment) -> float:
+        """Return the step of a case, no longer than its own machine allows.
+
+        It is what `integrate` chooses by error on `SCOUTS` machines of the case's cell with seeds of their own, the
+        finest of those with its method.
+        """
+        from sealscope.physics.rig import rig_numbers
+        from sealscope.physics.solvers.limits import longest_step
+        from sealscope.simulation.integrate import FINEST, LONGEST_STEP, choose_method
+
+        method = choose_method(experiment.rig, experiment.method)
+        step = self._cell(case.levels).get(method) or chosen_step(experiment)
+        limit = max(longest_step(rig_numbers(experiment.rig)), LONGEST_STEP / FINEST)
+        return step if step <= limit else stepped(experiment.rate * oversampling(experiment), limit)
+
+    def _cell(self, levels: Mapping[str, str | float]) -> dict[str, float]:
+        """Return method -> step of a cell of the factors."""
+        key = digest(dict(levels))
+        if key not in self._cells:
+            steps: dict[str, float] = {}
+            for number in range(SCOUTS):
+                seed = int(digest([self._world, dict(levels), f"scout {number}"])[:15], 16)
+                scout = Case("", seed, 0, "calibrate", 0.0, "laminar", "", levels, number)
+                try:
+                    method, step = _chosen(unsized(self._plan, scout, self._profile))
+                except SealscopeError:  # a machine of the bench that cannot do this duty
+                    continue
+                steps[method] = min(step, steps.get(method, math.inf))
+            self._cells[key] = steps
+        return self._cells[key]
+
+
+def stepped(rate: float, limit: float) -> float:
+    """Return the longest step [s] within `limit` [s] that divides the interval of outputs at `rate` [Hz]."""
+    from sealscope.simulation.integrate import steps_per_output
+
+    return 1.0 / (rate * steps_per_output(rate, limit))
+
+
+def chosen_step(experiment: Experiment) -> float:
+    """Return the step [s] that `integrate` chooses by error over the first seconds of an experiment."""
+    return _chosen(experiment)[1]
+
+
+def _chosen(experiment: Experiment) -> tuple[str, float]:
+    path = trajectory(replace(experiment, duration=min(experiment.duration, SCOUTED), leaks=()), ())
+    return path.method, path.step
+
+
+def place_of_run(experiment: Experiment) -> Place:
+    """Return where the record of an experiment with a stated step and sized leaks is made, as `place_of` would.
+
+    Command and cycle are those of the whole record. Under a sine, pressure level and direction come from whole
+    periods of a short run before any leak, without instruments and later drifts; under another command, or with
+    another fault, from a run of full length.
+    """
+    command = experiment.commanded
+    samples = round(experiment.duration * experiment.rate)
+    duration = samples / experiment.rate
+    if experiment.faults or not isinstance(command, Sine) or not (command.amplitude and command.omega):
+        return Place(operating_point(_clean(experiment, 0.0, duration, with_command=True)), duration)
+    period = 2.0 * math.pi / abs(command.omega)
+    length = min(max(LEAST_SECONDS, PERIODS * period), experiment.duration)
+    looked = max(1, int(length / 2.0 / period)) * period
+    point = operating_point(_clean(experiment, max(0.0, length - looked), length))
+    rms, cycle = _of_command(command, samples, experiment.rate)
+    return Place(replace(point, command_rms=rms, cycle=cycle), duration)
+
+
+def _clean(experiment: Experiment, start: float, stop: float, *, with_command: bool = False) -> Recording:
+    """Return the true x, p_A and p_B (and u) at the record's samples start <= t < stop [s]."""
+    whole = stop >= experiment.duration
+    short = experiment if whole else replace(experiment, duration=stop, leaks=())
+    path = trajectory(short, short.leaks)
+    factor = oversampling(short)
+    kept = slice(round(start * short.rate) * factor, round(stop * short.rate) * factor, factor)
+    channels = {name: path[name][kept] for name in ("x", *CHAMBERS)}
+    if with_command:
+        channels["u"] = experiment.commanded.volts(path.t[kept])
+    return Recording(path.t[kept], channels, CHANNEL_UNITS, short.rate)
+
+
+@lru_cache(maxsize=1024)
+def _of_command(command: Sine, samples: int, rate: float) -> tuple[float, float | None]:
+    """Return rms [V] and cycle [s] of a command over the record."""
+    t = np.arange(samples) / rate
+    u = command.volts(t)
+    return float(np.sqrt(np.mean(u**2))), find_cycle(Recording(t, {"u": u}, CHANNEL_UNITS, rate))

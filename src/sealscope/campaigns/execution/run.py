@@ -1,0 +1,130 @@
+"""Run a campaign: carry out what is missing in its folder; every row is stored, an interrupted run continues."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+from sealscope.campaigns.cases.case import Case, cases_of
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.execution import batches, store
+from sealscope.campaigns.execution.cluster import on_cluster
+from sealscope.campaigns.execution.workers import Workers
+from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.errors import InputError
+
+#: Called with how many records have their row, how many there are, and how many of those failed.
+ProgressCallback = Callable[[int, int, int], None]
+#: Carries out one case of a plan; the last argument is the folder to write its recording into, None for none.
+Task = Callable[[SimulatedPlan, Case, "Path | None"], CaseRow]
+RECORDINGS = "recordings"
+
+
+def run(
+    plan: SimulatedPlan,
+    folder: str | os.PathLike[str],
+    *,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    retry: bool = False,
+    progress: ProgressCallback | None = None,
+    task: Task = work,
+    batch: bool = False,
+    device: str = "cpu",
+) -> store.CampaignProgress:
+    """Carry out what is missing of the plan in `folder`, and return how far it is then.
+
+    `jobs`: processes of this machine, one a core by default, 1 for this process alone; `cluster`: address of a Dask
+    scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side by side (`batches`) on the
+    `device`, cpu (with `jobs` threads) or gpu, which implies `batch`. The rows are the same whoever makes them and in
+    whatever order, those of batches in any batch. Raises InputError where the folder holds another campaign, another
+    run is at work in it, or a batch cannot do what the plan asks for.
+    """
+    if jobs is not None and jobs < 1:
+        raise InputError(f"--jobs must be >= 1, got {jobs}")
+    batch = batch or device != "cpu"
+    cases = cases_of(plan)
+    mode = store.RUN_BY_RUN
+    if batch:
+        if cluster is not None:
+            raise InputError("--cluster must stand without --batch: a batch is made by one machine")
+        batches.check_device(plan, device)
+        batches.check_plan(plan, cases)
+        mode = batches.mode_of(device)
+    place = Path(folder)
+    store.begin(place, store.made_from(plan, mode))
+    with store.locked(place):
+        rows = store.rows_of(plan, place)
+        if retry:
+            rows = {name: row for name, row in rows.items() if row.error is None}
+        waiting = [case for case in cases if case.id not in rows]
+        failures = sum(row.error is not None for row in rows.values())
+        done = len(rows)
+        if progress is not None:
+            progress(done, plan.size, failures)
+        keep = None
+        if plan.keep_recordings:
+            keep = place / RECORDINGS
+            keep.mkdir(exist_ok=True)
+        jobs = jobs or _cores()
+        if batch:
+            made = batches.in_batches(plan, waiting, jobs, device)
+        else:
+            made = _rows(partial(_carry_out, task, plan, keep), waiting, jobs, cluster)
+        with store.Appender(place) as appender, closing(made):
+            for row in made:
+                appender.append(row)
+                done += 1
+                failures += row.error is not None
+                if progress is not None:
+                    progress(done, plan.size, failures)
+    return store.progress_of(plan, place)
+
+
+def _carry_out(task: Task, plan: SimulatedPlan, keep: Path | None, case: Case) -> CaseRow:
+    return task(plan, case, keep)
+
+
+def _rows(
+    task: Callable[[Case], CaseRow], cases: Sequence[Case], jobs: int, cluster: str | None
+) -> Generator[CaseRow, None, None]:
+    """Yield the rows of the cases as they end."""
+    if cases and cluster is not None:
+        yield from on_cluster(task, cases, cluster)
+    elif jobs == 1 or not cases:
+        yield from map(task, cases)
+    else:
+        yield from _in_processes(task, cases, min(jobs, len(cases)))
+
+
+def _in_processes(task: Callable[[Case], CaseRow], cases: Sequence[Case], jobs: int) -> Generator[CaseRow, None, None]:
+    """Yield the rows of the cases from `jobs` processes; a case whose process dies twice is a failed row."""
+    waiting, died = deque(cases), set[str]()
+    with Workers(jobs, task) as workers:
+        while waiting or workers.items:
+            while waiting and workers.free:
+                workers.begin(waiting.popleft())
+            rows = []
+            for case, row in workers.ended():
+                if row is not None:
+                    rows.append(row)
+                elif case.id in died:
+                    rows.append(CaseRow.of(case, error="the process that carried it out died"))
+                else:  # by a hand or the memory's end: tried once more, last
+                    died.add(case.id)
+                    waiting.append(case)
+            while waiting and workers.free:
+                workers.begin(waiting.popleft())
+            yield from rows
+
+
+def _cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)))
+    return os.cpu_count() or 1

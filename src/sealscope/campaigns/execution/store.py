@@ -1,0 +1,232 @@
+"""A campaign's folder: rows appended safely while it runs, and what they were made from."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from sealscope.campaigns.cases.case import cases_of, code_key, digest, world
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
+from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.atomic import atomic_write
+
+#: What rows of one folder must share, and how messages call it.
+_SAME = {
+    "format": "form of rows",
+    "name": "campaign",
+    "world": "rig, bench, length, onset or seed",
+    "code": "program code",
+    "mode": "mode of making rows (run by run, or in batches on which device)",
+    "false_alarm_within": "false-alarm probability, at which its detectors search within a record",
+    "assumed": "rig that its detectors assume",
+    "plug_ins": "detectors of other distributions",
+    "views": "channels that its detectors see",
+}
+#: The form of a row: 2 since rows hold what each detector stated.
+FORMAT = 2
+ROWS, HEAD, LOCK = "rows.jsonl", "campaign.json", ".lock"
+#: How rows are made unless in batches.
+RUN_BY_RUN = "run by run"
+
+
+@dataclass(frozen=True)
+class CampaignProgress:
+    """How far a campaign is.
+
+    `records` in the plan, how many are `done`, and `failed` of these; `seconds`: processor time of a record on
+    average, None where none is done.
+    """
+
+    records: int
+    done: int
+    failed: int
+    seconds: float | None
+
+    @property
+    def complete(self) -> bool:
+        """Whether every record has its row."""
+        return self.done == self.records
+
+
+def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
+    """Return what a campaign's rows depend on, as plain values; `mode`: `RUN_BY_RUN` or `batches.mode_of`."""
+    from sealscope.diagnosis.calibration.scorers import scorer
+
+    # a detector that searches within the record sets its own threshold for the probability, and its score may follow
+    detectors = [plan_detector(name) for name in plan.detectors]
+    searching = any(detector.detector or scorer(detector.of).timing == "search" for detector in detectors)
+    assumed = plan.assumed or plan.rig
+    return {
+        "format": FORMAT,
+        "name": plan.name,
+        "title": plan.title,
+        "world": world(plan),
+        "mode": mode,
+        "code": code_key(),
+        "false_alarm_within": plan.false_alarm if searching else None,
+        "assumed": digest({row.name: repr(row.value) for row in assumed.table()}) if searching else None,
+        "plug_ins": _plug_ins(plan),
+        "views": {view: list(plan.views.get(view, ())) for view in sorted({detector.view for detector in detectors})},
+        "version": _version(),
+    }
+
+
+def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
+    """Return the detectors of other distributions that a plan runs, each with a hash of its source."""
+    from sealscope.diagnosis.plugins import PlugIn
+    from sealscope.diagnosis.registry import detectors
+
+    run = {detector.of for name in plan.detectors if (detector := plan_detector(name)).detector}
+    return {
+        name: plug_in.fingerprint
+        for name, plug_in in detectors().items()
+        if isinstance(plug_in, PlugIn) and (name in run or DIAGNOSE in run)
+    }
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("sealscope")
+    except PackageNotFoundError:  # a source tree that is not installed
+        return "unknown"
+
+
+def read_rows(folder: Path) -> dict[str, CaseRow]:
+    """Return rows by case id, the last of each; a torn last line is ignored.
+
+    Raises UnreadableFile for a line that is no row.
+    """
+    path = folder / ROWS
+    if not path.is_file():
+        return {}
+    rows: dict[str, CaseRow] = {}
+    with path.open("rb") as file:
+        for number, line in enumerate(file, 1):
+            if not line.endswith(b"\n"):
+                break
+            try:
+                row = CaseRow.from_dict(json.loads(line))
+            except (ValueError, TypeError, KeyError, AttributeError, IndexError):
+                raise UnreadableFile(
+                    f"a line of a campaign must be a row, got something else ({path}, line {number})"
+                ) from None
+            rows[row.id] = row
+    return rows
+
+
+def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
+    """Return the folder's rows that belong to the plan, by case id in rising order.
+
+    A row without one of the plan's detectors is not among them.
+    """
+    rows = read_rows(folder)
+    of_plan = (rows.get(case.id) for case in sorted(cases_of(plan), key=lambda case: case.id))
+    wanted = set(plan.detectors)
+    return {row.id: row for row in of_plan if row is not None and (row.error or wanted <= set(row.scores))}
+
+
+def progress_of(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
+    """Return how far the campaign in the folder is."""
+    rows = rows_of(plan, folder).values()
+    seconds = [row.seconds for row in rows if row.error is None]
+    mean = sum(seconds) / len(seconds) if seconds else None
+    return CampaignProgress(plan.size, len(rows), len(rows) - len(seconds), mean)
+
+
+def head(folder: Path) -> dict[str, Any] | None:
+    """Return what the folder's campaign was made from, None where there is none yet."""
+    path = folder / HEAD
+    if not path.is_file():
+        return None
+    try:
+        tree = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        tree = None
+    if not isinstance(tree, dict):
+        raise UnreadableFile(f"a campaign's head must be a JSON object, got something else ({path})")
+    return tree
+
+
+def make_folder(folder: Path) -> None:
+    """Make a campaign's folder where there is none; raise InputError where it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot create folder: {error.strerror} ({folder})") from None
+
+
+def begin(folder: Path, source: Mapping[str, Any]) -> None:
+    """Make the folder a campaign's, or continue in it; raise InputError where it holds rows of another campaign."""
+    make_folder(folder)
+    before = head(folder)
+    if before is not None and (folder / ROWS).is_file():
+        for key, name in _SAME.items():
+            if before.get(key) != source[key]:
+                raise InputError(
+                    f"a campaign continues only with the same {name}: its rows would not belong together; choose "
+                    f"another folder or remove this one ({folder})"
+                )
+    with atomic_write(folder / HEAD) as temporary:
+        temporary.write_text(json.dumps(source, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+class Appender:
+    """The one writer of a campaign's rows: each line is on disk before the next is begun."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / ROWS
+        self._file: IO[bytes] | None = None
+
+    def __enter__(self) -> Appender:
+        file = self._path.open("ab+")
+        size = file.seek(0, os.SEEK_END)
+        keep = size
+        while keep and _byte(file, keep - 1) != b"\n":  # a line that was being written when the power went
+            keep -= 1
+        if keep < size:
+            file.truncate(keep)
+        self._file = file
+        return self
+
+    def append(self, row: CaseRow) -> None:
+        """Write one row and have it on disk."""
+        assert self._file is not None
+        self._file.write(json.dumps(row.as_dict(), allow_nan=False, sort_keys=True).encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file is not None:
+            self._file.close()
+
+
+def _byte(file: IO[bytes], at: int) -> bytes:
+    file.seek(at)
+    return file.read(1)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock; raise InputError where another run of the campaign holds it.
+
+    The lock ends with the process, however that ends.
+    """
+    from filelock import FileLock, Timeout
+
+    try:
+        with FileLock(folder / LOCK, timeout=0):
+            yield
+    except Timeout:
+        raise InputError(f"a campaign must be run by one process at a time, got another at work ({folder})") from None

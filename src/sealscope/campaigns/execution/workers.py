@@ -1,0 +1,114 @@
+"""Worker processes of this machine; the death of one costs the item that it carried out and no other."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any, Generic, TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class Workers(Generic[Item, Result]):
+    """Up to `jobs` spawned processes that carry out `task(item)`, one item each at a time.
+
+    `task` and items are pickled; `task` goes to each process once. Every process is an executor of its own, so that
+    one that dies breaks no other and the item it had is known. Processes ignore the interrupt, and end when the block
+    ends or the parent does, however that ends.
+    """
+
+    def __init__(self, jobs: int, task: Callable[[Item], Result]) -> None:
+        self._jobs, self._task = jobs, task
+        self._idle: list[ProcessPoolExecutor] = []
+        self._busy: dict[Future[Result], tuple[ProcessPoolExecutor, Item]] = {}
+        self._lifeline, self._held = get_context("spawn").Pipe(duplex=False)
+
+    def __enter__(self) -> Workers[Item, Result]:
+        return self
+
+    @property
+    def items(self) -> list[Item]:
+        """The items in work."""
+        return [item for _, item in self._busy.values()]
+
+    @property
+    def free(self) -> bool:
+        """Whether another item can begin."""
+        return len(self._busy) < self._jobs
+
+    def begin(self, item: Item) -> None:
+        """Begin an item in an idle process, or in a new one."""
+        pool = self._idle.pop() if self._idle else self._new_process()
+        with one_thread_each():  # a process starts with its first item
+            self._busy[pool.submit(_carry_out, item)] = pool, item
+
+    def ended(self) -> list[tuple[Item, Result | None]]:
+        """Wait until an item ends, and return those that have with their results, None where the process died.
+
+        Raises what `task` raised.
+        """
+        results: list[tuple[Item, Result | None]] = []
+        for future in wait(self._busy, return_when=FIRST_COMPLETED).done:
+            pool, item = self._busy.pop(future)
+            try:
+                results.append((item, future.result()))
+                self._idle.append(pool)
+            except BrokenProcessPool:
+                results.append((item, None))
+        return results
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._held.close()
+        self._lifeline.close()
+        for pool in (*self._idle, *(pool for pool, _ in self._busy.values())):
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def _new_process(self) -> ProcessPoolExecutor:
+        context = get_context("spawn")
+        return ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(self._task, self._lifeline))
+
+
+#: In a worker process: what it carries out its items with.
+_task: list[Callable[[Any], Any]] = []
+
+
+def _begin(task: Callable[[Any], Any], lifeline: Connection[Any, Any]) -> None:
+    _task[:] = [task]
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+
+
+def _carry_out(item: Any) -> Any:
+    return _task[0](item)
+
+
+def _end_with(lifeline: Connection[Any, Any]) -> None:
+    """End this process when the parent closes its end of the pipe, or is gone."""
+    with suppress(EOFError, OSError):
+        lifeline.recv_bytes()
+    os._exit(1)
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Let processes that start in the block keep to one thread for linear algebra: the processes run side by side."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update({name: "1" for name, value in before.items() if value is None})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)

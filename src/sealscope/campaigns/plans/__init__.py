@@ -1,0 +1,1 @@
+"""Plans: what a campaign simulates or reads, and which detectors judge it."""

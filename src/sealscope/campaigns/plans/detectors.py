@@ -1,0 +1,85 @@
+"""The names in a plan's `detectors`: scorers, registered detectors and the fused verdict, each on a set of channels.
+
+"d3 of p_A fell"                a scorer, its threshold from the plan's leak-free records
+"volume balance"                a registered detector by its own threshold, for the plan's false-alarm probability
+"volume balance, calibrated"    its score, the threshold from the plan's leak-free records
+"diagnose"                      the fused verdict of all registered detectors
+"diagnose @ pressures"          the same, given the channels of the view `pressures` alone
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+from sealscope.diagnosis.calibration.scorers import CALIBRATED, SCORERS, VIEW, scorer, split_view
+from sealscope.diagnosis.registry import detectors
+from sealscope.errors import InputError
+from sealscope.recordings.recording import CHANNEL_UNITS
+
+DIAGNOSE = "diagnose"
+_OWN = ", own threshold"
+#: name -> channels; the name "" stands for what detectors see that name no view.
+Views = Mapping[str, tuple[str, ...]]
+#: Channels that detectors see by default: all but the flow meter of the bypass, which is no part of the machine.
+ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
+
+
+@dataclass(frozen=True)
+class PlanDetector:
+    """One name of a plan's `detectors`, parsed.
+
+    `of`: the scorer, the detector or `diagnose`; `own`: whether its verdict is by its own threshold; `detector`:
+    whether it is a registered detector or `diagnose`; `view`: the set of channels it sees, "" where none is named.
+    """
+
+    name: str
+    of: str
+    own: bool
+    detector: bool
+    view: str
+
+    @property
+    def key(self) -> str:
+        """The name under which its statement is stored: the same for its own and for a calibrated threshold."""
+        return f"{self.of}{VIEW}{self.view}" if self.view else self.of
+
+    @property
+    def needs_calibration(self) -> bool:
+        """Whether leak-free records must set its threshold."""
+        return not self.own and (self.detector or scorer(self.of).threshold is None)
+
+
+@cache
+def plan_detector(name: str) -> PlanDetector:
+    """Parse a detector's name, known or not."""
+    base, view = split_view(name)
+    if base in SCORERS and not base.endswith((_OWN, CALIBRATED)):
+        return PlanDetector(name, base, False, False, view)
+    if base.endswith(CALIBRATED):
+        return PlanDetector(name, base.removesuffix(CALIBRATED), False, True, view)
+    return PlanDetector(name, base.removesuffix(_OWN), True, True, view)
+
+
+def check_detector(name: str, views: Views) -> None:
+    """Raise InputError for a name that is no detector, or names an unknown view."""
+    parsed = plan_detector(name)
+    if parsed.view and parsed.view not in views:
+        known_views = ", ".join(view for view in views if view) or "none"
+        raise InputError(f"what stands behind '@' must be one of [views] ({known_views}), got {name!r}")
+    if not parsed.detector:
+        return
+    known = [DIAGNOSE, *detectors()]
+    if parsed.of == DIAGNOSE and not parsed.own:
+        raise InputError(f"{DIAGNOSE!r} has no score of its own and cannot be calibrated, got {name!r}")
+    if parsed.of in known:
+        return
+    import difflib
+
+    choices = [*SCORERS, *known, *(f"{detector}{CALIBRATED}" for detector in known[1:])]
+    near = difflib.get_close_matches(split_view(name)[0], choices, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise InputError(
+        f"a detector must be one of {', '.join(known)}, or a scorer's name such as 'd3 of p_A fell', got {name!r}{hint}"
+    )
