@@ -23,8 +23,8 @@ import numpy as np
 from bench_solvers import CASES, FREQUENCY, RATE, Case, build, quartiles, rms, theirs, write
 
 from sealscope.simulation.batch.batch import simulate_batch
-from sealscope.simulation.experiment import Experiment, make_experiment
-from sealscope.simulation.simulate import run
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 PROMISED = 0.35
 #: Rig, peer and steps [s].
@@ -36,7 +36,7 @@ RUNS, LENGTHS = (256, 512, 1024, 2048), (180.0, 360.0, 720.0, 1440.0)
 def experiments(case: Case, count: int, duration: float, step: float) -> list[Experiment]:
     """`count` runs of a case that differ in their noise."""
     words = f"{case.amplitude} sin({FREQUENCY}t)"
-    first = make_experiment(rig=case.rig(), command=words, duration=duration, step=step)
+    first = Experiment.of(rig=case.rig(), command=words, duration=duration, step=step)
     return [replace(first, seed=seed) for seed in range(count)]
 
 
@@ -50,7 +50,7 @@ def timed(runs: list[Experiment], threads: int) -> tuple[float, float]:
 def same_run(case: Case, program: Path, step: float) -> float:
     """Rms difference [Pa] in p_A of the C++ program from the run that the batch is tested against, over 5 s."""
     one = experiments(case, 1, 5.0, step)[0]
-    ours = run(one).truth.outputs["p_A"]
+    ours = simulate_with_truth(one).truth.outputs["p_A"]
     difference = rms(theirs(program, case, step, 5.0)()[1][:, 1] - ours)
     if not difference < 1.0:
         raise SystemExit(f"{case.name}: the C++ program and ours must agree within 1 Pa rms, got {difference:.3g} Pa")

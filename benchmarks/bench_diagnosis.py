@@ -71,8 +71,8 @@ def main() -> None:
     if min(chosen.rounds, chosen.imports) < 1:
         parser.error("--rounds and --imports must be 1 or more")
     values = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
-    sound = [simulate(seed=seed, values=values) for seed in range(6)]
-    leaky = simulate(seed=9, leak="0.0042 L/min from 90 s", values=values)
+    sound = [simulate(seed=seed, set=values) for seed in range(6)]
+    leaky = simulate(seed=9, leak="0.0042 L/min from 90 s", set=values)
     cases: dict[str, Callable[[], object]] = {
         "within the recording, no leak": lambda: diagnose(sound[0]),
         "within the recording, leak": lambda: diagnose(leaky),

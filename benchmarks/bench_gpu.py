@@ -25,7 +25,7 @@ from bench_solvers import CASES, FREQUENCY, PEERS, RATE, Case, ours, quartiles, 
 
 from sealscope.errors import InputError
 from sealscope.simulation.batch.batch import runner_of, simulate_batch
-from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.experiment import Experiment
 
 #: Most seconds that 100 000 runs of 180 s may take, by case.
 PROMISED = {CASES[0].name: 5.0, CASES[2].name: 15.0}
@@ -39,10 +39,10 @@ def experiments(case: Case, count: int, duration: float) -> list[Experiment]:
     base = case.rig()
     shares = np.random.default_rng(1).uniform(0.9, 1.1, (RIGS, 2))
     rigs = [
-        base.with_values({"friction.F_v": base.friction.F_v * a, "fluid.K_oil": base.fluid.K_oil * b})
+        base.with_overrides({"friction.F_v": base.friction.F_v * a, "fluid.K_oil": base.fluid.K_oil * b})
         for a, b in shares.tolist()
     ]
-    first = make_experiment(rig=base, command=f"{case.amplitude} sin({FREQUENCY}t)", duration=duration)
+    first = Experiment.of(rig=base, command=f"{case.amplitude} sin({FREQUENCY}t)", duration=duration)
     return [replace(first, rig=rigs[seed % RIGS], seed=seed) for seed in range(count)]
 
 

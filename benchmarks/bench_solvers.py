@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.inputs import RunInputs
 from sealscope.simulation.integrate import integrate
 
@@ -74,7 +74,7 @@ class Case:
         throttles = (
             {} if self.closed is None else {"orifices": "present", "closed_A": self.closed, "closed_B": self.closed}
         )
-        return load_rig("thesis").with_values({**CHECK_RIG, **throttles})
+        return load_rig("thesis").with_overrides({**CHECK_RIG, **throttles})
 
     def words(self) -> list[str]:
         """The case as the peers' arguments."""
@@ -93,7 +93,7 @@ CASES = (
 def ours(case: Case, method: str, step: float | None, duration: float) -> Solve:
     """Our solver, at a step or (None) at the one it chooses: seconds and (n, 3) x [m], p_A, p_B [Pa]."""
     rig = case.rig()
-    experiment = make_experiment(rig=rig, command=f"{case.amplitude} sin({FREQUENCY}t)", duration=duration)
+    experiment = Experiment.of(rig=rig, command=f"{case.amplitude} sin({FREQUENCY}t)", duration=duration)
     refused = step is not None and step >= REFUSED
 
     def solve() -> tuple[float, Rows]:

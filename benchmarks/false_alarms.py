@@ -25,7 +25,7 @@ from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.examination import Examination
 from sealscope.diagnosis.registry import DETECTORS
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
 from sealscope.simulation.simulate import oversampling, sized_leaks, trajectory
 
@@ -69,11 +69,11 @@ def records_of(
     command: str, throttled: bool, leak_lpm: float, duration: float, base: int, count: int
 ) -> Iterator[Recording]:
     """`count` records of one case, equal but for the noise; the leak opens half-way."""
-    experiment = make_experiment(
+    experiment = Experiment.of(
         command=command,
         duration=duration,
         leak=f"{leak_lpm:g} L/min from {duration / 2:g} s" if leak_lpm else None,
-        values=THROTTLED if throttled else None,
+        set=THROTTLED if throttled else None,
     )
     path = trajectory(experiment, sized_leaks(experiment))
     volts, factor = experiment.command.volts(experiment.sample_times()), oversampling(experiment)

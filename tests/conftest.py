@@ -37,7 +37,7 @@ def check_rig() -> Callable[..., Rig]:
 
     def make(throttled: bool = False, **values: Any) -> Rig:
         throttles = HALF_CLOSED if throttled else {}
-        return load_rig("thesis").with_values({**CHECK_RIG, **throttles, **values})
+        return load_rig("thesis").with_overrides({**CHECK_RIG, **throttles, **values})
 
     return make
 

@@ -11,21 +11,10 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "sealscope"
 FILES = sorted(SOURCE.rglob("*.py"))
-#: Longest file, in lines, and the files that may be longer, each with its reason.
-MOST_LINES = 350
-LONGER: dict[str, str] = {}
 
 
 def name_of(path: Path) -> str:
     return path.relative_to(SOURCE).as_posix()
-
-
-def test_files_are_short():
-    lengths = {name_of(path): len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
-    assert len(lengths) > 50
-    longer = {name: lines for name, lines in lengths.items() if lines > MOST_LINES}
-    assert set(longer) == set(LONGER), longer
-    assert max(longer.values(), default=0) <= 1.1 * MOST_LINES, longer
 
 
 def test_nothing_is_called_utils():

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from sealscope.recordings import Recording, inspect, read, write
     from sealscope.reporting import write_page
     from sealscope.simulation.batch.batch import simulate_batch
-    from sealscope.simulation.experiment import Experiment, make_experiment
+    from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.proof import prove
-    from sealscope.simulation.simulate import run, simulate
+    from sealscope.simulation.simulate import simulate, simulate_with_truth
 
 _HOMES = {
     "Diagnosis": "diagnosis.verdict.diagnosis",
@@ -29,12 +29,11 @@ _HOMES = {
     "diagnose": "diagnosis.diagnose",
     "inspect": "recordings",
     "load_rig": "parameters",
-    "make_experiment": "simulation.experiment",
     "prove": "simulation.proof",
     "read": "recordings",
-    "run": "simulation.simulate",
     "simulate": "simulation.simulate",
     "simulate_batch": "simulation.batch.batch",
+    "simulate_with_truth": "simulation.simulate",
     "write": "recordings",
     "write_page": "reporting",
 }
@@ -48,12 +47,11 @@ __all__ = [
     "diagnose",
     "inspect",
     "load_rig",
-    "make_experiment",
     "prove",
     "read",
-    "run",
     "simulate",
     "simulate_batch",
+    "simulate_with_truth",
     "write",
     "write_page",
 ]

@@ -28,8 +28,11 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
     'command'?``. Missing and surplus arguments raise InputError too. What the function itself raises is not touched.
     """
     signature = inspect.signature(function)
-    names = [name for name, parameter in signature.parameters.items() if parameter.kind is not parameter.VAR_KEYWORD]
-    any_keyword = len(names) < len(signature.parameters)
+    parameters = signature.parameters.values()
+    names = [parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD]
+    any_keyword = len(names) < len(parameters)
+    if names[:1] in (["self"], ["cls"]):
+        del names[0]
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -37,12 +40,12 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
             for name in kwargs:
                 if name not in names:
                     raise InputError(
-                        f"{function.__name__} has no argument {name!r}{closest(repr(name), map(repr, names))}"
+                        f"{function.__qualname__} has no argument {name!r}{closest(repr(name), map(repr, names))}"
                     )
         try:
             signature.bind(*args, **kwargs)
         except TypeError as error:
-            raise InputError(f"{function.__name__}: {error}") from None
+            raise InputError(f"{function.__qualname__}: {error}") from None
         return function(*args, **kwargs)
 
     return call

@@ -9,8 +9,8 @@ from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings import read, write
 from sealscope.reporting import write_page
-from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.simulate import Progress, Truth, run
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import Progress, Truth, simulate_with_truth
 
 #: The demo's experiment: the thesis's rig with both throttles half closed (its Table 4.3 d), its smallest leak from
 #: half time on.
@@ -18,7 +18,7 @@ EXPERIMENT = {
     "command": "3 sin(4t)",
     "leak": "0.0042 L/min from 90 s",
     "duration": 180.0,
-    "values": {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"},
+    "set": {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"},
 }
 
 
@@ -34,8 +34,8 @@ class Demo:
 
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
     """Simulate, write the recording, read it back, diagnose it and write the page, all into `folder`."""
-    experiment = make_experiment(**EXPERIMENT, seed=seed)  # type: ignore[arg-type]
-    made = run(experiment, progress)
+    experiment = Experiment.of(**EXPERIMENT, seed=seed)  # type: ignore[arg-type]
+    made = simulate_with_truth(experiment, progress)
     folder.mkdir(parents=True, exist_ok=True)
     file, page = folder / "recording.nc", folder / "report.html"
     write(made.recording, file)

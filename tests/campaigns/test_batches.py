@@ -23,7 +23,7 @@ from sealscope.diagnosis.calibration.calibrated import place_of
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
 from sealscope.simulation.commands import parse_command
-from sealscope.simulation.simulate import run
+from sealscope.simulation.simulate import simulate_with_truth
 
 QUIET = {f"sensors.{name}.{what}": 0.0 for name in ("p_A", "p_B") for what in ("noise", "drift", "hum")}
 QUIET |= {"sensors.common_noise": 0.0, "daq.bits": 24}
@@ -60,7 +60,7 @@ def alone(plan, case):
     """Scores and place of a case's whole recording, at the step that it has in a batch."""
     experiment = unsized(plan, case)
     experiment = replace(experiment, step=StepChooser(plan).of(case, experiment))
-    made = run(replace(experiment, leaks=sized_once(experiment)))
+    made = simulate_with_truth(replace(experiment, leaks=sized_once(experiment)))
     look = Look(made.recording, plan.onset_s, plan.false_alarm, plan.rig)
     return stated(look, plan.detectors, plan.views)[0], place_of(made.recording), made.truth
 
@@ -200,7 +200,7 @@ def test_a_place_under_other_commands_is_that_of_the_recording(plan_with, comman
     plan = plan_with([{"count": 1}], duration="8 s", onset="4 s", detectors=["sign rule: d3 of p_A fell"])
     case = cases_of(plan)[-1]
     experiment = replace(unsized(plan, case), command=parse_command(command), step=5e-4)
-    found, expected = place_of_run(experiment), place_of(run(experiment).recording)
+    found, expected = place_of_run(experiment), place_of(simulate_with_truth(experiment).recording)
     assert found.point.level == pytest.approx(expected.point.level, abs=0.03)
     assert replace(found.point, level=0.0) == replace(expected.point, level=0.0)
 

@@ -44,7 +44,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
     settings = {"omega_per_volt": 26.7, "G_pump": 2.4e-13, "sensors.p_A.noise": 3e3}
-    rig = load_rig("thesis").with_values(settings, source="set by --set")
+    rig = load_rig("thesis").with_overrides(settings, source="set by --set")
     return experiment_for(rig, "7 sin(4t)", 20.0)
 
 

@@ -39,7 +39,7 @@ FIGURES = {
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
-    return load_rig("thesis").with_values(CHECK)
+    return load_rig("thesis").with_overrides(CHECK)
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +48,9 @@ def short(rig: Rig) -> Experiment:
 
 
 def run_of(rig: Rig, command: str, duration: float, x_0: float = 0.0) -> Experiment:
-    from sealscope.simulation.experiment import make_experiment
+    from sealscope.simulation.experiment import Experiment
 
-    return make_experiment(rig=rig, command=command, duration=duration, x_0=x_0)
+    return Experiment.of(rig=rig, command=command, duration=duration, x_0=x_0)
 
 
 def test_bound_of_a_straight_line_is_the_textbooks() -> None:
@@ -131,7 +131,7 @@ def test_leak_derivative_does_not_depend_on_the_solvers_step(short: Experiment) 
 
 def test_parameter_derivative_is_a_slope(short: Experiment) -> None:
     found = parameter_sensitivity(short, "F_v")
-    rig = short.rig.with_values({"F_v": short.rig.friction.F_v * 1.002})
+    rig = short.rig.with_overrides({"F_v": short.rig.friction.F_v * 1.002})
     change = clean_channels(replace(short, rig=rig)) - clean_channels(short)
     assert np.sqrt(np.mean((change - 0.002 * found.slope) ** 2)) < 0.05 * np.sqrt(np.mean(change**2))
     for name in ("integrator", "F_l"):

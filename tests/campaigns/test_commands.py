@@ -11,8 +11,8 @@ import pytest
 from sealscope import cli
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.recordings import write
-from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.simulate import run
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 
 @pytest.fixture
@@ -126,12 +126,17 @@ def logs(tmp_path):
     files = {}
     for seed in range(10):
         path = tmp_path / f"sound-{seed}.csv"
-        write(run(make_experiment(command="3 sin(4t)", duration=8.0, seed=seed)).recording, path)
+        write(simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording, path)
         files[path.stem] = path
     leaky = tmp_path / "leaky.csv"
-    write(run(make_experiment(command="3 sin(4t)", duration=8.0, seed=77, leak="0.3 L/min from 4 s")).recording, leaky)
+    write(
+        simulate_with_truth(
+            Experiment.of(command="3 sin(4t)", duration=8.0, seed=77, leak="0.3 L/min from 4 s")
+        ).recording,
+        leaky,
+    )
     other = tmp_path / "other.csv"
-    write(run(make_experiment(command="5 sin(2t)", duration=8.0, seed=78)).recording, other)
+    write(simulate_with_truth(Experiment.of(command="5 sin(2t)", duration=8.0, seed=78)).recording, other)
     return files, leaky, other
 
 

@@ -13,8 +13,8 @@ from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import held_out_result, recorded_result, write_result
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings import write
-from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.simulate import run
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 PLAN = """
 [campaign]
@@ -44,10 +44,12 @@ size = 0.3
 def folder(tmp_path):
     """Twelve sound recordings and two leaky ones of one machine."""
     for seed in range(1, 13):
-        made = run(make_experiment(command="3 sin(4t)", duration=8.0, seed=seed)).recording
+        made = simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording
         write(made, tmp_path / f"sound-{seed}.csv")
     for seed in range(2):
-        leak = run(make_experiment(command="3 sin(4t)", duration=8.0, seed=50 + seed, leak="0.3 L/min from 4 s"))
+        leak = simulate_with_truth(
+            Experiment.of(command="3 sin(4t)", duration=8.0, seed=50 + seed, leak="0.3 L/min from 4 s")
+        )
         write(leak.recording, tmp_path / f"leaky-{seed}.csv")
     return tmp_path
 

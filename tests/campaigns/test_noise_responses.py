@@ -30,7 +30,7 @@ SIZES = (0.004, 0.016)
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
     values = {"omega_per_volt": 26.7, "orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
-    return Experiment(rig=load_rig("thesis").with_values(values), command=parse_command("7 sin(4t)"), duration=20.0)
+    return Experiment(rig=load_rig("thesis").with_overrides(values), command=parse_command("7 sin(4t)"), duration=20.0)
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.faults.faults import From, Leak
-from sealscope.simulation.simulate import run
+from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 
 FELL, ROSE, CHANGED = (ChangeDetector("d3", "p_A", side) for side in ("fell", "rose", "changed"))
@@ -43,20 +43,20 @@ def rig() -> Rig:
         "sensors.p_B.noise": 3e3,
         "common_noise": 1e3,
     }
-    return load_rig("thesis").with_values(values)
+    return load_rig("thesis").with_overrides(values)
 
 
 def test_start_keeps_the_widest_sweep_off_the_caps(rig: Rig) -> None:
     experiment = experiment_for(with_closing(rig, None), "8 sin(t)", 20.0)
     assert -0.3 < experiment.x_0 < -0.15
-    assert np.abs(run(experiment).truth.outputs["x"]).max() < 0.28
+    assert np.abs(simulate_with_truth(experiment).truth.outputs["x"]).max() < 0.28
     assert experiment_for(rig, "8 sin(t)", 20.0, 0.01).x_0 == 0.01
 
 
 def test_throttles_are_told_in_words(rig: Rig) -> None:
     assert closing_words(with_closing(rig, None)) == "none"
     assert closing_words(with_closing(rig, 0.25)) == "25 %"
-    assert closing_words(rig.with_values({"closed_A": 0.25})) == "25 % at A, 50 % at B"
+    assert closing_words(rig.with_overrides({"closed_A": 0.25})) == "25 % at A, 50 % at B"
 
 
 def test_prediction_agrees_with_recordings_made_afresh(rig: Rig) -> None:
@@ -69,7 +69,7 @@ def test_prediction_agrees_with_recordings_made_afresh(rig: Rig) -> None:
     for row, leaks in ((0, ()), (1, (leak,))):
         fresh = []
         for seed in range(1000, 1040):
-            made = run(replace(experiment, leaks=leaks, seed=seed))
+            made = simulate_with_truth(replace(experiment, leaks=leaks, seed=seed))
             look = Look(made.recording)
             fresh.append([one.change(look) for one in detectors])
         table = np.array(fresh)
@@ -89,12 +89,12 @@ def test_scatter_falls_with_the_root_of_time_and_rises_with_noise(rig: Rig) -> N
 
     still = scatter(20.0, rig)
     assert still / scatter(80.0, rig) == pytest.approx(2.0, rel=0.4)
-    louder = rig.with_values({"sensors.p_A.noise": 9e3, "sensors.p_B.noise": 9e3})
+    louder = rig.with_overrides({"sensors.p_A.noise": 9e3, "sensors.p_B.noise": 9e3})
     assert scatter(20.0, louder) > 1.2 * still
 
 
 def test_noise_holds_what_the_instruments_add_and_loses_no_sample(rig: Rig) -> None:
-    flaky = rig.with_values({"sensors.p_A.drop_rate": 5.0, "sensors.p_B.stuck_rate": 1.0, "sensors.p_A.offset": 1e3})
+    flaky = rig.with_overrides({"sensors.p_A.drop_rate": 5.0, "sensors.p_B.stuck_rate": 1.0, "sensors.p_A.offset": 1e3})
     experiment = experiment_for(flaky, "3 sin(4t)", 20.0)
     noise = instrument_noise(experiment, 3, 2)
     assert noise.shape == (3, 2, 10_000)
@@ -167,9 +167,7 @@ def test_json_is_one_object_with_the_stated_fields() -> None:
     assert found.exit_code == 0, found.output
     tree = json.loads(found.stdout)
     assert tree["rig"] == "thesis"
-    assert (
-        tree["parameters_set"] == {"sensors.p_A.noise": pytest.approx("3447.378646584177 Pa")} or tree["parameters_set"]
-    )
+    assert tree["overrides"] == {"sensors.p_A.noise": pytest.approx("3447.378646584177 Pa")} or tree["overrides"]
     assert (tree["duration_s"], tree["onset_s"], tree["false_alarm_probability"]) == (20.0, 10.0, 0.02)
     assert set(tree["noise_pa"]) == {"p_A", "p_B"}
     (one,) = tree["detectors"]

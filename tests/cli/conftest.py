@@ -134,10 +134,10 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with simulated recordings: `leak.nc` (a leak from second 40 of 80), `healthy_1.nc` to `healthy_3.nc`
     (40 s, no leak)."""
     folder = tmp_path_factory.mktemp("recordings")
-    leaky = sealscope.simulate(duration=80.0, leak="0.0135 L/min from 40 s", values=THROTTLED, seed=8)
+    leaky = sealscope.simulate(duration=80.0, leak="0.0135 L/min from 40 s", set=THROTTLED, seed=8)
     sealscope.write(leaky, folder / "leak.nc")
     for seed in (1, 2, 3):
-        healthy = sealscope.simulate(duration=40.0, values=THROTTLED, seed=seed)
+        healthy = sealscope.simulate(duration=40.0, set=THROTTLED, seed=seed)
         sealscope.write(healthy, folder / f"healthy_{seed}.nc")
     return folder
 

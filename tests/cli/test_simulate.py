@@ -18,7 +18,7 @@ def test_a_setting_reaches_the_recording(call, tmp_path):
     assert (plain.rate, len(plain)) == (500, 2000)
     assert (changed.rate, len(changed)) == (250, 1000)
     assert changed["p_A"].mean() - plain["p_A"].mean() == pytest.approx(2e5, rel=0.05)
-    asked = changed.provenance["experiment"]["parameters_set"]
+    asked = changed.provenance["experiment"]["overrides"]
     assert set(asked) == {"fluid.p_charge", "daq.sample_rate"}
     assert float(asked["fluid.p_charge"].split()[0]) == 5e5
 
@@ -30,7 +30,7 @@ def test_python_and_the_command_give_the_same_bytes(call, tmp_path):
     )  # fmt: skip
     assert done.status == 0
     made = sealscope.simulate(
-        command="2 sin(3t)", duration=4.0, seed=11, leak="0.01 L/min from 2 s", x_0=0.05, values={"V_1": "60[cm^3]"}
+        command="2 sin(3t)", duration=4.0, seed=11, leak="0.01 L/min from 2 s", x_0=0.05, set={"V_1": "60[cm^3]"}
     )
     read = sealscope.read(tmp_path / "one.nc")
     assert read["x"][0] == pytest.approx(0.05, abs=1e-3)
@@ -92,7 +92,7 @@ def test_a_stated_error_reaches_the_solver(call, tmp_path):
     both = call("simulate", "-o", tmp_path / "none.nc", "--error", "20[Pa]", "--step", "1e-3")
     assert (both.status, len(both.err.splitlines())) == (2, 1)
     assert "a stated step or a stated error, not both" in both.err
-    assert "--error must have a unit of pressure" in call("simulate", "-o", tmp_path / "none.nc", "--error", "1[V]").err
+    assert "error must have a unit of pressure" in call("simulate", "-o", tmp_path / "none.nc", "--error", "1[V]").err
     assert not (tmp_path / "none.nc").exists()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sealscope.diagnosis import registry
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
 from sealscope.simulation.simulate import oversampling, sized_leaks, trajectory
 
@@ -30,9 +30,7 @@ def records() -> Records:
 
     @lru_cache(maxsize=4)
     def case(command: str, leak: str | None, duration: float, throttled: bool):  # type: ignore[no-untyped-def]
-        experiment = make_experiment(
-            command=command, leak=leak, duration=duration, values=THROTTLED if throttled else None
-        )
+        experiment = Experiment.of(command=command, leak=leak, duration=duration, set=THROTTLED if throttled else None)
         path = trajectory(experiment, sized_leaks(experiment))
         return experiment, path, experiment.command.volts(experiment.sample_times()), oversampling(experiment)
 

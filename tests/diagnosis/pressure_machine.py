@@ -13,7 +13,7 @@ from sealscope.diagnosis.pressure_model.track import Track, wander
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.changes.drifts import Drift, Linear
 from sealscope.simulation.commands import Command, Recorded
-from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
 from sealscope.simulation.integrate import Trajectory
 from sealscope.simulation.simulate import oversampling, sized_leaks, trajectory
@@ -56,13 +56,13 @@ def _case(
     command: str, leak: str | None, fault: str | None, drift: tuple[str, float] | None, values: tuple, duration: float
 ) -> tuple[Experiment, Trajectory, np.ndarray]:
     drifts = () if drift is None else (Drift(drift[0], Linear(drift[1], duration)),)
-    experiment = make_experiment(
+    experiment = Experiment.of(
         command=_command(command, duration),
         leak=leak,
         fault=fault,
         drifts=drifts,
         duration=duration,
-        values={"pump.G_pump": G_PUMP, "fluid.p_charge": P_CHARGE, **dict(values)},
+        set={"pump.G_pump": G_PUMP, "fluid.p_charge": P_CHARGE, **dict(values)},
     )
     path = trajectory(experiment, sized_leaks(experiment))
     return experiment, path, experiment.command.volts(experiment.sample_times())
@@ -85,7 +85,7 @@ def recorded(
     experiment, path, volts = _case(command, leak, fault, drift, chosen, duration)
     rig = experiment.rig
     if noise != 1.0:
-        rig = rig.with_values({name: noise * rig[name] for name in NOISE})
+        rig = rig.with_overrides({name: noise * rig[name] for name in NOISE})
     return record(rig, path, volts, oversampling(experiment), seed).only(READ)
 
 

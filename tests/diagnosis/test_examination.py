@@ -113,7 +113,7 @@ def test_a_pressure_that_rests_cannot_be_its_own_baseline() -> None:
 
 
 def test_it_is_made_for_the_rig_given_or_the_thesis_s(recording: Recording) -> None:
-    other = assumed_rig().with_values({"q_b": 1e-6})
+    other = assumed_rig().with_overrides({"q_b": 1e-6})
     for rig, expected in ((other, other), (None, assumed_rig())):
         examination = Examination(recording, false_alarm_probability=0.05, rig=rig)
         assert examination._detector("looker").rig == expected  # type: ignore[attr-defined]

@@ -189,12 +189,12 @@ def test_unasked_it_names_what_stepped_plainly_and_nothing_else(monkeypatch: pyt
 
 @cache
 def simulated(words: str, command: str) -> Recording:
-    from sealscope.simulation.experiment import make_experiment
-    from sealscope.simulation.simulate import run
+    from sealscope.simulation.experiment import Experiment
+    from sealscope.simulation.simulate import simulate_with_truth
 
     what = {"leak" if words.endswith("L/min") and not words.startswith("rod") else "fault": f"{words} from 60 s"}
     values = {"line.orifices": "present", "line.closed_A": 0.5, "line.closed_B": 0.5, "makeup.check_valves": "present"}
-    return run(make_experiment(command=command, duration=120.0, values=values, seed=3, **what)).recording
+    return simulate_with_truth(Experiment.of(command=command, duration=120.0, set=values, seed=3, **what)).recording
 
 
 @pytest.mark.parametrize("command", ["3 sin(4t)", pytest.param("8 sin(t)", marks=pytest.mark.slow)])

@@ -26,8 +26,8 @@ from sealscope.diagnosis.observer.volume_filter import VolumeFilter
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.simulate import run
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 P = 0.01
 ALL = ("u", "theta", "x", "p_A", "p_B")
@@ -50,7 +50,9 @@ def machine():  # type: ignore[no-untyped-def]
         if key not in made:
             words = f"0.0042 L/min from {duration / 2:g} s" if leak else None
             values = {"pump.G_pump": 2e-13}
-            made[key] = run(make_experiment(command=command, leak=words, duration=duration, seed=seed, values=values))
+            made[key] = simulate_with_truth(
+                Experiment.of(command=command, leak=words, duration=duration, seed=seed, set=values)
+            )
         return made[key]
 
     return of
@@ -155,7 +157,7 @@ def test_own_parameters_not_the_plants(thesis: Rig, machine) -> None:  # type: i
     told = Observer(thesis).follow(recording.only(PRESSURES))
     bare = replace(recording, provenance={}, history=())
     assert np.array_equal(told.G, Observer(thesis).follow(bare.only(PRESSURES)).G)
-    other = Observer(thesis.with_values({"friction.F_v": 330.0}, source="wrong")).follow(recording.only(PRESSURES))
+    other = Observer(thesis.with_overrides({"friction.F_v": 330.0}, source="wrong")).follow(recording.only(PRESSURES))
     assert not np.array_equal(told.G, other.G)
 
 
@@ -198,7 +200,7 @@ def test_ten_per_cent_of_wrong_knowledge_is_told_by_a_bounded_error(values, thes
     """All channels: score hardly changes, and L/min is wrong by the error of the displacement alone."""
     made = machine(True)
     right = Observer(thesis).examine(made.recording.only(ALL), [], P)
-    wrong = Observer(thesis.with_values(values, source="wrong on purpose")).examine(made.recording.only(ALL), [], P)
+    wrong = Observer(thesis.with_overrides(values, source="wrong on purpose")).examine(made.recording.only(ALL), [], P)
     assert wrong.verdict == "leak"
     assert wrong.score == pytest.approx(right.score, rel=0.1)
     share = 1.1 if "pump.q_b" in values else 1.0
@@ -208,7 +210,7 @@ def test_ten_per_cent_of_wrong_knowledge_is_told_by_a_bounded_error(values, thes
 @pytest.mark.parametrize("values", [{"fluid.K_oil": 620e6}, {"friction.F_v": 330.0, "friction.F_pr": 27.5}])
 def test_the_pressures_alone_bear_wrong_knowledge(values, thesis: Rig, machine) -> None:  # type: ignore[no-untyped-def]
     made = machine(True)
-    found = Observer(thesis.with_values(values, source="wrong on purpose")).examine(
+    found = Observer(thesis.with_overrides(values, source="wrong on purpose")).examine(
         made.recording.only(PRESSURES), [], P
     )
     assert found.verdict == "leak", found.reason
@@ -345,4 +347,4 @@ def test_a_stream_refuses_gaps(thesis: Rig) -> None:
 def test_start_parameters_follow_the_rig(thesis: Rig) -> None:
     number = PARAMETERS.index("volume_slope")
     assert start_parameters(thesis)[0][number] == 0.0
-    assert start_parameters(thesis.with_values({"cylinder.volumes": "position"}))[0][number] == 1.0
+    assert start_parameters(thesis.with_overrides({"cylinder.volumes": "position"}))[0][number] == 1.0

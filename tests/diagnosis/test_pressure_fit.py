@@ -40,7 +40,7 @@ def thesis() -> Rig:
 
 def truth_of(rig: Rig) -> np.ndarray:
     """The parameters (12,) of the machine of `recorded`, where nothing else is said."""
-    theta = nominal(rig.with_values({"fluid.p_charge": P_CHARGE}))
+    theta = nominal(rig.with_overrides({"fluid.p_charge": P_CHARGE}))
     theta[G] = G_PUMP
     return theta
 

@@ -58,7 +58,7 @@ def followed(rig: Rig, recording: Recording) -> Followed:
 
 def truth_of(rig: Rig) -> np.ndarray:
     """The parameters (12,) of the machine of `recorded`, where nothing else is said."""
-    theta = nominal(rig.with_values({"fluid.p_charge": P_CHARGE}))
+    theta = nominal(rig.with_overrides({"fluid.p_charge": P_CHARGE}))
     theta[G] = G_PUMP
     return theta
 
@@ -218,7 +218,7 @@ def test_ten_per_cent_of_wrong_knowledge_costs_little(
 ) -> None:
     """At most a factor 2 in the leak that is found, so at most 2 in the score."""
     right = detector.examine(worn, [], P)
-    told = thesis.with_values({name: factor * float(thesis[name]) for name in names}, source="wrong on purpose")
+    told = thesis.with_overrides({name: factor * float(thesis[name]) for name in names}, source="wrong on purpose")
     found = PressureModel(told).examine(worn, [], P)
     assert found.verdict == "leak", found.reason
     assert found.score > 0.5 * right.score

@@ -33,7 +33,7 @@ def test_asked_once_for_a_recording_a_detector_and_a_rig() -> None:
         _recording(),
         _recording(),
         load_rig("thesis"),
-        load_rig("thesis").with_values({"pump.q_b": 5e-6}),
+        load_rig("thesis").with_overrides({"pump.q_b": 5e-6}),
     )
     assert [remembered(first, ("one", rig), find) for _ in range(3)] == [1, 1, 1]
     assert remembered(second, ("one", rig), find) == 2

@@ -53,7 +53,7 @@ def test_the_call_of_the_readme() -> None:
         leak="0.0042 L/min from 90 s",
         duration=180,
         seed=1,
-        values={"orifices": "present", "closed_A": 0.5, "closed_B": 0.5},
+        set={"orifices": "present", "closed_A": 0.5, "closed_B": 0.5},
     )
     found = diagnose(recording)
     assert found.verdict == "leak"

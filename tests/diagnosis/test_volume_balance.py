@@ -117,7 +117,7 @@ def test_no_sign_convention_is_assumed(detector: VolumeBalance, worn: Recording,
 @pytest.mark.parametrize("K, A, q_b", [(1.1, 1.0, 1.0), (0.9, 0.9, 1.0), (1.1, 1.1, 0.97), (1.0, 1.0, 1.1)])
 def test_wrong_knowledge_costs_nothing_but_the_scale(K: float, A: float, q_b: float, worn: Recording) -> None:
     rig = load_rig("thesis")
-    wrong = rig.with_values(
+    wrong = rig.with_overrides(
         {
             "K_oil": K * rig.fluid.K_oil,
             "A_A": A * rig.cylinder.A_A,
@@ -133,7 +133,7 @@ def test_wrong_knowledge_costs_nothing_but_the_scale(K: float, A: float, q_b: fl
 
 
 def test_another_geometry_is_told_and_the_leak_found(worn: Recording) -> None:
-    rig = load_rig("thesis").with_values({"q_b": 1.4 * 4.9e-6})
+    rig = load_rig("thesis").with_overrides({"q_b": 1.4 * 4.9e-6})
     found = VolumeBalance(rig).examine(worn, [], P)
     assert found.verdict == "leak"
     assert found.leak_lpm is None

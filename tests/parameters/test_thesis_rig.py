@@ -154,7 +154,7 @@ def test_nomenclature_names_every_parameter() -> None:
 
 
 def test_rig_survives_json_and_pickle() -> None:
-    rig = load_rig("thesis").with_values({"V_1": "50[cm^3]"}, source="sweep")
+    rig = load_rig("thesis").with_overrides({"V_1": "50[cm^3]"}, source="sweep")
     again = type(rig).from_dict(json.loads(json.dumps(rig.as_dict())), place="log.nc")
     assert again == rig
     assert again.entry("V_1").source == "sweep"
@@ -166,7 +166,7 @@ def test_rig_survives_json_and_pickle() -> None:
 def test_loading_does_not_import_what_is_heavy() -> None:
     code = (
         "import sys, sealscope.parameters as p; assert 'pydantic' not in sys.modules;"
-        "p.load_rig('thesis').with_values({'R_c': '0.8[ohm]', 'p_A.noise': '1 psi', 'omega_per_volt': '90 rpm/V'});"
+        "p.load_rig('thesis').with_overrides({'R_c': '0.8[ohm]', 'p_A.noise': '1 psi', 'omega_per_volt': '90 rpm/V'});"
         "heavy = {'pint', 'scipy', 'numba', 'xarray', 'pywt'} & set(sys.modules); assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

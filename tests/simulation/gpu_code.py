@@ -24,7 +24,7 @@ from numba.cuda.cudadrv import nvvm
 from sealscope.simulation.batch import gpu as batch_gpu
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.bench.machines import draw
-from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.experiment import Experiment
 
 KERNELS = ("_advance_rk4", "_advance_imex", "_sense", "_move", "_clear")
 SPECIAL = {"tid": "THREAD", "ctaid": "BLOCK", "ntid": "THREADS"}
@@ -155,11 +155,11 @@ def take_over() -> None:
 
 def many(throttles: str, count: int) -> list[Experiment]:
     """More runs than a warp has threads, of five rigs."""
-    first = make_experiment(values={"line.orifices": throttles})
-    rigs = [first.rig.with_values({"friction.F_v": 300.0 + k}) for k in range(5)]
+    first = Experiment.of(set={"line.orifices": throttles})
+    rigs = [first.rig.with_overrides({"friction.F_v": 300.0 + k}) for k in range(5)]
     words = [f"{2 + 0.01 * k} sin(4t)" for k in range(count)]
     return [
-        make_experiment(rig=rigs[k % 5], command=words[k], leak="C = 2e-11 from 3 s", duration=6.0, seed=k)
+        Experiment.of(rig=rigs[k % 5], command=words[k], leak="C = 2e-11 from 3 s", duration=6.0, seed=k)
         for k in range(count)
     ]
 
@@ -189,7 +189,7 @@ def main() -> None:
     others = {
         "70 free": many("absent", 70),
         "40 throttled": many("present", 40),
-        "air": [make_experiment(values=air, duration=2.0, seed=k) for k in range(2)],
+        "air": [Experiment.of(set=air, duration=2.0, seed=k) for k in range(2)],
         "drifting": drifting(),
     }
     for name, runs in others.items():

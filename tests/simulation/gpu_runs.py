@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sealscope.simulation.batch.batch import Batch, simulate_batch
-from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.experiment import Experiment
 
 
 def free() -> list[Experiment]:
@@ -20,8 +20,8 @@ def free() -> list[Experiment]:
     values = {"sensors.p_A.hum": 2e3, "sensors.p_A.drift": 50.0, "sensors.p_B.gain_error": 0.01}
     late = ({}, {"sensors.p_B.delay": "0.7 [ms]"}, {})
     return [
-        make_experiment(
-            values={**values, **late[k], "friction.F_v": 280.0 + 20.0 * k},
+        Experiment.of(
+            set={**values, **late[k], "friction.F_v": 280.0 + 20.0 * k},
             command=f"{2 + 0.2 * k} sin(4t) + 0.05", leak=leak, duration=0.7, seed=k, step=1e-3,
         )
         for k, leak in enumerate(leaks)
@@ -37,14 +37,14 @@ def throttled() -> list[Experiment]:
         "fluid.p_charge": "1 [MPa]",
     }
     return [
-        make_experiment(values=values, command="3 sin(4t)", fault=fault, duration=0.6, seed=k, step=1e-3)
+        Experiment.of(set=values, command="3 sin(4t)", fault=fault, duration=0.6, seed=k, step=1e-3)
         for k, fault in enumerate([None, "friction x1.5 from 0.305 s"])
     ]
 
 
 def sized() -> list[Experiment]:
     """A leak that is found from its mean flow."""
-    return [make_experiment(command="3 sin(4t)", leak="0.05 L/min from 0.1 s", duration=0.3, step=1e-3)]
+    return [Experiment.of(command="3 sin(4t)", leak="0.05 L/min from 0.1 s", duration=0.3, step=1e-3)]
 
 
 def batches(device: str) -> Iterator[tuple[str, Batch]]:

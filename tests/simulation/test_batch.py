@@ -16,8 +16,8 @@ from sealscope.signals.details import details
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.batch.noise import half_turn_sine, keys, logarithm, normals
 from sealscope.simulation.bench.machines import draw
-from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.simulate import run
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 QUIET = {f"sensors.{channel}.{what}": 0.0 for channel in ("p_A", "p_B") for what in ("noise", "drift")}
 QUIET["sensors.common_noise"] = 0.0
@@ -44,7 +44,7 @@ def test_each_run_is_what_it_is_by_itself(check_rig, throttled, volumes):
     leaks = [None, "G = 6e-13 from 4 s", "C = 2e-10 from 3 s", "G = 1e-12 growing from 2 s to 9 s", "G = 6e-13"]
     bounds = [0.0, 2.5, 4.0, 10.0]
     experiments = [
-        make_experiment(
+        Experiment.of(
             rig=check_rig(throttled, volumes=volumes, p_charge="0.5[MPa]", F_v=280.0 + 20.0 * k, **QUIET),
             command=f"{2 + 0.2 * k} sin(4t {'+ 0.2' if k % 2 else ''}) + 0.05",
             leak=leak,
@@ -56,23 +56,23 @@ def test_each_run_is_what_it_is_by_itself(check_rig, throttled, volumes):
     ]
     batch = simulate_batch(experiments, bounds=bounds)
     for k, one in enumerate(experiments):
-        alone = run(one)
+        alone = simulate_with_truth(one)
         np.testing.assert_allclose(batch.rms[k], rms_of(alone.recording, bounds), rtol=1e-6)
         assert batch.mean_leak_lpm[k] == pytest.approx(alone.truth.mean_leak_lpm, rel=1e-4, abs=1e-12)
     assert np.all(batch.steps == 5e-4)
     # the anti-alias filter, gain, offset, hum and saturation too
     values = {"sensors.p_A.gain_error": 0.01, "sensors.p_A.offset": 4000.0, "sensors.p_B.range_hi": 4.9e5}
-    seen = replace(experiments[1], rig=experiments[1].rig.with_values(values))
+    seen = replace(experiments[1], rig=experiments[1].rig.with_overrides(values))
     changed = simulate_batch([seen], bounds=bounds)
-    np.testing.assert_allclose(changed.rms[0], rms_of(run(seen).recording, bounds), rtol=1e-6)
+    np.testing.assert_allclose(changed.rms[0], rms_of(simulate_with_truth(seen).recording, bounds), rtol=1e-6)
     assert np.abs(changed.rms[0] / batch.rms[1] - 1.0).max() > 1e-3
 
 
 def test_hum_is_read_as_by_itself_up_to_its_phase(check_rig):
     values = {**FINE, "sensors.p_A.hum": 1e5, "sensors.p_A.hum_frequency": 50.0}
-    one = make_experiment(rig=check_rig(**values), command="0 sin(t)", duration=8.0)
+    one = Experiment.of(rig=check_rig(**values), command="0 sin(t)", duration=8.0)
     batch = simulate_batch([one], bounds=[0.0, 8.0])
-    np.testing.assert_allclose(batch.rms[0, 0], rms_of(run(one).recording, [0.0, 8.0])[0], rtol=2e-3)
+    np.testing.assert_allclose(batch.rms[0, 0], rms_of(simulate_with_truth(one).recording, [0.0, 8.0])[0], rtol=2e-3)
     assert batch.rms[0, 0, 0, 2] > 1e4
 
 
@@ -80,29 +80,29 @@ def test_other_commands_and_drifting_machines_are_what_they_are_by_themselves():
     for seed in (3, 4):
         machine = draw("bench", seed, duration=12.0)
         one = machine.experiment(duration=12.0)
-        one = replace(one, rig=one.rig.with_values(FINE), step=5e-4 if one.rig.line.orifices == "absent" else 1e-3)
+        one = replace(one, rig=one.rig.with_overrides(FINE), step=5e-4 if one.rig.line.orifices == "absent" else 1e-3)
         assert one.drifts
         bounds = [0.0, 6.0, 12.0]
         # drifts are held over other cells than in a run by itself, and the ringing answers to friction's last per cent
         np.testing.assert_allclose(
-            simulate_batch([one], bounds=bounds).rms[0], rms_of(run(one).recording, bounds), rtol=3e-2
+            simulate_batch([one], bounds=bounds).rms[0], rms_of(simulate_with_truth(one).recording, bounds), rtol=3e-2
         )
-    noisy = make_experiment(command="prbs 1 every 0.5 s seed 4", values=QUIET, duration=8.0, step=5e-4)
+    noisy = Experiment.of(command="prbs 1 every 0.5 s seed 4", set=QUIET, duration=8.0, step=5e-4)
     found = simulate_batch([noisy], bounds=[0.0, 8.0]).rms[0]
-    np.testing.assert_allclose(found, rms_of(run(noisy).recording, [0.0, 8.0]), rtol=1e-6)
+    np.testing.assert_allclose(found, rms_of(simulate_with_truth(noisy).recording, [0.0, 8.0]), rtol=1e-6)
 
 
 def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself():
-    one = make_experiment(fault="friction x1.5 from 5.13 s", values=QUIET, duration=10.0, step=5e-4)
+    one = Experiment.of(fault="friction x1.5 from 5.13 s", set=QUIET, duration=10.0, step=5e-4)
     bounds = [0.0, 5.0, 10.0]
     found = simulate_batch([one], bounds=bounds).rms[0]
-    np.testing.assert_allclose(found, rms_of(run(one).recording, bounds), rtol=1e-6)
+    np.testing.assert_allclose(found, rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-6)
     assert np.abs(found[0, 1] / found[0, 0] - 1.0).max() > 0.05
 
 
 def test_neither_order_nor_number_nor_threads_change_a_run(check_rig):
     experiments = [
-        make_experiment(
+        Experiment.of(
             rig=check_rig(k % 3 == 0), command=f"{2 + k % 2} sin({3 + k % 2}t)", duration=6.0, seed=k, step=1e-3
         )
         for k in range(11)
@@ -118,19 +118,19 @@ def test_neither_order_nor_number_nor_threads_change_a_run(check_rig):
 
 def test_a_leak_of_a_stated_mean_has_it(check_rig):
     experiments = [
-        make_experiment(rig=check_rig(), command="3 sin(4t)", leak=f"{mean} L/min {law} from 3 s", duration=8.0, seed=k)
+        Experiment.of(rig=check_rig(), command="3 sin(4t)", leak=f"{mean} L/min {law} from 3 s", duration=8.0, seed=k)
         for k, (mean, law) in enumerate([(0.0042, "laminar"), (0.01, "orifice"), (0.05, "laminar")])
     ]
     batch = simulate_batch(experiments)
     np.testing.assert_allclose(batch.mean_leak_lpm, [0.0042, 0.01, 0.05], rtol=2e-3)
-    alone = run(experiments[1]).truth
+    alone = simulate_with_truth(experiments[1]).truth
     assert batch.coefficients[1] == pytest.approx(alone.leaks[0].coefficient, rel=3e-3)
     with pytest.raises(SimulationFailed, match="to resolve the leak of run 0"):
-        simulate_batch([make_experiment(leak="1.5 L/min", command="1 sin(4t)", duration=2.0)])
+        simulate_batch([Experiment.of(leak="1.5 L/min", command="1 sin(4t)", duration=2.0)])
 
 
 def test_the_noise_is_white_and_of_the_stated_size(check_rig):
-    one = make_experiment(rig=check_rig(), command="0 sin(t)", duration=20.0, step=5e-4)
+    one = Experiment.of(rig=check_rig(), command="0 sin(t)", duration=20.0, step=5e-4)
     batch = simulate_batch([replace(one, seed=k) for k in range(64)], bounds=[0.0, 20.0])
     sensors = one.rig.sensors
     for channel, name in enumerate(NAMES):
@@ -184,7 +184,7 @@ def test_the_elementary_functions_of_the_noise():
 
 def test_memory_does_not_grow_with_the_length_of_the_runs(check_rig):
     def peak(duration: float) -> float:
-        experiments = [make_experiment(rig=check_rig(), duration=duration, seed=k, step=1e-3) for k in range(16)]
+        experiments = [Experiment.of(rig=check_rig(), duration=duration, seed=k, step=1e-3) for k in range(16)]
         tracemalloc.start()
         simulate_batch(experiments, threads=1)
         found = tracemalloc.get_traced_memory()[1]
@@ -196,9 +196,9 @@ def test_memory_does_not_grow_with_the_length_of_the_runs(check_rig):
 
 
 def test_the_changes_are_those_of_the_thesis_s_statistic(check_rig):
-    one = make_experiment(rig=check_rig(**QUIET), leak="G = 3e-12 from 10 s", duration=20.0, step=5e-4)
+    one = Experiment.of(rig=check_rig(**QUIET), leak="G = 3e-12 from 10 s", duration=20.0, step=5e-4)
     batch = simulate_batch([one])
-    expected = rms_of(run(one).recording, [0.0, 10.0, 20.0])
+    expected = rms_of(simulate_with_truth(one).recording, [0.0, 10.0, 20.0])
     np.testing.assert_allclose(batch.changes()[0], 100.0 * (expected[:, 1] / expected[:, 0] - 1.0), atol=1e-3)
     assert batch.changes()[0, 0, 2] < -5.0  # d3 falls
 
@@ -208,14 +208,14 @@ def test_the_changes_are_those_of_the_thesis_s_statistic(check_rig):
     [
         ({"leak": ["G = 1e-13", "C = 1e-11"]}, r"at most one leak, got 2 \(run 1\)"),
         ({"fault": "sensor p_A offset -2 psi from 2 s"}, r"no fault of a sensor, got .* \(run 1\)"),
-        ({"values": {"sensors.p_B.drop_rate": 0.1}}, r"sensors\.p_B\.drop_rate = 0, got 0\.1 \(run 1\)"),
-        ({"values": {"motor.integrator": "euler"}}, r"motor\.integrator = state, got euler \(run 1\)"),
+        ({"set": {"sensors.p_B.drop_rate": 0.1}}, r"sensors\.p_B\.drop_rate = 0, got 0\.1 \(run 1\)"),
+        ({"set": {"motor.integrator": "euler"}}, r"motor\.integrator = state, got euler \(run 1\)"),
         ({"duration": 5.0}, r"one duration, got 4 and 5 \(run 1\)"),
     ],
 )
 def test_a_run_that_cannot_be_side_by_side_is_refused(values, rule):
     with pytest.raises(InputError, match=rule):
-        simulate_batch([make_experiment(duration=4.0), make_experiment(**{"duration": 4.0, **values})])
+        simulate_batch([Experiment.of(duration=4.0), Experiment.of(**{"duration": 4.0, **values})])
 
 
 def test_bad_calls_and_bad_runs_are_refused(check_rig):
@@ -223,20 +223,20 @@ def test_bad_calls_and_bad_runs_are_refused(check_rig):
         simulate_batch([])
     for bounds in ([0.0], [1.0, 1.0], [0.0, 9.0], [-1.0, 2.0]):
         with pytest.raises(InputError, match=r"bounds must rise within 0 \.\. 4 s"):
-            simulate_batch([make_experiment(duration=4.0)], bounds=bounds)
-    good = make_experiment(rig=check_rig(), duration=4.0, step=1e-3)
+            simulate_batch([Experiment.of(duration=4.0)], bounds=bounds)
+    good = Experiment.of(rig=check_rig(), duration=4.0, step=1e-3)
     with pytest.raises(SimulationFailed, match=r"pressures of run 1 must stay above vacuum"):
-        simulate_batch([good, replace(good, command=make_experiment(command="9 sin(4t)").command, x_0=0.29)])
+        simulate_batch([good, replace(good, command=Experiment.of(command="9 sin(4t)").command, x_0=0.29)])
     with pytest.raises(SimulationFailed, match=r"step must be <= .* to resolve"):
         simulate_batch([replace(good, step=1 / 500)])
 
 
 def test_late_channels_are_read_late(check_rig):
     values = {**QUIET, "sensors.p_A.delay": "0.7 [ms]", "sensors.p_B.delay": "3 [ms]"}
-    one = make_experiment(rig=check_rig(**values), duration=6.0, step=5e-4)
-    prompt = make_experiment(rig=check_rig(**QUIET), duration=6.0, step=5e-4)
+    one = Experiment.of(rig=check_rig(**values), duration=6.0, step=5e-4)
+    prompt = Experiment.of(rig=check_rig(**QUIET), duration=6.0, step=5e-4)
     bounds = [0.0, 1.01, 3.0, 6.0]
     batch = simulate_batch([one, prompt], bounds=bounds)
-    np.testing.assert_allclose(batch.rms[0], rms_of(run(one).recording, bounds), rtol=1e-6)
-    np.testing.assert_allclose(batch.rms[1], rms_of(run(prompt).recording, bounds), rtol=1e-6)
+    np.testing.assert_allclose(batch.rms[0], rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-6)
+    np.testing.assert_allclose(batch.rms[1], rms_of(simulate_with_truth(prompt).recording, bounds), rtol=1e-6)
     assert np.abs(batch.rms[0] / batch.rms[1] - 1.0).max() > 1e-5

@@ -15,10 +15,10 @@ QUIET["sensors.common_noise"] = 0.0
 
 def test_a_batch_of_words_is_what_each_recording_is():
     words = [
-        {"command": "3 sin(4t)", "duration": 8.0, "values": QUIET, "step": 5e-4, "leak": leak}
+        {"command": "3 sin(4t)", "duration": 8.0, "set": QUIET, "step": 5e-4, "leak": leak}
         for leak in (None, "G = 3e-12 from 4 s")
     ]
-    batch = ss.simulate_batch([ss.make_experiment(**one) for one in words], bounds=[1.0, 3.5, 7.5])
+    batch = ss.simulate_batch([ss.Experiment.of(**one) for one in words], bounds=[1.0, 3.5, 7.5])
     for k, one in enumerate(words):
         found = details(ss.simulate(**one)["p_A"])
         for part, (start, stop) in enumerate([(500, 1750), (1750, 3750)]):
@@ -30,7 +30,7 @@ def test_a_batch_of_words_is_what_each_recording_is():
 
 
 def test_seeds_are_noise_and_nothing_else():
-    made = [ss.make_experiment(duration=4.0, seed=seed, leak="0.05 L/min from 1 s") for seed in range(3)]
+    made = [ss.Experiment.of(duration=4.0, seed=seed, leak="0.05 L/min from 1 s") for seed in range(3)]
     batch = ss.simulate_batch(made)
     assert np.ptp(batch.mean_leak_lpm) == 0.0
     assert np.unique(batch.rms[:, 0, 0, 0]).size == 3

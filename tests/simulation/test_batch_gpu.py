@@ -23,7 +23,7 @@ from sealscope.physics.rig import rig_numbers
 from sealscope.physics.vector.fixed import FIXED, left_to_table, pair, settled, taken
 from sealscope.physics.vector.runs import CHOICES, LANE_FIELDS
 from sealscope.simulation.batch.batch import runner_of, simulate_batch
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 
 from . import gpu_runs
 
@@ -73,14 +73,14 @@ numba.cuda.dispatcher.get_current_device = lambda: SimpleNamespace(compute_capab
 from sealscope.physics.vector.fixed import left_to_table
 from sealscope.physics.rig import rig_numbers
 from sealscope.simulation.batch import gpu as batch_gpu
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 
 
 def rows(axes, kind=types.float64):
     return types.Array(kind, axes, "C")
 
 def advance(values, own):
-    numbers = numba.typeof(left_to_table(rig_numbers(make_experiment(values=values).rig), own, choices=True))
+    numbers = numba.typeof(left_to_table(rig_numbers(Experiment.of(set=values).rig), own, choices=True))
     return (rows(3), types.float64, types.int64, rows(1), rows(2), rows(3), rows(3), rows(4), rows(1, types.int64),
             numbers, types.int64, rows(4), types.int64, rows(3))
 
@@ -162,14 +162,14 @@ def test_a_gpu_finds_what_the_processor_finds():
         pytest.skip("no GPU here: the kernels cannot run")
     for (name, found), (_, expected) in zip(gpu_runs.batches("gpu"), gpu_runs.batches("cpu"), strict=True):
         assert_same(found, expected, 1e-6), name
-    one = make_experiment(command="3 sin(4t)", duration=20.0, seed=7)
-    many = [make_experiment(command=f"{2 + k % 7 / 7} sin(4t)", duration=20.0, seed=k, step=1e-3) for k in range(100)]
+    one = Experiment.of(command="3 sin(4t)", duration=20.0, seed=7)
+    many = [Experiment.of(command=f"{2 + k % 7 / 7} sin(4t)", duration=20.0, seed=k, step=1e-3) for k in range(100)]
     assert_same(simulate_batch([one, *many], device="gpu"), simulate_batch([one, *many]), 1e-6)
 
 
 def test_what_is_missing_for_a_gpu_is_said(monkeypatch):
     with pytest.raises(InputError, match="device must be one of cpu, gpu, got 'tpu'"):
-        simulate_batch([make_experiment(duration=2.0)], device="tpu")
+        simulate_batch([Experiment.of(duration=2.0)], device="tpu")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"needs numba-cuda, which is not installed: pip install 'sealscope\[gpu\]'"):
         runner_of("gpu")

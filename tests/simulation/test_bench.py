@@ -15,8 +15,8 @@ from sealscope.simulation.bench.machines import centred_start, draw
 from sealscope.simulation.bench.profile import Profile, load_profile
 from sealscope.simulation.changes.drifts import RESOLUTION
 from sealscope.simulation.changes.rig import LONGEST_BLOCK, Schedule
-from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.simulate import run
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 PSI = 6894.757293168361
 
@@ -48,7 +48,7 @@ def machines(bench):
     ],
 )
 def test_what_differs_between_machines_fills_its_range_evenly(machines, name, low, high):
-    drawn = (np.array([machine.values[name] for machine in machines]) - low) / (high - low)
+    drawn = (np.array([machine.overrides[name] for machine in machines]) - low) / (high - low)
     assert drawn.min() >= -1e-12
     assert drawn.max() <= 1 + 1e-12
     counts, _ = np.histogram(drawn, 5, (0, 1))
@@ -58,15 +58,15 @@ def test_what_differs_between_machines_fills_its_range_evenly(machines, name, lo
 
 def test_what_does_not_differ_is_the_same_on_every_machine(machines):
     for machine in machines[:20]:
-        assert machine.values["daq.bits"] == 14
-        assert machine.values["sensors.x.resolution"] == pytest.approx(20e-6)
-        assert machine.values["sensors.theta.counts"] == 20_000
-        assert machine.values["sensors.common_noise"] == 0.0
+        assert machine.overrides["daq.bits"] == 14
+        assert machine.overrides["sensors.x.resolution"] == pytest.approx(20e-6)
+        assert machine.overrides["sensors.theta.counts"] == 20_000
+        assert machine.overrides["sensors.common_noise"] == 0.0
 
 
 def test_friction_differs_and_drifts_as_one(machines):
     rig, names = load_rig(), ("friction.F_pr", "friction.F_cfr", "friction.F_v")
-    factors = np.array([[m.values[name] / rig[name] for name in names] for m in machines])
+    factors = np.array([[m.overrides[name] / rig[name] for name in names] for m in machines])
     np.testing.assert_allclose(factors, np.broadcast_to(factors[:, :1], factors.shape), rtol=1e-12)
     assert factors.min() >= 0.9 - 1e-12
     assert factors.max() <= 1.1 + 1e-12
@@ -128,10 +128,12 @@ def test_a_drift_of_the_bench_moves_less_than_its_resolution_from_block_to_block
 def test_the_same_seed_is_the_same_machine_and_the_same_bytes(bench):
     assert draw(bench, 7) == draw("bench", 7)
     assert draw(bench, 7) != draw(bench, 8)
-    one, again = (run(draw("bench", 7, duration=4.0).experiment(leak="G = 6e-13 from 2 s")) for _ in range(2))
+    one, again = (
+        simulate_with_truth(draw("bench", 7, duration=4.0).experiment(leak="G = 6e-13 from 2 s")) for _ in range(2)
+    )
     for name in one.recording.channels:
         assert one.recording[name].tobytes() == again.recording[name].tobytes()
-    other = run(draw("bench", 8, duration=4.0).experiment()).recording
+    other = simulate_with_truth(draw("bench", 8, duration=4.0).experiment()).recording
     assert not np.array_equal(one.recording["p_A"], other["p_A"])
     assert "drift" not in str(dict(one.recording.provenance)["experiment"]).replace(".drift", "")
     assert len(one.truth.drifts) == len(draw("bench", 7).drifts)
@@ -140,17 +142,17 @@ def test_the_same_seed_is_the_same_machine_and_the_same_bytes(bench):
 def test_one_nuisance_less_leaves_the_others_as_they_were(bench):
     fewer = replace(bench, nuisances=tuple(n for n in bench.nuisances if n.name not in ("bulk modulus", "bias")))
     whole, part = draw(bench, 5), draw(fewer, 5)
-    assert "fluid.K_oil" not in part.values
-    assert all(whole.values[name] == value for name, value in part.values.items())
+    assert "fluid.K_oil" not in part.overrides
+    assert all(whole.overrides[name] == value for name, value in part.overrides.items())
     assert set(part.drifts) < set(whole.drifts)
     assert (part.command, part.closed) == (whole.command, whole.closed)
 
 
 def test_a_machine_applies_to_another_rig_and_duty():
-    rig = load_rig().with_values({"F_v": "400[N s/m]"})
+    rig = load_rig().with_overrides({"F_v": "400[N s/m]"})
     built = draw("bench", 3, rig=rig, duration=2.0).experiment(command="2 sin(3t)", seed=99)
-    assert built.rig["F_v"] == pytest.approx(draw("bench", 3).values["friction.F_v"] * 400.0 / 300.0)
-    assert built.rig["fluid.K_oil"] == draw("bench", 3).values["fluid.K_oil"]
+    assert built.rig["F_v"] == pytest.approx(draw("bench", 3).overrides["friction.F_v"] * 400.0 / 300.0)
+    assert built.rig["fluid.K_oil"] == draw("bench", 3).overrides["fluid.K_oil"]
     assert str(built.command) == "2 sin(3t)"
     assert built.seed == 99
     assert built.rig.entry("K_oil").source == "drawn from profile bench, seed 3"
@@ -158,10 +160,10 @@ def test_a_machine_applies_to_another_rig_and_duty():
 
 @pytest.mark.parametrize("command", ["8 sin(t)", "5 sin(2t)", "ramp 3 from 1 s to 2 s"])
 def test_strokes_lie_about_the_middle(command):
-    rig = load_rig().with_values({"omega_per_volt": 26.7})
+    rig = load_rig().with_overrides({"omega_per_volt": 26.7})
     duration = 6.0 if "ramp" in command else 40.0
     x_0 = centred_start(rig, command, duration)
-    x = run(make_experiment(rig=rig, command=command, duration=duration, x_0=x_0)).truth.outputs["x"]
+    x = simulate_with_truth(Experiment.of(rig=rig, command=command, duration=duration, x_0=x_0)).truth.outputs["x"]
     assert abs(x.max() + x.min()) < 0.02 * np.ptp(x) + 1e-3
     assert np.ptp(x) > 0.05
 
@@ -195,7 +197,7 @@ def write(tmp_path: Path, text: str) -> Path:
 
 def test_a_profile_of_one_s_own(tmp_path):
     machine = draw(load_profile(write(tmp_path, SMALL)), 1, duration=30.0)
-    assert 6e8 <= machine.values["fluid.K_oil"] <= 7e8
+    assert 6e8 <= machine.overrides["fluid.K_oil"] <= 7e8
     assert machine.closed == 0.5
     assert 1.0 <= machine.command.amplitude <= 2.0
     assert [drift.parameter for drift in machine.drifts] == ["fluid.K_oil"]

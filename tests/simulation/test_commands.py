@@ -20,8 +20,8 @@ from sealscope.simulation.commands import (
     parse_command,
     recorded_command,
 )
-from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.simulate import run, simulate
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate, simulate_with_truth
 
 number = st.floats(-1e6, 1e6, allow_subnormal=False)
 positive = st.floats(1e-6, 1e6)
@@ -117,8 +117,8 @@ def test_a_command_beyond_the_converter_is_refused_with_value_and_time():
     with pytest.raises(
         InputError, match=r"command must stay within \+-10 V, got 10\.\d+ V at t = .* s \(10\.5 sin\(4t\)\)"
     ):
-        make_experiment(command="10.5 sin(4t)", duration=5.0)
-    make_experiment(command="10 sin(4t)", duration=5.0)
+        Experiment.of(command="10.5 sin(4t)", duration=5.0)
+    Experiment.of(command="10 sin(4t)", duration=5.0)
     for bad in (Step(float("nan")), Step(float("inf"))):
         with pytest.raises(InputError):
             check_command(bad, np.array([0.0, 1.0]), 10.0)
@@ -127,7 +127,7 @@ def test_a_command_beyond_the_converter_is_refused_with_value_and_time():
 def test_a_command_beyond_the_converter_between_samples_is_refused_too():
     # 12 V at 500 Hz, sampled at 500 Hz: zero at every sample
     with pytest.raises(InputError, match=r"within \+-10 V, got -?12 V"):
-        run(make_experiment(command=Sine(12.0, 1000.0 * np.pi), duration=1.0))
+        simulate_with_truth(Experiment.of(command=Sine(12.0, 1000.0 * np.pi), duration=1.0))
     # and what it would be after the end is nobody's business
     simulate(command="ramp 20 from 0 s to 2 s", duration=1.0)
 

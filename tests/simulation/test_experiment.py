@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,10 @@ import pytest
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.simulation.commands import Recorded, Sine
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.faults import Leak, Tabulated
 from sealscope.simulation.proof import prove
-from sealscope.simulation.simulate import run, trajectory
+from sealscope.simulation.simulate import simulate, simulate_with_truth, trajectory
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 
@@ -31,7 +32,7 @@ THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 )
 def test_an_impossible_experiment_is_refused(parts, rule):
     with pytest.raises(InputError, match=rule):
-        make_experiment(**parts)
+        Experiment.of(**parts)
 
 
 def test_the_key_tells_experiments_apart_to_the_last_digit():
@@ -44,41 +45,41 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
     bent[2500] += 1e-9
     common = {"duration": 2.0}
     experiments = [
-        make_experiment(**common),
-        make_experiment(**common, command=Sine(3.0, 4.0 + 1e-9)),
-        make_experiment(**common, command=Recorded(t, u, "log.csv")),
-        make_experiment(**common, command=Recorded(t, nudged, "log.csv")),
-        make_experiment(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, opening))),
-        make_experiment(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, bent))),
-        make_experiment(**common, leak=["G = 1e-13", "C = 1e-10"]),
-        make_experiment(**common, seed=1),
-        make_experiment(**common, step=1e-4),
-        make_experiment(**common, error=1e-4),
-        make_experiment(**common, method="rk4"),
-        make_experiment(**common, allow_unresolved=True),
-        make_experiment(**common, values={"R_c": 0.73 + 1e-12}),
-        make_experiment(duration=2.0 + 1 / 500),
+        Experiment.of(**common),
+        Experiment.of(**common, command=Sine(3.0, 4.0 + 1e-9)),
+        Experiment.of(**common, command=Recorded(t, u, "log.csv")),
+        Experiment.of(**common, command=Recorded(t, nudged, "log.csv")),
+        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, opening))),
+        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, bent))),
+        Experiment.of(**common, leak=["G = 1e-13", "C = 1e-10"]),
+        Experiment.of(**common, seed=1),
+        Experiment.of(**common, step=1e-4),
+        Experiment.of(**common, error=1e-4),
+        Experiment.of(**common, method="rk4"),
+        Experiment.of(**common, allow_unresolved=True),
+        Experiment.of(**common, set={"R_c": 0.73 + 1e-12}),
+        Experiment.of(duration=2.0 + 1 / 500),
     ]
     keys = [one.key() for one in experiments]
     assert len(set(keys)) == len(keys)
-    assert make_experiment(**common).key() == keys[0]
-    assert make_experiment(**common, command=Recorded(t.copy(), u.copy(), "log.csv")).key() == keys[2]
+    assert Experiment.of(**common).key() == keys[0]
+    assert Experiment.of(**common, command=Recorded(t.copy(), u.copy(), "log.csv")).key() == keys[2]
 
 
 def test_a_run_is_told_in_its_provenance():
-    found = run(make_experiment(duration=1.0, values={"V": "200[cm^3]"}, seed=9)).recording
+    found = simulate_with_truth(Experiment.of(duration=1.0, set={"V": "200[cm^3]"}, seed=9)).recording
     told = found.provenance
     assert told["origin"] == "simulation"
     found_error = told["solver"].pop("error_found_pa")
     assert 0.0 < found_error < 100.0
     assert told["solver"] == {"method": "rk4", "step_s": 5e-4, "allow_unresolved": False, "error_pa": 100.0}
     assert told["experiment"]["seed"] == 9
-    assert "cylinder.V" in told["experiment"]["parameters_set"]
+    assert "cylinder.V" in told["experiment"]["overrides"]
 
 
 @pytest.mark.parametrize("values", [{}, THROTTLED], ids=["free", "throttled"])
 def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
-    experiment = make_experiment(duration=4.0, values=values)
+    experiment = Experiment.of(duration=4.0, set=values)
     converged = trajectory(replace(experiment, step=2e-5), ())
 
     def error(path):
@@ -91,23 +92,26 @@ def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
         steps.append(path.step)
         assert error(path) < (100.0 if allowed is None else allowed)
     assert steps[0] > steps[1] > steps[2]
-    told = run(replace(experiment, duration=1.0, error=3.0)).recording.provenance["solver"]
+    told = simulate_with_truth(replace(experiment, duration=1.0, error=3.0)).recording.provenance["solver"]
     assert told["error_pa"] == 3.0
     assert told["error_found_pa"] < 3.0
-    assert "error_pa" not in run(replace(experiment, duration=1.0, step=5e-4)).recording.provenance["solver"]
+    assert (
+        "error_pa"
+        not in simulate_with_truth(replace(experiment, duration=1.0, step=5e-4)).recording.provenance["solver"]
+    )
 
 
 def test_an_error_is_positive_and_stands_alone():
     for wrong in (0.0, -20.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="error must be > 0 Pa, got"):
-            run(make_experiment(duration=1.0, error=wrong))
+            simulate_with_truth(Experiment.of(duration=1.0, error=wrong))
     with pytest.raises(InputError, match=r"a stated step or a stated error, not both, got .* 0\.0005 s and error = 20"):
-        make_experiment(duration=1.0, error=20.0, step=5e-4)
+        Experiment.of(duration=1.0, error=20.0, step=5e-4)
 
 
 @pytest.mark.parametrize("values", [{}, THROTTLED], ids=["free", "throttled"])
 def test_the_default_step_proves_itself(values):
-    proof = prove(make_experiment(duration=20.0, leak="0.0042 L/min from 10 s", values=values))
+    proof = prove(Experiment.of(duration=20.0, leak="0.0042 L/min from 10 s", set=values))
     assert proof.resolved
     assert proof.halved == proof.step / 2
     names = [one.name for one in proof.differences]
@@ -118,24 +122,83 @@ def test_the_default_step_proves_itself(values):
 
 
 def test_an_under_resolved_run_is_refused_and_says_what_moved():
-    coarse = {"duration": 20.0, "step": 1.5e-3, "values": {"sample_rate": "400[Hz]"}}
+    coarse = {"duration": 20.0, "step": 1.5e-3, "set": {"sample_rate": "400[Hz]"}}
     with pytest.raises(SimulationFailed, match=r"under-resolved: halving the step of 0\.00125 s \(rk4\) moves "):
-        prove(make_experiment(**coarse))
-    proof = prove(make_experiment(**coarse, allow_unresolved=True))
+        prove(Experiment.of(**coarse))
+    proof = prove(Experiment.of(**coarse, allow_unresolved=True))
     assert not proof.resolved
     assert not proof.worst().resolved
 
 
 def test_a_chattering_run_cannot_prove_itself():
-    experiment = make_experiment(duration=5.0, values=THROTTLED, method="rk4", step=1e-4, allow_unresolved=True)
+    experiment = Experiment.of(duration=5.0, set=THROTTLED, method="rk4", step=1e-4, allow_unresolved=True)
     assert not prove(experiment).resolved
 
 
 def test_progress_is_told_from_nothing_to_all():
     told: list[tuple[str, float]] = []
-    run(make_experiment(duration=10.0, leak="0.01 L/min"), progress=lambda words, share: told.append((words, share)))
+    simulate_with_truth(
+        Experiment.of(duration=10.0, leak="0.01 L/min"), progress=lambda words, share: told.append((words, share))
+    )
     assert {words for words, _ in told} == {"sizing the leak", "simulating"}
     simulating = [share for words, share in told if words == "simulating"]
     assert simulating == sorted(simulating)
     assert simulating[-1] == 1.0
     assert all(0.0 <= share <= 1.0 for _, share in told)
+
+
+def test_a_text_means_what_the_number_means():
+    numbers = {"duration": 90.0, "rate": 250.0, "x_0": 0.01, "step": 5e-4, "leak": "0.0042 L/min from 90 s"}
+    texts = {
+        "duration": "1.5 min", "rate": "0.25[kHz]", "x_0": "10 mm", "step": "500[us]",
+        "leak": "0.0042[L/min] from 1.5 min",
+    }  # fmt: skip
+    one, other = Experiment.of(**numbers), Experiment.of(**texts)
+    assert (one.duration, one.rate, one.x_0, one.step) == (90.0, 250.0, 0.01, 5e-4)
+    assert one.key() == other.key()
+    assert Experiment.of(error="20[Pa]").error == Experiment.of(error="0.02 kPa").error == 20.0
+    growing = Experiment.of(leak="7e-8[m^3/s] orifice growing from 1[min] to 0.05[h]").leaks[0]
+    assert growing == Experiment.of(leak="0.0042 L/min orifice growing from 60 s to 180").leaks[0]
+    fault = "sensor p_A offset 2[psi] growing from 0.5 min to 1 min"
+    assert (
+        Experiment.of(fault=fault).faults
+        == Experiment.of(fault="sensor p_A offset 2 psi growing from 30 to 60 s").faults
+    )
+
+
+@pytest.mark.parametrize(
+    ("parts", "rule"),
+    [
+        ({"comand": "3 sin(4t)"}, r"Experiment\.of has no argument 'comand'; did you mean 'command'\?"),
+        ({"duration": None}, "duration must be a number with or without a unit, such as 2.s., got None"),
+        ({"duration": "20 psi"}, "duration must have a unit of time"),
+        ({"command": 3}, "command must be a text or a Command, got 3"),
+        ({"leak": 0.0042}, "leak must be a text, a Leak or several of them, got 0.0042"),
+        ({"fault": [3]}, "fault must be a text, a Fault or several of them, got 3"),
+        ({"set": "V_1=3"}, "set must map names of parameters to values, got 'V_1=3'"),
+        ({"seed": 1.5}, "seed must be a whole number, got 1.5"),
+        ({"rig": 5}, "rig must be a Rig, the name of a rig or a path, got 5"),
+        ({"leak": "1 L/min from 2 psi"}, "leak must be like"),
+        ({"leak": "1[psi]"}, "a leak must have a unit of volume flow"),
+    ],
+)
+def test_a_wrong_argument_is_refused_by_name(parts, rule):
+    with pytest.raises(InputError, match=rule):
+        Experiment.of(**parts)
+    if "comand" not in parts:
+        with pytest.raises(InputError, match=rule):
+            simulate(**parts)
+
+
+def test_simulate_names_itself():
+    with pytest.raises(InputError, match=r"simulate has no argument 'comand'; did you mean 'command'\?"):
+        simulate(comand="3 sin(4t)")
+    with pytest.raises(InputError, match="simulate: too many positional arguments"):
+        simulate("3 sin(4t)")
+    with pytest.raises(InputError, match="experiment must be an Experiment"):
+        simulate_with_truth("3 sin(4t)")
+
+
+def test_simulate_and_an_experiment_take_the_same_arguments():
+    ours, theirs = (dict(inspect.signature(function).parameters) for function in (simulate, Experiment.of))
+    assert ours == theirs

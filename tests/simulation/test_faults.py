@@ -10,13 +10,13 @@ import pytest
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.simulation.commands import Sine, Step
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.duty import DutyChange
 from sealscope.simulation.faults.faults import From, Growing, Tabulated
 from sealscope.simulation.faults.parse import parse_fault
 from sealscope.simulation.faults.rig import AirInOil, ExternalLeakage, FrictionChange, PumpLeakage
 from sealscope.simulation.faults.sensors import SensorGain, SensorOffset, SensorStuck
-from sealscope.simulation.simulate import run, write_truth
+from sealscope.simulation.simulate import simulate_with_truth, write_truth
 
 PSI = 6894.757293168361
 LPM = 1e-3 / 60
@@ -55,12 +55,12 @@ def test_faults_are_read_from_words_and_their_own_words_read_back(text, fault):
         assert type(one) is type(fault)
         assert str(one) == str(fault)
         assert one.onset() == fault.onset()
-    assert make_experiment(values=LEAKING_PUMP, duration=1.0, fault=found).faults[0].kind == fault.kind
+    assert Experiment.of(set=LEAKING_PUMP, duration=1.0, fault=found).faults[0].kind == fault.kind
 
 
 def test_no_fault_is_none():
     assert parse_fault("none") is None
-    assert make_experiment(fault=["none", "friction x2"], duration=1.0).faults == (FrictionChange(2.0),)
+    assert Experiment.of(fault=["none", "friction x2"], duration=1.0).faults == (FrictionChange(2.0),)
 
 
 @pytest.mark.parametrize(
@@ -91,17 +91,19 @@ def test_other_words_are_refused_in_one_line(text, rule):
 
 def test_a_fault_that_cannot_be_on_this_rig_is_refused():
     with pytest.raises(InputError, match=r"needs pump.G_pump > 0, got 0 \(pump leak x3 from 90 s\)"):
-        make_experiment(fault="pump leak x3 from 90 s")
+        Experiment.of(fault="pump leak x3 from 90 s")
     with pytest.raises(InputError, match=r"command must stay within \+-10 V, got -?1\d"):
-        make_experiment(fault="duty amplitude x2 from 90 s", command="7 sin(4t)")
+        Experiment.of(fault="duty amplitude x2 from 90 s", command="7 sin(4t)")
     with pytest.raises(InputError, match="got a table"):
         DutyChange(2.0, opening=Tabulated(np.array([0.0]), np.array([1.0])))
 
 
 def pair(fault: str, *, values: dict | None = None, duration: float = 8.0, **others):
     """The same experiment without and with a fault from half time on."""
-    common = {"duration": duration, "values": values or {}, **others}
-    return run(make_experiment(**common)), run(make_experiment(**common, fault=f"{fault} from {duration / 2:g} s"))
+    common = {"duration": duration, "set": values or {}, **others}
+    return simulate_with_truth(Experiment.of(**common)), simulate_with_truth(
+        Experiment.of(**common, fault=f"{fault} from {duration / 2:g} s")
+    )
 
 
 def halves(found) -> tuple[np.ndarray, np.ndarray]:
@@ -164,8 +166,8 @@ def test_a_rod_seal_loses_what_it_says():
 
 
 def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
-    common = {"duration": 4.0, "values": QUIET}
-    healthy = run(make_experiment(**common))
+    common = {"duration": 4.0, "set": QUIET}
+    healthy = simulate_with_truth(Experiment.of(**common))
     t = healthy.recording.t
     after = t >= 2.0
     for words, expected in (
@@ -175,7 +177,7 @@ def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
         ("sensor p_A stuck from 2 s", lambda p: np.where(after, p[1000], p)),
         ("sensor p_A stuck from 2 s to 3 s", lambda p: np.where(after & (t < 3.0), p[1000], p)),
     ):
-        faulty = run(make_experiment(**common, fault=words))
+        faulty = simulate_with_truth(Experiment.of(**common, fault=words))
         step = 3000 * PSI / 2**23
         np.testing.assert_allclose(
             faulty.recording["p_A"], expected(healthy.recording["p_A"]), atol=1.6 * step, err_msg=words
@@ -183,7 +185,9 @@ def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
         for name in ("p_1", "p_2", "p_B", "x", "q_leak"):
             np.testing.assert_array_equal(faulty.recording[name], healthy.recording[name])
         np.testing.assert_array_equal(faulty.truth.outputs["p_A"], healthy.truth.outputs["p_A"])
-    shifted = run(make_experiment(**common, fault=["sensor x offset 1 mm", "sensor q_leak offset 3 mL/min"])).recording
+    shifted = simulate_with_truth(
+        Experiment.of(**common, fault=["sensor x offset 1 mm", "sensor q_leak offset 3 mL/min"])
+    ).recording
     np.testing.assert_allclose(shifted["x"], healthy.recording["x"] + 1e-3, atol=21e-6)
     np.testing.assert_allclose(shifted["q_leak"], healthy.recording["q_leak"] + 5e-8, atol=2e-9)
 
@@ -199,14 +203,16 @@ def test_a_changed_duty_changes_size_and_pace_without_a_jump_in_phase():
     np.testing.assert_allclose(pace, 1.0 + np.clip((t - 5) / 5, 0, 1), atol=2e-3)
     assert np.abs(np.diff(gradual.volts(t))).max() < 6.5e-3
     assert Step(1.0).volts(t).shape == DutyChange(2.0).commanded(Step(1.0)).volts(t).shape
-    recorded = run(make_experiment(duration=4.0, fault="duty amplitude x1.5 frequency x0.5 from 2 s")).recording
+    recorded = simulate_with_truth(
+        Experiment.of(duration=4.0, fault="duty amplitude x1.5 frequency x0.5 from 2 s")
+    ).recording
     late = recorded.t >= 2.0
     np.testing.assert_allclose(recorded["u"][late], 4.5 * np.sin(8 + 2 * (recorded.t[late] - 2)), atol=1e-9)
 
 
 def test_the_truth_lists_the_faults_and_the_recording_does_not(tmp_path):
-    made = run(
-        make_experiment(
+    made = simulate_with_truth(
+        Experiment.of(
             duration=4.0,
             leak="G = 6e-13 from 3 s",
             fault=["friction x1.3 from 2 s", "sensor p_A stuck from 1 s"],
@@ -225,7 +231,7 @@ def test_the_truth_lists_the_faults_and_the_recording_does_not(tmp_path):
 
 
 def test_faults_tell_experiments_apart():
-    common = {"duration": 2.0, "values": LEAKING_PUMP}
+    common = {"duration": 2.0, "set": LEAKING_PUMP}
     faults = (None, "pump leak x3", "pump leak x3.0000001", "pump leak x3 from 1 s", ["pump leak x3", "friction x1.1"])
-    keys = {make_experiment(**common, fault=fault).key() for fault in faults}
+    keys = {Experiment.of(**common, fault=fault).key() for fault in faults}
     assert len(keys) == len(faults)

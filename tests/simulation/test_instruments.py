@@ -31,7 +31,7 @@ def still(n: int, pressure: float = 1e6, **outputs: np.ndarray) -> Trajectory:
 
 
 def read(n: int, values: dict | None = None, seed: int = 0, path: Trajectory | None = None):
-    return record(load_rig("thesis").with_values(values or {}), path or still(n), np.zeros(n), FACTOR, seed)
+    return record(load_rig("thesis").with_overrides(values or {}), path or still(n), np.zeros(n), FACTOR, seed)
 
 
 def rms(values: np.ndarray) -> float:

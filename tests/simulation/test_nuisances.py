@@ -14,10 +14,10 @@ from sealscope.parameters import load_rig
 from sealscope.physics.rig import rig_numbers
 from sealscope.simulation.changes.drifts import RESOLUTION, Drift, Linear, Table, Wander
 from sealscope.simulation.changes.rig import LONGEST_BLOCK, Effect, Schedule
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.rig import FrictionChange, PumpLeakage
 from sealscope.simulation.instruments import FILTER_REACH, decimate
-from sealscope.simulation.simulate import run, simulate
+from sealscope.simulation.simulate import simulate, simulate_with_truth
 
 PRESSURES = ("p_1", "p_2", "p_A", "p_B")
 QUIET = {"sensors.common_noise": 0.0, "bits": 24} | {
@@ -31,10 +31,10 @@ LINEAR = {"F_pr": 0.0, "F_cfr": 0.0, "G_pump": 3e-13}
 
 def test_a_drifting_viscous_friction_follows_the_equation_with_time_in_it():
     """The linear rig with F_v(t) = F_v (1 + 0.3 t/20), against an independent program that has F_v in its equations."""
-    rig = load_rig().with_values(LINEAR)
+    rig = load_rig().with_overrides(LINEAR)
     drift = Drift("friction.F_v", Linear(0.3, 20.0))
-    common = {"rig": rig, "duration": 20.0, "values": {"sample_rate": "100[Hz]"}}
-    drifting, constant = (run(make_experiment(**common, drifts=d)).truth for d in ((drift,), ()))
+    common = {"rig": rig, "duration": 20.0, "set": {"sample_rate": "100[Hz]"}}
+    drifting, constant = (simulate_with_truth(Experiment.of(**common, drifts=d)).truth for d in ((drift,), ()))
     m, c, d = rig.motor, rig.cylinder, rig.pump.q_b / (2 * np.pi)
     k = rig.fluid.K_oil / c.V
 
@@ -74,8 +74,8 @@ def test_a_drift_of_nothing_changes_no_byte():
 def test_a_number_that_steps_in_the_table_is_the_rig_with_that_number(throttled):
     """Pump leakage of three times from the start on is the rig with three times the pump leakage, to the last bit."""
     values = {"G_pump": 1e-13} | ({"orifices": "present", "closed_A": 0.5, "closed_B": 0.5} if throttled else {})
-    changed = run(make_experiment(duration=3.0, values=values, fault=PumpLeakage(3.0))).truth.outputs
-    built = run(make_experiment(duration=3.0, values={**values, "G_pump": 3.0 * 1e-13})).truth.outputs
+    changed = simulate_with_truth(Experiment.of(duration=3.0, set=values, fault=PumpLeakage(3.0))).truth.outputs
+    built = simulate_with_truth(Experiment.of(duration=3.0, set={**values, "G_pump": 3.0 * 1e-13})).truth.outputs
     for name in ("x", "p_A", "p_B", "p_1"):
         np.testing.assert_array_equal(changed[name], built[name])
 
@@ -83,8 +83,8 @@ def test_a_number_that_steps_in_the_table_is_the_rig_with_that_number(throttled)
 def test_the_oil_s_modulus_may_drift_without_making_oil():
     values = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
     drifts = (Drift("K_oil", Wander((0.1, -0.05), 5.0)), Drift("line.C_d", Linear(-0.2, 5.0)))
-    o = run(make_experiment(duration=5.0, values=values, drifts=drifts)).truth.outputs
-    rig = load_rig().with_values(values)
+    o = simulate_with_truth(Experiment.of(duration=5.0, set=values, drifts=drifts)).truth.outputs
+    rig = load_rig().with_overrides(values)
     held = rig.cylinder.V * (o["p_A"] + o["p_B"]) + rig.line.V_1 * (o["p_1"] + o["p_2"])
     np.testing.assert_allclose(held, held[0], rtol=1e-9)
 
@@ -125,7 +125,7 @@ def test_blocks_are_short_where_it_changes_fast_and_long_where_nothing_changes()
         (lambda: Linear(0.1, 0.0), "last > 0 s"),
         (lambda: Wander((float("nan"),), 1.0), "finite weights"),
         (lambda: Table(np.array([1.0, 0.0]), np.zeros(2)), "times must rise"),
-        (lambda: make_experiment(duration=9.0, drifts=(Drift("F_v", Linear(-1.2, 9.0)),)), "above -100 %, got -120 %"),
+        (lambda: Experiment.of(duration=9.0, drifts=(Drift("F_v", Linear(-1.2, 9.0)),)), "above -100 %, got -120 %"),
     ],
 )
 def test_an_impossible_drift_is_refused(make, rule):
@@ -154,8 +154,8 @@ def test_noise_bias_and_hum_drift_at_the_instruments_alone():
         Drift("sensors.p_1.offset", Linear(3000.0, 60.0), absolute=True),
         Drift("sensors.p_B.hum", Linear(1.0, 60.0)),
     )
-    common = {"command": "step 0", "duration": 60.0, "values": values}
-    plain, drifting = (run(make_experiment(**common, drifts=d)) for d in ((), drifts))
+    common = {"command": "step 0", "duration": 60.0, "set": values}
+    plain, drifting = (simulate_with_truth(Experiment.of(**common, drifts=d)) for d in ((), drifts))
     for name in plain.truth.outputs:
         np.testing.assert_array_equal(plain.truth.outputs[name], drifting.truth.outputs[name])
     read, t = drifting.recording, drifting.recording.t
@@ -179,8 +179,8 @@ def test_a_delayed_channel_shows_the_past(factor, delay):
 
 
 def test_skew_and_scale_are_seen_in_the_channel_that_has_them():
-    plain = simulate(duration=4.0, values=QUIET)
-    skewed = simulate(duration=4.0, values={**QUIET, "sensors.p_A.delay": "2[ms]", "sensors.x.scale_error": "1 %"})
+    plain = simulate(duration=4.0, set=QUIET)
+    skewed = simulate(duration=4.0, set={**QUIET, "sensors.p_A.delay": "2[ms]", "sensors.x.scale_error": "1 %"})
     np.testing.assert_allclose(skewed["p_A"][1:], plain["p_A"][:-1], atol=5.0)  # one sample at 500 Hz
     np.testing.assert_array_equal(skewed["p_B"], plain["p_B"])
     np.testing.assert_allclose(skewed["x"], 1.01 * plain["x"], atol=41e-6)

@@ -10,7 +10,7 @@ import pytest
 from sealscope.errors import InputError
 from sealscope.signals.details import details
 from sealscope.signals.windows import rms
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.inputs import RunInputs
 from sealscope.simulation.integrate import integrate
 from sealscope.simulation.resolution import windows
@@ -25,7 +25,7 @@ def off(run, truth) -> float:
 @pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
 @pytest.mark.parametrize("command", ["3 sin(4t)", "5 sin(t)", "prbs 1 every 0.5 s seed 1"])
 def test_the_error_that_is_asked_for_comes_out(check_rig, throttled, command):
-    experiment = make_experiment(rig=check_rig(throttled), command=command, leak="G = 6e-13 from 10 s", duration=20.0)
+    experiment = Experiment.of(rig=check_rig(throttled), command=command, leak="G = 6e-13 from 10 s", duration=20.0)
     inputs = RunInputs(experiment, experiment.leaks)
     truth = integrate(experiment.rig, inputs, 20.0, 500.0, step=5e-5)
     steps = []
@@ -46,7 +46,7 @@ def test_the_error_that_is_asked_for_comes_out(check_rig, throttled, command):
 
 def test_a_quick_command_gets_a_finer_step_than_a_slow_one(check_rig):
     def step(command: str) -> float:
-        experiment = make_experiment(rig=check_rig(), command=command, duration=4.0)
+        experiment = Experiment.of(rig=check_rig(), command=command, duration=4.0)
         return integrate(experiment.rig, RunInputs(experiment, ()), 4.0, 500.0).step
 
     assert step("prbs 1 every 0.5 s seed 1") < step("1 sin(2t)")
@@ -85,11 +85,11 @@ def test_the_inputs_at_the_nodes_are_those_at_the_times(check_rig):
     offsets = np.array([1e-12, 5e-4, 1e-3])
     start = np.arange(5000) * 1e-3
     for command in ("3 sin(4t + 0.3) + 0.2", "9.9 sin(4t) + 3", "chirp 3 from 0.1 Hz to 5 Hz over 60 s"):
-        experiment = make_experiment(rig=check_rig(), leak="C = 1e-10 from 2 s", duration=1.0, command="1 sin(t)")
-        object.__setattr__(experiment, "command", make_experiment(rig=check_rig(u_max=20.0), command=command).command)
+        experiment = Experiment.of(rig=check_rig(), leak="C = 1e-10 from 2 s", duration=1.0, command="1 sin(t)")
+        object.__setattr__(experiment, "command", Experiment.of(rig=check_rig(u_max=20.0), command=command).command)
         inputs = RunInputs(experiment, experiment.leaks)
         if "9.9" in command:
-            inputs._experiment = make_experiment(rig=check_rig(), duration=0.01)
+            inputs._experiment = Experiment.of(rig=check_rig(), duration=0.01)
         t = start[:, None] + offsets
         for one, other in zip(inputs.at_nodes(start, offsets), inputs(t), strict=True):
             np.testing.assert_allclose(one, other, rtol=0, atol=2e-14)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sealscope.errors import InputError
-from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.faults import From, Growing, Leak, Tabulated, parse_leak
-from sealscope.simulation.simulate import run, sized_leaks, trajectory
+from sealscope.simulation.simulate import simulate_with_truth, sized_leaks, trajectory
 from sealscope.units import LITRE_PER_MINUTE
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
@@ -26,8 +26,8 @@ def flow(leak: Leak, path) -> np.ndarray:
 @pytest.mark.parametrize("values", [{}, THROTTLED], ids=["free", "throttled"])
 @pytest.mark.parametrize("lpm", [0.0042, 0.0163, 0.3])
 def test_the_mean_is_what_was_asked_for(law, values, lpm):
-    experiment = make_experiment(leak=f"{lpm} L/min {law} from 4 s", duration=12.0, values=values)
-    truth = run(experiment).truth
+    experiment = Experiment.of(leak=f"{lpm} L/min {law} from 4 s", duration=12.0, set=values)
+    truth = simulate_with_truth(experiment).truth
     assert truth.mean_leak_lpm == pytest.approx(lpm, rel=1e-3)
     assert truth.onset_s == 4.0
     # recomputed from the truth's own pressures and from its flow
@@ -41,12 +41,12 @@ def test_the_mean_is_what_was_asked_for(law, values, lpm):
 
 def test_the_coefficient_is_the_one_the_operating_point_implies():
     # friction makes about 0.1 MPa: 0.0042 L/min needs near 6 to 7e-13 m^3/(s Pa)
-    (leak,) = sized_leaks(make_experiment(leak="0.0042 L/min", duration=10.0))
+    (leak,) = sized_leaks(Experiment.of(leak="0.0042 L/min", duration=10.0))
     assert 5e-13 < leak.coefficient < 8e-13
 
 
 def test_two_leaks_at_once_each_get_their_mean():
-    experiment = make_experiment(leak=["0.01 L/min from 2 s", "0.05 L/min orifice from 6 s"], duration=12.0)
+    experiment = Experiment.of(leak=["0.01 L/min from 2 s", "0.05 L/min orifice from 6 s"], duration=12.0)
     leaks = sized_leaks(experiment)
     path = trajectory(experiment, leaks)
     for leak, lpm in zip(leaks, (0.01, 0.05), strict=True):
@@ -58,8 +58,8 @@ def test_two_leaks_at_once_each_get_their_mean():
 
 def test_a_growing_leak_and_a_table_are_sized_at_full_opening():
     for opening in (Growing(2.0, 8.0), Tabulated(np.array([0.0, 2.0, 8.0]), np.array([0.0, 0.0, 1.0]))):
-        experiment = make_experiment(leak=Leak(mean=0.02 * LITRE_PER_MINUTE, opening=opening), duration=12.0)
-        truth = run(experiment).truth
+        experiment = Experiment.of(leak=Leak(mean=0.02 * LITRE_PER_MINUTE, opening=opening), duration=12.0)
+        truth = simulate_with_truth(experiment).truth
         assert truth.mean_leak_lpm == pytest.approx(0.02, rel=1e-3)
         assert truth.onset_s == 2.0
         q = np.abs(truth.outputs["q_leak"])
@@ -70,24 +70,24 @@ def test_a_growing_leak_and_a_table_are_sized_at_full_opening():
 
 def test_a_leak_near_the_pump_s_flow_is_still_found():
     for law in ("laminar", "orifice"):
-        truth = run(make_experiment(leak=f"0.5 L/min {law}", duration=6.0)).truth
+        truth = simulate_with_truth(Experiment.of(leak=f"0.5 L/min {law}", duration=6.0)).truth
         assert truth.mean_leak_lpm == pytest.approx(0.5, rel=1e-3)
 
 
 def test_a_leak_larger_than_the_pump_s_flow_is_refused():
     rule = r"smaller than the pump's mean flow, 0\.5\d* L/min for this command, got 3 L/min"
     with pytest.raises(InputError, match=rule):
-        run(make_experiment(leak="3 L/min", duration=6.0))
+        simulate_with_truth(Experiment.of(leak="3 L/min", duration=6.0))
 
 
 def test_a_leak_that_never_opens_is_refused():
     with pytest.raises(InputError, match="must be open within the run"):
-        run(make_experiment(leak="0.01 L/min from 100 s", duration=6.0))
+        simulate_with_truth(Experiment.of(leak="0.01 L/min from 100 s", duration=6.0))
 
 
 def test_no_leak_and_a_leak_of_nothing_have_no_onset():
     for leak in (None, "none", "G = 0", "0 L/min"):
-        truth = run(make_experiment(leak=leak, duration=2.0)).truth
+        truth = simulate_with_truth(Experiment.of(leak=leak, duration=2.0)).truth
         assert (truth.onset_s, truth.mean_leak_lpm) == (None, 0.0)
         assert np.all(truth.outputs["q_leak"] == 0.0)
 

@@ -93,7 +93,7 @@ def test_drifts_keep_within_their_bounds_and_go_both_ways() -> None:
 
 def test_a_drifted_rig_differs_in_friction_bulk_modulus_and_noise_alone() -> None:
     rig = load_rig("thesis")
-    moved = rig.with_values(Drift(1.05, 0.97, 1.04).values(rig))
+    moved = rig.with_overrides(Drift(1.05, 0.97, 1.04).values(rig))
     before = {row.name: row.value for row in rig.table()}
     ratios = {
         row.name: float(row.value) / float(before[row.name]) for row in moved.table() if row.value != before[row.name]

@@ -35,17 +35,17 @@ class Direct:
         self.runs: dict[RunSpec, SimulatedRun] = {}
 
     def run(self, spec: RunSpec) -> SimulatedRun:
-        from sealscope.simulation.experiment import make_experiment
-        from sealscope.simulation.simulate import run
+        from sealscope.simulation.experiment import Experiment
+        from sealscope.simulation.simulate import simulate_with_truth
 
         if spec not in self.runs:
-            made = run(
-                make_experiment(
+            made = simulate_with_truth(
+                Experiment.of(
                     rig=spec.rig,
                     command=spec.command,
                     duration=spec.duration,
                     leak=spec.leaks,
-                    values=dict(spec.values),
+                    set=dict(spec.values),
                     seed=spec.seed,
                 )
             )

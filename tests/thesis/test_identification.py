@@ -65,8 +65,8 @@ class Asked:
 
 
 def bench_rig(rate: float = 500.0) -> Rig:
-    rig = load_rig("thesis").with_values({**TRUTH, "daq.sample_rate": rate})
-    return rig.with_values({f"sensors.{c}.noise": own_noise(rig, c, sigma) for c, sigma in NOISE.items()})
+    rig = load_rig("thesis").with_overrides({**TRUTH, "daq.sample_rate": rate})
+    return rig.with_overrides({f"sensors.{c}.noise": own_noise(rig, c, sigma) for c, sigma in NOISE.items()})
 
 
 def sheet_from(rig: Rig, conditions: tuple[Condition, ...] = BENCH) -> Sheet:
@@ -97,7 +97,7 @@ def test_conditions_are_the_tests_of_the_appendix() -> None:
 def test_a_condition_sets_both_throttles_alike_and_leaves_an_open_line_to_the_rig(closed: float) -> None:
     values = experiment_values(Condition(1, "3 sin(4t)", closed, 0.01, "small"))
     for orifices in ("absent", "present"):
-        rig = load_rig("thesis").with_values({"orifices": orifices}).with_values(values)
+        rig = load_rig("thesis").with_overrides({"orifices": orifices}).with_overrides(values)
         assert rig.line.closed_A == rig.line.closed_B == pytest.approx(closed / 100)
         assert rig.line.orifices == ("present" if closed else orifices)
 

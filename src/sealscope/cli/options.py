@@ -23,7 +23,7 @@ def complete_rigs(incomplete: str) -> list[str]:
     return [name for name in rig_names() if name.startswith(incomplete)]
 
 
-def complete_settings(incomplete: str) -> list[str]:
+def complete_overrides(incomplete: str) -> list[str]:
     """Names of parameters that begin so, whole or as a symbol that only one has, ready for a value."""
     from sealscope.parameters import declared_names
 
@@ -48,7 +48,7 @@ AssumeOption = Annotated[
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="NAME=VALUE[unit]", help="Override a parameter; repeat.", autocompletion=complete_settings
+        "--set", metavar="NAME=VALUE[unit]", help="Override a parameter; repeat.", autocompletion=complete_overrides
     ),
 ]
 MapOption = Annotated[
@@ -101,12 +101,12 @@ def assumed_rig(name: str | None) -> Rig | None:
     return None if name is None else load_rig(name)
 
 
-def rig_with(name: str, settings: Sequence[str] | None) -> Rig:
+def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
     """The rig of that name or file with the values of `--set`."""
-    from sealscope.parameters import load_rig, parse_settings
+    from sealscope.parameters import load_rig, parse_overrides
 
     rig = load_rig(name)
-    return rig.with_values(parse_settings(list(settings)), source="set by --set") if settings else rig
+    return rig.with_overrides(parse_overrides(overrides), source="set by --set") if overrides else rig
 
 
 def channel_map_of(options: Sequence[str] | None) -> dict[str, str]:

@@ -31,7 +31,7 @@ def plan(
     detection: Annotated[
         float, typer.Option("--detection", help="Probability with which the smallest leak is to be found.")
     ] = 0.9,
-    settings: SetOption = None,
+    overrides: SetOption = None,
     detectors: Annotated[
         list[str] | None,
         typer.Option("--detector", help="Detector, e.g. 'd3 of p_A fell', 'd2 of p_B changed'; repeat. The thesis's."),
@@ -67,7 +67,7 @@ def plan(
         seed=seed,
     )
     experiment = experiment_for(
-        rig_with(rig, settings),
+        rig_with(rig, overrides),
         command,
         parse_quantity(duration, "s", name="--duration"),
         None if start is None else parse_quantity(start, "m", name="--start-position"),

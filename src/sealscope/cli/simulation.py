@@ -48,12 +48,15 @@ def simulate(
             help="Another fault, e.g. 'air 1 % from 90 s', 'sensor p_A offset 2 psi'; repeat.",
         ),
     ] = None,
-    duration: Annotated[str, typer.Option("--duration", help="Length [s].")] = "180",
+    duration: Annotated[str, typer.Option("--duration", help="Length, e.g. '180', '3 min' [s].")] = "180",
+    rate: Annotated[
+        str | None, typer.Option("--rate", help="Sampling rate [Hz]; by default the rig's own (daq.sample_rate).")
+    ] = None,
     start: Annotated[
         str, typer.Option("--start-position", help="Piston position at the start, from mid-stroke [m].")
     ] = "0",
     seed: SeedOption = 0,
-    settings: SetOption = None,
+    overrides: SetOption = None,
     method: Annotated[str, typer.Option("--method", help="auto, rk4 or imex.")] = "auto",
     step: Annotated[str | None, typer.Option("--step", help="Largest step of the solver [s].")] = None,
     error: Annotated[
@@ -75,32 +78,32 @@ def simulate(
     """Simulate the rig and record it as its instruments would."""
     from sealscope.recordings import write
     from sealscope.recordings.files import check_target
-    from sealscope.simulation.experiment import make_experiment
+    from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.proof import prove as prove_run
-    from sealscope.simulation.simulate import run, write_truth
-    from sealscope.units import parse_quantity
+    from sealscope.simulation.simulate import simulate_with_truth, write_truth
 
     check_target(output)
     if truth is not None:
         check_folder(truth)
         if truth.resolve() == output.resolve():
             raise InputError(f"recording and truth must be two files, got {output} for both")
-    experiment = make_experiment(
-        rig=rig_with(rig, settings),
+    experiment = Experiment.of(
+        rig=rig_with(rig, overrides),
         command=command,
         leak=leak,
         fault=fault,
-        duration=parse_quantity(duration, "s", name="--duration"),
-        x_0=parse_quantity(start, "m", name="--start-position"),
+        duration=duration,
+        rate=rate,
+        x_0=start,
         seed=seed,
-        method=method,
-        step=None if step is None else parse_quantity(step, "s", name="--step"),
-        error=None if error is None else parse_quantity(error, "Pa", name="--error"),
+        method=method,  # type: ignore[arg-type]  # checked by Experiment
+        step=step,
+        error=error,
         allow_unresolved=allow_unresolved,
     )
     with progress() as told:
         proof = prove_run(experiment, told) if prove else None
-        made = run(experiment, told)
+        made = simulate_with_truth(experiment, told)
     write(made.recording, output)
     if truth is not None:
         write_truth(made.truth, truth)
@@ -123,11 +126,11 @@ def parameters(
     rig: Annotated[
         str, typer.Argument(help="Rig by name, or the path of a rig's TOML file.", autocompletion=complete_rigs)
     ] = "thesis",
-    settings: SetOption = None,
+    overrides: SetOption = None,
     output: Annotated[TableFormat, typer.Option("--format", help="Table, CSV or JSON.")] = TableFormat.table,
 ) -> None:
     """List a rig's parameters: symbol, name, value, unit and source."""
-    loaded = rig_with(rig, settings)
+    loaded = rig_with(rig, overrides)
     columns = ("symbol", "name", "meaning", "value", "unit", "source")
     rows = [{column: getattr(row, column) for column in columns} for row in loaded.table()]
     if output is TableFormat.json:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from sealscope.parameters.drive import Fluid, Line, MakeUp, Motor, Pump
     from sealscope.parameters.instruments import Daq, PressureTransducer, Sensors
     from sealscope.parameters.load import load_rig, rig_names
-    from sealscope.parameters.names import parse_setting, parse_settings
+    from sealscope.parameters.names import parse_override, parse_overrides
     from sealscope.parameters.rig import Entry, Rig, Row, declared_names
 
 _HOMES = {
@@ -29,8 +29,8 @@ _HOMES = {
     "Sensors": "instruments",
     "declared_names": "rig",
     "load_rig": "load",
-    "parse_setting": "names",
-    "parse_settings": "names",
+    "parse_override": "names",
+    "parse_overrides": "names",
     "rig_names": "load",
 }
 
@@ -50,8 +50,8 @@ __all__ = [
     "Sensors",
     "declared_names",
     "load_rig",
-    "parse_setting",
-    "parse_settings",
+    "parse_override",
+    "parse_overrides",
     "rig_names",
 ]
 

@@ -94,7 +94,7 @@ class Part(BaseModel):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A copy; with `update` it raises InputError, because pydantic would not validate the new values."""
         if update:
-            raise InputError("a rig must be changed by Rig.with_values, got model_copy(update=...)")
+            raise InputError("a rig must be changed by Rig.with_overrides, got model_copy(update=...)")
         return super().model_copy(deep=deep)
 
 

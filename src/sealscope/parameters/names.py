@@ -1,4 +1,4 @@
-"""Names of parameters: bare where unique, dotted otherwise; and settings as typed on a command line."""
+"""Names of parameters: bare where unique, dotted otherwise; and overrides as typed on a command line."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ def resolve(name: str, dotted: Sequence[str]) -> str:
     raise InputError(f"{name!r} is not a parameter{closest(name, dotted if '.' in name else [*dict.fromkeys(bare)])}")
 
 
-def parse_setting(text: str) -> tuple[str, str]:
-    """Name and value of one `NAME=VALUE[unit]`; the value stays text, for `Rig.with_values` to read.
+def parse_override(text: str) -> tuple[str, str]:
+    """Name and value of one `NAME=VALUE[unit]`; the value stays text, for `Rig.with_overrides` to read.
 
     Raises InputError where there is no name, no equals sign or no value.
     """
     name, equals, value = text.partition("=")
     name, value = name.strip(), value.strip()
     if not (name and equals and value):
-        raise InputError(f"a setting must be NAME=VALUE or NAME=VALUE[unit], got {text!r}")
+        raise InputError(f"an override must be NAME=VALUE or NAME=VALUE[unit], got {text!r}")
     return name, value
 
 
-def parse_settings(texts: Sequence[str]) -> dict[str, str]:
-    """All settings of one command; a name given twice with different values raises InputError."""
-    settings: dict[str, str] = {}
+def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
+    """All overrides of one command; a name given twice with different values raises InputError."""
+    overrides: dict[str, str] = {}
     for text in texts:
-        name, value = parse_setting(text)
-        if settings.setdefault(name, value) != value:
-            raise InputError(f"{name} must be set once, got {settings[name]} and {value}")
-    return settings
+        name, value = parse_override(text)
+        if overrides.setdefault(name, value) != value:
+            raise InputError(f"{name} must be set once, got {overrides[name]} and {value}")
+    return overrides

@@ -49,7 +49,7 @@ class Row(NamedTuple):
 
 
 class Rig(Part):
-    """Parameters of one actuator; made by `load_rig`, changed only into another one by `with_values`.
+    """Parameters of one actuator; made by `load_rig`, changed only into another one by `with_overrides`.
 
     Numbers are SI doubles: `rig.motor.R_c` [ohm], `rig.sensors.p_A.noise` [Pa]. Two rigs are equal when all numbers and
     choices are, whatever the units and sources they came with. Raises InputError where parts do not fit together.
@@ -86,6 +86,13 @@ class Rig(Part):
     def __hash__(self) -> int:
         return hash(tuple(getattr(self, part) for part in Rig.model_fields))
 
+    def __repr__(self) -> str:
+        overrides = sum(entry.source.startswith("set by") for _, entry in self._entries)
+        changed = f", {overrides} overridden" if overrides else ""
+        return f"<Rig {self._name}: {self._title or 'no title'}, {len(self._entries)} parameters{changed}>"
+
+    __str__ = __repr__
+
     @property
     def name(self) -> str:
         """Name of the rig."""
@@ -112,7 +119,7 @@ class Rig(Part):
             raise InputError("a rig must have sources; make it with load_rig or Rig.from_entries, not from bare parts")
         return dict(self._entries)
 
-    def with_values(self, settings: Mapping[str, Value], *, source: str = "set by caller") -> Rig:
+    def with_overrides(self, overrides: Mapping[str, Value], *, source: str = "set by caller") -> Rig:
         """Another rig with some values replaced, `source` written beside each.
 
         A name is bare where it is unique (`V_1`), else dotted (`sensors.p_A.noise`). A number is in SI; a text carries
@@ -123,7 +130,7 @@ class Rig(Part):
             raise InputError("source must not be blank")
         entries = self._given()
         replaced: dict[str, str] = {}
-        for name, value in settings.items():
+        for name, value in overrides.items():
             full = resolve(name, declared_names())
             if full in replaced:
                 raise InputError(f"{full} must be set once, got {replaced[full]} and {name}")

@@ -12,6 +12,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array, Recording
+from sealscope.units import parse_quantity
 
 
 def number_text(value: float) -> str:
@@ -173,28 +174,37 @@ def check_command(command: Command, t: Array, limit: float) -> None:
         raise InputError(f"command must stay within +-{limit:g} V, got {u[k]:.4g} V at t = {t[k]:.4g} s ({command})")
 
 
-_N = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_SIGNED = _N.replace("[-+]?", r"[-+]\s*", 1)
-_S = r"\s*s?"
+#: Patterns in texts of commands, leaks and faults: a number without and with a sign, and a time ("90", "90 s",
+#: "1.5[min]").
+UNSIGNED = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+NUMBER = rf"[-+]?{UNSIGNED}"
+TIME = rf"{UNSIGNED}\s*(?:\[\s*\w+\s*\]|(?:s|ms|min|h)\b)?"
+_N, _T = NUMBER, rf"[-+]?{TIME}"
+_SIGNED = rf"[-+]\s*{UNSIGNED}"
 _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
     (
         rf"({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_SIGNED})?\s*\)\s*({_SIGNED})?\s*v?",
         lambda g: Sine(_number(g[0], 1.0), _number(g[1], 1.0), _number(g[2], 0.0), _number(g[3], 0.0)),
     ),
-    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_N}){_S})?", lambda g: Step(_number(g[0], 0.0), _number(g[1], 0.0))),
+    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda g: Step(_number(g[0], 0.0), seconds(g[1]))),
     (
-        rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_N}){_S}\s+)?(?:to|over)\s+({_N}){_S}",
-        lambda g: Ramp(_number(g[0], 0.0), _number(g[1], 0.0), _number(g[2], 0.0)),
+        rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_T})\s+)?(?:to|over)\s+({_T})",
+        lambda g: Ramp(_number(g[0], 0.0), seconds(g[1]), seconds(g[2])),
     ),
     (
-        rf"chirp\s+({_N})\s*v?\s+from\s+({_N})\s*(?:hz)?\s+to\s+({_N})\s*(?:hz)?\s+over\s+({_N}){_S}",
-        lambda g: Chirp(_number(g[0], 0.0), _number(g[1], 0.0), _number(g[2], 0.0), _number(g[3], 0.0)),
+        rf"chirp\s+({_N})\s*v?\s+from\s+({_N})\s*(?:hz)?\s+to\s+({_N})\s*(?:hz)?\s+over\s+({_T})",
+        lambda g: Chirp(_number(g[0], 0.0), _number(g[1], 0.0), _number(g[2], 0.0), seconds(g[3])),
     ),
     (
-        rf"prbs\s+({_N})\s*v?\s+every\s+({_N}){_S}(?:\s+seed\s+(\d+))?",
-        lambda g: PseudoRandom(_number(g[0], 0.0), _number(g[1], 0.0), int(g[2] or 0)),
+        rf"prbs\s+({_N})\s*v?\s+every\s+({_T})(?:\s+seed\s+(\d+))?",
+        lambda g: PseudoRandom(_number(g[0], 0.0), seconds(g[1]), int(g[2] or 0)),
     ),
 )
+
+
+def seconds(text: str | None) -> float:
+    """Time [s] that a match of `TIME` states; 0 for None."""
+    return 0.0 if text is None else parse_quantity(text.lower(), "s", name="a time")
 
 
 def _number(text: str | None, default: float) -> float:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from sealscope.calls import checked_call
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.changes.drifts import Drift
@@ -20,15 +22,17 @@ from sealscope.simulation.commands import Command, Sine, check_command, parse_co
 from sealscope.simulation.faults.faults import Fault, Leak, parse_leak
 from sealscope.simulation.integrate import Method, choose_method
 from sealscope.simulation.resolution import PRESSURE_TOLERANCE
+from sealscope.units import parse_quantity
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Most samples a recording may have (about 1.4 GB of channels), so that a slip of the unit cannot fill the memory.
 MOST_SAMPLES = 20_000_000
+_Kind = TypeVar("_Kind", Leak, Fault)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Experiment:
     """Everything a run depends on; equal experiments give equal bytes.
 
@@ -79,6 +83,70 @@ class Experiment:
             drift.check(np.linspace(0.0, self.duration, 2001))
         self.effects()
 
+    @classmethod
+    @checked_call
+    def of(
+        cls,
+        *,
+        rig: Rig | str | os.PathLike[str] = "thesis",
+        command: Command | str = "3 sin(4t)",
+        leak: Leak | str | Iterable[Leak | str] | None = None,
+        fault: Fault | str | Iterable[Fault | str] | None = None,
+        drifts: Iterable[Drift] = (),
+        set: Mapping[str, float | str] | None = None,
+        duration: float | str = 180.0,
+        rate: float | str | None = None,
+        x_0: float | str = 0.0,
+        seed: int = 0,
+        method: Method = "auto",
+        step: float | str | None = None,
+        error: float | str | None = None,
+        allow_unresolved: bool = False,
+    ) -> Experiment:
+        """Make an experiment of numbers in SI units and texts with units; the arguments are those of `simulate`.
+
+        `drifts` are parameters of the rig and of its instruments that change slowly within the run. Raises InputError
+        for whatever breaks a rule.
+
+        Examples
+        --------
+        >>> import sealscope as ss
+        >>> ss.Experiment.of(leak="0.0042 L/min from 1.5 min", duration="3 min", seed=1)
+        <Experiment: rig thesis, 3 sin(4t), 180 s at 500 Hz, 0.0042 L/min laminar from 90 s, seed 1>
+        """
+        from sealscope.parameters import load_rig
+        from sealscope.simulation.faults.parse import parse_fault
+
+        if not isinstance(set, Mapping | None):
+            raise InputError(f"set must map names of parameters to values, got {set!r}")
+        overrides = dict(set or {})
+        if rate is not None:
+            overrides["daq.sample_rate"] = parse_quantity(rate, "Hz", name="rate")
+        loaded = load_rig(rig)
+        if not isinstance(command, str) and not hasattr(command, "volts"):
+            raise InputError(f"command must be a text or a Command, got {command!r}")
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
+            raise InputError(f"seed must be a whole number, got {seed!r}")
+        return cls(
+            rig=loaded.with_overrides(overrides) if overrides else loaded,
+            command=parse_command(command) if isinstance(command, str) else command,
+            duration=parse_quantity(duration, "s", name="duration", finite=False),
+            leaks=_each(leak, Leak, parse_leak, "leak"),
+            seed=int(seed),
+            x_0=parse_quantity(x_0, "m", name="x_0", finite=False),
+            method=method,
+            step=None if step is None else parse_quantity(step, "s", name="step", finite=False),
+            allow_unresolved=allow_unresolved,
+            faults=_each(fault, Fault, parse_fault, "fault"),
+            drifts=tuple(drifts),
+            error=None if error is None else parse_quantity(error, "Pa", name="error", finite=False),
+        )
+
+    def __repr__(self) -> str:
+        parts = [f"rig {self.rig.name}", str(self.command), f"{self.duration:g} s at {self.rate:g} Hz"]
+        parts += [str(one) for one in (*self.leaks, *self.faults, *self.drifts)]
+        return f"<Experiment: {', '.join(parts)}, seed {self.seed}>"
+
     @property
     def commanded(self) -> Command:
         """The command that the rig gets: `command` as the faults of the duty leave it."""
@@ -124,7 +192,7 @@ class Experiment:
         """The experiment in plain words and numbers, without what only the truth may know (leaks, faults, drifts)."""
         return {
             "rig": self.rig.name,
-            "parameters_set": {
+            "overrides": {
                 row.name: f"{row.value} {row.unit}".strip()
                 for row in self.rig.table()
                 if row.source.startswith("set by")
@@ -156,36 +224,16 @@ def exact(value: Any) -> Any:
     return repr(value)
 
 
-def make_experiment(
-    *,
-    rig: Rig | str = "thesis",
-    command: Command | str = "3 sin(4t)",
-    leak: Leak | str | Iterable[Leak | str] | None = None,
-    fault: Fault | str | Iterable[Fault | str] | None = None,
-    values: Mapping[str, float | str] | None = None,
-    **others: Any,
-) -> Experiment:
-    """An Experiment from words: rig by name or file, command, leaks and faults as text, parameters by name
-    (`values={"V_1": "50[cm^3]"}`).
-
-    Raises InputError for whatever breaks a rule, with rule, value and place.
-    """
-    from sealscope.parameters import load_rig
-
-    loaded = load_rig(rig)
-    if values:
-        loaded = loaded.with_values(values)
-    given = [] if leak is None else [leak] if isinstance(leak, (str, Leak)) else list(leak)
-    leaks = [parse_leak(one) if isinstance(one, str) else one for one in given]
-    if fault is not None:
-        from sealscope.simulation.faults.parse import parse_fault
-
-        several = [fault] if isinstance(fault, (str, Fault)) else list(fault)
-        faults = [parse_fault(one) if isinstance(one, str) else one for one in several]
-        others["faults"] = (*others.get("faults", ()), *(one for one in faults if one is not None))
-    return Experiment(
-        rig=loaded,
-        command=parse_command(command) if isinstance(command, str) else command,
-        leaks=tuple(one for one in leaks if one is not None),
-        **others,
-    )
+def _each(given: Any, kind: type[_Kind], parse: Callable[[str], _Kind | None], name: str) -> tuple[_Kind, ...]:
+    """The leaks or faults of an argument: one or several, as texts or as objects; InputError for anything else."""
+    several = [] if given is None else [given] if isinstance(given, (str, kind)) else given
+    if not isinstance(several, Iterable):
+        raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {given!r}")
+    result = []
+    for item in several:
+        if not isinstance(item, (str, kind)):
+            raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {item!r}")
+        parsed = parse(item) if isinstance(item, str) else item
+        if parsed is not None:
+            result.append(parsed)
+    return tuple(result)

@@ -111,7 +111,7 @@ def parameter_sensitivity(experiment: Experiment, name: str, channels: Sequence[
     names = tuple(channels)
 
     def at(share: float) -> Array:
-        rig = experiment.rig.with_values({name: value * (1.0 + share)}, source="varied for a sensitivity")
+        rig = experiment.rig.with_overrides({name: value * (1.0 + share)}, source="varied for a sensitivity")
         return clean_channels(replace(experiment, rig=rig), (), names)
 
     def quotient(h: float) -> Array:

@@ -6,22 +6,28 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sealscope.calls import checked_call
+from sealscope.errors import InputError
 from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.changes.drifts import Drift
-from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults.faults import Fault, Leak
 from sealscope.simulation.inputs import RunInputs
 from sealscope.simulation.instruments import FILTER_REACH, record
-from sealscope.simulation.integrate import DEFAULT_STEP, Trajectory, choose_method, integrate
+from sealscope.simulation.integrate import DEFAULT_STEP, Method, Trajectory, choose_method, integrate
 from sealscope.simulation.sizing import leak_flow, mean_while_open, sized
 from sealscope.units import LITRE_PER_MINUTE
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+    from sealscope.simulation.commands import Command
 
 #: Told what is being done and how far it is, 0..1.
 Progress = Callable[[str, float], None]
@@ -108,12 +114,38 @@ def sized_leaks(experiment: Experiment, progress: Progress | None = None) -> tup
     return found
 
 
-def run(experiment: Experiment, progress: Progress | None = None) -> Run:
-    """Simulate the experiment.
+@checked_call
+def simulate_with_truth(experiment: Experiment, progress: Progress | None = None) -> Run:
+    """Simulate an experiment and keep its truth beside the recording.
 
-    Raises InputError for an experiment that cannot be (a leak larger than the pump's flow), SimulationFailed for a
-    run that diverged or cannot be resolved.
+    Parameters
+    ----------
+    experiment : Experiment
+        What is simulated, as `Experiment.of` makes it.
+    progress : callable, optional
+        Called with what is being done (str) and how far it is (0 to 1).
+
+    Returns
+    -------
+    Run
+        `recording`, and `truth`: leaks with their coefficients, onset, mean leak and every state without noise.
+
+    Raises
+    ------
+    InputError
+        The experiment is impossible, such as a leak larger than the pump's flow.
+    SimulationFailed
+        The run diverged, fell below vacuum, or is not resolved by its step.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> run = ss.simulate_with_truth(ss.Experiment.of(leak="0.05 L/min from 1 s", duration=2.0))
+    >>> run.truth.onset_s, round(run.truth.mean_leak_lpm, 3)
+    (1.0, 0.05)
     """
+    if not isinstance(experiment, Experiment):
+        raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
     leaks = sized_leaks(experiment, progress)
     n = round(experiment.duration * experiment.rate)
     factor = oversampling(experiment)
@@ -186,10 +218,85 @@ def _told_drift(drift: Drift, t: Array) -> dict[str, Any]:
     return {"parameter": drift.parameter, "span_pct": 100.0 * span, "start_to_end_pct": 100.0 * end}
 
 
-def simulate(**experiment: Any) -> Recording:
-    """Simulate from words and return the Recording: `simulate(command="3 sin(4t)", leak="0.0042 L/min from 90 s",
-    duration=180, seed=1)`.
+@checked_call
+def simulate(
+    *,
+    rig: Rig | str | os.PathLike[str] = "thesis",
+    command: Command | str = "3 sin(4t)",
+    leak: Leak | str | Iterable[Leak | str] | None = None,
+    fault: Fault | str | Iterable[Fault | str] | None = None,
+    drifts: Iterable[Drift] = (),
+    set: Mapping[str, float | str] | None = None,
+    duration: float | str = 180.0,
+    rate: float | str | None = None,
+    x_0: float | str = 0.0,
+    seed: int = 0,
+    method: Method = "auto",
+    step: float | str | None = None,
+    error: float | str | None = None,
+    allow_unresolved: bool = False,
+) -> Recording:
+    """Simulate a rig under a command and record it as its instruments would.
 
-    Keywords are those of `make_experiment`; `run` gives the truth beside the recording.
+    A quantity is a number in the SI unit stated below, or a text with a unit of its own (``"3 min"``, ``"20[Pa]"``),
+    as on the command line.
+
+    Parameters
+    ----------
+    rig : Rig, str or path-like, optional
+        A rig, the name of a packaged one, or the path of a TOML file.
+    command : str or Command, optional
+        Voltage sent to the servo drive: ``"3 sin(4t)"``, ``"step 5 at 1 s"``, ``"ramp 5 from 1 s to 3 s"``, ``"chirp 3
+        from 0.1 Hz to 5 Hz over 60 s"``, ``"prbs 2 every 0.5 s seed 1"``, or ``"file LOG"`` (channel u of a recording).
+    leak : str, Leak or several of them, optional
+        Leakage across the piston: ``"0.0042 L/min from 90 s"`` (mean flow while open), ``"0.01[L/min] orifice growing
+        from 1 min to 2 min"``, ``"G = 6.1e-13 from 90 s"``, ``"C = 2e-10"``, ``"table LEAK.csv"`` or ``"none"``.
+    fault : str, Fault or several of them, optional
+        Other faults: ``"pump leak x3 from 90 s"``, ``"rod seal A 0.01 L/min"``, ``"friction +20 %"``, ``"air 1 %"``,
+        ``"sensor p_A offset 2 psi"``, ``"sensor p_A gain -1 %"``, ``"sensor p_A stuck from 90 s to 100 s"``, ``"duty
+        amplitude x1.5"``.
+    drifts : iterable of Drift, optional
+        Parameters of the rig and of its instruments that change slowly within the run.
+    set : mapping of str to float or str, optional
+        Overrides of the rig's parameters: ``{"V_1": "50[cm^3]"}``.
+    duration : float or str, optional
+        Length of the recording [s].
+    rate : float or str, optional
+        Sampling rate [Hz]; the rig's own (``daq.sample_rate``) by default.
+    x_0 : float or str, optional
+        Position of the piston at the start, from mid-stroke [m].
+    seed : int, optional
+        Seed of the instruments' noise.
+    method : {"auto", "rk4", "imex"}, optional
+        Integration method; "auto" takes the implicit-explicit one for a rig with throttles.
+    step : float or str, optional
+        Largest step of the solver [s], instead of one chosen by `error`.
+    error : float or str, optional
+        Error that a pressure may have [Pa rms], 100 Pa by default; the step is chosen by it.
+    allow_unresolved : bool, optional
+        Let an unstable or under-resolved run through, marked in the provenance.
+
+    Returns
+    -------
+    Recording
+        What the instruments recorded. `simulate_with_truth` returns the truth beside it.
+
+    Raises
+    ------
+    InputError
+        An argument breaks a rule, or is not known.
+    SimulationFailed
+        The run diverged, fell below vacuum, or is not resolved by its step.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> recording = ss.simulate(command="3 sin(4t)", leak="0.05 L/min from 1 s", duration="2 s", seed=1)
+    >>> recording.rate, len(recording)
+    (500.0, 1000)
     """
-    return run(make_experiment(**experiment)).recording
+    experiment = Experiment.of(
+        rig=rig, command=command, leak=leak, fault=fault, drifts=drifts, set=set, duration=duration, rate=rate, x_0=x_0,
+        seed=seed, method=method, step=step, error=error, allow_unresolved=allow_unresolved,
+    )  # fmt: skip
+    return simulate_with_truth(experiment).recording

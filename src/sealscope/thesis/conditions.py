@@ -33,7 +33,7 @@ class Condition:
 
 
 def experiment_values(condition: Condition) -> dict[str, str | float]:
-    """The rig's parameters that a test sets, by name, for `Rig.with_values` or `make_experiment(values=...)`.
+    """The rig's parameters that a test sets, by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
 
     Both throttles are closed alike. A test with the throttles fully open leaves `line.orifices` as the rig has it:
     absent in the thesis's model (section 4.2.1), present in a rig whose open valve bodies stay in the line.

@@ -43,7 +43,7 @@ def unsized(plan: SimulatedPlan, case: Case, profile: Profile | None = None) -> 
         machine = draw(profile or plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s)
     else:
         machine = Machine("none", case.machine_seed, plan.rig, plan.duration_s, {}, (), Sine(3.0, 4.0), 0.0)
-    values = dict(machine.values)
+    values = dict(machine.overrides)
     for name, level in case.levels.items():
         if name == "command":
             machine = replace(machine, command=parse_command(str(level)))
@@ -51,7 +51,7 @@ def unsized(plan: SimulatedPlan, case: Case, profile: Profile | None = None) -> 
             values |= {"line.orifices": str(plan.rig["line.orifices"])} | closing_values(level)
         else:
             values[name] = level
-    machine = replace(machine, values=_by_full_name(values))
+    machine = replace(machine, overrides=_by_full_name(values))
     fault = fault_of(case.fault, plan.onset_s) if case.fault else None
     return machine.experiment(seed=case.noise_seed, fault=fault, leak=leak_of(plan, case))
 

@@ -39,9 +39,9 @@ def _work(plan: SimulatedPlan, case: Case, keep: Path | None) -> CaseRow:
     from sealscope.campaigns.cases.scoring import stated
     from sealscope.diagnosis.calibration.calibrated import looked_at, place_of
     from sealscope.diagnosis.calibration.scorers import Look
-    from sealscope.simulation.simulate import run
+    from sealscope.simulation.simulate import simulate_with_truth
 
-    simulated = run(experiment_of(plan, case))
+    simulated = simulate_with_truth(experiment_of(plan, case))
     if keep is not None:
         from sealscope.recordings import write
 

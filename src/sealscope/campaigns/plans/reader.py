@@ -143,7 +143,7 @@ def _rig(head: PlanTable) -> Rig:
     values |= given
     if not values:
         return rig
-    return _in("campaign.set", head.place, lambda: rig.with_values(values, source="set by the plan"))
+    return _in("campaign.set", head.place, lambda: rig.with_overrides(values, source="set by the plan"))
 
 
 def _profile(head: PlanTable) -> str:
@@ -181,7 +181,7 @@ def _check_level(name: str, level: str | float, rig: Rig) -> None:
             raise InputError(f"a command must be a text such as '3 sin(4t)', got {level!r}")
         parse_command(level)
     else:
-        rig.with_values(closing_values(level) if name == "closed" else {name: level})
+        rig.with_overrides(closing_values(level) if name == "closed" else {name: level})
 
 
 def _records(given: Any, onset: float, place: str) -> tuple[RecordGroup, ...]:

@@ -158,7 +158,7 @@ class PlanTable:
                 return rig
             if not isinstance(given, Mapping):
                 raise self.fail(f"assume_set must be a table of parameters, got {given!r}")
-            return (rig or load_rig("thesis")).with_values(given, source="assumed by the plan")
+            return (rig or load_rig("thesis")).with_overrides(given, source="assumed by the plan")
         except InputError as error:
             if self.place in str(error):
                 raise

@@ -54,9 +54,9 @@ def stated(experiment: Experiment) -> dict[str, str | float]:
 
 
 def _signed(experiment: Experiment, detectors: Sequence[ChangeDetector]) -> tuple[Array, float]:
-    from sealscope.simulation.simulate import run
+    from sealscope.simulation.simulate import simulate_with_truth
 
-    made = run(experiment)
+    made = simulate_with_truth(experiment)
     look = Look(made.recording, experiment.duration / 2.0)
     return np.array([detector.change(look) for detector in detectors]), made.truth.mean_leak_lpm
 

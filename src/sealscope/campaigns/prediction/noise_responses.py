@@ -43,7 +43,7 @@ def instrument_noise(experiment: Experiment, records: int, seed: int) -> Array:
     """What the instruments add to the chamber pressures: readings less the truth (r, c, n) [Pa] of `records` leak-free
     records, by the rig's own instruments; samples that would be lost or stuck are not."""
     whole = {f"sensors.{name}.{rate}": 0.0 for name in CHAMBERS for rate in ("stuck_rate", "drop_rate")}
-    rig = experiment.rig.with_values(whole, source="varied for a plan")
+    rig = experiment.rig.with_overrides(whole, source="varied for a plan")
     times = experiment.sample_times()
     path, u = filtered(experiment), experiment.command.volts(times)
     clean = np.stack([path[name] for name in CHAMBERS])

@@ -59,9 +59,9 @@ MOST_NOISE = 3e7
 def with_closing(rig: Rig, closing: float | None) -> Rig:
     """The rig without throttles, or with both closed by this share."""
     if closing is None:
-        return rig.with_values({"orifices": "absent"}, source="varied for a plan")
+        return rig.with_overrides({"orifices": "absent"}, source="varied for a plan")
     values: dict[str, float | str] = {"orifices": "present", "closed_A": closing, "closed_B": closing}
-    return rig.with_values(values, source="varied for a plan")
+    return rig.with_overrides(values, source="varied for a plan")
 
 
 def closing_words(rig: Rig) -> str:
@@ -199,7 +199,7 @@ def outlook(
     described = experiment.describe()
     return Outlook(
         rig=rig.name,
-        parameters_set=described["parameters_set"],
+        overrides=described["overrides"],
         command=str(experiment.command),
         orifices=closing_words(rig),
         duration_s=experiment.duration,

@@ -84,7 +84,7 @@ class Outlook:
     """
 
     rig: str
-    parameters_set: Mapping[str, str]
+    overrides: Mapping[str, str]
     command: str
     orifices: str
     duration_s: float
@@ -106,7 +106,7 @@ class Outlook:
         """The plan as plain JSON values; sizes in L/min, None where no leak up to the largest is found."""
         return {
             "rig": self.rig,
-            "parameters_set": dict(self.parameters_set),
+            "overrides": dict(self.overrides),
             "command": self.command,
             "orifices": self.orifices,
             "duration_s": self.duration_s,

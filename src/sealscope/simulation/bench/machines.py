@@ -14,7 +14,7 @@ from sealscope.errors import InputError
 from sealscope.simulation.bench.profile import DriftRange, Nuisance, Profile, load_profile
 from sealscope.simulation.changes.drifts import Drift, Wander
 from sealscope.simulation.commands import Command, parse_command
-from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.experiment import Experiment
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -27,7 +27,7 @@ WANDER_TERMS = 6
 class Machine:
     """One machine on one day: a rig as designed, what differs from it, what drifts, and what the machine is asked for.
 
-    `values`: parameters by dotted name, in SI, for `rig.with_values`, throttles among them (`closed`; open ones leave
+    `overrides`: values of parameters by dotted name, in SI, throttles among them (`closed`; open ones leave
     `line.orifices` as the rig has it); `duration` [s] of the record over which the drifts have their sizes.
     """
 
@@ -35,19 +35,19 @@ class Machine:
     seed: int
     rig: Rig
     duration: float
-    values: Mapping[str, float | str]
+    overrides: Mapping[str, float | str]
     drifts: tuple[Drift, ...]
     command: Command
     closed: float
 
     def experiment(self, **others: Any) -> Experiment:
-        """This machine on its duty, from a start that centres its strokes; `others` are `make_experiment`'s (leak,
+        """This machine on its duty, from a start that centres its strokes; `others` are `Experiment.of`'s (leak,
         fault), and the machine's own seed, duration and drifts where they are not among them."""
-        built = self.rig.with_values(self.values, source=f"drawn from profile {self.profile}, seed {self.seed}")
+        built = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         own = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
         given = {**own, **others}
         given.setdefault("x_0", centred_start(built, given["command"], given["duration"]))
-        return make_experiment(rig=built, **given)
+        return Experiment.of(rig=built, **given)
 
 
 def centred_start(rig: Rig, command: Command | str, duration: float) -> float:
@@ -124,19 +124,19 @@ def draw(
     if not (math.isfinite(duration) and duration > 0):
         raise InputError(f"duration must be > 0 s and finite, got {duration}")
     oil = _path(_random(seed, "temperature of the oil"), ("linear", "wander"), duration, warms=True)
-    settings: dict[str, float | str] = {}
+    overrides: dict[str, float | str] = {}
     drifts: list[Drift] = []
     for one in found.nuisances:
         values, drifting = _drawn(one, seed, oil)
-        settings |= {name: float(base[name]) * value for name, value in values.items()} if one.scales else values
+        overrides |= {name: float(base[name]) * value for name, value in values.items()} if one.scales else values
         drifts += drifting
     random = _random(seed, "duty")
     command = parse_command(found.duty.commands[int(random.integers(len(found.duty.commands)))])
     closed = found.duty.closed[int(random.integers(len(found.duty.closed)))]
-    settings |= {"line.closed_A": closed, "line.closed_B": closed}
+    overrides |= {"line.closed_A": closed, "line.closed_B": closed}
     if closed > 0:
-        settings["line.orifices"] = "present"
+        overrides["line.orifices"] = "present"
     amplitude = float(random.uniform(*found.duty.amplitude))
     if amplitude != 1.0:
         command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, attr-defined]
-    return Machine(found.name, seed, base, duration, settings, tuple(drifts), command, closed)
+    return Machine(found.name, seed, base, duration, overrides, tuple(drifts), command, closed)

@@ -13,6 +13,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.changes.readings import Adjustment, Hold
 from sealscope.simulation.changes.rig import Effect
+from sealscope.simulation.commands import TIME, UNSIGNED, seconds
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 if TYPE_CHECKING:
@@ -174,17 +175,17 @@ class Leak:
         return f"{'G' if self.law == 'laminar' else 'C'} = {self.coefficient:g} {self.opening}"
 
 
-_N = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_SIZE = rf"(?:(?P<mean>{_N})\s*(?P<unit>[a-zA-Z^0-9]+/[a-zA-Z]+)|(?P<letter>[GC])\s*=\s*(?P<coefficient>{_N}))"
-#: When, in the words of leaks and faults: `from 90 s`, `growing from 60 s to 120 s`.
-WHEN = rf"(?:from\s+(?P<at>{_N})\s*s?|growing\s+from\s+(?P<start>{_N})\s*s?\s+to\s+(?P<stop>{_N})\s*s?)"
+_MEAN = rf"{UNSIGNED}\s*(?:\[[^\]]+\]|[a-zA-Z^0-9]+/[a-zA-Z]+)"
+_SIZE = rf"(?:(?P<mean>{_MEAN})|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))"
+#: When, in texts of leaks and faults: `from 90 s`, `growing from 1 min to 120 s`.
+WHEN = rf"(?:from\s+(?P<at>{TIME})|growing\s+from\s+(?P<start>{TIME})\s+to\s+(?P<stop>{TIME}))"
 
 
 def opening_from(part: dict[str, str | None]) -> Opening:
     """The opening that the groups of `WHEN` say; open from the start where they say nothing."""
     if part["start"] is not None and part["stop"] is not None:
-        return Growing(float(part["start"]), float(part["stop"]))
-    return From(float(part["at"] or 0.0))
+        return Growing(seconds(part["start"]), seconds(part["stop"]))
+    return From(seconds(part["at"]))
 
 
 def parse_leak(text: str) -> Leak | None:
@@ -219,5 +220,5 @@ def parse_leak(text: str) -> Leak | None:
         if part["law"] not in (None, law):
             raise InputError(f"{part['letter']} is the coefficient of the {law} law, got law {part['law']} ({text!r})")
         return Leak(law, coefficient=float(part["coefficient"]), opening=opening)
-    mean = parse_quantity(f"{part['mean']}[{part['unit']}]", "m^3/s")
+    mean = parse_quantity(part["mean"], "m^3/s", name="a leak")
     return Leak(part["law"] or "laminar", mean=mean, opening=opening)  # type: ignore[arg-type]

@@ -7,15 +7,17 @@ from collections.abc import Callable
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
+from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, seconds
 from sealscope.simulation.faults.duty import DutyChange
 from sealscope.simulation.faults.faults import WHEN, Fault, From, Growing, opening_from
 from sealscope.simulation.faults.rig import AirInOil, ExternalLeakage, FrictionChange, PumpLeakage
 from sealscope.simulation.faults.sensors import SensorGain, SensorOffset, SensorStuck
+from sealscope.units import parse_quantity
 
-_N = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_FACTOR = rf"(?:x\s*(?P<times>{_N})|(?P<percent>[-+]\s*{_N.removeprefix('[-+]?')})\s*%)"
+_N = NUMBER
+_FACTOR = rf"(?:x\s*(?P<times>{_N})|(?P<percent>[-+]\s*{UNSIGNED})\s*%)"
 _SHARE = rf"(?P<share>{_N})\s*(?P<sign>%?)"
-_UNIT = r"[a-zA-Z0-9^/_]+"
+_SIZE = rf"(?P<size>{_N}\s*(?:\[[^\]]+\]|[a-zA-Z0-9^/_]+))"
 _TAIL = rf"(?:\s+{WHEN})?"
 _Part = dict[str, str | None]
 
@@ -32,17 +34,12 @@ def _share(part: _Part) -> float:
     return _number(part["share"]) / (100.0 if part["sign"] else 1.0)
 
 
-def _quantity(part: _Part, unit: str) -> float:
-    from sealscope.units import parse_quantity
-
-    return parse_quantity(f"{part['size']}[{part['unit']}]", unit)
-
-
 def _rod_seal(part: _Part) -> Fault:
     side = "A" if (part["side"] or "").upper() == "A" else "B"
     if part["G"] is not None:
         return ExternalLeakage(side, coefficient=_number(part["G"]), opening=opening_from(part))  # type: ignore[arg-type]
-    return ExternalLeakage(side, flow=_quantity(part, "m^3/s"), opening=opening_from(part))  # type: ignore[arg-type]
+    flow = parse_quantity(part["size"] or "", "m^3/s", name="a rod seal's leak")
+    return ExternalLeakage(side, flow=flow, opening=opening_from(part))  # type: ignore[arg-type]
 
 
 def _duty(part: _Part) -> Fault:
@@ -53,12 +50,13 @@ def _duty(part: _Part) -> Fault:
 
 def _offset(part: _Part) -> Fault:
     channel = part["channel"] or ""
-    return SensorOffset(channel, _quantity(part, CHANNEL_UNITS.get(channel, "Pa")), opening_from(part))
+    offset = parse_quantity(part["size"] or "", CHANNEL_UNITS.get(channel, "Pa"), name="a sensor's offset")
+    return SensorOffset(channel, offset, opening_from(part))
 
 
 def _stuck(part: _Part) -> Fault:
-    until = {} if part["until"] is None else {"until": _number(part["until"])}
-    return SensorStuck(part["channel"] or "", _number(part["since"]), **until)
+    until = {} if part["until"] is None else {"until": seconds(part["until"])}
+    return SensorStuck(part["channel"] or "", seconds(part["since"]), **until)
 
 
 _SENSOR = r"sensor\s+(?P<channel>\w+)"
@@ -70,14 +68,14 @@ _FORMS: tuple[tuple[str, Callable[[_Part], Fault]], ...] = (
     ),
     (
         rf"(?:rod\s+seal|external\s+leak(?:age)?)\s+(?P<side>[ABab])\s+"
-        rf"(?:G\s*=\s*(?P<G>{_N})|(?P<size>{_N})\s*(?P<unit>{_UNIT})){_TAIL}",
+        rf"(?:G\s*=\s*(?P<G>{_N})|{_SIZE}){_TAIL}",
         _rod_seal,
     ),
     (rf"friction\s+{_FACTOR}{_TAIL}", lambda p: FrictionChange(_factor(p), opening_from(p))),
     (rf"air\s+{_SHARE}{_TAIL}", lambda p: AirInOil(_share(p), opening_from(p))),
-    (rf"{_SENSOR}\s+offset\s+(?P<size>{_N})\s*(?P<unit>{_UNIT}){_TAIL}", _offset),
+    (rf"{_SENSOR}\s+offset\s+{_SIZE}{_TAIL}", _offset),
     (rf"{_SENSOR}\s+gain\s+{_SHARE}{_TAIL}", lambda p: SensorGain(p["channel"] or "", _share(p), opening_from(p))),
-    (rf"{_SENSOR}\s+stuck(?:\s+from\s+(?P<since>{_N})\s*s?(?:\s+to\s+(?P<until>{_N})\s*s?)?)?", _stuck),
+    (rf"{_SENSOR}\s+stuck(?:\s+from\s+(?P<since>{TIME})(?:\s+to\s+(?P<until>{TIME}))?)?", _stuck),
     (
         rf"duty(?=\s+[af])(?:\s+amplitude\s+x\s*(?P<amplitude>{_N}))?(?:\s+frequency\s+x\s*(?P<speed>{_N}))?{_TAIL}",
         _duty,

@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.errors import SimulationFailed
-from sealscope.simulation.experiment import Experiment, make_experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.proof import prove
-from sealscope.simulation.simulate import run, sized_leaks
+from sealscope.simulation.simulate import simulate_with_truth, sized_leaks
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 
 
 def experiment_of(spec: RunSpec) -> Experiment:
     """The experiment that a spec describes; raises InputError for one that cannot be."""
-    return make_experiment(
+    return Experiment.of(
         rig=spec.rig,
         command=spec.command,
         leak=spec.leaks,
-        values=dict(spec.values),
+        set=dict(spec.values),
         duration=spec.duration,
         seed=spec.seed,
         x_0=spec.x_0,
@@ -33,7 +33,7 @@ def simulated(spec: RunSpec, experiment: Experiment) -> SimulatedRun:
     """The run of a spec, its leaks sized once for the run and for its halving test."""
     try:
         experiment = replace(experiment, leaks=sized_leaks(experiment))
-        made = run(experiment)
+        made = simulate_with_truth(experiment)
         proof = prove(experiment) if spec.prove else None
     except SimulationFailed as error:
         return SimulatedRun(None, np.empty(0), {}, 0.0, False if spec.prove else None, diverged=str(error))

@@ -56,9 +56,9 @@ class Calibration:
     def rig(self, base: Rig, source: str = "fitted to leak-free tests") -> Rig:
         """`base` with everything fitted put in: settings, sampling rate, and each channel's own noise."""
         values: dict[str, float | str] = {**self.common, **self.best.settings, "daq.sample_rate": self.best.rate}
-        rig = base.with_values(values, source=source)
+        rig = base.with_overrides(values, source=source)
         own = {f"sensors.{chamber}.noise": own_noise(rig, chamber, sigma) for chamber, sigma in self.best.noise.items()}
-        return rig.with_values(own, source=source)
+        return rig.with_overrides(own, source=source)
 
 
 def leak_free(sheet: Sheet) -> Array:
@@ -122,7 +122,7 @@ def fit(
 
     free = FREE if free is None else tuple(free)
     shared = dict(COMMON if common is None else common)
-    rig = (load_rig(base) if isinstance(base, str) else base).with_values({"line.orifices": "present", **shared})
+    rig = (load_rig(base) if isinstance(base, str) else base).with_overrides({"line.orifices": "present", **shared})
     measured = leak_free(sheet)
     wanted = [(rate, transform) for transform in transforms for rate in (rates or RATES)]
     found: list[tuple[Trial, Problem, Array]] = []

@@ -50,15 +50,15 @@ def simulated(
     simulating raises.
     """
     from sealscope.signals.details import details
-    from sealscope.simulation.experiment import make_experiment
+    from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.instruments import decimate
     from sealscope.simulation.simulate import oversampling, sized_leaks, trajectory
 
     padded = used + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
-    experiment = make_experiment(
+    experiment = Experiment.of(
         rig=rig,
         command=condition.command,
-        values={**experiment_values(condition), **(values or {})},
+        set={**experiment_values(condition), **(values or {})},
         leak=leak,
         duration=padded,
         x_0=x_0,

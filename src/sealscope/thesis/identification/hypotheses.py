@@ -96,7 +96,7 @@ class Outcome:
 def outcome(rig: Rig, hypothesis: Hypothesis, conditions: tuple[Condition, ...] = APPENDIX_C) -> Outcome:
     """Simulate the tests, without and with their leaks, on the rig as the hypothesis has it."""
     h = hypothesis
-    before = _multiplied(rig.with_values(h.always) if h.always else rig, h.factors)
+    before = _multiplied(rig.with_overrides(h.always) if h.always else rig, h.factors)
     after = _multiplied(before, h.then)
     cache: dict[Group, Array] = {}
     made = np.empty((len(conditions), 2, len(CHAMBERS), len(QUANTITIES)))
@@ -117,4 +117,4 @@ def outcome(rig: Rig, hypothesis: Hypothesis, conditions: tuple[Condition, ...] 
 
 
 def _multiplied(rig: Rig, factors: Mapping[str, float]) -> Rig:
-    return rig.with_values({name: float(rig[name]) * by for name, by in factors.items()}) if factors else rig
+    return rig.with_overrides({name: float(rig[name]) * by for name, by in factors.items()}) if factors else rig

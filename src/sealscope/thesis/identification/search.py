@@ -80,7 +80,7 @@ class Problem:
             raise InputError(f"the sheet must have {len(conditions)} rows, got {measured.shape[0]}")
         self.measured, self.conditions, self.free = measured, conditions, tuple(free)
         self.rate, self.transform = rate, transform
-        self.base = base.with_values({"daq.sample_rate": rate})
+        self.base = base.with_overrides({"daq.sample_rate": rate})
         self.bounds = [(float(np.log(one.lo)), float(np.log(one.hi))) for one in free]
 
     def settings(self, z: Array) -> dict[str, float]:
@@ -89,7 +89,7 @@ class Problem:
 
     def squares(self, z: Array) -> Array:
         """Noise-free mean squares of each test at `z`, (tests, 2, 5)."""
-        rig = self.base.with_values(self.settings(z))
+        rig = self.base.with_overrides(self.settings(z))
         made = noise_free(rig, groups(self.conditions), transform=self.transform, used=USED_IN_SEARCH)
         return by_test(made, self.conditions)
 

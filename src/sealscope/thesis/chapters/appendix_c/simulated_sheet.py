@@ -117,12 +117,12 @@ def _range_MPa(t: Array, p_A: Array, p_B: Array, stop: float) -> tuple[float, fl
 
 
 def _experiment(condition: Condition, duration: float, leak: str | None = None, **others: Any) -> Experiment:
-    from sealscope.simulation.experiment import make_experiment
+    from sealscope.simulation.experiment import Experiment
 
-    return make_experiment(
+    return Experiment.of(
         rig=data_rig(),
         command=condition.command,
-        values=experiment_values(condition),
+        set=experiment_values(condition),
         leak=leak,
         duration=duration,
         **others,
@@ -147,7 +147,7 @@ def with_leak(quick: bool = False) -> Iterator[Row]:
     step, except in a quick reproduction."""
     from sealscope.simulation.faults.faults import From
     from sealscope.simulation.proof import prove
-    from sealscope.simulation.simulate import run, sized_leaks
+    from sealscope.simulation.simulate import simulate_with_truth, sized_leaks
 
     half = QUICK_HALF if quick else HALF
     proved: set[tuple[str, float]] = set()
@@ -156,7 +156,7 @@ def with_leak(quick: bool = False) -> Iterator[Row]:
         found = sized_leaks(_experiment(condition, SETTLING + _SIZING, asked))
         leaks = tuple(replace(leak, opening=From(half)) for leak in found)
         experiment = replace(_experiment(condition, 2 * half, seed=condition.number), leaks=leaks)
-        made = run(experiment)
+        made = simulate_with_truth(experiment)
         resolved = None
         if not quick and condition.group not in proved:
             proved.add(condition.group)
@@ -204,7 +204,7 @@ def with_drift(quick: bool = False) -> Iterator[Row]:
                 paths[condition.group] = trajectory(first, ())
             path = paths[condition.group]
             drift = drift_of(condition.number, draw)
-            rig = first.rig.with_values(drift.values(first.rig), source="drifted")
+            rig = first.rig.with_overrides(drift.values(first.rig), source="drifted")
             second = replace(first, rig=rig, seed=seed + 50_000)
             part = ((SETTLING, SETTLING + half),)
             before = detail_rms(_recorded(first, path), part)

@@ -287,7 +287,7 @@ def _one_way() -> Claim:
     closed: dict[str, float | int | str] = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
     told, tests = [], []
     for metering in ("literal", "meter-out"):
-        rig = load_rig("thesis").with_values({**closed, "metering": metering})
+        rig = load_rig("thesis").with_overrides({**closed, "metering": metering})
         A_in, A_out, B_in, B_out = throttle_coefficients(rig)
         sides = (A_in > A_out, B_in > B_out)
         words = ["free to the cylinder" if free else "throttled to the cylinder" for free in sides]

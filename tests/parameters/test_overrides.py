@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError
-from sealscope.parameters import Motor, Rig, load_rig, parse_setting, parse_settings
+from sealscope.parameters import Motor, Rig, load_rig, parse_override, parse_overrides
 from sealscope.parameters.fields import choices_of, unit_of
 from sealscope.parameters.rig import _declared
 
@@ -22,14 +22,14 @@ CHOICES = [name for name, field in _declared().items() if choices_of(field)]
 
 def message(settings: dict[str, Any], **more: Any) -> str:
     with pytest.raises(InputError) as caught:
-        RIG.with_values(settings, **more)
+        RIG.with_overrides(settings, **more)
     text = str(caught.value)
     assert "\n" not in text
     return text
 
 
 def test_numbers_are_si_and_texts_carry_units() -> None:
-    rig = RIG.with_values(
+    rig = RIG.with_overrides(
         {
             "motor.R_c": "0.8[ohm]",
             "V_1": 5e-5,
@@ -56,22 +56,22 @@ def test_numbers_are_si_and_texts_carry_units() -> None:
 
 
 def test_source_tells_who_set_it_and_the_first_rig_is_untouched() -> None:
-    rig = RIG.with_values({"V_1": 5e-5})
+    rig = RIG.with_overrides({"V_1": 5e-5})
     assert rig.entry("V_1").source == "set by caller"
     assert RIG.line.V_1 == 44e-6
-    assert RIG.with_values({"V_1": 5e-5}, source="rig survey of May").entry("line.V_1").source == "rig survey of May"
+    assert RIG.with_overrides({"V_1": 5e-5}, source="rig survey of May").entry("line.V_1").source == "rig survey of May"
     assert rig.entry("V_2") == RIG.entry("V_2")
     assert message({"V_1": 5e-5}, source=" ") == "source must not be blank"
 
 
 def test_equality_is_of_values() -> None:
-    again = RIG.with_values({"L": "600 mm"})
+    again = RIG.with_overrides({"L": "600 mm"})
     assert again == RIG
     assert hash(again) == hash(RIG)
     assert again.entry("L") != RIG.entry("L")
-    assert RIG.with_values({"L": 0.61}) != RIG
+    assert RIG.with_overrides({"L": 0.61}) != RIG
     assert RIG != "thesis"
-    assert RIG.with_values({}) == RIG
+    assert RIG.with_overrides({}) == RIG
 
 
 def test_immutable() -> None:
@@ -79,7 +79,7 @@ def test_immutable() -> None:
         RIG.motor.R_c = 1.0  # type: ignore[misc]
     with pytest.raises(Exception, match="frozen"):
         RIG.motor = RIG.motor  # type: ignore[misc]
-    with pytest.raises(InputError, match="with_values"):
+    with pytest.raises(InputError, match="with_overrides"):
         RIG.motor.model_copy(update={"R_c": -1.0})
     assert RIG.motor.model_copy() == RIG.motor
 
@@ -123,12 +123,12 @@ def test_each_rule_is_told_in_one_line(settings: dict[str, Any], text: str) -> N
 
 
 def test_dead_volume_must_be_positive_when_volumes_move() -> None:
-    assert RIG.with_values({"V": 1.5e-4}).cylinder.V == 1.5e-4
+    assert RIG.with_overrides({"V": 1.5e-4}).cylinder.V == 1.5e-4
     assert message({"V": 1.5e-4, "volumes": "position"}, source="--set") == (
         'cylinder.V must be > A_A L/2 = 0.0001899 m^3 when volumes = "position", got 0.00015 (--set)'
     )
     assert "A_B L/2 = 0.0003 m^3" in message({"A_B": 1e-3, "volumes": "position"})
-    assert RIG.with_values({"volumes": "position"}).cylinder.volumes == "position"
+    assert RIG.with_overrides({"volumes": "position"}).cylinder.volumes == "position"
 
 
 def test_parts_made_by_hand_obey_the_same_rules() -> None:
@@ -167,7 +167,7 @@ def test_every_number_has_a_range(name: str) -> None:
 def test_a_number_is_taken_exactly_or_refused_by_name(name: str, value: float) -> None:
     low, high = _range(name)
     try:
-        rig = RIG.with_values({name: value})
+        rig = RIG.with_overrides({name: value})
     except InputError as error:
         assert name.rpartition(".")[2] in str(error)
         assert "\n" not in str(error)
@@ -185,11 +185,11 @@ def test_text_and_number_agree(name: str, fraction: float) -> None:
     assert isinstance(current, float)
     value = current * fraction
     try:
-        rig = RIG.with_values({name: value})
+        rig = RIG.with_overrides({name: value})
     except InputError:
         return
-    assert RIG.with_values({name: repr(value)}) == rig
-    assert RIG.with_values({name: f"{value!r}[{unit_of(_declared()[name])}]"}) == rig
+    assert RIG.with_overrides({name: repr(value)}) == rig
+    assert RIG.with_overrides({name: f"{value!r}[{unit_of(_declared()[name])}]"}) == rig
 
 
 @pytest.mark.parametrize("name", CHOICES)
@@ -197,7 +197,7 @@ def test_every_word_of_a_choice_is_accepted(name: str) -> None:
     words = choices_of(_declared()[name])
     assert len(words) > 1
     for word in words:
-        assert RIG.with_values({name: f" {word} "})[name] == word
+        assert RIG.with_overrides({name: f" {word} "})[name] == word
 
 
 @example("", "0:\n0")
@@ -206,18 +206,25 @@ def test_every_word_of_a_choice_is_accepted(name: str) -> None:
 def test_anything_else_is_an_input_error(name: str, value: Any) -> None:
     for key in (name, "V_1"):
         try:
-            RIG.with_values({key: value})
+            RIG.with_overrides({key: value})
         except InputError as error:
             assert "\n" not in str(error)
 
 
-def test_parse_setting() -> None:
-    assert parse_setting("V_1=50[cm^3]") == ("V_1", "50[cm^3]")
-    assert parse_setting(" motor.R_c = 0.8 ") == ("motor.R_c", "0.8")
+def test_parse_override() -> None:
+    assert parse_override("V_1=50[cm^3]") == ("V_1", "50[cm^3]")
+    assert parse_override(" motor.R_c = 0.8 ") == ("motor.R_c", "0.8")
     for bad in ("V_1", "=3", "V_1=", "", " = "):
         with pytest.raises(InputError, match=r"NAME=VALUE\[unit\], got"):
-            parse_setting(bad)
-    assert parse_settings(["V_1=1", "V_2=2", "V_1=1"]) == {"V_1": "1", "V_2": "2"}
+            parse_override(bad)
+    assert parse_overrides(["V_1=1", "V_2=2", "V_1=1"]) == {"V_1": "1", "V_2": "2"}
     with pytest.raises(InputError, match="V_1 must be set once, got 1 and 2"):
-        parse_settings(["V_1=1", "V_1=2"])
-    assert RIG.with_values(dict([parse_setting("V_1=50[cm^3]")])).line.V_1 == 5e-5
+        parse_overrides(["V_1=1", "V_1=2"])
+    assert RIG.with_overrides(dict([parse_override("V_1=50[cm^3]")])).line.V_1 == 5e-5
+
+
+def test_a_rig_shows_itself_in_one_line() -> None:
+    assert repr(RIG).startswith("<Rig thesis: ")
+    changed = RIG.with_overrides({"V_1": 5e-5, "R_c": 0.7})
+    assert repr(changed).endswith(f"{len(RIG.table())} parameters, 2 overridden>")
+    assert str(changed) == repr(changed)
