@@ -78,7 +78,7 @@ def test_a_folder_that_cannot_be_one_is_refused_before_the_work(call, untouched,
     def not_called(*_):
         raise AssertionError("simulated before the folder was looked at")
 
-    monkeypatch.setattr("sealscope.demo.run", not_called)
+    monkeypatch.setattr("sealscope.demo.simulate_with_truth", not_called)
     assert call("demo", "-o", "taken").refused() == (
         "a folder to write into must be one or become one, got: File exists (taken)"
     )

@@ -54,7 +54,7 @@ def clean_channels(
     """The channels (c, n) without noise, at the recording's samples and behind its anti-alias filter.
 
     `leaks` take the place of the experiment's and have coefficients; `step` [s] of the solver, default its own.
-    Raises SimulationFailed as `sealscope.simulation.simulate.run` does.
+    Raises SimulationFailed as `sealscope.simulation.simulate.simulate_with_truth` does.
     """
     n = round(experiment.duration * experiment.rate)
     path = trajectory(experiment, tuple(leaks), step=step)

@@ -72,7 +72,7 @@ def simulate_batch(
     The runs have one duration and one sampling rate; rigs, leaks (one each, opening at once or evenly), drifts and
     faults of the machine may all differ. A run's step is its own `step`, or one that is chosen by its own or this
     `error` [Pa] for all runs of its kind and command. Results do not depend on the order of the runs, their number or
-    `threads` (default: the machine's cores); the noise is another stream than that of `simulate.run`. `device`: cpu, or
+    `threads` (default: the machine's cores); the noise is another stream than that of `simulate_with_truth`. `device`: cpu, or
     gpu (extra `gpu` and an NVIDIA GPU), where the same laws run, one thread a run; results agree to rounding, and the
     beginning of some runs is compared with the processor's.
 
