@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.errors import InputError
+from sealscope.calls import checked_call
+from sealscope.errors import InputError, MissingExtra
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.layout import LaneSet, sets_of, with_sizes
 from sealscope.simulation.batch.run import SetRun
@@ -22,7 +25,10 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import FINEST, LONGEST_STEP
 from sealscope.simulation.resolution import FIRST_WINDOW, PRESSURE_TOLERANCE
 from sealscope.simulation.sizing import scaled_size
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Told how far the batch is, 0..1.
 Progress = Callable[[float], None]
@@ -32,13 +38,17 @@ DEVICES = ("cpu", "gpu")
 _SCOUTS, _SCOUTED = 4, 2.0 * FIRST_WINDOW
 
 
-@dataclass(frozen=True)
-class Batch:
-    """What is left of the runs: RMS of the details in segments, and the leaks as they were.
+#: The details of which a batch keeps the RMS: db8's d1 .. d4 [Pa], and the product d3 d4 [Pa^2].
+DETAILS = ("d1", "d2", "d3", "d4", "d3d4")
 
-    `rms`: (runs, 2, segments, 5) of d1, d2, d3, d4 [Pa] and d3 d4 [Pa^2] of p_A and p_B as recorded; `bounds`:
-    (segments + 1,) [s]; `mean_leak_lpm`: (runs,) mean |Q| while open; `coefficients`: (runs,) leaks' G or C; `steps`:
-    (runs,) [s].
+
+@dataclass(frozen=True, repr=False)
+class Batch:
+    """Result of `simulate_batch`: RMS of the details in segments, and the leaks as they were.
+
+    `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`DETAILS`: d1, d2, d3, d4
+    [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) [s]; `mean_leak_lpm`: (runs,) mean |Q| while open [L/min];
+    `coefficients`: (runs,) leaks' G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]; `steps`: (runs,) [s].
     """
 
     rms: Array
@@ -47,9 +57,60 @@ class Batch:
     coefficients: Array
     steps: Array
 
-    def changes(self, before: int = 0, after: int = -1) -> Array:
-        """Change of each RMS from one segment to another, (runs, 2, 5) [%]: the thesis's statistic."""
-        return np.asarray(100.0 * (self.rms[:, :, after] / self.rms[:, :, before] - 1.0))
+    def __len__(self) -> int:
+        return len(self.rms)
+
+    def __repr__(self) -> str:
+        bounds = ", ".join(f"{bound:g}" for bound in self.bounds)
+        return f"<Batch: {len(self)} runs, segments between {bounds} s>"
+
+    @checked_call
+    def rms_of(self, channel: str, detail: str) -> Array:
+        """RMS of one detail of one channel in each segment, (runs, segments): ``batch.rms_of("p_A", "d3")``."""
+        return np.asarray(self.rms[:, _place(channel, CHAMBERS, "channel"), :, _place(detail, DETAILS, "detail")])
+
+    @checked_call
+    def changes(self, channel: str, detail: str, *, before: int = 0, after: int = -1) -> Array:
+        """Change of an RMS from segment `before` to segment `after`, (runs,) [%]: the thesis's statistic.
+
+        Examples
+        --------
+        >>> import sealscope as ss
+        >>> runs = [ss.Experiment.of(leak="0.3 L/min from 2 s", duration=4.0, seed=seed) for seed in range(3)]
+        >>> ss.simulate_batch(runs).changes("p_A", "d1").shape
+        (3,)
+        """
+        rms = self.rms_of(channel, detail)
+        return np.asarray(100.0 * (rms[:, after] / rms[:, before] - 1.0))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The batch as a table, one row for each run and segment; raises MissingExtra where pandas is not installed.
+
+        Columns: run, segment, start [s], stop [s], the RMS of each detail of each channel (`d3 of p_A [Pa]`), mean_leak
+        [L/min], coefficient, step [s].
+        """
+        try:
+            import pandas as pd
+        except ImportError:
+            raise MissingExtra("a table needs pandas: pip install pandas") from None
+        runs, _, segments, _ = self.rms.shape
+        run, segment = (index.ravel() for index in np.indices((runs, segments)))
+        columns: dict[str, Any] = {"run": run, "segment": segment}
+        columns |= {"start [s]": self.bounds[segment], "stop [s]": self.bounds[segment + 1]}
+        for channel in CHAMBERS:
+            for detail in DETAILS:
+                unit = "Pa^2" if detail == "d3d4" else "Pa"
+                columns[f"{detail} of {channel} [{unit}]"] = self.rms_of(channel, detail).ravel()
+        columns["mean_leak [L/min]"] = self.mean_leak_lpm[run]
+        columns["coefficient"] = self.coefficients[run]
+        columns["step [s]"] = self.steps[run]
+        return pd.DataFrame(columns)
+
+
+def _place(name: str, names: tuple[str, ...], what: str) -> int:
+    if name not in names:
+        raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
+    return names.index(name)
 
 
 def halves(experiment: Experiment) -> Array:
@@ -57,30 +118,65 @@ def halves(experiment: Experiment) -> Array:
     return np.array([0.0, 0.5, 1.0]) * experiment.duration
 
 
+@checked_call
 def simulate_batch(
-    experiments: Sequence[Experiment],
+    experiments: Iterable[Experiment],
     *,
     bounds: Sequence[float] | Array | None = None,
-    error: float = PRESSURE_TOLERANCE,
+    error: float | str = PRESSURE_TOLERANCE,
     threads: int | None = None,
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> Batch:
-    """Run experiments side by side, record p_A and p_B as the instruments would, and keep the RMS of the db8 details.
+    """Simulate experiments side by side and keep the RMS of the db8 details of p_A and p_B as recorded.
 
-    `bounds` [s]: where the segments begin and end (default: both halves); what the transform's edges touch is left out.
-    The runs have one duration and one sampling rate; rigs, leaks (one each, opening at once or evenly), drifts and
+    The runs have one duration and one sampling rate; rigs, leaks (one each, opening abruptly or evenly), drifts and
     faults of the machine may all differ. A run's step is its own `step`, or one that is chosen by its own or this
-    `error` [Pa] for all runs of its kind and command. Results do not depend on the order of the runs, their number or
-    `threads` (default: the machine's cores); the noise is another stream than that of `simulate_with_truth`. `device`: cpu, or
-    gpu (extra `gpu` and an NVIDIA GPU), where the same laws run, one thread a run; results agree to rounding, and the
-    beginning of some runs is compared with the processor's.
+    `error` for all runs of its kind and command. Results do not depend on the order of the runs, their number or
+    `threads`. The noise is another stream than that of `simulate`.
 
-    Raises InputError for runs that cannot be side by side; SimulationFailed, naming the run, where one diverges or
-    falls below vacuum.
+    Parameters
+    ----------
+    experiments : iterable of Experiment
+        What is simulated.
+    bounds : sequence of float, optional
+        Times [s] between which the segments lie, both halves by default; samples at the record's ends that the
+        transform cannot see whole are left out.
+    error : float or str, optional
+        Error that a pressure may have [Pa rms] in the runs that state neither a step nor an error.
+    threads : int, optional
+        Threads of the processor, by default one a core.
+    device : {"cpu", "gpu"}, optional
+        What the batch runs on; "gpu" needs the extra `gpu` and an NVIDIA GPU. Results agree to rounding, and the
+        beginning of some runs is compared with the processor's.
+    progress : callable, optional
+        Called with how far the batch is (0 to 1).
+
+    Returns
+    -------
+    Batch
+        RMS by run, channel, segment and detail, and the leaks' mean flows and coefficients.
+
+    Raises
+    ------
+    InputError
+        The runs cannot be side by side.
+    SimulationFailed
+        A run, which the message names, diverged or fell below vacuum.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> runs = [ss.Experiment.of(duration="4 s", seed=seed) for seed in range(3)]
+    >>> ss.simulate_batch(runs, bounds=[0, 2, 4])
+    <Batch: 3 runs, segments between 0, 2, 4 s>
     """
+    error = parse_quantity(error, "Pa", name="error", finite=False)
     runner = runner_of(device)
     experiments = list(experiments)
+    for experiment in experiments:
+        if not isinstance(experiment, Experiment):
+            raise InputError(f"a batch must have experiments (Experiment.of(...) makes one), got {experiment!r}")
     sets = sets_of(experiments)
     first = experiments[0]
     edges = np.asarray(halves(first) if bounds is None else bounds, dtype=np.float64)

@@ -1,0 +1,53 @@
+"""The types that a user's project sees: right calls pass mypy, wrong ones do not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sealscope
+
+RIGHT = """\
+import sealscope as ss
+
+recording: ss.Recording = ss.simulate(command="3 sin(4t)", leak="0.0042 L/min from 90 s", duration="3 min", rate=500)
+experiment: ss.Experiment = ss.Experiment.of(rig=ss.load_rig("thesis"), set={"V_1": "50[cm^3]"}, error="20[Pa]")
+changes = ss.simulate_batch([experiment], device="cpu").changes("p_A", "d3")
+reveal_type(ss.simulate_with_truth(experiment).truth.onset_s)
+reveal_type(ss.load_rig().cylinder.L)
+"""
+WRONG = """\
+import sealscope as ss
+
+ss.simulate(comand="3 sin(4t)")
+ss.simulate(duration=[3])
+ss.simulate(method="euler")
+ss.simulate_batch("3 sin(4t)")
+ss.simulte()
+"""
+
+
+def checked(folder: Path, text: str) -> list[str]:
+    """What mypy says of a script outside the project; `py.typed` is all that it knows of Sealscope."""
+    (folder / "script.py").write_text(text)
+    source = Path(sealscope.__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(folder / "cache"), "script.py"],
+        cwd=folder, capture_output=True, text=True, check=False, timeout=300, env={"MYPYPATH": str(source)},
+    )  # fmt: skip
+    return [line for line in done.stdout.splitlines() if line.startswith("script.py")]
+
+
+def test_types_reach_a_user_s_project(tmp_path):
+    pytest.importorskip("mypy", reason="mypy is not installed")
+    assert (Path(sealscope.__file__).parent / "py.typed").exists()
+    notes = checked(tmp_path, RIGHT)
+    assert [line.partition("note: ")[2] for line in notes] == [
+        'Revealed type is "float | None"',
+        'Revealed type is "float"',
+    ]
+    wrong = checked(tmp_path, WRONG)
+    assert [line.split(":")[1] for line in wrong if ": error: " in line] == ["3", "4", "5", "6", "7"], wrong
