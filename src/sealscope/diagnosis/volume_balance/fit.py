@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.volume_balance.blocks import DP_12, FLOW, I_12, I_AB, I_ROOT, THETA, BalanceBlocks, Y
 from sealscope.recordings.recording import Array
@@ -21,8 +22,13 @@ from sealscope.recordings.recording import Array
 #: the usual information.
 _SPOILT = 5.0
 _STILL = 0.02
-#: ... nor one in which position and angle go together by another ratio than usually, by this share.
+#: ... nor one in which the ratio of position and angle differs from the usual one by this share.
 _OTHER_RATIO = 0.1
+#: Where a leak opens near an end of a block, the block's conductance may lie outside those of its neighbours by this
+#: share of their difference.
+_BENT = 0.25
+#: Where fewer blocks than this share are left, all of them take part, and the residual shows that nothing fits.
+_FEWEST_KEPT = 0.1
 #: The integrals of two pressure differences differ where what sets them apart is over this many times its noise, and
 #: give two conductances where it is over so many times.
 _APART = 1.5
@@ -97,18 +103,52 @@ def _noise_of_integrals(blocks: BalanceBlocks) -> float:
     return variance * step**2 * blocks.samples**2 / 15.0
 
 
-def _solve(gram: Array, shared: list[int]) -> tuple[Array, Array, Array]:
-    """Coefficients (m,) of the shared columns, their covariance over the residual's variance (m, m), and the sum of
-    squares that is left in each block (n,)."""
-    rest = _beyond(gram, I_AB)
-    total = rest.sum(axis=0)
+def _solve(gram: Array, shared: list[int]) -> tuple[Array, Array]:
+    """Coefficients (m,) of the shared columns, and their covariance over the residual's variance (m, m)."""
+    total = _beyond(gram, I_AB).sum(axis=0)
     size = np.sqrt(np.maximum(np.diag(total)[shared], np.finfo(float).tiny))
     scaled = total[np.ix_(shared, shared)] / np.outer(size, size)
     inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) / np.outer(size, size)
-    beta = inverse @ total[shared, Y]
-    part = rest[:, shared][:, :, shared]
-    left = rest[:, Y, Y] - 2.0 * rest[:, Y][:, shared] @ beta + np.einsum("i,nij,j->n", beta, part, beta)
-    return beta, inverse, np.maximum(left, 0.0)
+    return inverse @ total[shared, Y], inverse
+
+
+def _left(gram: Array, shared: list[int], beta: Array) -> Array:
+    """Sum of squares (n,) that the balance with coefficients `beta` leaves in each block."""
+    rest = _beyond(gram, I_AB)
+    left = rest[:, Y, Y] - 2.0 * rest[:, Y][:, shared] @ beta
+    left += np.einsum("i,nij,j->n", beta, rest[:, shared][:, :, shared], beta)
+    return np.asarray(np.maximum(left, 0.0))
+
+
+def _one_motion(gram: Array) -> NDArray[np.bool_]:
+    """Blocks (n,) in which position and angle move in the usual ratio, as they are or beyond the integral of dp.
+
+    A large leak changes the first ratio and not the second; where the integral is nearly the motion itself, noise
+    changes the second and not the first.
+    """
+    usual = np.zeros(len(gram), dtype=bool)
+    for sums in (gram, _beyond(gram, I_AB)):
+        ratio = sums[:, THETA, Y] / np.maximum(sums[:, THETA, THETA], np.finfo(float).tiny)
+        median = float(np.median(ratio))
+        usual |= np.abs(ratio - median) <= _OTHER_RATIO * abs(median)
+    return usual
+
+
+def _between_neighbours(slope: Array, spoilt: NDArray[np.bool_], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Spoilt blocks (n,) whose conductance lies between those of the next blocks before and after that are kept.
+
+    A large leak that opens within a block bends the volumes there, which the block's one conductance does not follow:
+    that is no fault of the recording, and the block holds the onset.
+    """
+    known = np.flatnonzero(keep)
+    between = np.zeros(spoilt.size, dtype=bool)
+    for block in np.flatnonzero(spoilt):
+        after = int(np.searchsorted(known, block))
+        if 0 < after < known.size:
+            low, high = sorted((slope[known[after - 1]], slope[known[after]]))
+            margin = _BENT * (high - low)
+            between[block] = low - margin <= slope[block] <= high + margin
+    return between
 
 
 def fit_balance(blocks: BalanceBlocks) -> BalanceFit:
@@ -118,17 +158,15 @@ def fit_balance(blocks: BalanceBlocks) -> BalanceFit:
     `residual` and `signal`.
     """
     information = blocks.gram[:, I_AB, I_AB]
-    ratio = blocks.gram[:, THETA, Y] / np.maximum(blocks.gram[:, THETA, THETA], np.finfo(float).tiny)
-    usual_ratio = float(np.median(ratio))
-    keep = information > _STILL * float(np.median(information))
-    keep &= np.abs(ratio - usual_ratio) <= _OTHER_RATIO * abs(usual_ratio)
+    moving = information > _STILL * float(np.median(information))
+    keep = moving & _one_motion(blocks.gram)
     freedom = max(1, blocks.samples - 4)
     shared = _shared_columns(blocks)
     for _ in range(4):
-        if not keep.any():
+        if np.mean(keep) < _FEWEST_KEPT:
             keep = np.ones(len(blocks), dtype=bool)
             break
-        _, _, left = _solve(blocks.gram[keep], shared)
+        left = _left(blocks.gram[keep], shared, _solve(blocks.gram[keep], shared)[0])
         usual = float(np.median(left))
         spoilt = left > _SPOILT**2 * usual
         if not spoilt.any() or usual == 0.0:
@@ -136,12 +174,14 @@ def fit_balance(blocks: BalanceBlocks) -> BalanceFit:
         # the worst one first: what it does to the shared coefficients may make others look bad
         worst = spoilt & (left >= 0.25 * left.max())
         keep[np.flatnonzero(keep)[worst]] = False
-    used = blocks.chosen(keep)
-    beta, inverse, left = _solve(used.gram, shared)
-    own = np.maximum(used.gram[:, I_AB, I_AB], np.finfo(float).tiny)
-    leaning = used.gram[:, I_AB][:, shared] / own[:, None]
-    slope = used.gram[:, I_AB, Y] / own - leaning @ beta
-    usual = float(np.median(left)) / freedom
+    beta, inverse = _solve(blocks.gram[keep], shared)
+    own = np.maximum(information, np.finfo(float).tiny)
+    leaning = blocks.gram[:, I_AB][:, shared] / own[:, None]
+    slope = blocks.gram[:, I_AB, Y] / own - leaning @ beta
+    usual = float(np.median(_left(blocks.gram[keep], shared, beta))) / freedom
+    keep |= _between_neighbours(slope, moving & ~keep, keep)
+    used, own, leaning, slope = blocks.chosen(keep), own[keep], leaning[keep], slope[keep]
+    left = _left(used.gram, shared, beta)
     sense = _sense(used, slope, beta)
     variance = np.maximum(usual, np.where(left > 2.0 * usual * freedom, left / freedom, 0.0))
     # numerically exact data have no residual; a relative rounding error keeps deviations above zero
