@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
-from sealscope.diagnosis.volume_balance.evidence import level_interval
-from sealscope.diagnosis.volume_balance.fit import told_apart
+from sealscope.diagnosis.volume_balance.evidence import level
+from sealscope.diagnosis.volume_balance.fit import discriminate
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import COUNTS, Recording
 
@@ -68,10 +68,9 @@ def test_deviations_are_those_of_repeated_records(detector: VolumeBalance) -> No
     fits = [fitted(detector, machine(seed, G=1.0e-13)) for seed in range(25)]
     within = np.mean([np.std(np.diff(one.g)) / np.sqrt(2) for one in fits])
     assert within == pytest.approx(np.mean([one.sd.mean() for one in fits]), rel=0.15)
-    levels = [level_interval(one) for one in fits]
-    stated = np.mean([(high - low) / 3.92 for _, low, high in levels])
-    assert np.std([mean for mean, _, _ in levels]) < 1.5 * stated
-    assert np.mean([mean for mean, _, _ in levels]) == pytest.approx(3.4e-13, rel=0.04)
+    levels = [level(one) for one in fits]
+    assert np.std([one.value for one in levels]) < 1.5 * np.mean([one.error for one in levels])
+    assert np.mean([one.value for one in levels]) == pytest.approx(3.4e-13, rel=0.04)
 
 
 def test_finds_a_leak_its_onset_and_its_size(detector: VolumeBalance, worn: Recording) -> None:
@@ -195,11 +194,11 @@ def test_throttles_tell_the_pump_from_the_piston(detector: VolumeBalance) -> Non
 
 def test_throttles_give_both_conductances(detector: VolumeBalance) -> None:
     fit = fitted(detector, machine(5, drop=2.0, G=2.0e-13))
-    mean, low, high = level_interval(fit)
+    piston = level(fit)
     assert fit.pump is not None
     assert fit.pump == pytest.approx(2.4e-13, abs=3 * fit.pump_sd + 0.1e-13)
-    assert mean == pytest.approx(2.0e-13, rel=0.15)
-    assert low <= 2.0e-13 <= high
+    assert piston.value == pytest.approx(2.0e-13, rel=0.15)
+    assert abs(piston.value - 2.0e-13) <= 1.96 * piston.error
     assert "the piston leaks" in detector.examine(machine(5, drop=2.0, G=2.0e-13), [], P).reason
     assert fitted(detector, machine(5)).pump is None
 
@@ -210,8 +209,8 @@ def test_law_of_the_leak_where_the_pressure_tells(detector: VolumeBalance) -> No
 
     laminar = fitted(detector, machine(6, G=step(0.0, 1.5e-12), load=load))
     orifice = fitted(detector, machine(6, C=step(0.0, 8.0e-10), load=load))
-    assert told_apart(laminar, 60.0, 0.0, within=60.0)["orifice"] < -10.0
-    assert told_apart(orifice, 60.0, 0.0, within=60.0)["orifice"] > 10.0
+    assert discriminate(laminar, 60.0, 0.0, within=60.0)["orifice"] < -10.0
+    assert discriminate(orifice, 60.0, 0.0, within=60.0)["orifice"] > 10.0
 
 
 def test_an_encoder_that_slips_is_no_leak(detector: VolumeBalance) -> None:

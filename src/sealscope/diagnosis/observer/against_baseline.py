@@ -2,84 +2,76 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.baseline.level import DayToDay, Level, against_baseline, incomparable
 from sealscope.diagnosis.baseline.operating_point import difference, operating_point
-from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, within
+from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, misfit, within
 from sealscope.diagnosis.observer.model import G_UNIT
+from sealscope.diagnosis.observer.stream import formulation_of
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.changepoint.step_in_walk import WalkStep
+    from sealscope.parameters import Rig
 
-#: Least scatter of the level from one recording to the next, as a share of the pump's own leakage (8 %: two kelvin of
-#: oil) and, by the ringing, in units of `G_UNIT`: what friction alone may seem to change.
-_SHARE, _BY_RINGING = 0.08, 0.25
-#: Fewest baselines whose own scatter counts.
-_FEWEST = 3
+#: From day to day the level differs by this share of the pump's own leakage (8 %: two kelvin of oil) and, by the
+#: ringing, by so many `G_UNIT` (what friction alone may seem to change), known as from five machines.
+_SHARE, _BY_RINGING, _FREEDOM = 0.08, 0.25, 4.0
 
 
 def compare(
     recording: Recording,
     series: ConductanceSeries,
     baseline: Sequence[Recording],
-    others: Sequence[ConductanceSeries],
+    follow: Callable[[Recording], ConductanceSeries],
     step: WalkStep,
     probability: float,
+    rig: Rig,
 ) -> Evidence:
-    """Evidence from the mean conductance against that of the baselines that can be compared.
+    """Return the evidence from the step within the recording and from its mean conductance against the baseline's.
 
-    With b baselines of mean m and deviation s the score is (g - m)/(s sqrt(1 + 1/b)), Student's t with b - 1 degrees of
-    freedom; s is at least what two kelvin of oil make. Fewer than three baselines say nothing of s: then it is that
-    least scatter alone, and the normal law.
+    A baseline recording can be compared where it has the same operating point and formulation, and where the model
+    describes it.
     """
-    from scipy.special import ndtri, stdtrit
-
-    here = operating_point(recording)
-    reasons = [difference(here, operating_point(one)) for one in baseline]
-    usable = [one for one, why in zip(others, reasons, strict=False) if why is None and one.G.size]
-    if len(others) != len(baseline) or not usable:
-        why = next((reason for reason in reasons if reason is not None), "its channels are not the same")
-        return Evidence("cannot tell", f"no baseline recording can be compared: {why}")
-    levels = np.array([np.mean(one.G) for one in usable])
     inner = within(series, step)
-    late = series.t > inner.onset_s if inner.onset_s is not None else np.ones(series.t.size, dtype=bool)
-    level, expected, b = float(np.mean(series.G[late])), float(np.mean(levels)), levels.size
-    least = _SHARE * abs(expected) if series.formulation == "volume" else _BY_RINGING
-    enough = b >= _FEWEST
-    scatter = max(least, float(np.std(levels, ddof=1)) if enough else 0.0)
-    spread = scatter * float(np.sqrt(1.0 + 1.0 / b))
-    score = (level - expected) / spread
-    threshold = float(-stdtrit(b - 1, probability) if enough else -ndtri(probability))
-    lpm = (level - expected) * G_UNIT * float(np.mean(series.dp[late])) / LITRE_PER_MINUTE
-    half = float(stdtrit(b - 1, 0.975) if enough else ndtri(0.975)) * spread * lpm / (level - expected)
-    told = f"score {score:.2f}, threshold {threshold:.2f}; {b} baseline recordings" + (
-        "" if enough else ", too few to tell their own scatter"
-    )
-    followed = course(series, step, expected)
-    if score <= threshold:
-        return Evidence(
-            "no leak",
-            f"no more passes between the chambers than in the baseline ({told})",
-            score,
-            threshold,
-            course=followed,
-        )
-    return Evidence(
-        "leak",
-        f"{lpm:.4f} L/min more passes between the chambers than in the baseline ({told}), past the piston or in the "
-        "pump",
-        score,
-        threshold,
-        inner.onset_s,
-        inner.onset_interval_s,
-        lpm,
-        (max(0.0, lpm - half), lpm + half),
+    here = operating_point(recording)
+    levels: list[Level] = []
+    reasons: list[str] = []
+    for other in baseline:
+        reason = difference(here, operating_point(other))
+        if reason is None and formulation_of(other) != series.formulation:
+            reason = "its channels are not the same"
+        if reason is None:
+            followed = follow(other)
+            reason = misfit(followed.estimates, followed.formulation, rig) if followed.G.size else "it is too short"
+            if reason is None:
+                levels.append(level(followed))
+        if reason is not None:
+            reasons.append(reason)
+    if not levels:
+        return incomparable(inner, reasons[0])
+    expected = float(np.mean([one.value for one in levels]))
+    scale = _SHARE * abs(expected) if series.formulation == "volume" else _BY_RINGING
+    return against_baseline(
+        inner,
+        level(series),
+        levels,
+        DayToDay(scale, _FREEDOM),
+        probability,
+        part="conductance against the baseline",
+        flows=(G_UNIT * float(np.mean(series.dp)) / LITRE_PER_MINUTE,),
         cause="piston or pump leak",
-        course=followed,
+        course=course(series, step, expected),
     )
+
+
+def level(series: ConductanceSeries) -> Level:
+    """Return the mean conductance of a recording, in `G_UNIT`; the scatter of the blocks is its error."""
+    scatter = float(np.std(series.G, ddof=1)) if series.G.size > 1 else float(series.sd.mean())
+    return Level(float(np.mean(series.G)), scatter / float(np.sqrt(series.G.size)))

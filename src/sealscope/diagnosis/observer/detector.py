@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.baseline.level import share_of_each
 from sealscope.diagnosis.changepoint.step_in_walk import FEWEST, WalkStep, find_leak_step
 from sealscope.diagnosis.observer.against_baseline import compare
 from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, within
@@ -96,12 +97,15 @@ class Observer:
         unfit = misfit(series.estimates, series.formulation, self.rig)
         if unfit is not None:
             return Evidence("cannot tell", unfit)
-        step = self._step(series, false_alarm_probability)
+        probability = share_of_each(false_alarm_probability, baseline)
+        step = self._step(series, probability)
         if not baseline:
             return within(series, step)
-        alike = [other for other in baseline if formulation_of(other) == series.formulation]
-        others = [remembered(other, (self.name, self.rig), self.follow) for other in alike]
-        return compare(recording, series, baseline, others, step, false_alarm_probability)
+
+        def follow(other: Recording) -> ConductanceSeries:
+            return remembered(other, (self.name, self.rig), self.follow)
+
+        return compare(recording, series, baseline, follow, step, probability, self.rig)
 
     @staticmethod
     def _step(series: ConductanceSeries, probability: float) -> WalkStep:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.baseline.level import Level
 from sealscope.diagnosis.pressure_model.duty import Duty, differences, duty_of, moving
 from sealscope.diagnosis.pressure_model.fit import (
     LONG_WINDOW,
@@ -42,8 +43,8 @@ _AS_GOOD = 1e-3
 @dataclass(frozen=True, eq=False)
 class Followed:
     """A record as the model sees it. `theta` (12,): first fit; `path` (b, 12); `steps` of G; `edges` (b + 1,) [samples]
-    from the first sample; `seconds` of a block; `explained`: share of dp's variance; `level`, `level_deviation`
-    [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to the last third, as shares."""
+    from the first sample; `seconds` of a block; `explained`: share of dp's variance; `level` [m^3/(s Pa)]: mean
+    G; `friction_change`, `stiffness_change`: from the first to the last third, as shares."""
 
     theta: Array
     path: Array
@@ -52,8 +53,7 @@ class Followed:
     seconds: float
     explained: float
     misfit: float
-    level: float
-    level_deviation: float
+    level: Level
     friction_change: float
     stiffness_change: float
     command_rms: float
@@ -137,8 +137,7 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
         length,
         1.0 - followed.variance / float(np.var(dp)),
         followed.variance / long.variance,
-        float(steps.level.mean()),
-        float(steps.level_deviation.mean()),
+        Level(float(steps.level.mean()), float(steps.level_deviation.mean())),
         friction,
         float(late[K] / early[K] - 1.0),
         float(np.std(u)),

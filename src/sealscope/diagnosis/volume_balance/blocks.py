@@ -18,8 +18,8 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
-#: Columns of every block (flow: that of the pump, d theta/dt); the last two only where the pump's ports are recorded.
-COLUMNS = ("y", "theta", "flow", "I_AB", "I_root", "dp_12", "I_12")
+#: Columns of every block: displaced volume, angle, flow of the pump (d theta/dt), integrals of dp and of its root, and
+#: pressure difference at the pump's ports with its integral; the last two only where the pump's ports are recorded.
 Y, THETA, FLOW, I_AB, I_ROOT, DP_12, I_12 = range(7)
 #: Length a block should have [s], and the share of a short recording it may take.
 BLOCK_SECONDS = 3.0
@@ -34,12 +34,15 @@ _ENOUGH = 0.5
 
 @dataclass(frozen=True, eq=False)
 class BalanceBlocks:
-    """n blocks of equal length. `t` (n,): middles [s]; `gram` (n, c, c): sums of products of the columns beyond
+    """Sums over n blocks of equal length.
+
+    `t` (n,): middles [s]; `gram` (n, c, c): sums of products of the columns beyond
     offset, slope and stored oil; `slope` (n, c): slopes of the columns [1/s] beside the stored oil; `stored` (n, c):
     their coefficients of dp; `abs_dp`, `root_dp` (n,): means of abs(dp), sqrt(abs(dp)); `motion` (n,):
     mean of dp times the piston's velocity; `walk` (n,): variance of the conductance, over its square, that the noise of
     dp makes in the integral; `noise`, `noise_12` (n,): variance of the noise of dp, of dp_12; `samples`: samples of a
-    block; `seconds`: its length."""
+    block; `seconds`: its length.
+    """
 
     t: Array
     gram: Array
@@ -58,39 +61,46 @@ class BalanceBlocks:
         return int(self.t.size)
 
     def chosen(self, which: Array | np.ndarray) -> BalanceBlocks:
-        """The blocks of an index or mask."""
-        arrays = {one.name: getattr(self, one.name)[which] for one in fields(self)[:-2]}
+        """Return the blocks of an index or mask."""
+        arrays = {name: getattr(self, name)[which] for name in _ARRAYS}
         return BalanceBlocks(**arrays, samples=self.samples, seconds=self.seconds)
 
     @staticmethod
     def joined(parts: list[BalanceBlocks]) -> BalanceBlocks:
-        """All blocks of the parts, in their order; the parts must have blocks of one length."""
-        arrays = {
-            one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(BalanceBlocks)[:-2]
-        }
+        """Return all blocks of the parts, in their order; the parts must have blocks of one length."""
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
         return BalanceBlocks(**arrays, samples=parts[0].samples, seconds=parts[0].seconds)
 
 
+_ARRAYS = tuple(field.name for field in fields(BalanceBlocks))[:-2]
+
+
 def channels_needed(recording: Recording) -> str | None:
-    """None where the recording has what the balance needs, else what is missing, in one line."""
+    """Return None where the recording has what the balance needs, else what is missing, in one line."""
     missing = [name for name in (*CHAMBERS, "x") if name not in recording]
     if "theta" not in recording and "omega" not in recording:
         missing.append("theta or omega")
     return f"needs {', '.join(missing)} as well (both chamber pressures and both encoders)" if missing else None
 
 
-def samples_of(recording: Recording) -> dict[str, Array]:
-    """The channels of the balance: `x`, `theta` (or `omega` where it is not recorded), `p_A`, `p_B`, and `p_1`, `p_2`
-    where both are recorded and move."""
-    names = ["x", "theta" if "theta" in recording else "omega", *CHAMBERS]
-    if all(name in recording and np.nanmax(recording[name]) > np.nanmin(recording[name]) for name in ("p_1", "p_2")):
-        names += ["p_1", "p_2"]
-    return {name: recording[name] for name in names}
+def balance_channels(recording: Recording) -> tuple[str, ...]:
+    """Return the channels of the balance.
+
+    They are `x`, `theta` (or `omega` where it is not recorded), `p_A`, `p_B`, and `p_1`, `p_2` where both are recorded
+    and move.
+    """
+    names = ("x", "theta" if "theta" in recording else "omega", *CHAMBERS)
+    ports = ("p_1", "p_2")
+    moves = all(name in recording and np.nanmax(recording[name]) > np.nanmin(recording[name]) for name in ports)
+    return names + ports if moves else names
 
 
 def block_samples(recording: Recording, seconds: float | None = None) -> int:
-    """Samples of a block: whole cycles of the duty of about `seconds` (3 s, less for a short recording); without a
-    cycle, as short as the information of the reversals within it allows."""
+    """Return the samples of a block.
+
+    A block is whole cycles of the duty of about `seconds` (3 s, less for a short recording); without a cycle it is as
+    short as the information of the reversals within it allows.
+    """
     rate, duration = recording.rate, recording.duration
     share = min(BLOCK_SECONDS, max(_SHORTEST_SECONDS, _SHARE * duration), max(duration, 1.0 / rate))
     wanted = share if seconds is None else seconds
@@ -101,15 +111,15 @@ def block_samples(recording: Recording, seconds: float | None = None) -> int:
         if _FEWEST_BLOCKS * whole <= len(recording):
             return whole
     lengths = [max(fewest, round(wanted * factor * rate)) for factor in _WITHOUT_CYCLE]
-    lengths = [one for one in lengths if _FEWEST_BLOCKS * one <= len(recording)] or lengths[:1]
+    lengths = [length for length in lengths if _FEWEST_BLOCKS * length <= len(recording)] or lengths[:1]
     dp = recording["p_A"] - recording["p_B"]
-    information = [_information(dp, one) for one in lengths]
-    enough = (one for one, value in zip(lengths, information, strict=True) if value >= _ENOUGH * information[-1])
+    information = [_information(dp, length) for length in lengths]
+    enough = (n for n, value in zip(lengths, information, strict=True) if value >= _ENOUGH * information[-1])
     return next(enough, lengths[-1])
 
 
 def _information(dp: Array, length: int) -> float:
-    """Sum of squares of the integral of dp beyond offset, slope and dp itself, over blocks of so many samples."""
+    """Return the sum of squares of the integral of dp beyond offset, slope and dp, over blocks of `length` samples."""
     count = dp.size // length
     rows = np.nan_to_num(dp[: count * length]).reshape(count, length)
     columns = np.stack([rows, _integral(rows, 1.0)], axis=1)
@@ -118,14 +128,14 @@ def _information(dp: Array, length: int) -> float:
 
 
 def _integral(rows: Array, step: float) -> Array:
-    """Integral over each row (n, L) from its first sample, by trapezia."""
-    found = np.zeros_like(rows)
-    np.cumsum(0.5 * step * (rows[:, 1:] + rows[:, :-1]), axis=1, out=found[:, 1:])
-    return found
+    """Return the integral over each row (n, L) from its first sample, by trapezia."""
+    integral = np.zeros_like(rows)
+    np.cumsum(0.5 * step * (rows[:, 1:] + rows[:, :-1]), axis=1, out=integral[:, 1:])
+    return integral
 
 
 def _beyond(columns: Array, dp: Array, step: float) -> tuple[Array, Array, Array]:
-    """What offset, slope and dp leave of columns (n, c, L), and the coefficients (n, c) of slope [1/s] and dp."""
+    """Return what offset, slope and dp leave of columns (n, c, L), and coefficients (n, c) of slope [1/s] and dp."""
     length = dp.shape[1]
     tau = (np.arange(length) - 0.5 * (length - 1)) * step
     tau2 = float(tau @ tau)
@@ -142,14 +152,16 @@ def _beyond(columns: Array, dp: Array, step: float) -> tuple[Array, Array, Array
 
 
 def _noise(rows: Array) -> Array:
-    """Variance (n,) of white noise in rows of slow signals (n, L): that of the second differences over 6."""
+    """Return the variance (n,) of white noise in rows of slow signals (n, L): that of the second differences over 6."""
     return np.asarray(np.mean(np.diff(rows, 2, axis=1) ** 2, axis=1) / 6.0)
 
 
 def _walk(integral: Array, step: float) -> Array:
-    """Relative variance (n,) of a conductance from noise of dp of unit variance, which the integral sums up to a random
-    walk: sum_t I_t sum_{j <= t} noise_j step / sum_t I_t^2 has the variance step^2 sum_j (sum_{t >= j} I_t)^2 / (sum_t
-    I_t^2)^2."""
+    """Return the relative variance (n,) of a conductance from noise of dp of unit variance.
+
+    The integral sums the noise up to a random walk: sum_t I_t sum_{j <= t} noise_j step / sum_t I_t^2 has the variance
+    step^2 sum_j (sum_{t >= j} I_t)^2 / (sum_t I_t^2)^2.
+    """
     reach = np.cumsum(integral[:, ::-1], axis=1)
     own = np.maximum(np.sum(integral**2, axis=1), np.finfo(float).tiny)
     return np.asarray(step**2 * np.sum(reach**2, axis=1) / own**2)
@@ -158,10 +170,10 @@ def _walk(integral: Array, step: float) -> Array:
 def cut_blocks(
     t: Array, samples: Mapping[str, Array], length: int, rate: float, *, area: float, displacement: float, pump: bool
 ) -> BalanceBlocks:
-    """Whole blocks of `length` samples from the first on; what is left over is not used, nor is a block with a missing
-    value or an uneven time base.
+    """Cut samples into whole blocks of `length` samples from the first on.
 
-    `t` (m,) [s]; `samples` as `samples_of` gives them, in any unit; `area` [m^2] and `displacement` [m^3/rad] turn x
+    What is left over is not used, nor is a block with a missing value or an uneven time base. `t` (m,) [s]; `samples`:
+    the `balance_channels`, in any unit; `area` [m^2] and `displacement` [m^3/rad] turn x
     and theta into volumes; `pump`: keep the columns of the pump's ports.
     """
     count = t.size // length
@@ -182,7 +194,7 @@ def cut_blocks(
     usable = np.all(np.isfinite(x + theta + dp + (0.0 if pump_dp is None else pump_dp)), axis=1)
     spacing = np.diff(times, axis=1) * rate
     usable &= np.all(np.isfinite(times), axis=1) & np.all((spacing > 0.5) & (spacing < 1.5), axis=1)
-    times, x, theta, flow, dp = (one[usable] for one in (times, x, theta, flow, dp))
+    times, x, theta, flow, dp = (values[usable] for values in (times, x, theta, flow, dp))
     columns = [x, theta, flow, _integral(dp, step), _integral(np.sign(dp) * np.sqrt(np.abs(dp)), step)]
     if pump_dp is not None:
         columns += [pump_dp[usable], _integral(pump_dp[usable], step)]

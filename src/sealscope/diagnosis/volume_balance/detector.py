@@ -1,9 +1,9 @@
 """Volume balance: what the pump delivers and the piston does not displace has leaked, or is stored in the oil.
 
-Both encoders are so fine that a few seconds tell the leakage conductance of pump and piston together to some
-hundredths of what a pump leaks when it is sound (`balance_fit`). What limits the search for a leak is the pump's own
-leakage, which drifts with the oil's temperature; so a leak is a step, or a growth, of the conductance that no smooth
-drift explains (`step_in_drift`). Nothing is assumed of friction, bulk modulus or the pump's leakage; the piston's area
+Both encoders are so fine that a few seconds give the leakage conductance of pump and piston together to some
+hundredths of what a healthy pump leaks (`fit`). What limits the search for a leak is the pump's own leakage, which
+drifts with the oil's temperature; so a leak is a step, or a growth, of the conductance that no smooth drift explains
+(`changepoint.step_in_drift`). Nothing is assumed of friction, bulk modulus or the pump's leakage; the piston's area
 turns the result into L/min, and displacement over area shows whether the assumed geometry fits.
 """
 
@@ -14,19 +14,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.baseline.level import share_of_each
 from sealscope.diagnosis.changepoint.step_in_drift import FEWEST
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.volume_balance.against_baseline import against_baseline
 from sealscope.diagnosis.volume_balance.blocks import (
     BalanceBlocks,
+    balance_channels,
     block_samples,
     channels_needed,
     cut_blocks,
-    samples_of,
 )
-from sealscope.diagnosis.volume_balance.evidence import describe_leak, no_step, trouble
+from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trouble
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance
-from sealscope.diagnosis.volume_balance.search import search
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
 from sealscope.recordings.symptoms import clipped
@@ -36,12 +35,14 @@ if TYPE_CHECKING:
 
 #: Share of the samples that a pressure may be cut off.
 _CLIPPED = 0.005
-STEP = "step of the conductance"
 
 
 class VolumeBalance:
-    """Leakage from the balance of volumes: needs both chamber pressures, the piston's position and the pump's angle (or
-    speed); the pressures at the pump's ports, where there are any, tell the pump's leakage from the piston's."""
+    """Leakage from the balance of volumes.
+
+    It needs both chamber pressures, the piston's position and the pump's angle (or speed); the pressures at the pump's
+    ports, where there are any, tell the pump's leakage from the piston's.
+    """
 
     name = "volume balance"
     reads = ("u", "theta", "omega", "x", "p_1", "p_2", *CHAMBERS)
@@ -52,6 +53,7 @@ class VolumeBalance:
         self.displacement = float(rig.pump.q_b / (2.0 * np.pi))
 
     def usable(self, recording: Recording) -> str | None:
+        """Return None where the recording has what the balance needs, else the reason why not."""
         missing = channels_needed(recording)
         if missing is not None:
             return missing
@@ -64,33 +66,34 @@ class VolumeBalance:
         return None
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
+        """Return the evidence of a rise of the conductance, and of its level against the baseline's."""
         fit, problem = self.fit(recording)
         if fit is None:
             return Evidence("cannot tell", problem)
-        probability = false_alarm_probability / (2.0 if baseline else 1.0)
-        metres = recording.units["x"] == "m"
-        within = self._within(fit, probability, metres)
+        probability = share_of_each(false_alarm_probability, baseline)
+        within = judge(fit, probability)
         if not baseline:
             return within
-        fits = (remembered(other, (self.name, self.rig), self.fit) for other in baseline)
-        others = [one for one, _ in fits if one is not None]
-        return against_baseline(fit, others, within, probability, metres=metres)
+        fits = [remembered(other, (self.name, self.rig), self.fit)[0] for other in baseline]
+        return judge_level(fit, [other for other in fits if other is not None], within, probability)
 
-    def blocks(self, recording: Recording, length: int | None = None) -> BalanceBlocks:
-        """The blocks of a recording, of `length` samples or as its duty suggests."""
-        samples = samples_of(recording)
+    def blocks(
+        self, recording: Recording, length: int | None = None, names: Sequence[str] | None = None
+    ) -> BalanceBlocks:
+        """Return the blocks of a recording, of `length` samples and `names` of channels, or as its duty suggests."""
+        names = balance_channels(recording) if names is None else names
         return cut_blocks(
             recording.t,
-            samples,
+            {name: recording[name] for name in names},
             block_samples(recording) if length is None else length,
             recording.rate,
             area=self.area,
             displacement=self.displacement,
-            pump="p_1" in samples,
+            pump="p_1" in names,
         )
 
     def fit(self, recording: Recording) -> tuple[BalanceFit | None, str]:
-        """The balance of a recording, or None and the reason why there is none."""
+        """Return the balance of a recording, or None and the reason why there is none."""
         rail = _at_the_rail(recording)
         if rail is not None:
             return None, rail
@@ -101,21 +104,13 @@ class VolumeBalance:
             )
         if not np.all(np.isfinite(blocks.gram)):
             return None, "the balance cannot be computed: values are beyond floating point"
-        fit = fit_balance(blocks)
+        fit = fit_balance(blocks, metres=recording.units["x"] == "m")
         problem = trouble(fit)
         return (fit, "") if problem is None else (None, problem)
 
-    @staticmethod
-    def _within(fit: BalanceFit, probability: float, metres: bool) -> Evidence:
-        found = search(fit, probability)
-        part = Evidence("leak" if found.found else "no leak", "", found.score, found.threshold, detector=STEP)
-        if found.found:
-            return describe_leak(fit, found, part, metres=metres)
-        return no_step(fit, found, search(fit, probability, sign=-1), part, metres=metres)
-
 
 def _at_the_rail(recording: Recording) -> str | None:
-    """Which chamber pressure is cut off for so long that its integral is not known, in one line, or None."""
+    """Return which chamber pressure is cut off for so long that its integral is not known, in one line, or None."""
     for name in CHAMBERS:
         values = recording[name]
         values = values[np.isfinite(values)]

@@ -1,4 +1,4 @@
-"""The balance of volumes over blocks: one geometry for all, one conductance a block.
+"""The balance of volumes over blocks, one geometry for all and one conductance a block, and a rise in these.
 
     A x = s (q_b/(2 pi)) (theta - tau omega) - g_k integral(dp_AB) dt - (V/2K)_k dp_AB - (V_1/2K) dp_12 + a_k + b_k t
 
@@ -10,14 +10,18 @@ block a wrong s passes for a leak: the integral of a rectangular pressure differ
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.changepoint.step_in_drift import StepFound, find_step
 from sealscope.diagnosis.volume_balance.blocks import DP_12, FLOW, I_12, I_AB, I_ROOT, THETA, BalanceBlocks, Y
 from sealscope.recordings.recording import Array
 
+#: Laws that a leak may follow: proportional to the pressure difference (a worn seal), or to its root (an orifice).
+Law = Literal["laminar", "orifice"]
 #: A block whose residual is over this many times the usual one does not take part, nor one with less than this share of
 #: the usual information.
 _SPOILT = 5.0
@@ -35,16 +39,24 @@ _APART = 1.5
 _SEPARATE = 10.0
 #: The stored oil tells the sense of the pressures where it is this many deviations from zero.
 _SURE = 5.0
+#: More blocks than this are merged for the search; around the rise they are searched one by one.
+MOST_BLOCKS = 96
+#: Errors that the blocks share count where they differ between blocks by more than this share of a block's own error.
+_DIFFERENT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class BalanceFit:
-    """`blocks`: those that took part; `left_out`: those that did not; `columns`: those that blocks share, with
+    """Balance of a recording.
+
+    `blocks`: those that took part; `left_out`: those that did not; `columns`: those that blocks share, with
     their coefficients `beta`; `sense`: 1, or -1 where dp counts against the motion; `pump`: the pump's own conductance
     where throttles tell it from the piston's, else None, and its deviation `pump_sd`; `g` (n,): conductance of the
     piston, or of both together [m^3/(s Pa)], positive where oil leaks; `sd` (n,): its deviation, from the residual and
     the noise of dp; `shared` (n, m): deviations common to the blocks, from the shared coefficients; `residual` [m^3]:
-    rms; `signal` [m^3]: rms of the motion; `slip` (n,): flow that nothing explains [m^3/s]."""
+    rms; `signal` [m^3]: rms of the motion; `slip` (n,): flow that nothing explains [m^3/s]; `metres`: the position
+    has a unit.
+    """
 
     blocks: BalanceBlocks
     left_out: BalanceBlocks
@@ -59,16 +71,29 @@ class BalanceFit:
     residual: float
     signal: float
     slip: Array
+    metres: bool
 
     @property
     def scale(self) -> float:
-        """s: displacement over area, over the assumed one; negative where an encoder counts the other way."""
+        """Displacement over area, over the assumed one, s; negative where an encoder counts the other way."""
         return float(self.beta[0])
 
     @property
     def lag(self) -> float:
-        """tau: how far the position's reading lags behind the angle's [s]."""
+        """Lag of the position's reading behind the angle's, tau [s]."""
         return float(-self.beta[1] / self.beta[0]) if self.beta[0] != 0 else float("inf")
+
+    def unit_flow(self, law: Law) -> Array:
+        """Return the mean flow (n,) [m^3/s] over each block of a leak that shows as one unit of conductance there.
+
+        A laminar leak has the flow g abs(dp). A leak C sign(dp) sqrt(abs(dp)) through an orifice shows as ``g = C
+        <I_AB, I_root>/<I_AB, I_AB>`` and has the mean flow C sqrt(abs(dp)).
+        """
+        if law == "laminar":
+            return self.blocks.abs_dp
+        gram = self.blocks.gram
+        shown = gram[:, I_ROOT, I_AB] / np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny)
+        return np.asarray(self.blocks.root_dp / shown)
 
     @property
     def share_left_out(self) -> float:
@@ -77,15 +102,17 @@ class BalanceFit:
 
 
 def _beyond(gram: Array, column: int) -> Array:
-    """Sums of products (n, c, c) of what `column` leaves of the others in each block."""
+    """Return the sums of products (n, c, c) of what `column` leaves of the others in each block."""
     own = np.maximum(gram[:, column, column], np.finfo(float).tiny)
     return np.asarray(gram - gram[:, :, column, None] * gram[:, None, column, :] / own[:, None, None])
 
 
 def _shared_columns(blocks: BalanceBlocks) -> list[int]:
-    """Columns whose coefficients all blocks share: the angle, its lag (the flow), the pump's ports where they are
-    recorded, and the pump's leakage where throttles set the ports so far apart from the chambers that it can be told
-    from the piston's."""
+    """Return the columns whose coefficients all blocks share.
+
+    They are the angle, its lag (the flow), the pump's ports where they are recorded, and the pump's leakage where
+    throttles set the ports so far apart from the chambers that it can be told from the piston's.
+    """
     if blocks.gram.shape[1] <= I_12:
         return [THETA, FLOW]
     own = float(np.median(_beyond(blocks.gram, I_AB)[:, I_12, I_12]))
@@ -94,9 +121,11 @@ def _shared_columns(blocks: BalanceBlocks) -> list[int]:
 
 
 def _noise_of_integrals(blocks: BalanceBlocks) -> float:
-    """Sum of squares in a block, beyond offset, slope and dp_AB's integral, of the random walk that noise makes of
-    dp_12's: sigma^2 step^2 L^2/15 (a Brownian path about its best line has the mean square T/15), sigma^2 that of dp_12
-    and, by the square of the factor between the two, of dp_AB."""
+    """Return the sum of squares in a block of the random walk that noise makes of the integral of dp_12.
+
+    Beyond offset, slope and dp_AB's integral it is sigma^2 step^2 L^2/15 (a Brownian path about its best line has the
+    mean square T/15), sigma^2 that of dp_12 and, by the square of the factor between the two, of dp_AB.
+    """
     factor = np.median(blocks.gram[:, I_12, I_AB] / np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny))
     variance = float(np.median(blocks.noise_12) + factor**2 * np.median(blocks.noise))
     step = blocks.seconds / blocks.samples
@@ -104,7 +133,7 @@ def _noise_of_integrals(blocks: BalanceBlocks) -> float:
 
 
 def _solve(gram: Array, shared: list[int]) -> tuple[Array, Array]:
-    """Coefficients (m,) of the shared columns, and their covariance over the residual's variance (m, m)."""
+    """Return the coefficients (m,) of the shared columns, and their covariance over the residual's variance (m, m)."""
     total = _beyond(gram, I_AB).sum(axis=0)
     size = np.sqrt(np.maximum(np.diag(total)[shared], np.finfo(float).tiny))
     scaled = total[np.ix_(shared, shared)] / np.outer(size, size)
@@ -113,7 +142,7 @@ def _solve(gram: Array, shared: list[int]) -> tuple[Array, Array]:
 
 
 def _left(gram: Array, shared: list[int], beta: Array) -> Array:
-    """Sum of squares (n,) that the balance with coefficients `beta` leaves in each block."""
+    """Return the sum of squares (n,) that the balance with coefficients `beta` leaves in each block."""
     rest = _beyond(gram, I_AB)
     left = rest[:, Y, Y] - 2.0 * rest[:, Y][:, shared] @ beta
     left += np.einsum("i,nij,j->n", beta, rest[:, shared][:, :, shared], beta)
@@ -121,7 +150,7 @@ def _left(gram: Array, shared: list[int], beta: Array) -> Array:
 
 
 def _one_motion(gram: Array) -> NDArray[np.bool_]:
-    """Blocks (n,) in which position and angle move in the usual ratio, as they are or beyond the integral of dp.
+    """Return the blocks (n,) in which position and angle move in the usual ratio, or do beyond the integral of dp.
 
     A large leak changes the first ratio and not the second; where the integral is nearly the motion itself, noise
     changes the second and not the first.
@@ -135,7 +164,7 @@ def _one_motion(gram: Array) -> NDArray[np.bool_]:
 
 
 def _between_neighbours(slope: Array, spoilt: NDArray[np.bool_], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Spoilt blocks (n,) whose conductance lies between those of the next blocks before and after that are kept.
+    """Return the spoilt blocks (n,) whose conductance lies between those of the kept blocks before and after.
 
     A large leak that opens within a block bends the volumes there, which the block's one conductance does not follow:
     that is no fault of the recording, and the block holds the onset.
@@ -151,11 +180,11 @@ def _between_neighbours(slope: Array, spoilt: NDArray[np.bool_], keep: NDArray[n
     return between
 
 
-def fit_balance(blocks: BalanceBlocks) -> BalanceFit:
+def fit_balance(blocks: BalanceBlocks, *, metres: bool = True) -> BalanceFit:
     """Fit the balance; blocks in which the machine stands, or the residual stands out, are left out.
 
-    Needs one block or more; a fit that means nothing (no motion, encoders that do not belong together) is told by
-    `residual` and `signal`.
+    Needs one block or more; `residual` and `signal` show a fit that means nothing (no motion, encoders that do not
+    belong together).
     """
     information = blocks.gram[:, I_AB, I_AB]
     moving = information > _STILL * float(np.median(information))
@@ -204,11 +233,12 @@ def fit_balance(blocks: BalanceBlocks) -> BalanceFit:
         residual=float(np.sqrt(usual)),
         signal=float(np.sqrt(np.median(used.gram[:, Y, Y]) / used.samples)),
         slip=slip,
+        metres=metres,
     )
 
 
 def _sense(blocks: BalanceBlocks, slope: Array, beta: Array) -> int:
-    """1 where p_A - p_B rises as the piston is pushed towards positive A x, -1 where channels count the other way.
+    """Return 1 where p_A - p_B rises as the piston is pushed towards positive A x, -1 where channels count otherwise.
 
     Stored oil takes volume from the motion whatever the signs of the encoders are; where its share is not clear, the
     pressure works along the motion on the whole (friction).
@@ -221,9 +251,11 @@ def _sense(blocks: BalanceBlocks, slope: Array, beta: Array) -> int:
     return 1 if float(np.sum(blocks.motion)) >= 0 else -1
 
 
-def told_apart(fit: BalanceFit, onset: float, rise: float, *, within: float) -> dict[str, float]:
-    """Twice the log likelihood by which a leak elsewhere, or of another law, explains a rise at `onset` [s] better than
-    a laminar leak past the piston: `orifice` (past the piston, with the root of the pressure difference), `scale` (no
+def discriminate(fit: BalanceFit, onset: float, rise: float, *, within: float) -> dict[str, float]:
+    """Compare the explanations of a rise of the conductance at `onset` [s] over `rise` [s].
+
+    Returns twice the log likelihood by which each explains the blocks better than a laminar leak past the piston:
+    `orifice` (past the piston, with the root of the pressure difference), `scale` (no
     leak: displacement or the reading of an encoder changed by a factor), `pump` (with the pressure difference at the
     pump's ports, where it is recorded). Near 0: the data do not tell.
 
@@ -239,7 +271,7 @@ def told_apart(fit: BalanceFit, onset: float, rise: float, *, within: float) -> 
         return {}
     gram, shared, beta = fit.blocks.gram, list(fit.columns), fit.beta
     rest = _beyond(gram, I_AB)
-    found = {}
+    evidence = {}
     for name, column in (("orifice", I_ROOT), ("scale", THETA), ("pump", I_12)):
         if column >= gram.shape[1]:
             continue
@@ -254,5 +286,51 @@ def told_apart(fit: BalanceFit, onset: float, rise: float, *, within: float) -> 
         deviation = np.sqrt(np.var(b[after], ddof=1) / after.sum() + np.var(b[before], ddof=1) / before.sum())
         z = np.array([moved, moved - whole]) / max(float(deviation), np.finfo(float).tiny)
         here, there = (freedom + 1) * np.log1p(z**2 / freedom)
-        found[name] = float(here - there)
-    return found
+        evidence[name] = float(here - there)
+    return evidence
+
+
+def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> StepFound:
+    """Return the best rise (or fall, `sign` -1) of the conductance, with `level` at every block of the fit."""
+    shared = _shared_errors(fit)
+    every = -(-len(fit.blocks) // MOST_BLOCKS)
+    if every == 1:
+        return find_step(fit.blocks.t, fit.g, fit.sd, probability, sign=sign, shared=shared)
+    t, g, sd, common = _merged(fit, shared, every)
+    coarse = find_step(t, g, sd, probability, sign=sign, shared=common)
+    level = np.interp(fit.blocks.t, t, coarse.level[:, 0])[:, None]
+    coarse = replace(coarse, level=level, index=int(np.searchsorted(fit.blocks.t, coarse.onset)))
+    if not coarse.found or coarse.rise > 0:
+        return coarse
+    first = max(0, min(coarse.index - MOST_BLOCKS // 2, len(fit.blocks) - MOST_BLOCKS))
+    near = slice(first, first + MOST_BLOCKS)
+    fine = find_step(fit.blocks.t[near], fit.g[near], fit.sd[near], probability, sign=sign)
+    low, high = coarse.onset_interval
+    if not (fine.found and fine.rise == 0 and low <= fine.onset <= high):
+        return coarse
+    return replace(coarse, onset=fine.onset, onset_interval=fine.onset_interval, index=first + fine.index)
+
+
+def _merged(fit: BalanceFit, shared: Array | None, every: int) -> tuple[Array, Array, Array, Array | None]:
+    """Return times, conductances, deviations and shared errors of `every` blocks merged by their weights."""
+    starts = np.arange(0, len(fit.blocks), every)
+    weight = 1.0 / fit.sd**2
+    total = np.add.reduceat(weight, starts)
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.add.reduceat(weight * values, starts) / total)
+
+    common = None if shared is None else np.stack([mean(column) for column in shared.T], axis=1)
+    return mean(fit.blocks.t), mean(fit.g), np.sqrt(1.0 / total), common
+
+
+def _shared_errors(fit: BalanceFit) -> Array | None:
+    """Return the errors that the blocks share where these differ enough from block to block to look like a change.
+
+    None where they are one constant, or grow evenly, as with a duty that repeats.
+    """
+    u = fit.blocks.t - fit.blocks.t.mean()
+    rest = fit.shared - fit.shared.mean(axis=0)
+    rest = rest - np.outer(u, u @ rest) / max(float(u @ u), np.finfo(float).tiny)
+    size = float(np.sqrt(np.sum(rest**2, axis=1).mean()))
+    return fit.shared if size > _DIFFERENT * float(np.median(fit.sd)) else None

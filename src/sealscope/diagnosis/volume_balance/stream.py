@@ -13,7 +13,7 @@ overlap, so false alarms come in clusters, which leaves the true rate some 2 to 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,21 +23,13 @@ from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import (
     BLOCK_SECONDS,
     BalanceBlocks,
+    balance_channels,
     block_samples,
     channels_needed,
-    cut_blocks,
-    samples_of,
 )
-from sealscope.diagnosis.volume_balance.evidence import (
-    LPM,
-    describe_leak,
-    geometry_fits,
-    level_interval,
-    no_step,
-    trouble,
-)
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.diagnosis.volume_balance.evidence import judge, total_lpm, trouble
 from sealscope.diagnosis.volume_balance.fit import fit_balance
-from sealscope.diagnosis.volume_balance.search import search
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array, Recording
 
@@ -89,8 +81,7 @@ class SequentialBalance:
         if not low <= alarms_per_hour <= high:
             raise InputError(f"alarms_per_hour must be {low:.2g} to {high:.3g}, got {alarms_per_hour}")
         self.alarms_per_hour, self.window, self.block_seconds = alarms_per_hour, window, block_seconds
-        self._area = float(0.5 * (rig.cylinder.A_A + rig.cylinder.A_B))
-        self._displacement = float(rig.pump.q_b / (2.0 * np.pi))
+        self._detector = VolumeBalance(rig)
         self._t: Array = np.empty(0)
         self._channels: dict[str, Array] = {}
         self._units: dict[str, str] = {}
@@ -120,7 +111,7 @@ class SequentialBalance:
                 return self.state
             first = joined.samples(slice(0, round(_LEARN_SECONDS * joined.rate)))
             self._length = block_samples(first, self.block_seconds)
-            self._used = tuple(samples_of(first))
+            self._used = balance_channels(first)
         count = len(joined) // self._length
         for number in range(count):
             self._take(joined.samples(slice(number * self._length, (number + 1) * self._length)))
@@ -149,15 +140,7 @@ class SequentialBalance:
         return Recording(np.concatenate([self._t, chosen.t]), channels, self._units, self._rate)
 
     def _take(self, block: Recording) -> None:
-        cut = cut_blocks(
-            block.t,
-            {name: block[name] for name in self._used},
-            self._length,
-            block.rate,
-            area=self._area,
-            displacement=self._displacement,
-            pump="p_1" in self._used,
-        )
+        cut = self._detector.blocks(block, self._length, self._used)
         end = float(block.t[-1]) + 1.0 / block.rate
         before = self.state
         evidence, alarm, total = before.evidence, before.alarm, before.total_lpm
@@ -173,16 +156,8 @@ class SequentialBalance:
         self.state = BalanceState(end, before.blocks + 1, before.refused + (not sound), evidence, alarm, total)
 
     def _judge(self, blocks: BalanceBlocks, metres: bool) -> tuple[Evidence, float | None]:
-        fit = fit_balance(blocks)
+        fit = fit_balance(blocks, metres=metres)
         problem = trouble(fit)
         if problem is not None:
             return Evidence("cannot tell", problem), None
-        found = search(fit, self.alarms_per_hour * blocks.seconds / 3600.0)
-        part = Evidence("no leak", "", found.score, found.threshold, detector="step of the conductance")
-        total = None
-        if metres and geometry_fits(fit):
-            total = level_interval(fit)[0] * float(fit.blocks.abs_dp.mean()) * LPM
-        if not found.found:
-            return no_step(fit, found, None, part, metres=metres), total
-        part = replace(part, verdict="leak")
-        return describe_leak(fit, found, part, metres=metres), total
+        return judge(fit, self.alarms_per_hour * blocks.seconds / 3600.0, falls=False), total_lpm(fit)

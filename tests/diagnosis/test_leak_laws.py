@@ -1,0 +1,33 @@
+"""The volume balance on simulated machines: the mean flow of laminar and turbulent leaks, and when they open."""
+
+from __future__ import annotations
+
+import pytest
+
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.parameters import load_rig
+from sealscope.simulation.experiment import make_experiment
+from sealscope.simulation.simulate import run
+
+ONSET = 61.3
+
+
+@pytest.mark.parametrize("command", ["3 sin(4t)", "5 sin(2t)"])
+@pytest.mark.parametrize("lpm", [0.0042, 0.015, 0.1])
+@pytest.mark.parametrize("law", ["laminar", "orifice"])
+def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
+    """The interval holds the true mean flow, which is stated within 1 %, and the onset is within 0.3 s.
+
+    The mean flow of an orifice was stated 2 to 4 % low, as that of a laminar leak; a leak of 0.015 L/min and more was
+    placed up to 2.5 s off, because the block in which it opens was left out; one of 0.1 L/min passed for an encoder
+    that slips.
+    """
+    leak = f"{lpm} L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
+    result = run(make_experiment(command=command, duration=125.0, leak=leak, seed=7))
+    evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
+    true = result.truth.mean_leak_lpm
+    assert evidence.verdict == "leak"
+    assert evidence.leak_lpm == pytest.approx(true, rel=0.012)
+    assert evidence.leak_interval_lpm is not None
+    assert evidence.leak_interval_lpm[0] <= true <= evidence.leak_interval_lpm[1]
+    assert evidence.onset_s == pytest.approx(ONSET, abs=0.3)
