@@ -6,8 +6,8 @@ import pytest
 
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.parameters import load_rig
-from sealscope.simulation.experiment import make_experiment
-from sealscope.simulation.simulate import run
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 ONSET = 61.3
 
@@ -23,7 +23,7 @@ def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
     that slips.
     """
     leak = f"{lpm} L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
-    result = run(make_experiment(command=command, duration=125.0, leak=leak, seed=7))
+    result = simulate_with_truth(Experiment.of(command=command, duration=125.0, leak=leak, seed=7))
     evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
     true = result.truth.mean_leak_lpm
     assert evidence.verdict == "leak"

@@ -11,7 +11,7 @@ from sealscope.diagnosis.baseline.level import DayToDay, Level, against_baseline
 from sealscope.diagnosis.baseline.operating_point import difference, operating_point
 from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, misfit, within
 from sealscope.diagnosis.observer.model import G_UNIT
-from sealscope.diagnosis.observer.stream import formulation_of
+from sealscope.diagnosis.observer.stream import Formulation, formulation_of
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
@@ -56,19 +56,24 @@ def compare(
             reasons.append(reason)
     if not levels:
         return incomparable(inner, reasons[0])
-    expected = float(np.mean([one.value for one in levels]))
-    scale = _SHARE * abs(expected) if series.formulation == "volume" else _BY_RINGING
+    expected = float(np.mean([known.value for known in levels]))
     return against_baseline(
         inner,
         level(series),
         levels,
-        DayToDay(scale, _FREEDOM),
+        day_to_day(series.formulation, levels),
         probability,
         part="conductance against the baseline",
         flows=(G_UNIT * float(np.mean(series.dp)) / LITRE_PER_MINUTE,),
         cause="piston or pump leak",
         course=course(series, step, expected),
     )
+
+
+def day_to_day(formulation: Formulation, baseline: Sequence[Level]) -> DayToDay:
+    """Return the prior on the scatter of the level from day to day, in `G_UNIT`."""
+    usual = abs(float(np.mean([known.value for known in baseline])))
+    return DayToDay(_SHARE * usual if formulation == "volume" else _BY_RINGING, _FREEDOM)
 
 
 def level(series: ConductanceSeries) -> Level:

@@ -72,14 +72,14 @@ class PressureModel:
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a rise of G within the recording, and of its level against the baseline's."""
-        followed = self._follow(recording)
+        followed = self.follow(recording)
         if isinstance(followed, str):
             return Evidence("cannot tell", followed)
         probability = share_of_each(false_alarm_probability, baseline)
         within = _within(followed, recording, probability)
         if not baseline or within.score is None:
             return within
-        others = [remembered(other, (self.name, self.rig), self._follow) for other in baseline]
+        others = [remembered(other, (self.name, self.rig), self.follow) for other in baseline]
         return against_baseline(
             within,
             followed.level,
@@ -91,7 +91,7 @@ class PressureModel:
             cause="piston or pump leak",
         )
 
-    def _follow(self, recording: Recording) -> Followed | str:
+    def follow(self, recording: Recording) -> Followed | str:
         from sealscope.diagnosis.pressure_model.follow import follow
 
         cycle = find_cycle(recording)

@@ -76,18 +76,23 @@ def judge_level(fit: BalanceFit, baseline: Sequence[BalanceFit], within: Evidenc
     """Return the evidence of the conductance of the whole recording against that of leak-free recordings."""
     same = [other for other in baseline if abs(other.scale / fit.scale - 1.0) <= _SAME_MACHINE]
     levels = [level(other) for other in same if other.sense == fit.sense]
-    usual = float(np.mean([abs(one.value) for one in levels])) if levels else 0.0
     return against_baseline(
         within,
         level(fit),
         levels,
-        DayToDay(max(_DAY_TO_DAY * usual, np.finfo(float).tiny), _DAY_TO_DAY_FREEDOM),
+        day_to_day(levels),
         probability,
         part="conductance against the baseline",
         flows=[_mean_flow(fit, law) for law in ("laminar", "orifice")] if states_flow(fit) else (),
         cause="piston or pump leak",
         refuses=_refused(fit),
     )
+
+
+def day_to_day(baseline: Sequence[Level]) -> DayToDay:
+    """Return the prior on the scatter of the conductance from day to day."""
+    usual = float(np.mean([abs(known.value) for known in baseline])) if baseline else 0.0
+    return DayToDay(max(_DAY_TO_DAY * usual, np.finfo(float).tiny), _DAY_TO_DAY_FREEDOM)
 
 
 def _t_quantile(freedom: float) -> float:
