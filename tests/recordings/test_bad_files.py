@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings import inspect, read
-from sealscope.recordings.formats import table as assemble
+from sealscope.recordings.formats import table
 
 GOOD = "t [s],p_A [bar],note\n0,1,a\n0.002,2,b\n0.004,3,c\n"
 
@@ -136,7 +136,7 @@ def test_two_gigabytes_of_nothing_after_a_header(tmp_path: Path) -> None:
 
 
 def test_too_many_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(assemble, "MAX_VALUES", 100)
+    monkeypatch.setattr(table, "MAX_VALUES", 100)
     path = tmp_path / "log.csv"
     path.write_text("t [s],x [m]\n" + "".join(f"{i},{i}\n" for i in range(51)))
     assert "at most 100 values" in refused(path)

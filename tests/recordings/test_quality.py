@@ -253,3 +253,36 @@ def test_uniform_segments_of_a_sound_recording_and_of_parts() -> None:
     assert uniform_segments(holed, shortest=226) == [slice(20, 20_000)]
     with pytest.raises(InputError, match="p_B is not in this recording"):
         uniform_segments(holed, ["p_B"])
+
+
+def test_one_is_said_in_the_singular() -> None:
+    t = np.arange(5000) / RATE
+    late, twice, unknown = t.copy(), t.copy(), t.copy()
+    late[2000:] += 1.0 / RATE
+    twice[1000] = twice[999]
+    unknown[10] = np.nan
+    p = healthy()["p_A"][:5000]
+    holed, infinite = p.copy(), p.copy()
+    holed[77], infinite[77] = np.nan, np.inf
+    texts = {
+        finding.code: finding.text
+        for series, times in ((p, late), (p, twice), (p, unknown), (holed, t), (infinite, t), (p[:1], t[:1]))
+        for finding in inspect(recording({"p_A": series}, times))
+    }
+    assert texts["gap"] == "1 gap, about 1 sample lost, the longest 0.004 s"
+    assert texts["duplicated_time"] == "1 time stamp equal to the one before"
+    assert texts["missing_time"] == "1 sample without a time"
+    assert texts["missing"] == "p_A: 1 sample missing in 1 stretch, the longest 0.002 s"
+    assert texts["infinite"] == "p_A: 1 infinite sample"
+    assert texts["too_short"] == "1 sample; the slowest detail needs 226"
+
+
+@pytest.mark.parametrize("scale", [1e-320, 1e-300, 1e150, 1e300])
+@pytest.mark.filterwarnings("error")
+def test_no_number_is_too_large_or_too_small_to_inspect(scale: float) -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=3000) * scale
+    values[5] = np.finfo(float).max
+    t = np.sort(rng.normal(size=3000)) * scale
+    t[-1] = np.finfo(float).max
+    assert inspect(replace(recording({"p_A": values, "x": -values}, t), rate=1e300))

@@ -11,6 +11,7 @@ from sealscope.recordings import COUNTS, inspect, read
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "real" / "vtnsi_actuator"
 FILES = sorted(FOLDER.glob("*/*.txt"))
+SINGLE = [path for path in FILES if path.parent.name.startswith("act_")]
 pytestmark = pytest.mark.skipif(not FILES, reason="../shared/data/real/vtnsi_actuator is absent")
 MAP = {"p_A": "PG_1", "p_B": "PG_2"}
 
@@ -46,6 +47,6 @@ def test_what_is_not_connected_is_seen_as_hum() -> None:
             f.code == "mains_hum" and "60 Hz" in f.text
             for f in inspect(read(path, channel_map={"p_A": "PG_3"}, rate=1000))
         )
-        for path in FILES
+        for path in SINGLE
     )
-    assert hums > len(FILES) // 2
+    assert hums > len(SINGLE) // 2

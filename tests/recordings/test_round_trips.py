@@ -133,7 +133,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
         pass
 
     def fail(*args: object, **kwargs: object) -> None:
-        Path(str(args[1])).write_bytes(b"half a rec")
+        Path(str(args[0])).write_bytes(b"half a rec")
         raise DiskFullError(28, "No space left on device")
 
     module = {"nc": "netcdf", "csv": "text", "parquet": "parquet"}[suffix]
@@ -146,7 +146,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
 
 
 def test_interrupted_by_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*args: object) -> None:
+    def interrupt(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sealscope.recordings.formats.text.write_text", interrupt)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Recording
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
+from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
     from sealscope.recordings.atomic import atomic_write

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Writing files whole or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sealscope.errors import InputError
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary name in the folder of `path`: renamed to `path` when the block ends well, removed when it does not.
+    """Yield a temporary file in the folder of `path`: renamed to `path` when the block ends well, else removed.
 
     Raises InputError where the folder does not exist or cannot be written.
     """

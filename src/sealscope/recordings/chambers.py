@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from sealscope.recordings.recording import Recording
+from collections.abc import Container
 
 CHAMBERS = ("p_A", "p_B")
 #: The pump's ports and the chambers, in the order of the instruments.
 PRESSURES = ("p_1", "p_2", *CHAMBERS)
 
 
-def chambers_of(recording: Recording) -> tuple[str, ...]:
-    """List the chamber pressures that the recording has."""
+def chambers_of(recording: Container[str]) -> tuple[str, ...]:
+    """Return the names of the chamber pressures that a recording has."""
     return tuple(name for name in CHAMBERS if name in recording)

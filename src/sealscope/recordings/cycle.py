@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.channels import Array
 from sealscope.recordings.motion import moves
-from sealscope.recordings.recording import Array, Recording, remembered
+from sealscope.recordings.recording import Recording, remembered
 
 _LONGEST_CYCLE = 20.0
 _CYCLE_CORRELATION = 0.6

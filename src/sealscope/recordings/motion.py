@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.channels import Array
+from sealscope.recordings.recording import Recording
 
 #: A change of at most this share of a reading's largest value is rounding of the arithmetic: the reading does not move.
 ROUNDING = 1e-9

@@ -1,16 +1,22 @@
-"""What is wrong with a recording: found and named, never repaired."""
+"""The quality of a recording: what is wrong with it is found and named, never repaired.
+
+Each test of a channel's values lets quantised, slow and resting signals pass.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sealscope.recordings.motion import constant, stuck
-from sealscope.recordings.recording import Array, Recording
-from sealscope.recordings.symptoms import clipped, hum, infinite, missing
+from sealscope.calls import checked_call
+from sealscope.recordings.channels import Array
+from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.motion import constant, runs_of, spacing, stuck
+from sealscope.recordings.recording import Recording
 
 Severity = Literal["note", "warning", "fatal"]
 
@@ -26,14 +32,22 @@ _RATE_ERROR = 0.01
 #: Share of the power over 20 Hz, where leakage shows, from which hum disturbs, and from which there is little else.
 _LOUD_HUM = 0.1
 _UNCONNECTED = 0.5
+_FEWEST_AT_RAIL = 5
+_LONG_RUN = 20
+_HUM_BAND = 5.0
+_HUM_POWER_FROM = 20.0
+_HUM_OVER_REST = 4.0
+_HUM_OVER_FLOOR = 10.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong: `code`, `severity`, the `channel` (None: time), how often, where first [s], in words.
+    """One thing that is wrong with a recording.
 
-    `fatal`: the recording as a whole cannot be analysed as uniformly sampled; `uniform_segments` gives the parts that
-    can. `warning`: the channel needs a look before a verdict is believed. `note`: worth knowing.
+    `code` names it; `severity` is ``fatal`` (the recording as a whole cannot be analysed as uniformly sampled;
+    `uniform_segments` gives the parts that can), ``warning`` (the channel needs a look before a verdict is believed) or
+    ``note``; `channel` is None for the time; `count`: samples or intervals concerned; `first_t`: where first [s];
+    `text`: a sentence.
     """
 
     code: str
@@ -44,16 +58,45 @@ class Finding:
     text: str
 
 
+@checked_call
 def inspect(recording: Recording) -> tuple[Finding, ...]:
-    """Every finding on the time base and on each channel, time first, fatal ones foremost within time.
+    """Find what is wrong with the time base and the channels of a recording.
 
-    Time: `too_short`, `missing_time`, `reversed_time`, `duplicated_time`, `gap`, `rate_mismatch`, `irregular_sampling`.
-    Channels: `missing`, `mixed_rate`, `infinite`, `constant`, `clipped`, `stuck`, `mains_hum`.
+    Codes of the time: ``too_short``, ``missing_time``, ``reversed_time``, ``duplicated_time``, ``gap``,
+    ``rate_mismatch``, ``irregular_sampling``; of a channel: ``missing``, ``mixed_rate``, ``infinite``, ``constant``,
+    ``clipped``, ``stuck``, ``mains_hum``.
+
+    Parameters
+    ----------
+    recording : Recording
+        The recording to inspect; it is not changed.
+
+    Returns
+    -------
+    tuple of Finding
+        Those on the time first, then those on each channel; empty where nothing is wrong.
+
+    Raises
+    ------
+    InputError
+        If the call has another argument.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sealscope as ss
+    >>> t = np.arange(1000) / 500
+    >>> t[400:] += 0.1
+    >>> for finding in ss.inspect(ss.Recording(t, {"p_A": np.full(1000, 3e5)}, {"p_A": "Pa"}, rate=500.0)):
+    ...     print(finding.severity, finding.code, "-", finding.text)
+    fatal gap - 1 gap, about 50 samples lost, the longest 0.102 s
+    warning constant - p_A: is constant at 300000 Pa
     """
-    found = _time_findings(recording)
-    for name, values in recording.channels.items():
-        found += _channel_findings(recording, name, values)
-    return tuple(found)
+    with np.errstate(all="ignore"):
+        findings = _time_findings(recording)
+        for name, values in recording.channels.items():
+            findings += _channel_findings(recording, name, values)
+    return tuple(findings)
 
 
 def _moment(recording: Recording, index: int) -> float | None:
@@ -62,15 +105,15 @@ def _moment(recording: Recording, index: int) -> float | None:
 
 
 def _time_findings(recording: Recording) -> list[Finding]:
-    t, found = recording.t, list[Finding]()
+    t, findings = recording.t, list[Finding]()
     step = 1.0 / recording.rate
 
     def add(code: str, severity: Severity, where: Array | np.ndarray, text: str) -> None:
-        found.append(Finding(code, severity, None, len(where), _moment(recording, int(where[0])), text))
+        findings.append(Finding(code, severity, None, len(where), _moment(recording, int(where[0])), text))
 
     unknown = np.flatnonzero(~np.isfinite(t))
     if unknown.size:
-        add("missing_time", "fatal", unknown, f"{unknown.size} samples have no time")
+        add("missing_time", "fatal", unknown, f"{counted(unknown.size, 'sample')} without a time")
     known = np.flatnonzero(np.isfinite(t))
     steps = np.diff(t[known])
     back = np.flatnonzero(steps < 0)
@@ -79,7 +122,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
         add("reversed_time", "fatal", known[back + 1], f"time goes back {_times(back.size)}, by up to {worst:g} s")
     same = np.flatnonzero(steps == 0)
     if same.size:
-        add("duplicated_time", "fatal", known[same + 1], f"{same.size} time stamps repeat the one before")
+        add("duplicated_time", "fatal", known[same + 1], f"{counted(same.size, 'time stamp')} equal to the one before")
     forward = steps[steps > 0]
     if forward.size:
         typical = float(np.median(forward))
@@ -89,9 +132,9 @@ def _time_findings(recording: Recording) -> list[Finding]:
             step = typical
         gaps = np.flatnonzero(steps > _GAP * step)
         if gaps.size:
-            lost = int(np.round(steps[gaps] / step - 1.0).sum())
+            lost = np.round(steps[gaps] / step - 1.0).sum()
             longest = float(steps[gaps].max())
-            text = f"{gaps.size} gaps, about {lost} samples lost, the longest {longest:g} s"
+            text = f"{counted(gaps.size, 'gap')}, about {_lost(lost)} lost, the longest {longest:g} s"
             add("gap", "fatal", known[gaps], text)
         usual = forward[forward <= _GAP * step] / step
         scatter = float(usual.std()) if usual.size else 0.0
@@ -105,9 +148,13 @@ def _time_findings(recording: Recording) -> list[Finding]:
                 f"intervals scatter by {100 * scatter:.0f} % of the sampling step",
             )
     if len(recording) < SHORTEST:
-        text = f"{len(recording)} samples; the slowest detail needs {SHORTEST}"
-        found.append(Finding("too_short", "warning", None, len(recording), None, text))
-    return found
+        text = f"{counted(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
+        findings.append(Finding("too_short", "warning", None, len(recording), None, text))
+    return findings
+
+
+def _lost(samples: float) -> str:
+    return counted(int(samples), "sample") if samples < 1e15 else f"{samples:.3g} samples"
 
 
 def _times(count: int) -> str:
@@ -115,11 +162,11 @@ def _times(count: int) -> str:
 
 
 def _channel_findings(recording: Recording, name: str, values: Array) -> list[Finding]:
-    found: list[Finding] = []
+    findings: list[Finding] = []
     rate = recording.rate
 
     def add(code: str, severity: Severity, count: int, first: int, text: str) -> None:
-        found.append(Finding(code, severity, name, count, _moment(recording, first), f"{name}: {text}"))
+        findings.append(Finding(code, severity, name, count, _moment(recording, first), f"{name}: {text}"))
 
     holes = missing(values)
     if holes is not None:
@@ -130,46 +177,42 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         elif holes.samples == values.size:
             add("missing", "warning", holes.samples, 0, "has no values at all")
         else:
-            text = f"{holes.samples} samples missing in {_runs(holes.runs)}, the longest {holes.longest / rate:g} s"
+            missed = f"{counted(holes.samples, 'sample')} missing in {counted(holes.runs, 'stretch')}"
+            text = f"{missed}, the longest {holes.longest / rate:g} s"
             add("missing", "warning", holes.samples, holes.first, text)
     extreme = infinite(values)
     if extreme.size:
-        add("infinite", "warning", extreme.size, int(extreme[0]), f"{extreme.size} samples are infinite")
-    sound = np.flatnonzero(np.isfinite(values))
-    kept = values[sound]
+        add("infinite", "warning", extreme.size, int(extreme[0]), f"{counted(extreme.size, 'infinite sample')}")
+    present = np.flatnonzero(np.isfinite(values))
+    kept = values[present]
     if kept.size < 2:
-        return found
+        return findings
     if constant(kept):
         # a command may rest, and a flow meter on a closed bypass reads one value; a pressure never does
         severity: Severity = "note" if name in ("u", "q_leak") else "warning"
-        add("constant", severity, kept.size, int(sound[0]), f"is constant at {kept[0]:g} {recording.units[name]}")
-        return found
-    still = stuck(kept)
+        add("constant", severity, kept.size, int(present[0]), f"is constant at {kept[0]:g} {recording.units[name]}")
+        return findings
+    held = stuck(kept)
     if name.startswith("p_") or name == "q_leak":
-        for rail in clipped(kept, still, low=name != "q_leak"):
-            text = (
-                f"{rail.samples} samples stand at the {rail.side} end, {rail.value:g} {recording.units[name]}: clipped"
-            )
-            add("clipped", "warning", rail.samples, int(sound[rail.first]), text)
+        for rail in clipped(kept, held, low=name != "q_leak"):
+            at_end = f"{counted(rail.samples, 'sample')} at the {rail.side} end"
+            text = f"{at_end}, {rail.value:g} {recording.units[name]}: clipped"
+            add("clipped", "warning", rail.samples, int(present[rail.first]), text)
     if name not in ("u", "q_leak"):
         if name.startswith("p_"):  # at an end of its values it is clipped
-            still = still[(kept[still[:, 0]] > kept.min()) & (kept[still[:, 0]] < kept.max())]
-        if still.size:
-            first, length = (int(v) for v in still[0])
-            text = f"stands still {_times(len(still))} while it should move, first for {length / rate:g} s"
-            add("stuck", "warning", int(still[:, 1].sum()), int(sound[first]), text)
+            held = held[(kept[held[:, 0]] > kept.min()) & (kept[held[:, 0]] < kept.max())]
+        if held.size:
+            first, length = (int(v) for v in held[0])
+            text = f"does not move {_times(len(held))} while it should, first for {length / rate:g} s"
+            add("stuck", "warning", int(held[:, 1].sum()), int(present[first]), text)
     if kept.size > 0.9 * values.size:
         for line in hum(kept, rate):
             text = f"mains hum of {line.frequency:g} Hz, amplitude {line.amplitude:.3g} {recording.units[name]}"
             text += f", {100 * line.share:.2g} % of the power over 20 Hz"
             if line.share > _UNCONNECTED:
                 text += ": is the sensor connected?"
-            add("mains_hum", "warning" if line.share > _LOUD_HUM else "note", kept.size, int(sound[0]), text)
-    return found
-
-
-def _runs(count: int) -> str:
-    return "1 stretch" if count == 1 else f"{count} stretches"
+            add("mains_hum", "warning" if line.share > _LOUD_HUM else "note", kept.size, int(present[0]), text)
+    return findings
 
 
 def _ordinal(number: int) -> str:
@@ -178,18 +221,130 @@ def _ordinal(number: int) -> str:
 
 
 def uniform_segments(recording: Recording, channels: Sequence[str] | None = None, *, shortest: int = 1) -> list[slice]:
-    """The maximal stretches, as slices, sampled uniformly with the named channels (default: all) finite.
+    """Return the maximal stretches, as slices, sampled uniformly with the named channels (default: all) finite.
 
     A stretch has at least `shortest` samples; each interval in it lies between half and one and a half steps of
     `recording.rate`. Raises InputError for a channel that the recording does not have.
     """
     count = len(recording)
-    sound = np.isfinite(recording.t)
+    whole = np.isfinite(recording.t)
     for name in recording.channels if channels is None else channels:
-        sound = sound & np.isfinite(recording[name])
+        whole = whole & np.isfinite(recording[name])
     with np.errstate(invalid="ignore"):
         steps = np.diff(recording.t) * recording.rate
-        joined = sound[1:] & sound[:-1] & (steps > _CROWDED) & (steps < _GAP)
-    starts = np.flatnonzero(sound & np.r_[True, ~joined][:count])
-    stops = np.flatnonzero(sound & np.r_[~joined, True][-count:]) + 1 if count else starts
+        joined = whole[1:] & whole[:-1] & (steps > _CROWDED) & (steps < _GAP)
+    starts = np.flatnonzero(whole & np.r_[True, ~joined][:count])
+    stops = np.flatnonzero(whole & np.r_[~joined, True][-count:]) + 1 if count else starts
     return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if b - a >= shortest]
+
+
+class Holes(NamedTuple):
+    """Missing samples: how many, where first, runs, the longest; `every`: k where only each k-th row has one."""
+
+    samples: int
+    first: int
+    runs: int
+    longest: int
+    every: int
+
+
+class Rail(NamedTuple):
+    """Samples at one end of a clipped channel: `low` or `high` side, the value there, how many, where first."""
+
+    side: str
+    value: float
+    samples: int
+    first: int
+
+
+class HumLine(NamedTuple):
+    """A spectral line: frequency [Hz], amplitude [the channel's unit], its share of the power over 20 Hz."""
+
+    frequency: float
+    amplitude: float
+    share: float
+
+
+def missing(values: Array) -> Holes | None:
+    """Describe the NaN samples, and whether they are a slower channel's rows in between; None where there are none."""
+    absent = np.isnan(values)
+    if not absent.any():
+        return None
+    runs = runs_of(absent)
+    present = np.flatnonzero(~absent)
+    every = 0
+    if present.size >= 3:
+        spacing = np.diff(present)
+        usual = int(np.median(spacing))
+        if usual >= 2 and np.mean(spacing == usual) > 0.95:
+            every = usual
+    return Holes(int(absent.sum()), int(runs[0, 0]), len(runs), int(runs[:, 1].max()), every)
+
+
+def infinite(values: Array) -> NDArray[np.intp]:
+    """Return the indices of infinite samples."""
+    return np.flatnonzero(np.isinf(values))
+
+
+def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = True) -> list[Rail]:
+    """Find the ends at which finite values (n,) are cut off; the low one only where `low`.
+
+    A cut-off piles up at its value what lay beyond: far more samples than any of the five levels next to it, in runs
+    that the signal enters or leaves by more than three quantisation steps (one, for a long run). The crest of a slow
+    quantised signal also holds many samples, but its neighbours hold nearly as many and it is entered step by step; a
+    channel that rests at two levels, such as a square wave, has as many samples at the other. A run among `held`, as
+    `stuck` gives them, at an end of the values is a cut-off too.
+    """
+    levels, counts = np.unique(values, return_counts=True)
+    if levels.size < 3:
+        return []
+    fine = spacing(levels)
+    starts = np.empty(0) if held is None else values[held[:, 0]]
+    rails = []
+    for side, top, others in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
+        if side == "low" and not low:
+            continue
+        runs = runs_of(values == levels[top])
+        first, length = runs[np.argmax(runs[:, 1])]
+        before, after = values[max(first - 1, 0)], values[min(first + length, values.size - 1)]
+        drop = max(abs(before - levels[top]), abs(after - levels[top]))
+        piled = counts[top] >= _FEWEST_AT_RAIL and counts[top] > 5 * counts[others].max()
+        entered = length >= 3 and drop > (1.5 if length >= _LONG_RUN else 3.5) * fine
+        if (piled and entered) or (starts == levels[top]).any():
+            rails.append(Rail(side, float(levels[top]), int(counts[top]), int(runs[0, 0])))
+    return rails
+
+
+def hum(values: Array, rate: float) -> list[HumLine]:
+    """Find lines of the mains, 50 or 60 Hz, that stand clear of the spectrum within 5 Hz.
+
+    Hann-windowed periodogram of the values less their straight line; the amplitude of a line is 2 |X| / sum(w). Clear
+    means 10 times the median and 4 times the largest of what lies beside it. Nothing is looked for in under 1.5 s.
+    """
+    from scipy.fft import next_fast_len
+
+    count = values.size
+    if count / rate < 1.5:
+        return []
+    x = np.arange(count) - (count - 1) / 2
+    centred = values - values.mean()
+    centred = centred - x * (x @ centred) / (x @ x)
+    if not centred.any():
+        return []
+    window = np.hanning(count)
+    size = next_fast_len(count, real=True)
+    amplitudes = 2 * np.abs(np.fft.rfft(centred * window, size)) / window.sum()
+    frequencies = np.fft.rfftfreq(size, 1 / rate)
+    # amplitude^2/2 summed over bins counts each line's power 1.5 size/count times, as wide as Hann's window makes it
+    power = float((amplitudes[frequencies >= _HUM_POWER_FROM] ** 2).sum()) / 2 / (1.5 * size / count)
+    lines = []
+    for mains in (50.0, 60.0):
+        if mains + _HUM_BAND >= rate / 2:
+            continue
+        off = np.abs(frequencies - mains)
+        near = off <= max(0.1, 0.5 * rate / count)
+        beside = (off > max(0.5, 2.5 * rate / count)) & (off <= _HUM_BAND)
+        peak, rest = float(amplitudes[near].max(initial=0.0)), amplitudes[beside]
+        if rest.size >= 10 and peak > _HUM_OVER_REST * rest.max() and peak > _HUM_OVER_FLOOR * np.median(rest):
+            lines.append(HumLine(mains, peak, min(1.0, peak**2 / 2 / power)))
+    return lines

@@ -1,42 +1,35 @@
 """The Recording: labelled time series with units, a rate and a history; the one meeting point of the whole project.
 
-A Recording is what a rig's data logger would have written. Where it came from (a simulator, a file, a stream) is told
-by its provenance and by nothing else; the truth of a simulation is never part of it.
+A Recording is what a rig's data logger would have written. Where it came from (a simulator, a file, a stream) is in
+its provenance and nowhere else; the truth of a simulation is never part of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
+from html import escape
 from threading import Lock
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sealscope.errors import InputError
+from sealscope.calls import checked_call
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
+from sealscope.recordings.formats.columns import check_call, choose_columns, counted
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+__all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "remembered"]
+
 _T = TypeVar("_T")
-
-#: Channel names (the thesis's symbols) and the unit each has inside Sealscope; `docs/nomenclature.md` explains them.
-CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
-    {
-        "u": "V",
-        "omega": "rad/s",
-        "theta": "rad",
-        "x": "m",
-        "p_1": "Pa",
-        "p_2": "Pa",
-        "p_A": "Pa",
-        "p_B": "Pa",
-        "q_leak": "m^3/s",
-    }
-)
-
-#: Unit of a mapped channel that came without one: raw counts of a converter.
-COUNTS = "count"
+#: The rate in a data frame's `attrs` is kept where the time stamps agree with it to this share.
+_SAME_RATE = 0.01
 
 
 def _frozen(values: Any) -> Array:
@@ -54,15 +47,48 @@ class _Result:
     known: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """Channels sampled on one time base.
 
-    `t`: (n,) time [s]; `channels`: name -> (n,) values, NaN where a sample is missing; `units`: name -> unit, the SI
-    unit of `CHANNEL_UNITS` or `COUNTS`; `rate`: nominal sampling rate [Hz]; `provenance`: plain JSON values that say
-    where the data come from; `history`: one line for each processing step. Arrays are copied and read-only.
+    A recording does not change: arrays are copied and read-only, and what cuts or selects returns a new recording.
+    ``recording["p_A"]`` is a channel, ``"p_A" in recording`` asks for it, ``len(recording)`` is the number of samples.
 
-    Raises InputError when lengths differ, a unit is missing or the rate is not positive.
+    Parameters
+    ----------
+    t : array_like of float, shape (n,)
+        Time [s].
+    channels : mapping of str to array_like of float, shape (n,)
+        Values of each channel, NaN where a sample is missing. The names are those of `CHANNEL_UNITS`: ``u``, ``omega``,
+        ``theta``, ``x``, ``p_1``, ``p_2``, ``p_A``, ``p_B``, ``q_leak``.
+    units : mapping of str to str
+        Unit of each channel: the SI unit of `CHANNEL_UNITS`, or ``count`` for raw counts of a converter.
+    rate : float
+        Nominal sampling rate [Hz].
+    provenance : mapping of str to JSON value, optional
+        Where the data come from.
+    history : tuple of str, optional
+        One line for each processing step.
+
+    Raises
+    ------
+    InputError
+        If lengths differ, a unit is missing, a value is no number or the rate is not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sealscope as ss
+    >>> t = np.arange(1000) / 500
+    >>> pressures = {"p_A": 3e5 + 1e4 * np.sin(4 * t), "p_B": 3e5 - 1e4 * np.sin(4 * t)}
+    >>> recording = ss.Recording(t, pressures, {"p_A": "Pa", "p_B": "Pa"}, rate=500.0)
+    >>> recording
+    Recording(p_A [Pa], p_B [Pa]; 1000 samples, 500 Hz, 2 s)
+    >>> recording.between(0.5, 1.0).duration
+    0.5
+    >>> frame = recording.to_pandas()
+    >>> ss.Recording.from_pandas(frame[["p_A [Pa]"]])
+    Recording(p_A [Pa]; 1000 samples, 500 Hz, 2 s)
     """
 
     t: Array
@@ -71,11 +97,15 @@ class Recording:
     rate: float
     provenance: Mapping[str, Any] = field(default_factory=dict)
     history: tuple[str, ...] = ()
-    _results: dict[Hashable, _Result] = field(default_factory=dict, init=False, repr=False)
+    _results: dict[Hashable, _Result] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        t = _frozen(self.t)
-        channels = {name: _frozen(values) for name, values in self.channels.items()}
+        try:
+            t = _frozen(self.t)
+            channels = {name: _frozen(values) for name, values in self.channels.items()}
+            rate = float(self.rate)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"the values of a recording must be numbers: {error}") from None
         if t.ndim != 1:
             raise InputError(f"t must be one-dimensional, got shape {t.shape}")
         for name, values in channels.items():
@@ -83,12 +113,12 @@ class Recording:
                 raise InputError(f"channel {name} must have as many samples as t ({t.size}), got shape {values.shape}")
             if name not in self.units:
                 raise InputError(f"channel {name} must have a unit, got none")
-        if not (np.isfinite(self.rate) and self.rate > 0):
+        if not (np.isfinite(rate) and rate > 0):
             raise InputError(f"rate must be > 0 Hz, got {self.rate}")
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "channels", MappingProxyType(channels))
         object.__setattr__(self, "units", MappingProxyType({name: self.units[name] for name in channels}))
-        object.__setattr__(self, "rate", float(self.rate))
+        object.__setattr__(self, "rate", rate)
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
         object.__setattr__(self, "history", tuple(self.history))
 
@@ -105,35 +135,142 @@ class Recording:
     def __len__(self) -> int:
         return int(self.t.size)
 
+    def _extent(self) -> str:
+        return f"{counted(len(self), 'sample')}, {self.rate:g} Hz, {self.duration:g} s"
+
+    def __repr__(self) -> str:
+        channels = ", ".join(f"{name} [{unit}]" for name, unit in self.units.items()) or "no channels"
+        return f"Recording({channels}; {self._extent()})"
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for name, values in self.channels.items():
+            finite = values[np.isfinite(values)]
+            ends = [f"{of(finite):.6g}" if finite.size else "" for of in (np.min, np.mean, np.max)]
+            rows.append((name, LONG_NAMES.get(name, ""), self.units[name], *ends, values.size - finite.size))
+        heads = ("channel", "", "unit", "least", "mean", "most", "missing")
+        lines = ["".join(f"<th>{head}</th>" for head in heads)]
+        lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
+        table = "".join(f"<tr>{line}</tr>" for line in lines)
+        return f"<table><caption>Recording: {escape(self._extent())}</caption>{table}</table>"
+
     @property
     def duration(self) -> float:
         """Number of samples over the nominal rate [s]."""
         return self.t.size / self.rate
 
     def between(self, start: float, stop: float) -> Recording:
-        """The samples with start <= t < stop [s]."""
-        inside = (self.t >= start) & (self.t < stop)
-        return replace(
-            self,
-            t=self.t[inside],
-            channels={name: values[inside] for name, values in self.channels.items()},
-            history=(*self.history, f"cut to {start:g} s <= t < {stop:g} s"),
-        )
+        """Return the samples with start <= t < stop [s]."""
+        return self._cut((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")
 
     def samples(self, chosen: slice) -> Recording:
-        """The samples of a slice, times as they are."""
-        return replace(
-            self,
-            t=self.t[chosen],
-            channels={name: values[chosen] for name, values in self.channels.items()},
-            history=(*self.history, f"cut to samples {chosen.start} to {chosen.stop}"),
-        )
+        """Return the samples of a slice, times as they are."""
+        return self._cut(chosen, f"cut to samples {chosen.start} to {chosen.stop}")
+
+    def _cut(self, chosen: Any, note: str) -> Recording:
+        channels = {name: values[chosen] for name, values in self.channels.items()}
+        return replace(self, t=self.t[chosen], channels=channels, history=(*self.history, note))
 
     def only(self, names: Iterable[str]) -> Recording:
-        """The same recording with the named channels alone."""
+        """Return the same recording with the named channels alone."""
         part = replace(self, channels={name: self[name] for name in names})
         object.__setattr__(part, "_results", self._results)
         return part
+
+    def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
+        """Return values and units of the time, `t`, and the channels, and a description in JSON values.
+
+        The description holds rate, provenance and history. Raises InputError where a value is none of JSON's.
+        """
+        from sealscope.recordings.formats.table import description_of
+
+        description = description_of(self.rate, self.provenance, self.history)
+        return {"t": self.t, **self.channels}, {"t": "s", **self.units}, description
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a data frame: index ``t [s]``, columns such as ``p_A [Pa]``.
+
+        Its ``attrs`` hold the units by column, the rate, the provenance and the history; `from_pandas` reads them.
+
+        Returns
+        -------
+        pandas.DataFrame
+            A copy of the samples.
+
+        Raises
+        ------
+        MissingExtra
+            If pandas is not installed.
+        InputError
+            If the provenance holds other values than JSON's.
+        """
+        from sealscope.recordings.formats.frames import to_pandas
+
+        return to_pandas(*self.series())
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return a data set over the coordinate ``t`` with the variables and attributes of the NetCDF files.
+
+        Returns
+        -------
+        xarray.Dataset
+            A copy of the samples; each variable has ``units`` and ``long_name``.
+
+        Raises
+        ------
+        MissingExtra
+            If xarray is not installed.
+        InputError
+            If the provenance holds other values than JSON's.
+        """
+        from sealscope.recordings.formats.frames import to_xarray
+
+        return to_xarray(*self.series())
+
+    @classmethod
+    @checked_call
+    def from_pandas(
+        cls, frame: pandas.DataFrame, *, channel_map: Mapping[str, str] | None = None, rate: float | None = None
+    ) -> Recording:
+        """Make a recording of a data frame, by the rules that hold for files.
+
+        Parameters
+        ----------
+        frame : pandas.DataFrame
+            Columns such as ``p_A [bar]``; a unit may also be in ``frame.attrs["units"][column]`` or in the column's
+            own ``attrs["units"]``. The time is a column such as ``t [s]``, or the index: with a name, of numbers with
+            a fraction, of dates or of time differences.
+        channel_map : mapping of str to str, optional
+            Channel (or ``t``) -> column, as for `read`.
+        rate : float, optional
+            Sampling rate [Hz], in place of a time. It is inferred from the time otherwise.
+
+        Returns
+        -------
+        Recording
+            In SI units.
+
+        Raises
+        ------
+        MissingExtra
+            If pandas is not installed.
+        InputError
+            If no column is a channel, a unit is of another dimension, a value is no number, or there is neither time
+            nor rate.
+        """
+        from sealscope.recordings.formats.frames import read_pandas
+
+        channel_map = channel_map or {}
+        check_call(channel_map, rate)
+        choose = partial(choose_columns, channel_map=channel_map, rate=rate, place="data frame")
+        try:
+            table = read_pandas(frame, choose)
+            samples = table.samples({}, rate=rate, infer_rate=True)
+        except UnreadableFile as error:
+            raise InputError(str(error)) from None
+        own = (table.description or {}).get("rate", samples.rate)
+        same = rate is None and abs(samples.rate / own - 1.0) <= _SAME_RATE
+        return cls(*samples._replace(rate=own if same else samples.rate))
 
 
 def remembered(

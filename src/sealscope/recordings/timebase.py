@@ -9,16 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.recording import Array
+from sealscope.errors import InputError
+from sealscope.recordings.channels import Array
 from sealscope.units import to_si
 
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d{1,9})?)?"
-STAMP = re.compile(
-    rf"\s*(?:(?P<date>\d{{4}}-\d{{2}}-\d{{2}})|(?P<day>\d{{1,2}})\.(?P<month>\d{{1,2}})\.(?P<year>\d{{4}}))?"
-    rf"(?:(?:^|[T\s_])\s*(?P<clock>{_CLOCK}))?\s*(?P<zone>Z|UTC|[+-]\d{{2}}:?\d{{2}})?\s*"
+_STAMP = re.compile(
+    rf"(?:(?P<date>\d{{4}}-\d{{2}}-\d{{2}})|(?P<day>\d{{1,2}})\.(?P<month>\d{{1,2}})\.(?P<year>\d{{4}}))?"
+    rf"(?:(?:^|[T\s_])\s*(?P<clock>{_CLOCK}))?\s*(?P<zone>Z|UTC|[+-]\d{{2}}:?\d{{2}})?"
 )
-_SINCE = re.compile(r"\s*(?P<unit>[a-z]+)\s+since\s+(?P<start>.+?)\s*", re.IGNORECASE)
+_LONGEST_STAMP = 64
+_SINCE = re.compile(r"(?P<unit>[a-z]{1,20})\s{1,9}since\s{1,9}(?P<start>.{1,64})", re.IGNORECASE)
 _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
 #: Numbers from here on, without a unit, are read as the time since 1970 in this unit.
 _EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
@@ -34,21 +35,26 @@ class TimeBase(NamedTuple):
     notes: tuple[str, ...]
 
 
+def _parsed_stamp(text: str) -> re.Match[str] | None:
+    text = text.strip()
+    match = _STAMP.fullmatch(text) if len(text) <= _LONGEST_STAMP else None
+    return match if match and (match["date"] or match["year"] or match["clock"]) else None
+
+
 def is_stamp(text: str) -> bool:
-    """Whether `text` is a date stamp or the time of a day that `stamps` can read."""
-    match = STAMP.fullmatch(text)
-    return bool(match and (match["date"] or match["year"] or match["clock"]))
+    """Return whether `text` is a date stamp or the time of a day that `stamps` can read."""
+    return _parsed_stamp(text) is not None
 
 
 def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
-    """Date stamps (ISO, or day.month.year) and times of a day as datetime64[ns]; an empty cell is NaT.
+    """Read date stamps (ISO, or day.month.year) and times of a day as datetime64[ns]; an empty cell is NaT.
 
     Raises ValueError with the index of the first cell that is no stamp.
     """
     plain: list[str] = []
     for index, cell in enumerate(cells):
-        match = STAMP.fullmatch(cell)
-        if match is None or not (match["date"] or match["year"] or match["clock"]):
+        match = _parsed_stamp(cell)
+        if match is None:
             if cell.strip():
                 raise ValueError(index)
             plain.append("NaT")
@@ -70,7 +76,7 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
 
 
 def nominal_rate(t: Array) -> float:
-    """The sampling rate [Hz] that stamps `t` tell: the shortest decimal that agrees with them.
+    """Return the sampling rate [Hz] of time stamps `t` (n,): the shortest decimal that agrees with them.
 
     From the mean interval where they are uniform, else from the median interval. Raises InputError where no interval is
     positive.
@@ -96,39 +102,39 @@ def nominal_rate(t: Array) -> float:
     return rate
 
 
-def _from_stamps(values: NDArray[np.datetime64], place: str) -> tuple[Array, dict[str, Any]]:
+def _from_stamps(values: NDArray[np.datetime64]) -> tuple[Array, dict[str, Any]]:
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
     if not known.any():
-        raise UnreadableFile(f"time must have a stamp in some row, got none ({place})")
+        raise InputError("time must have a stamp in some row, got none")
     start = nanoseconds[known][0]
     t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
     t[~known] = np.nan
     return t, {"start": str(start)}
 
 
-def _from_numbers(values: Array, unit: str | None, name: str, place: str) -> tuple[Array, dict[str, Any], list[str]]:
+def _from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, dict[str, Any], list[str]]:
     finite = values[np.isfinite(values)]
     if not finite.size:
-        raise UnreadableFile(f"time must have a number in some row, got none ({place})")
+        raise InputError("time must have a number in some row, got none")
     first = float(finite[0])
-    since = _SINCE.fullmatch(unit) if unit else None
+    since = _SINCE.fullmatch(unit.strip()) if unit else None
     if since:
         word = since["unit"].lower()
         origin = since["start"]
-        seconds = to_si(values - first, _LONG_UNITS.get(word, word), "s", name="time", place=place)
+        seconds = to_si(values - first, _LONG_UNITS.get(word, word), "s", name="time")
         try:
             base = stamps([origin])[0]
             begin = base + np.timedelta64(round(to_si(first, _LONG_UNITS.get(word, word), "s") * 1e9), "ns")
-        except ValueError:
+        except (ValueError, OverflowError):
             return seconds, {"start": f"{first:g} {unit}"}, []
         return seconds, {"start": str(begin)}, []
     if unit is None:
         size = abs(first)
         if np.all(np.diff(finite) == 1) and finite.size == values.size and size < _EARLIEST_EPOCH:
-            raise UnreadableFile(
+            raise InputError(
                 f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
-                f"give the rate ({place})"
+                f"give the rate"
             )
         for least, epoch_unit in _EPOCH:
             if size >= least:
@@ -136,28 +142,22 @@ def _from_numbers(values: Array, unit: str | None, name: str, place: str) -> tup
                 epoch = to_si(first, epoch_unit, "s")
                 return seconds, {"start_epoch_s": epoch}, [f"column {name} read as {epoch_unit} since 1970"]
         return values, {}, [f"column {name} has no unit: taken as s"]
-    seconds = to_si(values, unit, "s", name="time", place=place)
+    seconds = to_si(values, unit, "s", name="time")
     first = float(seconds[np.isfinite(values)][0])
     if first >= _EARLIEST_EPOCH:
         return to_si(values - float(finite[0]), unit, "s"), {"start_epoch_s": first}, []
     return seconds, {}, []
 
 
-def time_base(values: NDArray[Any], unit: str | None, name: str, place: str) -> TimeBase:
-    """Seconds and rate from a time column's `values` (n,), numbers in `unit` or datetime64.
+def time_base(values: NDArray[Any], unit: str | None, name: str) -> TimeBase:
+    """Convert a time column's `values` (n,), numbers in `unit` or datetime64, to seconds and a rate.
 
     Stamps and epoch times are based at their first sample, whose moment is kept in `start`; other times are left where
-    they are. Raises UnreadableFile, naming `place`.
+    they are. Raises InputError.
     """
     notes: list[str] = []
-    try:
-        if values.dtype.kind == "M":
-            t, start = _from_stamps(values, place)
-        else:
-            t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name, place)
-        return TimeBase(t, nominal_rate(t), start, tuple(notes))
-    except UnreadableFile:
-        raise
-    except InputError as error:
-        text = str(error)
-        raise UnreadableFile(text if place in text else f"{text} ({place})") from None
+    if values.dtype.kind == "M":
+        t, start = _from_stamps(values)
+    else:
+        t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name)
+    return TimeBase(t, nominal_rate(t), start, tuple(notes))

@@ -27,8 +27,8 @@ from sealscope.diagnosis.volume_balance.blocks import (
 from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trouble
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Recording, remembered
-from sealscope.recordings.symptoms import clipped
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -114,7 +114,7 @@ def _at_the_rail(recording: Recording) -> str | None:
     for name in CHAMBERS:
         values = recording[name]
         values = values[np.isfinite(values)]
-        for rail in clipped(values, np.empty((0, 2), dtype=np.intp)):
+        for rail in clipped(values):
             if rail.samples > _CLIPPED * values.size:
                 return f"{name} is cut off at {rail.value:.4g} for {rail.samples / values.size:.1%} of the time"
     return None

@@ -1,20 +1,16 @@
-"""Which columns of a foreign table are which channels: names, units in names, and the user's map."""
+"""Which columns of a table are which channels: headings, the units in them, and the user's map."""
 
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from math import isfinite
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS
-from sealscope.units import parse_unit, same_dimension
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
+from sealscope.units import parse_unit, same_dimension, to_si
 
-_BRACKETS = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]\s*")
-_SOFT_UNIT = re.compile(
-    r"(?P<name>.*?)(?:\s*\((?P<unit>[^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s(?P<over>[^/]+(?:/[^/]+)?))\s*"
-)
 #: Names of a time column, most telling first, and the unit that the name itself tells.
 _TIME_NAMES = {
     "t": None,
@@ -42,7 +38,7 @@ _TIME_NAMES = {
 
 @dataclass(frozen=True)
 class Label:
-    """A column's heading: `whole` as it stands, `name` without the unit, `unit` where one is told."""
+    """A column's heading: `whole` as written, `name` without the unit, `unit` where one is given."""
 
     whole: str
     name: str
@@ -50,23 +46,53 @@ class Label:
 
     @classmethod
     def parse(cls, text: str, unit: str | None = None) -> Label:
-        """`p_A [psi]`, `p_A (psi)` and `p_A / psi`; a unit told elsewhere (a row or an attribute) is `unit`."""
+        """Parse `p_A [psi]`, `p_A (psi)` or `p_A / psi`; a unit given elsewhere (a row or an attribute) is `unit`."""
         whole = text.strip()
-        match = _BRACKETS.fullmatch(whole)
-        if match:
-            return cls(whole, match["name"], match["unit"].strip() if unit is None else unit)
-        match = _SOFT_UNIT.fullmatch(whole)
-        if match and match["name"]:
-            told = (match["unit"] or match["over"]).strip()
-            return cls(whole, match["name"], _unit_or_none(told) if unit is None else unit)
-        return cls(whole, whole, unit)
-
-    def is_called(self, name: str) -> bool:
-        return name in (self.whole, self.name)
+        name, bracketed = _square_brackets(whole)
+        if bracketed is not None:
+            return cls(whole, name, bracketed if unit is None else unit)
+        name, remark = _round_brackets_or_stroke(whole)
+        return cls(whole, name, _unit_or_none(remark) if unit is None else unit)
 
 
-def _unit_or_none(text: str) -> str | None:
-    """Round brackets may hold a remark (`pressure (port A)`) as well as a unit."""
+def _square_brackets(text: str) -> tuple[str, str | None]:
+    """Split `name [unit]`, without blanks around; (text, None) for any other text."""
+    begin = text.rfind("[")
+    if begin < 0 or not text.endswith("]") or "]" in text[begin:-1]:
+        return text, None
+    return text[:begin].rstrip(), text[begin + 1 : -1].strip()
+
+
+def _round_brackets_or_stroke(text: str) -> tuple[str, str | None]:
+    """Split `name (unit)`, the unit with one pair of brackets at most, or `name / unit`, where this is possible first.
+
+    Returns (text, None) for any other text.
+    """
+    ends: list[tuple[int, int]] = []  # where the name ends, and the unit begins
+    parts = text.split("/")
+    for count in (2, 1):  # `name / m/s`, `name / s`
+        unit = "/".join(parts[-count:])
+        end = len(text) - len(unit) - 1
+        if end > 1 and text[end - 1].isspace() and unit[:1].isspace() and all(unit[1:].split("/")):
+            ends.append((end - 1, end + 1))
+    depth = opened = 0
+    for at in range(len(text) - 1, -1, -1) if text.endswith(")") else ():
+        depth += {")": 1, "(": -1}.get(text[at], 0)
+        opened += text[at] == "("
+        if depth == 0:
+            if opened <= 2:
+                ends.append((len(text[:at].rstrip()), at))
+            break
+    end, begin = min(ends, default=(0, 0))
+    if not end:
+        return text, None
+    return text[:end].rstrip(), (text[begin + 1 : -1] if text[begin] == "(" else text[begin:]).strip()
+
+
+def _unit_or_none(text: str | None) -> str | None:
+    """Return None for the remark that round brackets may hold as well (`pressure (port A)`)."""
+    if not text:
+        return None
     try:
         parse_unit(text)
     except InputError:
@@ -75,22 +101,26 @@ def _unit_or_none(text: str) -> str | None:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What to load: `time` column and its unit, `channels`: name -> (column, unit); `notes` for the history."""
+class ColumnMap:
+    """What to load of a table: the number of the time column and its label, name -> (column, unit) of each channel.
+
+    `notes`: lines for the history.
+    """
 
     time: int | None
-    time_unit: str | None
+    time_label: Label | None
     channels: Mapping[str, tuple[int, str]]
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     @property
-    def columns(self) -> list[int]:
-        """The columns of the channels, each once, in the table's order."""
-        return sorted({column for column, _ in self.channels.values()})
+    def columns(self) -> list[tuple[int, bool]]:
+        """(column, whether it is read as time): those of the channels in the table's order, and at the end the time."""
+        channels = [(column, False) for column in sorted({column for column, _ in self.channels.values()})]
+        return channels if self.time is None else [*channels, (self.time, True)]
 
 
 def split_map_option(text: str) -> tuple[str, str]:
-    """``p_A=PG_1`` or ``p_A=PG_1[psi]`` as (channel, column of the file); raises InputError."""
+    """Split ``p_A=PG_1`` or ``p_A=PG_1[psi]`` into channel and column of the file; raise InputError for other text."""
     channel, equals, foreign = (part.strip() for part in text.partition("="))
     if not equals or not channel or not foreign:
         raise InputError(f"a map must read CHANNEL=COLUMN, such as p_A=PG_1 or p_A=PG_1[psi], got {text!r}")
@@ -99,7 +129,7 @@ def split_map_option(text: str) -> tuple[str, str]:
 
 
 def check_channel(channel: str) -> None:
-    """Raises InputError, with the nearest name, where `channel` is neither a channel nor `t`."""
+    """Raise InputError, with the nearest name, where `channel` is neither a channel nor `t`."""
     known = [*CHANNEL_UNITS, "t"]
     if channel not in known:
         near = difflib.get_close_matches(channel, known, 1, 0.5)
@@ -107,8 +137,29 @@ def check_channel(channel: str) -> None:
         raise InputError(f"a mapped channel must be one of {', '.join(known)}, got {channel}{hint}")
 
 
+def check_call(channel_map: Mapping[str, str], rate: float | None) -> None:
+    """Raise InputError for a map of what is no channel, and for a rate that is not positive."""
+    for channel in channel_map:
+        check_channel(channel)
+    if rate is not None and not (isfinite(rate) and rate > 0):
+        raise InputError(f"rate must be > 0 Hz, got {rate}")
+
+
+def counted(count: int, noun: str) -> str:
+    """Return the count and the noun, in the plural unless the count is 1: ``1 gap``, ``2 gaps``, ``3 stretches``."""
+    ending = "" if count == 1 else "es" if noun.endswith(("s", "ch")) else "s"
+    return f"{count} {noun}{ending}"
+
+
+def listed(names: Iterable[str], most: int = 12) -> str:
+    """Join names for a message, at most so many of them, each cut to 40 characters."""
+    names = list(names)
+    shown = ", ".join(name[:40] for name in names[:most])
+    return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"
+
+
 def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | None:
-    """The one column called `name`: as written, else whatever its case."""
+    """Return the one column called `name`: as written, else whatever its case."""
     folded = name.casefold()
     for matches in (
         [i for i, label in enumerate(labels) if label.whole == name],
@@ -116,18 +167,11 @@ def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | No
         [i for i, label in enumerate(labels) if folded in (label.whole.casefold(), label.name.casefold())],
     ):
         if len(matches) > 1:
-            found = " and ".join(str(i + 1) for i in matches)
-            raise UnreadableFile(f"{what} must be one column, got columns {found} ({place})")
+            numbers = " and ".join(str(i + 1) for i in matches)
+            raise UnreadableFile(f"{what} must be one column, got columns {numbers} ({place})")
         if matches:
             return matches[0]
     return None
-
-
-def listed(names: Iterable[str], most: int = 12) -> str:
-    """Names for a message, not too many of them."""
-    names = list(names)
-    shown = ", ".join(name[:40] for name in names[:most])
-    return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"
 
 
 def _mapped(labels: Sequence[Label], channel: str, foreign: str, place: str) -> tuple[int, str | None]:
@@ -135,28 +179,21 @@ def _mapped(labels: Sequence[Label], channel: str, foreign: str, place: str) -> 
     column = _find(labels, foreign, what, place)
     if column is not None:
         return column, labels[column].unit
-    match = _BRACKETS.fullmatch(foreign)
-    if match:
-        column = _find(labels, match["name"], what, place)
-        if column is not None:
-            return column, match["unit"].strip()
-    raise UnreadableFile(f"{what} must be a column, got columns {listed(label.whole for label in labels)} ({place})")
+    name, unit = _square_brackets(foreign)
+    column = None if unit is None else _find(labels, name, what, place)
+    if column is None:
+        have = listed(label.whole for label in labels)
+        raise UnreadableFile(f"{what} must be a column, got columns {have} ({place})")
+    return column, unit
 
 
 def _checked_unit(channel: str, unit: str | None, what: str, place: str) -> tuple[str, str | None]:
-    """(unit, note): raw counts where no unit is told."""
+    """Return (unit, note): raw counts where no unit is given."""
     if unit is None:
         return COUNTS, f"{what} has no unit: taken as raw counts"
     if same_dimension(unit, COUNTS):
         return COUNTS, None
-    si_unit = CHANNEL_UNITS[channel]
-    if not same_dimension(unit, si_unit):
-        from sealscope.units import to_si
-
-        try:
-            to_si(0.0, unit, si_unit, name=channel, place=place)
-        except InputError as error:
-            raise UnreadableFile(str(error)) from None
+    to_si(0.0, unit, CHANNEL_UNITS[channel], name=channel, place=place)
     return unit, None
 
 
@@ -172,54 +209,55 @@ def _find_time(labels: Sequence[Label], place: str) -> int | None:
     return None
 
 
-def plan(labels: Sequence[Label], channel_map: Mapping[str, str], rate: float | None, place: str) -> Plan:
+def choose_columns(
+    labels: Sequence[Label], channel_map: Mapping[str, str], rate: float | None, place: str
+) -> ColumnMap:
     """Decide which columns are read, and as what.
 
     A mapped channel comes before a column that bears the channel's own name. Raises UnreadableFile where a mapped
-    column is missing or its unit is of another dimension, where no column is a channel, and where there is neither time
-    nor rate.
+    column is missing, where no column is a channel, and where there is neither time nor rate; InputError for a unit of
+    another dimension.
     """
     notes: list[str] = []
     channels: dict[str, tuple[int, str]] = {}
     time: int | None = None
-    time_unit: str | None = None
+    time_label: Label | None = None
     for channel, foreign in channel_map.items():
         column, unit = _mapped(labels, channel, foreign, place)
+        whole = labels[column].whole
         if channel == "t":
-            time, time_unit = column, unit
+            time, time_label = column, Label(whole, whole, unit)
             continue
-        told, note = _checked_unit(channel, unit, f"column {labels[column].whole}, read as {channel},", place)
-        channels[channel] = column, told
-        notes += [note] if note else [f"column {labels[column].whole} read as {channel} in {told}"]
+        unit, note = _checked_unit(channel, unit, f"column {whole}, read as {channel},", place)
+        channels[channel] = column, unit
+        notes.append(note or f"column {whole} read as {channel} in {unit}")
     for channel in CHANNEL_UNITS:
-        if channel in channels:
-            continue
-        found = _find(labels, channel, f"channel {channel}", place)
-        if found is not None and found != time and found not in {column for column, _ in channels.values()}:
-            told, note = _checked_unit(channel, labels[found].unit, f"column {labels[found].whole}", place)
-            channels[channel] = found, told
+        own = None if channel in channels else _find(labels, channel, f"channel {channel}", place)
+        if own is not None and own != time and own not in {column for column, _ in channels.values()}:
+            unit, note = _checked_unit(channel, labels[own].unit, f"column {labels[own].whole}", place)
+            channels[channel] = own, unit
             notes += [note] if note else []
     if time is None:
         time = _find_time(labels, place)
         if time is not None:
-            time_unit = labels[time].unit or _TIME_NAMES.get(labels[time].name.casefold())
+            label = labels[time]
+            time_label = Label(label.whole, label.name, label.unit or _TIME_NAMES.get(label.name.casefold()))
+    have = listed(label.whole for label in labels)
     if not channels:
         raise UnreadableFile(
             f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
-            f"got columns {listed(label.whole for label in labels)} ({place})"
+            f"got columns {have} ({place})"
         )
-    seen_time = time
-    if rate is not None and time is not None:
-        notes.append(f"time column {labels[time].whole} not used: the rate was given as {rate:g} Hz")
-        time = None
-    elif rate is None and time is None:
+    if rate is None and time is None:
         raise UnreadableFile(
-            f"a recording must have a time column such as t [s] or be given a rate, "
-            f"got columns {listed(label.whole for label in labels)} ({place})"
+            f"a recording must have a time column such as t [s] or be given a rate, got columns {have} ({place})"
         )
-    order = {channel: channels[channel] for channel in sorted(channels, key=lambda c: channels[c][0])}
-    used = {column for column, _ in order.values()} | {seen_time}
+    used = {column for column, _ in channels.values()} | {time}
+    if rate is not None and time_label is not None:
+        notes.append(f"time column {time_label.whole} not used: the rate was given as {rate:g} Hz")
+        time = time_label = None
     ignored = [label.whole for i, label in enumerate(labels) if i not in used and label.whole]
     if ignored:
         notes.append(f"columns not used: {listed(ignored, 40)}")
-    return Plan(time, time_unit, order, tuple(notes))
+    order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel][0])}
+    return ColumnMap(time, time_label, order, tuple(notes))

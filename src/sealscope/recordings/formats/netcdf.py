@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,52 +11,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import UnreadableFile
+from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.columns import Label
-from sealscope.recordings.formats.table import FORMAT_VERSION, Table, check_size, own_words, read_own_words
-from sealscope.recordings.recording import Array, Recording
-from sealscope.recordings.timebase import stamps
+from sealscope.recordings.formats.table import (
+    FORMAT_VERSION,
+    Choose,
+    RawTable,
+    check_size,
+    from_text,
+    parse_description,
+)
 
 _OWN = "sealscope_format"
-_LONG_NAMES = {
-    "t": "time",
-    "u": "command",
-    "omega": "motor speed",
-    "theta": "motor angle",
-    "x": "piston position",
-    "p_1": "pressure at pump port 1",
-    "p_2": "pressure at pump port 2",
-    "p_A": "pressure in chamber A",
-    "p_B": "pressure in chamber B",
-    "q_leak": "leakage flow",
-}
-_ORDER = {name: place for place, name in enumerate(_LONG_NAMES)}
+_ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
 
-@contextmanager
-def open_hdf5(path: Path) -> Iterator[Table]:
-    """The one-dimensional data sets of a NetCDF-4 or HDF5 file, in all its groups; raises UnreadableFile."""
+def read_netcdf(path: Path, choose: Choose) -> RawTable:
+    """Read the chosen one-dimensional data sets of a NetCDF-4 or HDF5 file, of all its groups."""
     import h5py
 
     place = str(path)
-    try:
-        with h5py.File(path, "r") as file:
-            names: list[str] = []
-            file.visititems(lambda name, item: names.append(name) if _is_series(item) else None)
-            names.sort(key=lambda name: (name.count("/"), _ORDER.get(name, len(_ORDER)), name))
-            labels = [_label(name, file[name]) for name in names]
-
-            def fetch(columns: Sequence[int], time: int | None) -> tuple[list[Array], NDArray[Any] | None]:
-                wanted = [*columns, time] if time is not None else list(columns)
-                _check_lengths([(labels[i].whole, file[names[i]].shape[0]) for i in reversed(wanted)], place)
-                check_size(file[names[wanted[0]]].shape[0], len(wanted), place)
-                values = [_values(file[names[i]], labels[i].whole, place) for i in columns]
-                return values, None if time is None else _values(file[names[time]], labels[time].whole, place, True)
-
-            own = _own(file, place)
-            yield Table(place, "NetCDF" if "_NCProperties" in file.attrs else "HDF5", labels, fetch, own)
-    except (OSError, RuntimeError, KeyError) as error:
-        text = " ".join(str(error).split())[:160]
-        raise UnreadableFile(f"a NetCDF or HDF5 file must be whole, got: {text} ({place})") from error
+    with h5py.File(path, "r") as file:
+        names: list[str] = []
+        file.visititems(lambda name, item: names.append(name) if _is_series(item) else None)
+        names.sort(key=lambda name: (name.count("/"), _ORDER.get(name, len(_ORDER)), name))
+        choice = choose([_label(name, file[name]) for name in names])
+        chosen = [(names[column], file[names[column]]) for column, _ in choice.columns]
+        first, data = chosen[-1]
+        for name, other in reversed(chosen[:-1]):
+            if other.shape != data.shape:
+                raise UnreadableFile(
+                    f"{name} must have as many samples as {first} ({data.size}), got {other.size} ({place})"
+                )
+        check_size(data.size, len(chosen), place)
+        columns = [
+            _values(data, name, time, place) for (_, time), (name, data) in zip(choice.columns, chosen, strict=True)
+        ]
+        description = _description(file, place)
+        return RawTable("NetCDF" if "_NCProperties" in file.attrs else "HDF5", choice, columns, description)
 
 
 def _is_series(item: Any) -> bool:
@@ -87,21 +78,10 @@ def _label(name: str, data: Any) -> Label:
     return Label(name, label.name, label.unit)
 
 
-def _check_lengths(lengths: Sequence[tuple[str, int]], place: str) -> None:
-    first, count = lengths[0]
-    for name, length in lengths[1:]:
-        if length != count:
-            raise UnreadableFile(f"{name} must have as many samples as {first} ({count}), got {length} ({place})")
-
-
-def _values(data: Any, name: str, place: str, time: bool = False) -> NDArray[Any]:
-    """A data set as doubles (or, for time, stamps), with the scale, offset and fill value of the CF conventions."""
+def _values(data: Any, name: str, time: bool, place: str) -> NDArray[Any]:
+    """Read a data set as doubles (or, for time, stamps), with scale, offset and fill value of the CF conventions."""
     if data.dtype.kind in "OSU":
-        cells = [_text(cell) or "" for cell in data[...]]
-        try:
-            return stamps(cells) if time else np.array([float(cell) for cell in cells])
-        except ValueError as error:
-            raise UnreadableFile(f"{name} must hold numbers, got text ({place})") from error
+        return from_text([_text(cell) or "" for cell in data[...]], time, name, place)
     if data.dtype.kind not in "fiub":
         raise UnreadableFile(f"{name} must hold numbers, got the type {data.dtype} ({place})")
     raw = data[...]
@@ -113,12 +93,10 @@ def _values(data: Any, name: str, place: str, time: bool = False) -> NDArray[Any
     for key, change in (("scale_factor", np.multiply), ("add_offset", np.add)):
         if key in data.attrs:
             values = change(values, _number(data.attrs[key]))
-    if missing.any():
-        values = np.where(missing, np.nan, values)
-    return values
+    return np.where(missing, np.nan, values) if missing.any() else values
 
 
-def _own(file: Any, place: str) -> dict[str, Any] | None:
+def _description(file: Any, place: str) -> dict[str, Any] | None:
     if _OWN not in file.attrs:
         return None
     try:
@@ -127,35 +105,39 @@ def _own(file: Any, place: str) -> dict[str, Any] | None:
             lines = json.loads(history)
         except ValueError:  # another tool has added its own line, as the CF conventions ask
             lines = history.splitlines()
-        words = {
+        description = {
             "format": int(_number(file.attrs[_OWN])),
             "rate": _number(file.attrs["rate"]),
             "provenance": json.loads(_text(file.attrs["provenance"]) or "{}"),
             "history": lines,
         }
-    except (KeyError, IndexError, ValueError, TypeError) as error:
+    except (KeyError, IndexError, ValueError, TypeError, OverflowError) as error:
         raise UnreadableFile(f"the recording's description must be whole, got damaged attributes ({place})") from error
-    return read_own_words(json.dumps(words), place)
+    return parse_description(json.dumps(description), place)
 
 
-def write_netcdf(recording: Recording, path: Path) -> None:
-    """Write NetCDF-4 (an HDF5 file): dimension `t`, one variable a channel with `units`; doubles, to the bit.
+def attributes(description: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the global attributes; `provenance` and `history` are JSON texts, as NetCDF has no nested values."""
+    return {
+        "Conventions": "CF-1.11",
+        "title": "Sealscope recording",
+        _OWN: FORMAT_VERSION,
+        "rate": description["rate"],
+        "provenance": json.dumps(description["provenance"]),
+        "history": json.dumps(description["history"]),
+    }
 
-    `rate` is an attribute; `provenance` and `history` are one JSON text each, as NetCDF has no nested values.
-    """
+
+def write_netcdf(
+    path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
+) -> None:
+    """Write NetCDF-4 (an HDF5 file): dimension `t`, one variable a channel with `units`; doubles, to the bit."""
     import h5netcdf
 
-    words = own_words(recording)
     with h5netcdf.File(path, "w") as file:
-        file.attrs["Conventions"] = "CF-1.11"
-        file.attrs["title"] = "Sealscope recording"
-        file.attrs[_OWN] = FORMAT_VERSION
-        file.attrs["rate"] = recording.rate
-        file.attrs["provenance"] = json.dumps(words["provenance"])
-        file.attrs["history"] = json.dumps(words["history"])
-        file.dimensions = {"t": len(recording)}
-        units = {"t": "s", **recording.units}
-        for name, values in {"t": recording.t, **recording.channels}.items():
-            variable = file.create_variable(name, ("t",), np.float64, data=values)
+        file.attrs.update(attributes(description))
+        file.dimensions = {"t": len(values["t"])}
+        for name, series in values.items():
+            variable = file.create_variable(name, ("t",), np.float64, data=series)
             variable.attrs["units"] = units[name]
-            variable.attrs["long_name"] = _LONG_NAMES[name]
+            variable.attrs["long_name"] = LONG_NAMES[name]

@@ -1,10 +1,9 @@
-"""Parquet tables, with pyarrow: units in the columns' names, our own words in the table's metadata."""
+"""Parquet tables, with pyarrow: units in the columns' names, Sealscope's description in the table's metadata."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import MissingExtra, UnreadableFile
+from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.columns import Label
-from sealscope.recordings.formats.table import Table, check_size, own_words, read_own_words
-from sealscope.recordings.recording import Array, Recording
-from sealscope.recordings.timebase import stamps
+from sealscope.recordings.formats.table import Choose, RawTable, check_size, from_text, parse_description
 
 _OWN = b"sealscope"
 
@@ -29,28 +27,22 @@ def _pyarrow() -> tuple[Any, Any]:
     return pyarrow, pyarrow.parquet
 
 
-@contextmanager
-def open_parquet(path: Path) -> Iterator[Table]:
-    """The columns of a Parquet table; raises UnreadableFile, and MissingExtra where pyarrow is absent."""
-    pyarrow, parquet = _pyarrow()
+def read_parquet(path: Path, choose: Choose) -> RawTable:
+    """Read the chosen columns of a Parquet table; raise MissingExtra where pyarrow is absent."""
+    _, parquet = _pyarrow()
     place = str(path)
-    try:
-        with parquet.ParquetFile(path) as file:
-            schema = file.schema_arrow
-            labels = [_label(schema.field(i)) for i in range(len(schema))]
-
-            def fetch(columns: Sequence[int], time: int | None) -> tuple[list[Array], NDArray[Any] | None]:
-                wanted = [*columns, time] if time is not None else list(columns)
-                check_size(file.metadata.num_rows, len(wanted), place)
-                table = file.read(columns=[schema.field(i).name for i in wanted])
-                values = [_values(table, schema.field(i), place) for i in columns]
-                return values, None if time is None else _values(table, schema.field(time), place, True)
-
-            own = (schema.metadata or {}).get(_OWN)
-            yield Table(place, "Parquet", labels, fetch, read_own_words(own, place) if own else None)
-    except (OSError, pyarrow.ArrowException) as error:
-        text = " ".join(str(error).split())[:160]
-        raise UnreadableFile(f"a Parquet file must be whole, got: {text} ({place})") from error
+    with parquet.ParquetFile(path) as file:
+        schema = file.schema_arrow
+        choice = choose([_label(field) for field in schema])
+        fields = [schema.field(column) for column, _ in choice.columns]
+        check_size(file.metadata.num_rows, len(fields), place)
+        table = file.read(columns=[field.name for field in fields])
+        columns = [
+            _values(table.column(field.name), field, time, place)
+            for (_, time), field in zip(choice.columns, fields, strict=True)
+        ]
+        own = (schema.metadata or {}).get(_OWN)
+    return RawTable("Parquet", choice, columns, parse_description(own, place) if own else None)
 
 
 def _label(field: Any) -> Label:
@@ -59,29 +51,24 @@ def _label(field: Any) -> Label:
     return Label.parse(field.name, unit)
 
 
-def _values(table: Any, field: Any, place: str, time: bool = False) -> NDArray[Any]:
+def _values(column: Any, field: Any, time: bool, place: str) -> NDArray[Any]:
     import pyarrow
 
     types = pyarrow.types
-    column = table.column(field.name)
     if time and types.is_timestamp(field.type):
         return np.asarray(column.cast(pyarrow.timestamp("ns", field.type.tz)).to_numpy().astype("datetime64[ns]"))
     if types.is_integer(field.type) or types.is_floating(field.type) or types.is_decimal(field.type):
         return np.asarray(column.cast(pyarrow.float64(), safe=False).to_numpy(), dtype=np.float64)
     if types.is_string(field.type) or types.is_large_string(field.type):
-        cells = [cell or "" for cell in column.to_pylist()]
-        try:
-            return stamps(cells) if time else np.array([float(cell) if cell else np.nan for cell in cells])
-        except ValueError as error:
-            raise UnreadableFile(f"{field.name} must hold numbers, got text ({place})") from error
+        return from_text([cell or "" for cell in column.to_pylist()], time, field.name, place)
     raise UnreadableFile(f"{field.name} must hold numbers, got the type {field.type} ({place})")
 
 
-def write_parquet(recording: Recording, path: Path) -> None:
-    """Write columns `t [s]`, `p_A [Pa]`, ... as doubles, and rate, provenance and history in the table's metadata."""
+def write_parquet(
+    path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
+) -> None:
+    """Write columns `t [s]`, `p_A [Pa]`, ... as doubles, and the description in the table's metadata."""
     pyarrow, parquet = _pyarrow()
-    columns = {"t [s]": recording.t}
-    columns |= {f"{name} [{recording.units[name]}]": values for name, values in recording.channels.items()}
-    table = pyarrow.table({name: pyarrow.array(values, from_pandas=False) for name, values in columns.items()})
-    table = table.replace_schema_metadata({_OWN: json.dumps(own_words(recording)).encode()})
-    parquet.write_table(table, path)
+    columns = {f"{name} [{units[name]}]": pyarrow.array(series, from_pandas=False) for name, series in values.items()}
+    table = pyarrow.table(columns)
+    parquet.write_table(table.replace_schema_metadata({_OWN: json.dumps(description).encode()}), path)

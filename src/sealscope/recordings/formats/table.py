@@ -1,45 +1,85 @@
-"""From a table of named columns, whatever file it came from, to a Recording."""
+"""A table of named columns, whatever file it comes from, and the description that Sealscope writes beside it."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.formats.columns import Label, plan
-from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Array, Recording
-from sealscope.recordings.timebase import time_base
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
+from sealscope.recordings.formats.columns import ColumnMap, Label
+from sealscope.recordings.timebase import stamps, time_base
 from sealscope.units import to_si
 
 #: Most values that one file may hold in the columns used: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
 MAX_VALUES = 2**28
 FORMAT_VERSION = 1
+#: Decides from a table's labels which columns are read.
+Choose = Callable[[Sequence[Label]], ColumnMap]
+
+
+class Samples(NamedTuple):
+    """What a recording is made of, in the order of its arguments."""
+
+    t: Array
+    channels: dict[str, Array]
+    units: dict[str, str]
+    rate: float
+    provenance: dict[str, Any]
+    history: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Table:
-    """Named columns of a file that is open.
+class RawTable:
+    """The chosen columns of a table, in the units of the table.
 
-    `fetch(columns, time)` gives the channels' columns as doubles, in order, and the time column, if asked for, as
-    doubles or datetime64. `own`: what Sealscope itself wrote beside the numbers, or None.
+    `kind`: the format, in words; `columns`: the columns of `choice.columns`, each (n,) doubles, the time doubles or
+    datetime64; `description`: what Sealscope itself wrote beside the numbers, or None; `notes`: lines for the history.
     """
 
-    place: str
     kind: str
-    labels: Sequence[Label]
-    fetch: Callable[[Sequence[int], int | None], tuple[list[Array], NDArray[Any] | None]]
-    own: Mapping[str, Any] | None = None
+    choice: ColumnMap
+    columns: Sequence[NDArray[Any]]
+    description: Mapping[str, Any] | None = None
     notes: tuple[str, ...] = ()
+
+    def samples(self, source: Mapping[str, Any], *, rate: float | None, infer_rate: bool) -> Samples:
+        """Convert to SI. `source`: begins the provenance of a foreign table; `rate` [Hz]: where there is no time.
+
+        `infer_rate`: from the time, although the description has one. Raises InputError.
+        """
+        choice, own = self.choice, self.description
+        count = len(self.columns[0])
+        if count == 0:
+            raise InputError("a recording must have samples, got a header and no rows")
+        values = {column: cells for (column, time), cells in zip(choice.columns, self.columns, strict=True) if not time}
+        channels, units = {}, {}
+        for name, (column, unit) in choice.channels.items():
+            units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
+            channels[name] = to_si(values[column], unit, units[name], name=name)
+        notes = (*self.notes, *choice.notes)
+        start: dict[str, Any] = {}
+        if choice.time_label is None:
+            assert rate is not None
+            t = np.arange(count) / rate
+        elif own is not None and not infer_rate:
+            t, rate = self.columns[-1], own["rate"]
+        else:
+            label = choice.time_label
+            t, rate, start, more = time_base(self.columns[-1], label.unit, label.whole)
+            notes += more
+        if own is not None:
+            return Samples(t, channels, units, rate, own["provenance"], (*own["history"], *notes))
+        return Samples(t, channels, units, rate, {**source, "format": self.kind, **start}, notes)
 
 
 def check_size(rows: int, columns: int, place: str) -> None:
-    """Raises UnreadableFile where a file holds more than `MAX_VALUES` in the columns used."""
+    """Raise UnreadableFile where a file holds more than `MAX_VALUES` in the columns used."""
     if rows * columns > MAX_VALUES:
         raise UnreadableFile(
             f"a recording must have at most {MAX_VALUES} values in the columns used (2 GiB), "
@@ -47,16 +87,24 @@ def check_size(rows: int, columns: int, place: str) -> None:
         )
 
 
-def own_words(recording: Recording) -> dict[str, Any]:
-    """Rate, provenance and history as JSON values; raises InputError where a value is none of JSON's."""
-    words = {
+def from_text(cells: Sequence[str], time: bool, name: str, place: str) -> NDArray[Any]:
+    """Convert cells of text to doubles, or to stamps for the `time`; an empty cell is missing."""
+    try:
+        return stamps(cells) if time else np.array([float(cell) if cell else np.nan for cell in cells])
+    except ValueError as error:
+        raise UnreadableFile(f"{name} must hold numbers, got text ({place})") from error
+
+
+def description_of(rate: float, provenance: Mapping[str, Any], history: Sequence[str]) -> dict[str, Any]:
+    """Return rate, provenance and history as JSON values; raise InputError where a value is none of JSON's."""
+    description = {
         "format": FORMAT_VERSION,
-        "rate": recording.rate,
-        "provenance": dict(recording.provenance),
-        "history": list(recording.history),
+        "rate": rate,
+        "provenance": dict(provenance),
+        "history": list(history),
     }
     try:
-        return json.loads(json.dumps(words, default=_plain))  # type: ignore[no-any-return]
+        return json.loads(json.dumps(description, default=_plain))  # type: ignore[no-any-return]
     except (TypeError, ValueError) as error:
         raise InputError(f"provenance must hold JSON values only: {error}") from None
 
@@ -67,62 +115,21 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"got a {type(value).__name__}")
 
 
-def read_own_words(text: str | bytes, place: str) -> dict[str, Any]:
-    """The inverse of `own_words` from JSON text; raises UnreadableFile where it is damaged."""
+def parse_description(text: str | bytes, place: str) -> dict[str, Any]:
+    """Parse the JSON text of a `description_of`; raise UnreadableFile where it is damaged."""
     try:
-        words = json.loads(text)
-        own: dict[str, Any] = {
-            "rate": float(words["rate"]),
-            "provenance": dict(words["provenance"]),
-            "history": [str(line) for line in words["history"]],
-            "format": int(words["format"]),
+        found = json.loads(text)
+        description: dict[str, Any] = {
+            "rate": float(found["rate"]),
+            "provenance": dict(found["provenance"]),
+            "history": [str(line) for line in found["history"]],
+            "format": int(found["format"]),
         }
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise UnreadableFile(f"the recording's description must be whole, got damaged JSON ({place})") from error
-    if own["format"] > FORMAT_VERSION:
-        raise UnreadableFile(f"format must be at most {FORMAT_VERSION}, got {own['format']}: newer software ({place})")
-    if not (np.isfinite(own["rate"]) and own["rate"] > 0):
-        raise UnreadableFile(f"rate must be > 0 Hz, got {own['rate']} ({place})")
-    return own
-
-
-def check_writable(recording: Recording) -> None:
-    """Raises InputError where a recording could not be read back as it is."""
-    if len(recording) == 0 or not recording.channels:
-        raise InputError("a recording to write must hold at least one sample of one channel")
-    for name, unit in recording.units.items():
-        if name not in CHANNEL_UNITS:
-            raise InputError(f"a channel to write must be one of {', '.join(CHANNEL_UNITS)}, got {name}")
-        if unit not in (CHANNEL_UNITS[name], COUNTS):
-            raise InputError(f"channel {name} must be in {CHANNEL_UNITS[name]} or {COUNTS} to be written, got {unit}")
-
-
-def recording_of(table: Table, channel_map: Mapping[str, str], rate: float | None) -> Recording:
-    """The recording that `table` holds; raises UnreadableFile."""
-    chosen = plan(table.labels, channel_map, rate, table.place)
-    columns = chosen.columns
-    values, time_values = table.fetch(columns, chosen.time)
-    count = len(values[0])
-    if count == 0:
-        raise UnreadableFile(f"a recording must have samples, got a header and no rows ({table.place})")
-    at = {column: i for i, column in enumerate(columns)}
-    channels, units = {}, {}
-    for name, (column, unit) in chosen.channels.items():
-        si_unit = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
-        channels[name] = to_si(values[at[column]], unit, si_unit, name=name, place=table.place)
-        units[name] = si_unit
-    notes = [*table.notes, *chosen.notes]
-    start: dict[str, Any] = {}
-    if chosen.time is None or time_values is None:
-        assert rate is not None
-        t = np.arange(count) / rate
-    elif table.own is not None and not channel_map:
-        t, rate = time_values, table.own["rate"]
-    else:
-        name = table.labels[chosen.time].whole
-        t, rate, start, more = time_base(time_values, chosen.time_unit, name, table.place)
-        notes += more
-    if table.own is not None:
-        return Recording(t, channels, units, rate, table.own["provenance"], (*table.own["history"], *notes))
-    provenance = {"file": Path(table.place).name, "format": table.kind, **start}
-    return Recording(t, channels, units, rate, provenance, tuple(notes))
+    version, rate = description["format"], description["rate"]
+    if version > FORMAT_VERSION:
+        raise UnreadableFile(f"format must be at most {FORMAT_VERSION}, got {version}: newer software ({place})")
+    if not (np.isfinite(rate) and rate > 0):
+        raise UnreadableFile(f"rate must be > 0 Hz, got {rate} ({place})")
+    return description

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.formats.table import Table, check_size, own_words, read_own_words
+from sealscope.recordings.channels import Array
+from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.formats.table import Choose, RawTable, check_size, parse_description
 from sealscope.recordings.formats.text_layout import (
     COMMENTS,
     MISSING,
@@ -24,7 +26,6 @@ from sealscope.recordings.formats.text_layout import (
     is_number,
     layout_of,
 )
-from sealscope.recordings.recording import Array, Recording
 from sealscope.recordings.timebase import is_stamp, stamps
 
 _CHUNK = 8 * 1024 * 1024
@@ -33,9 +34,8 @@ _ROWS_WRITTEN_AT_ONCE = 8192
 _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 
 
-@contextmanager
-def open_text(path: Path) -> Iterator[Table]:
-    """The columns of a text log; raises UnreadableFile."""
+def read_text(path: Path, choose: Choose) -> RawTable:
+    """Read the chosen columns of a text log."""
     place = str(path)
     with path.open("rb") as file:
         head = file.read(SNIFF)
@@ -47,17 +47,15 @@ def open_text(path: Path) -> Iterator[Table]:
         if head.startswith(OWN_MARK.encode()):
             head += _own_line(file, head)
         layout = layout_of(head, encoding, len(file.read(1)) == 0, place)
-
-        def fetch(columns: Sequence[int], time: int | None) -> tuple[list[Array], NDArray[Any] | None]:
-            file.seek(0)
-            return _columns(file, layout, columns, time, place)
-
-        own = read_own_words(layout.own, place) if layout.own is not None else None
-        yield Table(place, layout.kind, layout.labels, fetch, own, layout.notes)
+        choice = choose(layout.labels)
+        file.seek(0)
+        columns = _columns(file, layout, choice.columns, place)
+    description = None if layout.own is None else parse_description(layout.own, place)
+    return RawTable(layout.kind, choice, columns, description, layout.notes)
 
 
 def _own_line(file: BinaryIO, head: bytes) -> bytes:
-    """The rest of a long first line of our own, and as much after it as is needed to see the layout."""
+    """Read the rest of a long first line of our own, and as much after it as is needed to see the layout."""
     more = b""
     while b"\n" not in head and b"\n" not in more and len(more) < _LONGEST_OWN_LINE:
         data = file.read(SNIFF)
@@ -68,7 +66,7 @@ def _own_line(file: BinaryIO, head: bytes) -> bytes:
 
 
 def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, list[str], bool]]:
-    """(number of the first line, whole lines, whether the last line is cut short), in bounded blocks."""
+    """Yield (number of the first line, whole lines, whether the last line is cut short), in bounded blocks."""
     width = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if width == 2 else "ascii")
     rest, number = b"", 1
@@ -104,25 +102,33 @@ def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, li
         number += len(lines)
 
 
-def _rows(lines: list[str], layout: Layout) -> list[list[str]]:
+def _rows(lines: list[str], numbers: Sequence[int], layout: Layout, cut: bool, place: str) -> list[list[str]]:
+    """Split lines into cells; a quotation mark must be closed on its line, but on one that was `cut` short."""
     if layout.delimiter == " ":
         return [line.split() for line in lines]
-    if any('"' in line for line in lines):
-        return list(csv.reader(lines, delimiter=layout.delimiter, skipinitialspace=True))
-    delimiter = layout.delimiter
-    return [line.split(delimiter) for line in lines]
+    if not any('"' in line for line in lines):
+        return [line.split(layout.delimiter) for line in lines]
+    reader = csv.reader([*lines, ""], delimiter=layout.delimiter, skipinitialspace=True)
+    rows: list[list[str]] = []
+    for line, row in enumerate(reader):
+        if reader.line_num > line + 1:  # the line goes on in the next
+            if cut and line == len(lines) - 1:
+                return [*rows, [*row[:-1], ""]]
+            raise UnreadableFile(
+                f"a quotation mark must be closed on its line, got an open one (line {numbers[line]}, {place})"
+            )
+        rows.append(row)
+    return rows[:-1]
 
 
-def _columns(
-    file: BinaryIO, layout: Layout, columns: Sequence[int], time: int | None, place: str
-) -> tuple[list[Array], NDArray[Any] | None]:
-    wanted = [*columns, time] if time is not None else list(columns)
-    parts: list[list[NDArray[Any]]] = [[] for _ in wanted]
+def _columns(file: BinaryIO, layout: Layout, columns: Sequence[tuple[int, bool]], place: str) -> list[NDArray[Any]]:
+    """Read columns; the one that is the time may hold stamps."""
+    parts: list[list[NDArray[Any]]] = [[] for _ in columns]
     total = 0
     stamped: bool | None = None
-    least = max(wanted) + 1
+    least = max(column for column, _ in columns) + 1
     usual = 0
-    for number, lines, open_end in _blocks(file, layout.encoding, place):
+    for number, lines, cut in _blocks(file, layout.encoding, place):
         skip = max(0, layout.first_row + 1 - number)
         blank = " " if layout.delimiter == "\t" else None  # tabs alone are a row of missing samples
         kept = [
@@ -131,40 +137,34 @@ def _columns(
         if not kept:
             continue
         numbers = [number + i for i in kept]
-        rows = _rows([lines[i] for i in kept], layout)
+        rows = _rows([lines[i] for i in kept], numbers, layout, cut, place)
         usual = len(rows[-2]) if len(rows) > 1 else usual
-        if open_end and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
+        if cut and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
             # a last line without an end was not written whole: half a number and what follows it are missing
             rows[-1] = [*rows[-1][:-1], *[""] * (least - len(rows[-1]) + 1)]
-        if min(map(len, rows)) < least:
-            short = next(i for i, row in enumerate(rows) if len(row) < least)
-            raise UnreadableFile(
-                f"a row must have {len(layout.labels)} cells, got {len(rows[short])} (line {numbers[short]}, {place})"
-            )
-        if max(map(len, rows)) > len(layout.labels):
-            _refuse_extra_cells(rows, numbers, layout, place)
         usual = len(rows[-1])
-        odd = any("_" in lines[i] for i in kept)  # Python takes 1_000 for a number
+        _check_widths(rows, numbers, least, layout, place)
         total += len(rows)
-        check_size(total, len(wanted), place)
-        if time is not None and stamped is None:
-            first = next((row[time] for row in rows if row[time].strip().lower() not in MISSING), "")
-            stamped = not is_number(first, layout.decimal) and is_stamp(first)
-        for part, column in zip(parts, wanted, strict=True):
+        check_size(total, len(columns), place)
+        for part, (column, time) in zip(parts, columns, strict=True):
             cells = [row[column] for row in rows]
-            if stamped and column == time:
-                part.append(_dates(cells, numbers, column, layout, place))
-            else:
-                part.append(_numbers(cells, numbers, column, layout, place, odd))
-    arrays = [np.concatenate(part) if part else np.empty(0) for part in parts]
-    return (arrays[:-1], arrays[-1]) if time is not None else (arrays, None)
+            if time and stamped is None:
+                first = next((cell for cell in cells if cell.strip().lower() not in MISSING), "")
+                stamped = not is_number(first, layout.decimal) and is_stamp(first)
+            read = _dates if time and stamped else _numbers
+            part.append(read(cells, numbers, column, layout, place))
+    return [np.concatenate(part) if part else np.empty(0) for part in parts]
 
 
-def _refuse_extra_cells(rows: list[list[str]], numbers: Sequence[int], layout: Layout, place: str) -> None:
+def _check_widths(rows: list[list[str]], numbers: Sequence[int], least: int, layout: Layout, place: str) -> None:
+    """Refuse rows that have too few cells, or more than the header and not empty."""
     most = len(layout.labels)
+    widths = [len(row) for row in rows]
+    if min(widths) >= least and max(widths) <= most:
+        return
     for row, number in zip(rows, numbers, strict=True):
-        if len(row) > most and any(cell.strip() for cell in row[most:]):
-            raise UnreadableFile(f"a row must have {most} cells, got {len(row)} (line {number}, {place})")
+        if len(row) < least or any(cell.strip() for cell in row[most:]):
+            raise UnreadableFile(f"a row must have {counted(most, 'cell')}, got {len(row)} (line {number}, {place})")
 
 
 def _place_of(index: int, numbers: Sequence[int], column: int, layout: Layout, place: str) -> str:
@@ -182,59 +182,58 @@ def _dates(cells: list[str], numbers: Sequence[int], column: int, layout: Layout
         ) from None
 
 
-def _numbers(cells: list[str], numbers: Sequence[int], column: int, layout: Layout, place: str, odd: bool) -> Array:
-    """Cells as doubles, missing ones as NaN; the first that is no number is named."""
-    if layout.decimal == ",":
-        cells = [cell.replace(".", "?").replace(",", ".") for cell in cells]
+def _numbers(cells: list[str], numbers: Sequence[int], column: int, layout: Layout, place: str) -> Array:
+    """Read cells as doubles, missing ones as NaN; the first that is no number is named."""
+    comma = layout.decimal == ","
+    texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if comma else cells
+    plain = not any("_" in text for text in texts)  # Python takes 1_000 for a number
     try:
-        values = np.fromiter(map(_number if odd else float, cells), np.float64, len(cells))
+        values = np.fromiter(map(float if plain else _number, texts), np.float64, len(texts))
     except ValueError:
-        values = np.fromiter(map(_number, cells), np.float64, len(cells))
-    suspicious = np.flatnonzero(~np.isfinite(values))
-    for index in suspicious.tolist():
-        cell = cells[index].strip()
-        shown = cell.replace(".", ",").replace("?", ".") if layout.decimal == "," else cell
-        if shown.lower() in MISSING:
-            continue
-        rule = "a finite number" if is_number(cell, ".") else "a number"
-        where = _place_of(index, numbers, column, layout, place)
-        raise UnreadableFile(f"a sample must be {rule}, got {shown[:40]!r} {where}")
+        values = np.fromiter(map(_number, texts), np.float64, len(texts))
+    for index in np.flatnonzero(~np.isfinite(values)).tolist():
+        shown = cells[index].strip()
+        if shown.lower() not in MISSING:
+            rule = "a finite number" if is_number(shown, layout.decimal) else "a number"
+            where = _place_of(index, numbers, column, layout, place)
+            raise UnreadableFile(f"a sample must be {rule}, got {shown[:40]!r} {where}")
     return values
 
 
-def _number(cell: str) -> float:
-    text = cell.strip()
+def _number(text: str) -> float:
+    text = text.strip()
     try:
         return float(text) if "_" not in text else np.nan
     except ValueError:
-        if is_number(text, "."):  # a Fortran exponent, 1.5D+03
-            return float(text.lower().replace("d", "e"))
-        return np.nan
+        # a Fortran exponent, 1.5D+03
+        return float(text.lower().replace("d", "e")) if is_number(text, ".") else np.nan
 
 
-def write_text(recording: Recording, path: Path, delimiter: str) -> None:
+def write_text(
+    path: Path,
+    values: Mapping[str, Array],
+    units: Mapping[str, str],
+    description: Mapping[str, Any],
+    delimiter: str,
+) -> None:
     """Write `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row a sample.
 
     Numbers read back to the same bits; a missing sample is an empty cell. Raises InputError where a value is infinite.
     """
-    import json
-
-    names = list(recording.channels)
-    for name in names:
-        if np.isinf(recording[name]).any():
-            raise InputError(f"channel {name} must be finite or missing to be written as text, got inf")
-    if np.isinf(recording.t).any():
-        raise InputError("t must be finite or missing to be written as text, got inf")
-    header = ["t [s]", *(f"{name} [{recording.units[name]}]" for name in names)]
-    columns = [recording.t, *recording.channels.values()]
+    for name, series in values.items():
+        if np.isinf(series).any():
+            what = name if name == "t" else f"channel {name}"
+            raise InputError(f"{what} must be finite or missing to be written as text, got inf")
     with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(OWN_MARK + json.dumps(own_words(recording)) + "\n")
-        file.write(delimiter.join(header) + "\n")
-        for start in range(0, len(recording), _ROWS_WRITTEN_AT_ONCE):
-            part = slice(start, start + _ROWS_WRITTEN_AT_ONCE)
-            texts = [list(map(repr, column[part].tolist())) for column in columns]
-            for column, cells in zip(columns, texts, strict=True):
-                for missing in np.flatnonzero(np.isnan(column[part])).tolist():
+        file.write(OWN_MARK + json.dumps(description) + "\n")
+        file.write(delimiter.join(f"{name} [{units[name]}]" for name in values) + "\n")
+        for start in range(0, len(values["t"]), _ROWS_WRITTEN_AT_ONCE):
+            rows = []
+            for series in values.values():
+                part = series[start : start + _ROWS_WRITTEN_AT_ONCE]
+                cells = list(map(repr, part.tolist()))
+                for missing in np.flatnonzero(np.isnan(part)).tolist():
                     cells[missing] = ""
-            file.write("\n".join(map(delimiter.join, zip(*texts, strict=True))))
+                rows.append(cells)
+            file.write("\n".join(map(delimiter.join, zip(*rows, strict=True))))
             file.write("\n")

@@ -1,4 +1,4 @@
-"""What a text log looks like, found from its beginning: encoding, delimiter, decimal sign, header, units, first row."""
+"""The layout of a text log, found from its beginning: encoding, delimiter, decimal sign, header, units, first row."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.formats.columns import Label
+from sealscope.recordings.formats.columns import Label, counted
 from sealscope.recordings.timebase import is_stamp
 from sealscope.units import parse_unit
 
@@ -21,12 +21,13 @@ MISSING = frozenset(
     {"", "nan", "-", "--", "---", "na", "n/a", "#n/a", "null", "none", "-nan", "+nan", "1.#qnan", "-1.#ind", "nan(ind)"}
 )
 _SAMPLE_ROWS = 200
+_LONGEST_NUMBER = 400
 _NUMBER = {
-    ".": re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
+    ".": re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
     ",": re.compile(r"[+-]?(?:\d+(?:,\d+)?|,\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
 }
 _LOOKS = (("\t", "."), ("\t", ","), (";", "."), (";", ","), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
-_SPACED_LABEL = re.compile(r"\S+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")
+_SPACED_LABEL = re.compile(r"\S+(?:\s{0,20}(?:\[[^\]]{0,40}\]|\([^)]{0,40}\)))?")
 _NAMES = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " ": "blank"}
 
 
@@ -44,12 +45,13 @@ class Layout:
 
     @property
     def kind(self) -> str:
+        """The format, in words."""
         comma = ", decimal comma" if self.decimal == "," else ""
         return f"text, {_NAMES[self.delimiter]} separated{comma}, {self.encoding}"
 
 
 def encoding_of(head: bytes) -> str | None:
-    """The encoding that the first bytes tell; None where they are no text."""
+    """Return the encoding of a text by its first bytes; None where they are no text."""
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
         (codecs.BOM_UTF16_LE, "utf-16-le"),
@@ -68,7 +70,7 @@ def encoding_of(head: bytes) -> str | None:
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """The cells of one line, quotation marks around a cell taken off."""
+    """Split one line into cells, without the quotation marks around a cell."""
     if delimiter == " ":
         return line.split()
     if '"' in line:
@@ -79,8 +81,9 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 
 
 def is_number(cell: str, decimal: str) -> bool:
-    """Whether the cell is a number with this decimal sign."""
-    return bool(_NUMBER[decimal].fullmatch(cell.strip()))
+    """Return whether the cell is a number with this decimal sign."""
+    cell = cell.strip()
+    return len(cell) <= _LONGEST_NUMBER and _NUMBER[decimal].fullmatch(cell) is not None
 
 
 def _is_value(cell: str, decimal: str) -> bool:
@@ -88,7 +91,7 @@ def _is_value(cell: str, decimal: str) -> bool:
 
 
 def _width(row: Sequence[str]) -> int:
-    """Number of cells without empty ones at the end."""
+    """Count the cells but the empty ones at the end."""
     width = len(row)
     while width and not row[width - 1].strip():
         width -= 1
@@ -96,7 +99,7 @@ def _width(row: Sequence[str]) -> int:
 
 
 def _look(body: Sequence[str]) -> tuple[str, str, int]:
-    """(delimiter, decimal sign, cells a row) under which most cells of the body are values."""
+    """Return (delimiter, decimal sign, cells a row) with which most cells of the body are values."""
     best: tuple[tuple[float, int], tuple[str, str, int]] | None = None
     for delimiter, decimal in _LOOKS:
         rows = [cells_of(line, delimiter) for line in body]
@@ -108,8 +111,8 @@ def _look(body: Sequence[str]) -> tuple[str, str, int]:
         width = max(counts, key=lambda w: (counts[w], w))
         if counts[width] < 0.5 * len(valued):
             continue
-        told = sum(cell.strip().lower() not in MISSING for row, _ in valued for cell in row)
-        share = sum(many for row, many in valued if len(row) == width) / told
+        present = sum(cell.strip().lower() not in MISSING for row, _ in valued for cell in row)
+        share = sum(many for row, many in valued if len(row) == width) / present
         if share > 0 and (best is None or (share, width) > best[0]):
             best = (share, width), (delimiter, decimal, width)
     return best[1] if best else (",", ".", 1)
@@ -122,26 +125,26 @@ def _header_labels(line: str, delimiter: str) -> list[str]:
 
 
 def _unit_cells(cells: Sequence[str]) -> list[str | None] | None:
-    """The units of a units row, or None where the row is none: most of its cells must be units."""
+    """Return the units of a units row; None for another row: most of the cells of a units row are units."""
     units: list[str | None] = []
-    known = told = 0
+    known = present = 0
     for cell in cells:
         text = cell.strip().strip("[]()").strip()
         if not text or text == "-":
             units.append(None)
             continue
-        told += 1
+        present += 1
         try:
             parse_unit(text)
             known += 1
         except InputError:
             pass
         units.append(text)
-    return units if told and known >= 0.6 * told else None
+    return units if present and known >= 0.6 * present else None
 
 
 def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decimal: str) -> tuple[list[Label], int]:
-    """(labels, number of rows they take) from the lines above the first data row."""
+    """Return (labels, number of rows they take) from the lines above the first data row."""
 
     def names(index: int, commented: bool = False) -> list[str] | None:
         if index < 0:
@@ -173,7 +176,7 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
 
 
 def _own_layout(lines: Sequence[str], encoding: str) -> Layout | None:
-    """The layout of a file that Sealscope wrote, whose second line is the header; None for any other."""
+    """Return the layout of a file that Sealscope wrote, whose second line is the header; None for any other."""
     if len(lines) < 2 or not lines[0].startswith(OWN_MARK) or not lines[1].startswith("t [s]"):
         return None
     delimiter = "\t" if "\t" in lines[1] else ","
@@ -182,16 +185,16 @@ def _own_layout(lines: Sequence[str], encoding: str) -> Layout | None:
 
 
 def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
-    """The layout of a log that begins with `head`; `whole` where that is all of it. Raises UnreadableFile."""
+    """Find the layout of a log that begins with `head`; `whole`: that is all of it. Raises UnreadableFile."""
     text = head.decode(encoding, errors="replace").lstrip("\ufeff")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if not whole:
         if len(lines) < 2:
             raise UnreadableFile(f"a text log must have lines, got none that ends within {SNIFF} bytes ({place})")
         lines.pop()
-    ours = _own_layout(lines, encoding)
-    if ours is not None:
-        return ours
+    own = _own_layout(lines, encoding)
+    if own is not None:
+        return own
     content = [line for line in lines if line.strip() and not line.lstrip().startswith(COMMENTS)]
     if not content:
         raise UnreadableFile(f"a recording must have samples, got an empty file ({place})")
@@ -228,7 +231,7 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         notes.append("no header: columns are called by their number, from 1")
     above = [line for line in lines[:first] if line.strip() and not line.startswith(COMMENTS)]
     if len(above) > taken:
-        notes.append(f"{len(above) - taken} lines before the header not used")
+        notes.append(f"{counted(len(above) - taken, 'line')} before the header not used")
     return Layout(encoding, delimiter, decimal, tuple(labels), first, None, tuple(notes))
 
 

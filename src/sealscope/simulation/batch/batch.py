@@ -92,7 +92,7 @@ class Batch:
         try:
             import pandas as pd
         except ImportError:
-            raise MissingExtra("a table needs pandas: pip install pandas") from None
+            raise MissingExtra("a table needs pandas: pip install 'sealscope[io]'") from None
         runs, _, segments, _ = self.rms.shape
         run, segment = (index.ravel() for index in np.indices((runs, segments)))
         columns: dict[str, Any] = {"run": run, "segment": segment}

@@ -1,0 +1,43 @@
+"""The channels of a recording: their names, which are the thesis's symbols, their SI units and what they measure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Channel names and the unit each has inside Sealscope; `docs/nomenclature.md` explains them.
+CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
+    {
+        "u": "V",
+        "omega": "rad/s",
+        "theta": "rad",
+        "x": "m",
+        "p_1": "Pa",
+        "p_2": "Pa",
+        "p_A": "Pa",
+        "p_B": "Pa",
+        "q_leak": "m^3/s",
+    }
+)
+#: What each channel, and the time, measures.
+LONG_NAMES: Mapping[str, str] = MappingProxyType(
+    {
+        "t": "time",
+        "u": "command",
+        "omega": "motor speed",
+        "theta": "motor angle",
+        "x": "piston position",
+        "p_1": "pressure at pump port 1",
+        "p_2": "pressure at pump port 2",
+        "p_A": "pressure in chamber A",
+        "p_B": "pressure in chamber B",
+        "q_leak": "leakage flow",
+    }
+)
+#: Unit of a mapped channel that came without one: raw counts of a converter.
+COUNTS = "count"
