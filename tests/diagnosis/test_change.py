@@ -8,22 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis.changepoint.abrupt import (
-    ONSET_CUT,
-    Drift,
-    Scan,
-    StepScan,
-    least_blocks,
-    onset_interval,
-    permutations_for,
-    two_samples,
-    upper_quantile,
-)
-from sealscope.diagnosis.changepoint.abrupt import _orders as orders
+from sealscope.diagnosis.changepoint.scatter import HealthyDrift, Scan, StepScan, permutations_for
+from sealscope.diagnosis.changepoint.scatter import _orders as orders
+from sealscope.diagnosis.changepoint.shapes import least_blocks
+from sealscope.diagnosis.changepoint.tails import ONSET_CUT, near_best, upper_quantile
 
 
-def scan(x: np.ndarray, joint: list[int], drift: Drift | None = None) -> Scan:
-    return StepScan(x, joint, drift).found()
+def scan(x: np.ndarray, joint: list[int], drift: HealthyDrift | None = None) -> Scan:
+    return StepScan(x, joint, drift).observed()
 
 
 def slow_scan(x: np.ndarray, joint: list[int], least: int) -> tuple[np.ndarray, np.ndarray, float]:
@@ -61,7 +53,7 @@ def test_scan_is_what_plain_loops_give(n: int, f: int, seed: int) -> None:
     assert found.trend == pytest.approx(trend, rel=1e-6)
 
 
-def slow_t2(x: np.ndarray, joint: list[int], drift: Drift, shape: np.ndarray) -> float:
+def slow_t2(x: np.ndarray, joint: list[int], drift: HealthyDrift, shape: np.ndarray) -> float:
     """T2 of a change of that shape (n,) by generalised least squares with the whole covariance matrix of all blocks and
     columns: what the change in `joint` adds to the fit of means and of the changes of no account."""
     n, f = x.shape
@@ -85,12 +77,12 @@ def test_scan_with_drift_is_generalised_least_squares(n: int, q: int, seed: int)
     random = np.random.default_rng(seed)
     x = random.standard_normal((n, 4)) @ (np.eye(4) + 0.3 * random.standard_normal((4, 4)))
     x += 0.3 * np.cumsum(random.standard_normal((n, 4)), axis=0)
-    drift = Drift(random.uniform(0.0, 1.0, (4, q)), np.array([[1.0], [0.8], [0.0], [0.4]]))
+    drift = HealthyDrift(random.uniform(0.0, 1.0, (4, q)), np.array([[1.0], [0.8], [0.0], [0.4]]))
     found = scan(x, [1, 2, 3], drift)
     for k in (least_blocks(n), n // 2, n - least_blocks(n)):
         shape = (np.arange(n) >= k).astype(float)
         assert found.joint[k - 1] == pytest.approx(slow_t2(x, [1, 2, 3], drift, shape), rel=1e-6, abs=1e-8)
-        alone = slow_t2(x[:, 2:3], [0], Drift(drift.walks[2:3], np.zeros((1, 0))), shape)
+        alone = slow_t2(x[:, 2:3], [0], HealthyDrift(drift.walks[2:3], np.zeros((1, 0))), shape)
         assert found.single[k - 1, 2] ** 2 == pytest.approx(alone, rel=1e-6, abs=1e-8)
     even = slow_t2(x, [1, 2, 3], drift, np.linspace(0.0, 1.0, n))
     assert found.trend == pytest.approx(even, rel=1e-6)
@@ -100,7 +92,7 @@ def test_other_steps_are_not_seen() -> None:
     """A step of any height along `other` moves no T2; across it does."""
     random = np.random.default_rng(4)
     x = random.standard_normal((90, 3))
-    drift = Drift(0.1 * np.eye(3), np.array([[1.0], [0.9], [0.5]]))
+    drift = HealthyDrift(0.1 * np.eye(3), np.array([[1.0], [0.9], [0.5]]))
     late = (np.arange(90) >= 50)[:, None] * drift.other.T
     made = StepScan(x, [1, 2], drift)
     plain, along, across = (made(one[None])[0][0] for one in (x, x + 0.3 * late, x + 2.0 * late * [1.0, 0.0, 1.0]))
@@ -117,9 +109,9 @@ def test_drift_of_the_stated_size_alarms_as_seldom_as_stated(strength: float) ->
     for _ in range(80):
         x = random.standard_normal((50, 3))
         x += strength * np.cumsum(random.standard_normal((50, 3)), axis=0)
-        for drift in (Drift(strength * np.eye(3), np.zeros((3, 0))), None):
+        for drift in (HealthyDrift(strength * np.eye(3), np.zeros((3, 0))), None):
             made = StepScan(x, [0, 1, 2], drift)
-            alarm = made.found().joint.max() > upper_quantile(made.null(199)[0], 0.05)
+            alarm = made.observed().joint.max() > upper_quantile(made.null(199)[0], 0.05)
             held, bare = held + (alarm and drift is not None), bare + (alarm and drift is None)
     assert held <= 11  # of 80 at 5 %: more has a probability of 0.1 %
     assert bare >= 20
@@ -129,22 +121,22 @@ def test_drift_of_the_stated_size_alarms_as_seldom_as_stated(strength: float) ->
 def test_many_columns_in_few_blocks_alarm_as_seldom_as_stated(n: int) -> None:
     """The scatter of eight columns is known badly from 24 blocks: orders must know it as badly."""
     random = np.random.default_rng(17)
-    drift = Drift(np.zeros((8, 0)), np.zeros((8, 0)))
+    drift = HealthyDrift(np.zeros((8, 0)), np.zeros((8, 0)))
     alarms = 0
     for _ in range(100):
         made = StepScan(random.standard_normal((n, 8)), list(range(8)), drift)
-        alarms += made.found().joint.max() > upper_quantile(made.null(99)[0], 0.1)
+        alarms += made.observed().joint.max() > upper_quantile(made.null(99)[0], 0.1)
     assert alarms <= 20  # of 100 at 10 %: more has a probability of 0.1 %
 
 
 def test_a_step_is_found_beside_a_drift() -> None:
     random = np.random.default_rng(18)
-    drift = Drift(0.05 * np.eye(3), np.zeros((3, 0)))
+    drift = HealthyDrift(0.05 * np.eye(3), np.zeros((3, 0)))
     found = 0
     for _ in range(30):
         x = stepped(random, 100, 50, 2.0) + 0.05 * np.cumsum(random.standard_normal((100, 3)), axis=0)
         made = StepScan(x, [0, 1, 2], drift)
-        found += made.found().joint.max() > upper_quantile(made.null(199)[0], 0.01)
+        found += made.observed().joint.max() > upper_quantile(made.null(199)[0], 0.01)
     assert found >= 26
 
 
@@ -208,7 +200,7 @@ def test_orders_keep_neighbours_together(n: int) -> None:
 
 def test_random_orders_are_an_argument() -> None:
     x = np.random.default_rng(0).standard_normal((40, 3))
-    made = StepScan(x, [0, 2], Drift(0.1 * np.eye(3), np.zeros((3, 0))))
+    made = StepScan(x, [0, 2], HealthyDrift(0.1 * np.eye(3), np.zeros((3, 0))))
     one, same, other = (made.null(300, seed) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one[0], same[0])
     np.testing.assert_array_equal(one[1], same[1])
@@ -250,12 +242,12 @@ def test_a_step_is_found_where_it_is() -> None:
 
 def test_onset_interval_covers_the_truth_as_often_as_stated() -> None:
     assert pytest.approx(7.35, abs=0.01) == ONSET_CUT  # the 95 % value of Eo and Morley's table
-    assert onset_interval(np.array([0.0, 5.0, 10.0, 9.0, 1.0])) == (2, 4)
+    assert near_best(np.array([0.0, 5.0, 10.0, 9.0, 1.0])).tolist() == [1, 2, 3]
     random = np.random.default_rng(13)
     covered = 0
     for _ in range(300):
-        first, last = onset_interval(scan(stepped(random, 100, 60, 1.0), [1]).joint)
-        covered += first <= 60 <= last
+        near = near_best(scan(stepped(random, 100, 60, 1.0), [1]).joint) + 1
+        covered += near[0] <= 60 <= near[-1]
     assert covered >= 0.93 * 300
 
 
@@ -271,14 +263,14 @@ def test_a_step_beats_a_trend_and_a_trend_a_step() -> None:
     assert drifts <= 6
 
 
-def test_two_samples_is_the_scan_at_one_instant() -> None:
+def test_two_samples_are_the_scan_at_one_instant() -> None:
     x = np.random.default_rng(15).standard_normal((200, 3))
-    score, single, null, single_null = two_samples(x, 20, [0, 1], 999)
+    made = StepScan(x, [0, 1], least=1)
     whole = scan(x, [0, 1])
-    assert score == pytest.approx(whole.joint[19])
-    np.testing.assert_allclose(single, whole.single[19])
+    assert made.observed().joint[19] == pytest.approx(whole.joint[19])
+    np.testing.assert_allclose(made.observed().single[19], whole.single[19])
+    null, single_null, _ = made.null(999, after=20)
     assert null.shape == (999,)
     assert single_null.shape == (999, 3)
     assert np.median(null) == pytest.approx(1.386, rel=0.25)  # chi-squared with 2 degrees of freedom
-    again = two_samples(x, 20, [0, 1], 999)
-    np.testing.assert_array_equal(again[2], null)
+    np.testing.assert_array_equal(made.null(999, after=20)[0], null)

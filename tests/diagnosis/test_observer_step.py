@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.changepoint.step_in_walk import find_leak_step
+from sealscope.diagnosis.changepoint.random_walk import find_leak_step
 from sealscope.errors import InputError
 
 P = 0.01

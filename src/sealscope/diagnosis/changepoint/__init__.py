@@ -1,1 +1,1 @@
-"""Scans for a step in noise, in a smooth drift or in a random walk."""
+"""Scans for a step in a series: in a smooth drift, in a random walk, in scattering vectors, beside an even drift."""

@@ -1,24 +1,36 @@
-"""Smooth drifts of a series, and how much better than any of them a step or a growth explains it.
+"""Scan for a step, or a growth, in a series that drifts smoothly.
 
-A series of n blocks is a + b t + walk + noise, walk a random walk plus an integrated random walk (the local level and
-the local linear trend of structural time series: Harvey, Forecasting, structural time series models and the Kalman
-filter, 1989, ch. 2). Their strengths are unknown: likelihoods, restricted to what a and b leave (REML), are compared
-over a grid of them, the scale of the noise being profiled out. All that depends on the time axis alone is computed
-once.
+The series g_1..g_n (estimates of short blocks of a recording) is a smooth drift, noise, and perhaps size * S(t; onset,
+rise), a rise from 0 to 1 that begins at `onset`. The drift is a + b t and a walk, which is a random walk plus an
+integrated random walk (the local level and the local linear trend of structural time series: Harvey, Forecasting,
+structural time series models and the Kalman filter, 1989, ch. 2). Their strengths are unknown: likelihoods, restricted
+to what a and b leave (REML), are compared over a grid of strengths, the scale of the noise being profiled out.
+
+The score is twice the logarithm of the ratio of two likelihoods: of the best step against the best of its rivals, which
+drift only, or drift and warm up exponentially, or swing at one period, or have one outlying block. Both sides choose
+their own strengths of drift, so that a step is not mistaken for a strong drift, nor a strong drift for a step. The
+threshold is the quantile of the score over series drawn from the drift that fits the data without a step, and from the
+drift that fits beside the step, whichever is higher.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.changepoint.shapes import least_blocks, rises, warm_ups
+from sealscope.diagnosis.changepoint.tails import near_best
+from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
-#: Durations of the rise, as a share of the series: at once, and a growth. Slower ones look like drifts that only bend:
-#: with 0.3 half of all false alarms on a bench that wanders were such.
-RISES = (0.0, 0.1)
+#: Fewest blocks in which a step can be distinguished from a drift.
+FEWEST = 16
+#: Durations of the rise, as a share of the series: an abrupt step, and a growth. Slower growths look like drifts that
+#: bend: with 0.3 half of all false alarms on a drifting bench were such.
+_RISES = (0.0, 0.1)
 #: Time constants of a warm-up, as a share of the series.
 _WARM_UPS = (0.03, 0.06, 0.12, 0.25)
 #: Periods of a swing, as a share of the series.
@@ -27,20 +39,59 @@ _SWINGS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 _WALKS = (0.0, 1e-3, 4e-3, 1.6e-2, 6e-2, 0.25, 1.0, 4.0, 20.0, 200.0)
 _SLOPES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 _WALKS_BESIDE_SLOPES = (0.0, 1e-2, 0.25)
+#: Strengths (walk, integrated walk) that are tried together.
+STRENGTHS = tuple((walk, 0.0) for walk in _WALKS) + tuple(
+    (walk, slope) for walk in _WALKS_BESIDE_SLOPES for slope in _SLOPES
+)
 #: Onsets tried in a block.
 _FRACTIONS = 3
-#: What else may explain a series: `scores` numbers them so.
-RIVALS = ("drift", "warm-up", "pulse", "swing")
+_DRAWS = 500
+_TAIL = 0.1
+#: Interventions whose score is within this of the best take part in the height of the step.
+_NEAR = 20.0
+#: Power of the likelihood that weighs drifts, onsets and rises for the height: under 1, because no real drift is of the
+#: family (a power posterior: Holmes & Walker, Biometrika 104 (2017) 497-503).
+_TRUST = 0.5
+_TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True, eq=False)
-class Drift:
-    """One strength of drift, ready for use.
+class DriftStep:
+    """The best step of a series.
 
-    `whiten` (n - p, n) takes out a + b t and the drift's correlation; `steps`, `warm_ups`, `pulses`, `swings` (., n):
-    unit vectors of the interventions after that, a swing in two rows; `norms`: lengths of the steps; `weight`: factor
-    of the sum of squares that makes likelihoods comparable; `root` (n, n): Cholesky factor of the covariance; `drift`
-    (n, n): the part of it that is not noise.
+    `score`, `threshold`: the score exceeds the threshold with the stated probability where nothing steps; `index`:
+    first block after the onset; `onset`, `onset_interval` (95 %): in the unit of t; `rise`: duration of the rise;
+    `size`, `size_sd`: height of the step, averaged over the likely onsets, rises and drifts; `freedom`: degrees of
+    freedom of `size_sd`; `level` (n,): the smooth drift fitted beside the step; `noise`: scale of the noise over the
+    stated one.
+    """
+
+    score: float
+    threshold: float
+    index: int
+    onset: float
+    onset_interval: tuple[float, float]
+    rise: float
+    size: float
+    size_sd: float
+    freedom: float
+    level: Array
+    noise: float
+
+    @property
+    def alarm(self) -> bool:
+        """Whether the score exceeds the threshold."""
+        return self.score > self.threshold
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedDrift:
+    """One strength of drift, prepared for many series.
+
+    `whiten` (n - 2, n) takes out a + b t and the drift's correlation; `steps`, `warm_ups`, `pulses`, `swings` (., n):
+    unit vectors of the interventions after that, a swing in two rows; `weight`: factor of the sum of squares that makes
+    likelihoods comparable; `root` (n, n): Cholesky factor of the covariance; `drift` (n, n): the part of it that is not
+    noise.
     """
 
     whiten: Array
@@ -48,7 +99,6 @@ class Drift:
     warm_ups: Array
     pulses: Array
     swings: Array
-    norms: Array
     weight: float
     root: Array
     drift: Array
@@ -64,30 +114,19 @@ class Posterior:
     scale: Array
 
 
-def strengths() -> list[tuple[float, float]]:
-    """Strengths of the random walk and of the wandering slope that are tried together."""
-    return [(walk, 0.0) for walk in _WALKS] + [(walk, slope) for walk in _WALKS_BESIDE_SLOPES for slope in _SLOPES]
-
-
-def interventions(t: Array, onsets: Array, rise: float) -> Array:
-    """S (k, n): 0 before each onset (k,), 1 after onset + rise, a straight line between; all in blocks.
-
-    A block covers one unit around its t, so that a step at once within a block moves it by the share that remains.
-    """
-    lead, width = (0.5, 1.0) if rise == 0.0 else (0.0, rise)
-    return np.clip((t[None, :] + lead - onsets[:, None]) / width, 0.0, 1.0)
-
-
 class DriftFamily:
-    """All drifts for one time axis (in blocks) and one set of relative deviations."""
+    """All drifts for one time axis `t` (n,) in blocks, and one set of relative deviations `sd` (n,).
+
+    `shared` (n, m): errors common to the blocks, as columns, in units of the deviations.
+    """
 
     def __init__(self, t: Array, sd: Array, shared: Array) -> None:
         n = t.size
         self.n, self.t = n, t
-        self.nulls: dict[tuple[int, bool, int], Array] = {}
-        least = max(3, round(0.03 * n))
-        starts, rises = [], []
-        for share in RISES:
+        self.nulls: dict[tuple[int, int], Array] = {}
+        least = least_blocks(n)
+        starts, durations = [], []
+        for share in _RISES:
             rise = share * float(t[-1] - t[0])
             if 0.0 < rise < 2.0:
                 continue
@@ -95,110 +134,234 @@ class DriftFamily:
             every = 1.0 / _FRACTIONS if rise == 0 else max(1.0, rise / 6.0)
             usable = np.arange(begin, end + 1e-9, every)
             starts.append(usable)
-            rises.append(np.full(usable.size, rise))
-        self.onsets, self.rises = np.concatenate(starts), np.concatenate(rises)
-        shapes = np.concatenate([interventions(t, some, float(r[0])) for some, r in zip(starts, rises, strict=True)])
+            durations.append(np.full(usable.size, rise))
+        self.onsets, self.rises = np.concatenate(starts), np.concatenate(durations)
+        self.shapes = np.concatenate([rises(t, some, float(r[0])) for some, r in zip(starts, durations, strict=True)])
         u = t - t[0]
         length = u[-1]
         turns = 2.0 * np.pi * u / length
         swings = np.array([[np.sin(turns / share), np.cos(turns / share)] for share in _SWINGS])
-        warm = np.array([np.exp(-u / (share * length)) for share in _WARM_UPS])
-        fixed = np.stack([np.ones(n), u / length], axis=1)
+        warm = warm_ups(u, length, _WARM_UPS)
+        self.fixed = np.stack([np.ones(n), u / length], axis=1)
+        self.freedom = n - self.fixed.shape[1]
         relative = sd / np.median(sd)
         some = shared / np.median(sd)
         noise = np.diag(relative**2) + some @ some.T
         low, high = np.minimum.outer(u, u), np.maximum.outer(u, u)
         walk, slope = low, low**2 * (3.0 * high - low) / 6.0
-        self.freedom = n - fixed.shape[1]
-        self.shapes, self.fixed = shapes, fixed
-        self.drifts = [
-            self._drift(noise, q1 * walk + q2 * slope, fixed, shapes, warm, swings) for q1, q2 in strengths()
-        ]
+        self.drifts = [self._drift(noise, q1 * walk + q2 * slope, warm, swings) for q1, q2 in STRENGTHS]
 
-    def _drift(self, noise: Array, drift: Array, fixed: Array, shapes: Array, warm: Array, swings: Array) -> Drift:
+    def _drift(self, noise: Array, drift: Array, warm: Array, swings: Array) -> WhitenedDrift:
         root = np.linalg.cholesky(noise + drift)
         inverse = np.linalg.inv(root)
-        basis, triangle = np.linalg.qr(inverse @ fixed, mode="complete")
-        rest = basis[:, fixed.shape[1] :]
-        whiten = rest.T @ inverse
+        basis, triangle = np.linalg.qr(inverse @ self.fixed, mode="complete")
+        whiten = basis[:, self.fixed.shape[1] :].T @ inverse
         log_det = 2.0 * np.sum(np.log(np.diag(root))) + 2.0 * np.sum(np.log(np.abs(np.diag(triangle))))
 
-        def units(rows: Array) -> tuple[Array, Array]:
+        def units(rows: Array) -> Array:
             white = whiten @ rows.T
-            norms = np.sqrt(np.sum(white**2, axis=0))
-            return (white / np.maximum(norms, 1e-12)).T, norms
+            return np.asarray((white / np.maximum(np.sqrt(np.sum(white**2, axis=0)), 1e-12)).T)
 
-        steps, norms = units(shapes)
-        return Drift(
+        return WhitenedDrift(
             whiten,
-            steps @ whiten,
-            units(warm)[0] @ whiten,
-            units(np.eye(self.n))[0] @ whiten,
+            units(self.shapes) @ whiten,
+            units(warm) @ whiten,
+            units(np.eye(self.n)) @ whiten,
             np.asarray(
                 np.concatenate([np.linalg.qr(whiten @ pair.T)[0].T for pair in swings]) @ whiten, dtype=np.float64
             ),
-            np.asarray(norms, dtype=np.float64),
             float(np.exp(log_det / self.freedom)),
             np.asarray(root, dtype=np.float64),
             drift,
         )
 
-    def scores(self, y: Array, sign: int) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
-        """Of series y (n, m): the score of every intervention (k, m), the best rival's number (m,) and the drift (m,)
-        that fits best without a step."""
+    def scores(self, y: Array, sign: int) -> tuple[Array, NDArray[np.intp]]:
+        """Return the score of every intervention (k, m) in series y (n, m), and the drift (m,) likeliest without any.
+
+        `sign`: 1 only a rise counts, -1 only a fall.
+        """
         best = np.full((self.onsets.size, y.shape[1]), np.inf)
-        rivals = np.full((len(RIVALS), y.shape[1]), np.inf)
-        plain = np.zeros(y.shape[1], dtype=np.intp)
-        for number, one in enumerate(self.drifts):
-            squares = np.sum((one.whiten @ y) ** 2, axis=0)
-            moved = one.steps @ y
-            if sign:
-                moved = np.maximum(sign * moved, 0.0)
-            np.minimum(best, one.weight * (squares - moved**2), out=best)
-            plain[one.weight * squares < rivals[0]] = number
-            gains = (
+        plain, least = np.full((2, y.shape[1]), np.inf)
+        number = np.zeros(y.shape[1], dtype=np.intp)
+        for row, drift in enumerate(self.drifts):
+            squares = np.sum((drift.whiten @ y) ** 2, axis=0)
+            moved = np.maximum(sign * (drift.steps @ y), 0.0)
+            np.minimum(best, drift.weight * (squares - moved**2), out=best)
+            number[drift.weight * squares < plain] = row
+            np.minimum(plain, drift.weight * squares, out=plain)
+            for gain in (
                 0.0,
-                np.max((one.warm_ups @ y) ** 2, axis=0),
-                np.max((one.pulses @ y) ** 2, axis=0),
-                np.max(((one.swings @ y) ** 2).reshape(len(_SWINGS), 2, -1).sum(axis=1), axis=0),
-            )
-            for row, gain in enumerate(gains):
-                np.minimum(rivals[row], one.weight * (squares - gain), out=rivals[row])
-        least = np.min(rivals, axis=0)
-        tiny = np.finfo(float).tiny
-        score = self.freedom * np.log(np.maximum(least, tiny) / np.maximum(best, tiny))
-        return np.asarray(score), np.argmin(rivals, axis=0), plain
+                np.max((drift.warm_ups @ y) ** 2, axis=0),
+                np.max((drift.pulses @ y) ** 2, axis=0),
+                np.max(((drift.swings @ y) ** 2).reshape(len(_SWINGS), 2, -1).sum(axis=1), axis=0),
+            ):
+                np.minimum(least, drift.weight * (squares - gain), out=least)
+        return np.asarray(self.freedom * np.log(np.maximum(least, _TINY) / np.maximum(best, _TINY))), number
 
     def posterior(self, y: Array, sign: int, near: NDArray[np.intp]) -> Posterior:
-        """What one series y (n,) says of every drift with every intervention of `near` (k,), the block in which a step
-        begins left out: how far it is moved depends on more than when within it the step came."""
+        """Return the posterior of one series y (n,) over every drift and every intervention of `near` (k,).
+
+        The block in which a step begins is left out: how far it is moved depends on more than when within it the step
+        came.
+        """
         shape = (len(self.drifts), near.size)
         log_l, size, variance, scale = (np.empty(shape) for _ in range(4))
         hit = np.argmin(np.abs(self.t[None, :] - np.floor(self.onsets[near] + 0.5)[:, None]), axis=1)
-        for row, one in enumerate(self.drifts):
-            target = one.whiten @ y
+        for row, drift in enumerate(self.drifts):
+            target = drift.whiten @ y
             squares = float(target @ target)
-            rise = one.whiten @ self.shapes[near].T
-            spare = one.whiten[:, hit] * (self.rises[near] == 0.0)
+            rise = drift.whiten @ self.shapes[near].T
+            spare = drift.whiten[:, hit] * (self.rises[near] == 0.0)
             spare /= np.maximum(np.sqrt(np.sum(spare**2, axis=0)), 1e-12)
             outside = target @ spare
             rise -= spare * np.sum(spare * rise, axis=0)
             norms = np.maximum(np.sqrt(np.sum(rise**2, axis=0)), 1e-9)
             moved = (target @ rise) / norms
-            rest = np.maximum(squares - outside**2 - moved**2, np.finfo(float).tiny)
-            if sign:
-                rest = np.where(sign * moved < 0, squares, rest)
+            rest = np.maximum(squares - outside**2 - moved**2, _TINY)
+            rest = np.where(sign * moved < 0, squares, rest)
             size[row] = moved / norms
             scale[row] = rest / (self.freedom - 2)
             variance[row] = scale[row] / norms**2
-            log_l[row] = -0.5 * self.freedom * np.log(one.weight * rest)
+            log_l[row] = -0.5 * self.freedom * np.log(drift.weight * rest)
         return Posterior(log_l, size, variance, scale)
 
     def level(self, y: Array, number: int, best: int) -> Array:
-        """The smooth drift (n,), its mean and slope included, beside the intervention `best`."""
-        one = self.drifts[number]
+        """Return the smooth drift (n,), its mean and slope included, beside the intervention `best`."""
+        drift = self.drifts[number]
         columns = np.column_stack([self.fixed, self.shapes[best]])
-        white, target = np.linalg.solve(one.root, columns), np.linalg.solve(one.root, y)
-        found, *_ = np.linalg.lstsq(white, target, rcond=None)
-        rest = np.linalg.solve(one.root.T, target - white @ found)
-        return np.asarray(self.fixed @ found[:-1] + one.drift @ rest)
+        white, target = np.linalg.solve(drift.root, columns), np.linalg.solve(drift.root, y)
+        coefficients, *_ = np.linalg.lstsq(white, target, rcond=None)
+        rest = np.linalg.solve(drift.root.T, target - white @ coefficients)
+        return np.asarray(self.fixed @ coefficients[:-1] + drift.drift @ rest)
+
+
+@lru_cache(maxsize=8)
+def _even_family(n: int) -> DriftFamily:
+    """Return the family of blocks of equal length and equal noise, the common case."""
+    return DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)))
+
+
+def _family(t: Array, sd: Array, shared: Array | None) -> DriftFamily:
+    even = np.allclose(np.diff(t), t[1] - t[0], rtol=0.02) and np.ptp(sd) <= 0.1 * float(np.median(sd))
+    if even and shared is None:
+        return _even_family(t.size)
+    return DriftFamily(t, sd, np.zeros((t.size, 1)) if shared is None else shared)
+
+
+def find_step(
+    t: Array,
+    g: Array,
+    sd: Array,
+    false_alarm_probability: float,
+    *,
+    sign: int = 1,
+    shared: Array | None = None,
+    seed: int = 0,
+) -> DriftStep:
+    """Look for a step or a growth in a series of block estimates against a smooth drift.
+
+    `t` (n,): middles of the blocks, rising; `g` (n,): estimates; `sd` (n,): their deviations, whose common scale is
+    estimated anew (only the ratios matter); `sign`: 1 only a rise counts, -1 only a fall; `shared` (n, m): errors
+    common to the blocks, as columns: their covariance is shared shared^T, in the units of `g`.
+
+    Raises InputError where there are fewer than 16 blocks, or shapes or values do not fit.
+    """
+    t, g, sd = (np.asarray(values, dtype=np.float64) for values in (t, g, sd))
+    _check(t, g, sd)
+    spacing = float(np.median(np.diff(t)))
+    u = (t - t[0]) / spacing
+    unit = np.median(sd)
+    family = _family(u, sd / unit, None if shared is None else shared / unit)
+    y = g / unit
+    scores, plain = family.scores(y[:, None], sign)
+    course = scores[:, 0]
+    best = int(np.argmax(course))
+    near = np.flatnonzero(course >= course[best] - _NEAR)
+    post = family.posterior(y, sign, near)
+    here = int(np.flatnonzero(near == best)[0])
+    beside = int(np.argmax(post.log_l[:, here]))
+    threshold = max(
+        _upper_tail(_null(family, number, seed), false_alarm_probability) for number in {int(plain[0]), beside}
+    )
+    size, size_sd = _height(post)
+    onset, first, last = _onset(u, y, family, sign, beside, course)
+    return DriftStep(
+        score=float(course[best]),
+        threshold=threshold,
+        index=int(np.searchsorted(u, onset)),
+        onset=float(t[0] + spacing * onset),
+        onset_interval=(float(t[0] + spacing * first), float(t[0] + spacing * last)),
+        rise=float(spacing * family.rises[best]),
+        size=float(size * unit),
+        size_sd=float(size_sd * unit),
+        freedom=float(family.freedom - 2),
+        level=family.level(y, beside, best) * unit,
+        noise=float(np.sqrt(post.scale[beside, here])),
+    )
+
+
+def _null(family: DriftFamily, number: int, seed: int) -> Array:
+    """Return the largest scores (m,) of series of that drift without a step."""
+    key = (number, seed)
+    if key not in family.nulls:
+        random = np.random.default_rng((seed, number))
+        y = family.drifts[number].root @ random.standard_normal((family.n, _DRAWS))
+        family.nulls[key] = np.asarray(np.max(family.scores(y, 1)[0], axis=0))
+    return family.nulls[key]
+
+
+def _upper_tail(null: Array, probability: float) -> float:
+    ordered = np.sort(null)
+    if probability >= _TAIL:
+        return float(np.quantile(ordered, 1.0 - probability))
+    start = float(np.quantile(ordered, 1.0 - _TAIL))
+    mean = float(np.mean(ordered[ordered > start] - start))
+    return start + mean * float(np.log(_TAIL / probability))
+
+
+def _height(post: Posterior) -> tuple[float, float]:
+    """Return height and deviation of the step, averaged over drift, onset and rise by their likelihood."""
+    weight = np.exp(_TRUST * (post.log_l - post.log_l.max()))
+    total = weight.sum(axis=0) + _TINY
+    joint = np.log(total)
+    over = np.exp(joint - joint.max())
+    over /= over.sum()
+    weight = weight / total * over
+    size = np.sum(weight * post.size)
+    return float(size), float(np.sqrt(np.sum(weight * (post.variance + (post.size - size) ** 2))))
+
+
+def _onset(
+    u: Array, y: Array, family: DriftFamily, sign: int, beside: int, course: Array
+) -> tuple[float, float, float]:
+    """Return the onset and its 95 % interval [blocks].
+
+    From the likelihood over all interventions, finer near the best, and half a block on either side, because how far a
+    block is moved depends on more than when within it the step came.
+    """
+    near = near_best(course)
+    first, last = float(family.onsets[near].min()), float(family.onsets[near].max())
+    best = int(np.argmax(course))
+    fine = float(family.onsets[best]) + np.arange(-8, 9) / 8.0
+    drift = family.drifts[beside]
+    white = drift.whiten @ rises(u, fine, float(family.rises[best])).T
+    target = drift.whiten @ y
+    moved = np.maximum(sign * (white.T @ target / np.maximum(np.sqrt(np.sum(white**2, axis=0)), 1e-12)), 0.0)
+    gain = -family.freedom * np.log(np.maximum(target @ target - moved**2, _TINY))
+    fitting = fine[near_best(gain)]
+    return float(fine[np.argmax(gain)]), min(first, float(fitting.min())) - 0.5, max(last, float(fitting.max())) + 0.5
+
+
+def _check(t: Array, g: Array, sd: Array) -> None:
+    if t.ndim != 1 or t.size < FEWEST:
+        raise InputError(f"a step needs {FEWEST} blocks or more to be distinguished from a drift, got {t.size}")
+    if not g.shape == sd.shape == t.shape:
+        raise InputError(
+            f"estimates and deviations must have one shape, of {t.size} blocks, got {g.shape} and {sd.shape}"
+        )
+    if not all(np.all(np.isfinite(values)) for values in (t, g, sd)):
+        raise InputError("times, estimates and deviations must be finite, got NaN or infinity")
+    if np.any(np.diff(t) <= 0):
+        raise InputError("times of blocks must rise, got some that do not")
+    if np.any(sd <= 0):
+        raise InputError(f"deviations must be > 0, got {sd.min()}")

@@ -17,7 +17,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.changepoint.step_in_walk import WalkStep
+    from sealscope.diagnosis.changepoint.random_walk import WalkStep
     from sealscope.parameters import Rig
 
 #: From day to day the level differs by this share of the pump's own leakage (8 %: two kelvin of oil) and, by the

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import share_of_each
-from sealscope.diagnosis.changepoint.step_in_walk import FEWEST, WalkStep, find_leak_step
+from sealscope.diagnosis.changepoint.random_walk import FEWEST, WalkStep, find_leak_step
 from sealscope.diagnosis.observer.against_baseline import compare
 from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, within
 from sealscope.diagnosis.observer.stream import Formulation, ObserverStream, channels_of, formulation_of, whole

@@ -16,7 +16,7 @@ from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.changepoint.step_in_walk import WalkStep
+    from sealscope.diagnosis.changepoint.random_walk import WalkStep
     from sealscope.parameters import Rig
 
 #: Error of the size itself, as a share: scales of the transducers; the model of friction and ringing.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import DayToDay, against_baseline, share_of_each
-from sealscope.diagnosis.changepoint.abrupt import ONSET_CUT, upper_quantile
+from sealscope.diagnosis.changepoint.tails import near_best, upper_quantile
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
@@ -165,7 +165,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
             "air in the oil": f"the oil became softer, the leakage conductance did not change ({figures})",
         }[cause]
         return Evidence("no leak", words, score, threshold, parts=(part,), cause=cause)
-    near = np.flatnonzero(z * np.abs(z) >= z[best] ** 2 - scatter**2 * ONSET_CUT)
+    near = near_best(z * np.abs(z), scatter**2)
     interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
     lpm = _mean_drop(recording, onset) / LITRE_PER_MINUTE
     reach = 1.96 * deviation

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingPoint, difference, operating_point
-from sealscope.diagnosis.changepoint.abrupt import permutations_for, two_samples, upper_quantile
+from sealscope.diagnosis.changepoint.scatter import StepScan, permutations_for
+from sealscope.diagnosis.changepoint.tails import upper_quantile
 from sealscope.diagnosis.rms_change.blocks import QUANTITIES, Blocks, cut, whole_log_rms
 from sealscope.diagnosis.rms_change.results import JUDGED, excess, largest_changes, method_result
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
@@ -182,17 +183,19 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
     if still is not None:
         return Evidence("cannot tell", f"the pressures cannot be trusted: {still}")
     joint = after.columns(*JUDGED)
-    score, single, t2_null, single_null = two_samples(x, split, joint, permutations_for(probability))
-    threshold = float(upper_quantile(t2_null, probability))
+    scan, orders = StepScan(x, joint, least=1), permutations_for(probability)
+    observed = scan.observed()
+    single = observed.single[split - 1]
+    t2_null, single_null, _ = scan.null(orders, after=split)
+    score, threshold = float(observed.joint[split - 1]), float(upper_quantile(t2_null, probability))
     thresholds = upper_quantile(single_null, probability)
     changes = x[split:].mean(axis=0) - x[:split].mean(axis=0)
     noisy = any(abs(single[k]) > thresholds[k] for k in after.columns("d1"))
     if noisy:
         beyond = excess(x, split)
-        score, _, t2_null, _ = two_samples(
-            beyond, split, list(range(beyond.shape[1])), permutations_for(probability), seed=1
-        )
-        threshold = float(upper_quantile(t2_null, probability))
+        scan = StepScan(beyond, list(range(beyond.shape[1])), least=1)
+        score = float(scan.observed().joint[split - 1])
+        threshold = float(upper_quantile(scan.null(orders, 1, after=split)[0], probability))
     methods = tuple(
         method_result(
             name,

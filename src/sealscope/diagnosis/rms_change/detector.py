@@ -13,14 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sealscope.diagnosis.changepoint.abrupt import (
-    Drift,
-    Scan,
-    StepScan,
-    onset_interval,
-    permutations_for,
-    upper_quantile,
-)
+from sealscope.diagnosis.changepoint.scatter import HealthyDrift, Scan, StepScan, permutations_for
+from sealscope.diagnosis.changepoint.tails import near_best, upper_quantile
 from sealscope.diagnosis.rms_change.against_baseline import against
 from sealscope.diagnosis.rms_change.blocks import Blocks, cut
 from sealscope.diagnosis.rms_change.drift import drift_beyond_noise, drift_of, settled
@@ -74,7 +68,7 @@ class RmsChange:
         x = blocks.log_rms
         drift, d1 = drift_of(blocks), blocks.columns("d1")
         scan = StepScan(x, blocks.columns(*JUDGED), drift)
-        found = scan.found()
+        found = scan.observed()
         null, single_null, trend_null = scan.null(permutations_for(probability))
         threshold, most_even = (float(upper_quantile(one, probability)) for one in (null, trend_null))
         thresholds = upper_quantile(single_null, probability)
@@ -83,8 +77,8 @@ class RmsChange:
         step = int(np.argmax(found.joint))
         changes = x[step + 1 :].mean(axis=0) - x[: step + 1].mean(axis=0)
         told = largest_changes(blocks.names, found.single[step], changes, thresholds)
-        noise = StepScan(x[:, d1], list(range(len(d1))), Drift(drift.walks[d1], np.zeros((len(d1), 0))))
-        noisy = noise.found()
+        noise = StepScan(x[:, d1], list(range(len(d1))), HealthyDrift(drift.walks[d1], np.zeros((len(d1), 0))))
+        noisy = noise.observed()
         even = found
         if float(noisy.joint.max()) > float(upper_quantile(noise.null(permutations_for(probability))[0], probability)):
             found, threshold = self._without_noise(blocks, int(np.argmax(noisy.joint)) + 1, probability)
@@ -112,8 +106,8 @@ class RmsChange:
                 "a leak that was there from the start would need a --baseline to be seen"
             )
             return Evidence("no leak", reason, score, threshold, parts=methods)
-        first, last = onset_interval(found.joint)
-        onset, interval = float(blocks.edges[step + 1]), (float(blocks.edges[first]), float(blocks.edges[last]))
+        near = blocks.edges[near_best(found.joint) + 1]
+        onset, interval = float(blocks.edges[step + 1]), (float(near[0]), float(near[-1]))
         reason = f"{told} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"
         return Evidence("leak", reason, score, threshold, onset, interval, parts=methods)
 
@@ -122,7 +116,7 @@ class RmsChange:
         beyond = excess(blocks.log_rms, split)
         scan = StepScan(beyond, list(range(beyond.shape[1])), drift_beyond_noise(blocks))
         null, _, _ = scan.null(permutations_for(probability), seed=1)
-        return scan.found(), float(upper_quantile(null, probability))
+        return scan.observed(), float(upper_quantile(null, probability))
 
     @staticmethod
     def _methods(blocks: Blocks, single: Array, thresholds: Array) -> tuple[Evidence, ...]:

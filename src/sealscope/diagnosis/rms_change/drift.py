@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.diagnosis.changepoint.abrupt import Drift
+from sealscope.diagnosis.changepoint.scatter import HealthyDrift
 from sealscope.diagnosis.rms_change.blocks import QUANTITIES, Blocks
 from sealscope.diagnosis.rms_change.results import JUDGED
 from sealscope.recordings.recording import Array
@@ -65,7 +65,7 @@ def own_shares(log_rms: Array) -> Array:
     return own
 
 
-def drift_of(blocks: Blocks) -> Drift:
+def drift_of(blocks: Blocks) -> HealthyDrift:
     """The drift that is allowed to the columns of `blocks.log_rms`, with a change of the noise as another step."""
     own = own_shares(blocks.log_rms)
     f, block = own.size, float(np.sqrt(_seconds(blocks) / WANDER_SECONDS))
@@ -83,12 +83,12 @@ def drift_of(blocks: Blocks) -> Drift:
             walks.append(MACHINE_WANDER * block * machine)
         walks.append(NOISE_WANDER * block * noise)
         other.append(noise)
-    return Drift(np.stack(walks, axis=1), np.stack(other, axis=1))
+    return HealthyDrift(np.stack(walks, axis=1), np.stack(other, axis=1))
 
 
-def drift_beyond_noise(blocks: Blocks) -> Drift:
+def drift_beyond_noise(blocks: Blocks) -> HealthyDrift:
     """The drift that is allowed to `rms_results.excess` of the blocks: energies, which move twice as far as the RMS,
     of the machine alone."""
     own = own_shares(blocks.log_rms)[blocks.columns(*JUDGED)]
     block = float(np.sqrt(_seconds(blocks) / WANDER_SECONDS))
-    return Drift(np.diag(2.0 * MACHINE_WANDER * block * own), np.zeros((own.size, 0)))
+    return HealthyDrift(np.diag(2.0 * MACHINE_WANDER * block * own), np.zeros((own.size, 0)))

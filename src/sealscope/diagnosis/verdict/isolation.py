@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.changepoint.even_drift import step_near
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
@@ -162,31 +163,7 @@ def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
 
 
 def _step(seen: Signatures, values: Array, onset: float) -> tuple[float, float]:
-    """The surest step of `values` (n,) at an edge of blocks near the onset, beside an even drift: its size, and over
-    its deviation; (0, 0) where there is no room for one."""
-    best = (0.0, 0.0)
-    near = max(NEAR, 2.0 * seen.half)
-    first, last = np.searchsorted(seen.t, [onset - REACH - near, onset + REACH + near])
-    t, values = seen.t[first:last], values[first:last]
-    edges = t[:-1] + seen.half
-    close = edges[np.abs(edges - onset) <= near]
-    # the block that the onset falls into belongs to neither side
-    whole = np.isfinite(values) & (np.abs(t - onset) >= seen.half)
-    for at in close:
-        within = whole & (np.abs(t - at) < REACH)
-        after = within & (t > at)
-        if min(np.count_nonzero(after), np.count_nonzero(within & ~after)) < FEWEST:
-            continue
-        x = np.stack([np.ones(within.sum()), t[within] - at, after[within].astype(np.float64)], axis=1)
-        inverse = np.linalg.inv(x.T @ x)
-        beta = inverse @ (x.T @ values[within])
-        rest = values[within] - x @ beta
-        scatter = math.sqrt(float(rest @ rest) / (rest.size - 3) * float(inverse[2, 2]))
-        size = float(beta[2])
-        surely = size / max(scatter, 1e-12 * (1.0 + abs(size)))
-        if abs(surely) > abs(best[1]):
-            best = (size, surely)
-    return best
+    return step_near(seen.t, values, seen.half, onset, near=NEAR, reach=REACH, fewest=FEWEST)
 
 
 def _duty(seen: Signatures, onset: float, strict: float) -> OtherCause | None:

@@ -3,7 +3,7 @@
 Both encoders are so fine that a few seconds give the leakage conductance of pump and piston together to some
 hundredths of what a healthy pump leaks (`fit`). What limits the search for a leak is the pump's own leakage, which
 drifts with the oil's temperature; so a leak is a step, or a growth, of the conductance that no smooth drift explains
-(`changepoint.step_in_drift`). Nothing is assumed of friction, bulk modulus or the pump's leakage; the piston's area
+(`changepoint.smooth_drift`). Nothing is assumed of friction, bulk modulus or the pump's leakage; the piston's area
 turns the result into L/min, and displacement over area shows whether the assumed geometry fits.
 """
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import share_of_each
-from sealscope.diagnosis.changepoint.step_in_drift import FEWEST
+from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import (
     BalanceBlocks,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import DayToDay, Level, against_baseline
-from sealscope.diagnosis.changepoint.step_in_drift import FEWEST, StepFound
+from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, DriftStep
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Figure, LeakCourse, Verdict
 from sealscope.diagnosis.volume_balance.blocks import Y
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, Law, discriminate, search
@@ -67,7 +67,7 @@ def trouble(fit: BalanceFit) -> str | None:
 def judge(fit: BalanceFit, probability: float, *, falls: bool = True) -> Evidence:
     """Return the evidence of a rise of the conductance within a recording; `falls`: name a fall where nothing rises."""
     step = search(fit, probability)
-    if step.found:
+    if step.alarm:
         return describe_leak(fit, step)
     return no_step(fit, step, search(fit, probability, sign=-1) if falls else None)
 
@@ -145,12 +145,12 @@ def _left_out_text(fit: BalanceFit) -> str:
     )
 
 
-def _figures(step: StepFound) -> str:
+def _figures(step: DriftStep) -> str:
     return f"score {step.score:.1f}, threshold {step.threshold:.1f}"
 
 
-def _part(step: StepFound) -> Evidence:
-    verdict: Verdict = "leak" if step.found else "no leak"
+def _part(step: DriftStep) -> Evidence:
+    verdict: Verdict = "leak" if step.alarm else "no leak"
     return Evidence(verdict, "", step.score, step.threshold, detector="step of the conductance")
 
 
@@ -161,7 +161,7 @@ def _flow_text(conductance: float, fit: BalanceFit) -> str:
     return f"{conductance / max(abs(level(fit).value), np.finfo(float).tiny):.0%} of the conductance"
 
 
-def no_step(fit: BalanceFit, step: StepFound, fall: StepFound | None) -> Evidence:
+def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None) -> Evidence:
     """Return the evidence where no rise of the conductance stands out from its drift."""
     mean, half = level(fit).value, 1.96 * level(fit).error
     low, high = mean - half, mean + half
@@ -173,7 +173,7 @@ def no_step(fit: BalanceFit, step: StepFound, fall: StepFound | None) -> Evidenc
             total = f"; pump and piston together leak{total}, in which a leak from the start would be hidden"
         else:
             total = f"; the piston leaks{total}, the pump {fit.pump * flow:.2g} L/min at the same pressure difference"
-    rise = float(step.level[-1, 0] - step.level[0, 0])
+    rise = float(step.level[-1] - step.level[0])
     verdict: Verdict = "no leak"
     reason = f"the leakage conductance does not rise beyond its smooth drift ({_figures(step)})"
     if rise > _LARGE_DRIFT * max(high - 0.5 * rise, 0.0) and rise > 6.0 * float(np.median(fit.sd)):
@@ -182,27 +182,27 @@ def no_step(fit: BalanceFit, step: StepFound, fall: StepFound | None) -> Evidenc
             f"the conductance rises smoothly by {_flow_text(rise, fit)} over the recording, more than oil that "
             f"warms up explains: a growing leak would look alike ({_figures(step)})"
         )
-    elif fall is not None and fall.found:
+    elif fall is not None and fall.alarm:
         reason = (
-            f"the conductance falls at {fall.onset:.1f} s by {_flow_text(-float(fall.size[0]), fit)}, which no "
+            f"the conductance falls at {fall.onset:.1f} s by {_flow_text(-fall.size, fit)}, which no "
             f"leak does, and never rises beyond its drift ({_figures(step)})"
         )
     return Evidence(verdict, reason + total + _left_out_text(fit), step.score, step.threshold, parts=(_part(step),))
 
 
-def _shape(fit: BalanceFit, step: StepFound) -> Array:
+def _shape(fit: BalanceFit, step: DriftStep) -> Array:
     """Return the share (n,) of the leak that is open in each block."""
     lead, width = (0.5 * fit.blocks.seconds, fit.blocks.seconds) if step.rise == 0.0 else (0.0, step.rise)
     return np.clip((fit.blocks.t + lead - step.onset) / width, 0.0, 1.0)
 
 
-def describe_leak(fit: BalanceFit, step: StepFound) -> Evidence:
+def describe_leak(fit: BalanceFit, step: DriftStep) -> Evidence:
     """Return the evidence where the conductance rises: where the oil goes, since when, how much."""
     shape = _shape(fit, step)
     near = discriminate(fit, step.onset, step.rise, within=max(_REACH, 12.0 * fit.blocks.seconds))
     cause, place = _place(fit, step, shape, near)
     open_ = shape >= 1.0 if step.rise == 0.0 else shape > 0.0
-    size, size_sd = float(step.size[0]), float(step.size_sd[0])
+    size, size_sd = step.size, step.size_sd
     laws, law_text = _laws(near)
     lpm, interval, course = None, None, None
     if not fit.metres:
@@ -252,7 +252,7 @@ def _laws(near: dict[str, float]) -> tuple[tuple[Law, ...], str]:
     return ("laminar", "orifice"), ""
 
 
-def _place(fit: BalanceFit, step: StepFound, shape: Array, near: dict[str, float]) -> tuple[Cause, str]:
+def _place(fit: BalanceFit, step: DriftStep, shape: Array, near: dict[str, float]) -> tuple[Cause, str]:
     """Return where the oil goes, as a cause and in words."""
     lost = _lost(fit, step, shape)
     if lost > 0.0:
@@ -276,7 +276,7 @@ def _place(fit: BalanceFit, step: StepFound, shape: Array, near: dict[str, float
     )
 
 
-def _lost(fit: BalanceFit, step: StepFound, shape: Array) -> float:
+def _lost(fit: BalanceFit, step: DriftStep, shape: Array) -> float:
     """Return the flow [m^3/s] that one side loses more than the other since the rise, whatever the pressure difference.
 
     0 where it is no more than a bias of the pressures makes of a leak between the sides.
@@ -288,14 +288,14 @@ def _lost(fit: BalanceFit, step: StepFound, shape: Array) -> float:
         return 0.0
     lost = abs(float(np.mean(after) - np.mean(before)))
     deviation = float(np.sqrt(np.var(before, ddof=1) / before.size + np.var(after, ddof=1) / after.size))
-    least = _LOST * float(step.size[0]) * float(fit.blocks.abs_dp.mean()) + 4.0 * deviation
+    least = _LOST * step.size * float(fit.blocks.abs_dp.mean()) + 4.0 * deviation
     return lost if lost > least else 0.0
 
 
-def _course(fit: BalanceFit, step: StepFound, shape: Array, law: Law) -> LeakCourse:
+def _course(fit: BalanceFit, step: DriftStep, shape: Array, law: Law) -> LeakCourse:
     """Return the leak block by block: the conductance beyond its drift, under each block's own pressure difference."""
     flow = fit.unit_flow(law) / LITRE_PER_MINUTE
-    lpm = (fit.g - step.level[:, 0]) * flow
-    noise = fit.sd * max(1.0, float(step.noise[0]))
-    half = _t_quantile(step.freedom) * np.hypot(noise, float(step.size_sd[0]) * shape) * flow
+    lpm = (fit.g - step.level) * flow
+    noise = fit.sd * max(1.0, step.noise)
+    half = _t_quantile(step.freedom) * np.hypot(noise, step.size_sd * shape) * flow
     return LeakCourse(fit.blocks.t, lpm, lpm - half, lpm + half)

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.changepoint.step_in_drift import StepFound, find_step
+from sealscope.diagnosis.changepoint.smooth_drift import DriftStep, find_step
 from sealscope.diagnosis.volume_balance.blocks import DP_12, FLOW, I_12, I_AB, I_ROOT, THETA, BalanceBlocks, Y
 from sealscope.recordings.recording import Array
 
@@ -290,7 +290,7 @@ def discriminate(fit: BalanceFit, onset: float, rise: float, *, within: float) -
     return evidence
 
 
-def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> StepFound:
+def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> DriftStep:
     """Return the best rise (or fall, `sign` -1) of the conductance, with `level` at every block of the fit."""
     shared = _shared_errors(fit)
     every = -(-len(fit.blocks) // MOST_BLOCKS)
@@ -298,15 +298,15 @@ def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> StepFound:
         return find_step(fit.blocks.t, fit.g, fit.sd, probability, sign=sign, shared=shared)
     t, g, sd, common = _merged(fit, shared, every)
     coarse = find_step(t, g, sd, probability, sign=sign, shared=common)
-    level = np.interp(fit.blocks.t, t, coarse.level[:, 0])[:, None]
+    level = np.interp(fit.blocks.t, t, coarse.level)
     coarse = replace(coarse, level=level, index=int(np.searchsorted(fit.blocks.t, coarse.onset)))
-    if not coarse.found or coarse.rise > 0:
+    if not coarse.alarm or coarse.rise > 0:
         return coarse
     first = max(0, min(coarse.index - MOST_BLOCKS // 2, len(fit.blocks) - MOST_BLOCKS))
     near = slice(first, first + MOST_BLOCKS)
     fine = find_step(fit.blocks.t[near], fit.g[near], fit.sd[near], probability, sign=sign)
     low, high = coarse.onset_interval
-    if not (fine.found and fine.rise == 0 and low <= fine.onset <= high):
+    if not (fine.alarm and fine.rise == 0 and low <= fine.onset <= high):
         return coarse
     return replace(coarse, onset=fine.onset, onset_interval=fine.onset_interval, index=first + fine.index)
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.changepoint.step_in_drift import FEWEST
+from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import (
     BLOCK_SECONDS,

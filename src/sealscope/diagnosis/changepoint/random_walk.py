@@ -1,14 +1,14 @@
-"""A step in a series that walks about as much as the observer says it does.
+"""Scan for a rise in a series that walks about as much as expected of a healthy machine.
 
 The series g_1..g_n (one estimate of the conductance a block) is taken as level + walk + noise + size S(onset): noise
 of the stated relative deviations and unknown scale, a random walk whose variance a block is `walk` times that of the
 noise, S the share of a block that lies behind the onset. `walk` is estimated beside every onset (restricted maximum
-likelihood), with a log-normal prior around the ratio that is expected of a healthy machine: that is what a model-based
-observer knows more than `step_in_drift.find_step`, which takes any smooth drift and must see a larger step.
+likelihood), with a log-normal prior around the ratio that is expected of a healthy machine. With this knowledge a
+smaller step is found than by `smooth_drift.find_step`, which allows any smooth drift.
 
 The score is the largest t of the size over all onsets, where only a rise counts. The threshold is the quantile of the
-same maximum over series drawn from the walk found beside the step and, where the caller is `wary`, from the one found
-without a step too, whichever is higher.
+same maximum over series drawn from the walk estimated beside the step and, where the caller is `wary`, from the one
+estimated without a step too, whichever is higher.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.changepoint.abrupt import ONSET_CUT
+from sealscope.diagnosis.changepoint.shapes import rises, warm_ups
+from sealscope.diagnosis.changepoint.tails import ONSET_CUT
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -35,14 +36,17 @@ _UNSETTLED = 1e6
 _DRAWS, _TAIL = 600, 0.1
 #: Time constants of a warm-up, as shares of the series.
 _WARM_UPS = (0.03, 0.06, 0.12, 0.25, 0.5)
+_TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
 class WalkStep:
-    """The best step. `score`, `threshold`; `onset`, `onset_interval` (95 %): in blocks from the beginning of the first;
-    `size`, `size_sd`: in the unit of the series; `freedom`: degrees of freedom of `size_sd`; `scale`: of the noise
-    over the stated deviations; `walk`: variance of a block's walk over the noise's; `warms_up`: an exponential
-    approach from the beginning on is likelier than the step."""
+    """The best step of a series.
+
+    `onset`, `onset_interval` (95 %): in blocks from the beginning of the first; `size`, `size_sd`: in the unit of the
+    series; `freedom`: degrees of freedom of `size_sd`; `scale`: of the noise over the stated deviations; `warms_up`: an
+    exponential approach from the beginning on is likelier than the step.
+    """
 
     score: float
     threshold: float
@@ -52,7 +56,6 @@ class WalkStep:
     size_sd: float
     freedom: int
     scale: float
-    walk: float
     warms_up: bool
 
     @property
@@ -67,7 +70,7 @@ class WalkStep:
 
 
 class _Walk:
-    """Everything about one strength of the walk: `whiten` (n, n) takes out correlation and level."""
+    """One strength of the walk: `whiten` (n, n) takes out correlation and level."""
 
     def __init__(self, relative: Array, walk: float) -> None:
         n = relative.size
@@ -81,31 +84,31 @@ class _Walk:
         self.log_det = 2.0 * float(np.log(np.diag(self.root)).sum()) + 2.0 * float(np.log(length))
 
     def fit(self, y: Array, shapes: Array) -> tuple[Array, Array, Array]:
-        """Of series y (n, m) and steps `shapes` (k, n): moves along each step (k, m), what is left of the sum of
-        squares (k, m), and the steps' lengths (k,)."""
+        """Fit steps `shapes` (k, n) to series y (n, m).
+
+        Returns the moves along each step (k, m), the sum of squares left (k, m), and the steps' lengths (k,).
+        """
         white = self.whiten @ shapes.T
         lengths = np.sqrt(np.sum(white**2, axis=0))
         target = self.whiten @ y
         moved = (white / lengths).T @ target
-        return moved, np.maximum(np.sum(target**2, axis=0) - moved**2, np.finfo(float).tiny), lengths
+        return moved, np.maximum(np.sum(target**2, axis=0) - moved**2, _TINY), lengths
 
 
-def shapes_of(onsets: Array, n: int) -> Array:
-    """S (k, n): the share of every block that lies behind each onset (k,) [blocks]."""
-    return np.clip(np.arange(1, n + 1)[None, :] - onsets[:, None], 0.0, 1.0)
+class _WalkScan:
+    """All strengths of the walk and all onsets, for blocks of the relative deviations `relative` (n,)."""
 
-
-class _Scan:
     def __init__(self, relative: Array, expected: float, spread: float) -> None:
         self.n = relative.size
         self.freedom = self.n - 2
         self.onsets = np.arange(LEAST, self.n - LEAST + 0.25, 0.5)
-        self.shapes = shapes_of(self.onsets, self.n)
+        self.middles: Array = np.arange(self.n, dtype=np.float64) + 0.5
+        self.shapes = rises(self.middles, self.onsets)
         self.walks = [_Walk(relative, float(walk)) for walk in _WALKS]
         self.prior = (np.log(_WALKS / expected) / spread) ** 2
 
     def scores(self, y: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Of series y (n, m), for every onset (k, m): t of a rise, number of the likeliest walk."""
+        """Return for every onset (k, m) of series y (n, m) the t of a rise and the number of the likeliest walk."""
         size = (self.onsets.size, y.shape[1])
         best, t, number = np.full(size, np.inf), np.zeros(size), np.zeros(size, dtype=np.int64)
         for row, walk in enumerate(self.walks):
@@ -118,7 +121,7 @@ class _Scan:
         return np.maximum(t, 0.0), number
 
     def deviance(self, y: Array, shapes: Array) -> float:
-        """Least -2 log likelihood of one series y (n, 1) with any of the shapes (k, n) and any walk."""
+        """Return the least -2 log likelihood of one series y (n, 1) with any of the shapes (k, n) and any walk."""
         return float(
             min(
                 np.min(self.freedom * np.log(walk.fit(y, shapes)[1])) + walk.log_det + self.prior[row]
@@ -127,10 +130,9 @@ class _Scan:
         )
 
     def without_step(self, y: Array) -> int:
-        """Number of the walk that is likeliest for one series y (n, 1) without a step."""
-        tiny = np.finfo(float).tiny
+        """Return the number of the walk that is likeliest for one series y (n, 1) without a step."""
         deviance = [
-            (self.n - 1) * np.log(np.sum((walk.whiten @ y) ** 2) + tiny) + walk.log_det + self.prior[row]
+            (self.n - 1) * np.log(np.sum((walk.whiten @ y) ** 2) + _TINY) + walk.log_det + self.prior[row]
             for row, walk in enumerate(self.walks)
         ]
         return int(np.argmin(deviance))
@@ -153,25 +155,26 @@ def find_leak_step(
 
     Raises InputError where there are fewer than 16 blocks or values that are not finite.
     """
-    if g.size < FEWEST:
-        raise InputError(f"a step needs {FEWEST} blocks or more to be found, got {g.size}")
+    n = g.size
+    if n < FEWEST:
+        raise InputError(f"a step needs {FEWEST} blocks or more to be found, got {n}")
     if g.shape != sd.shape or not (np.all(np.isfinite(g)) and np.all(np.isfinite(sd)) and np.all(sd > 0)):
         raise InputError("estimates and their deviations must be finite and of one shape, and deviations > 0")
     unit = float(np.median(sd))
     relative = sd / unit
-    scan = _Scan(relative, expected_walk, spread)
+    scan = _WalkScan(relative, expected_walk, spread)
     y = g[:, None] / unit
     t, number = (column[:, 0] for column in scan.scores(y))
     best = int(np.argmax(t))
     walk = scan.walks[number[best]]
-    drawn = np.random.default_rng(seed).standard_normal((g.size, _DRAWS))
+    drawn = np.random.default_rng(seed).standard_normal((n, _DRAWS))
     threshold = max(
-        _upper_tail(scan.scores(scan.walks[one].root @ drawn)[0].max(axis=0), false_alarm_probability)
-        for one in {int(number[best]), *([scan.without_step(y)] if wary else [])}
+        _upper_tail(scan.scores(scan.walks[row].root @ drawn)[0].max(axis=0), false_alarm_probability)
+        for row in {int(number[best]), *([scan.without_step(y)] if wary else [])}
     )
 
-    fine = np.clip(scan.onsets[best] + np.arange(-0.75, 0.75 + 1e-9, _FINE), 1.0, g.size - 1.0)
-    sharp = scan.freedom * np.log(walk.fit(y, shapes_of(fine, g.size))[1][:, 0])
+    fine: Array = np.clip(scan.onsets[best] + np.arange(-0.75, 0.75 + 1e-9, _FINE), 1.0, n - 1.0)
+    sharp = scan.freedom * np.log(walk.fit(y, rises(scan.middles, fine))[1][:, 0])
     onset = float(fine[np.argmin(sharp)])
     cut = float(sharp.min()) + ONSET_CUT
     coarse = scan.freedom * np.log(walk.fit(y, scan.shapes)[1][:, 0])
@@ -179,10 +182,9 @@ def find_leak_step(
 
     settled = relative.copy()
     settled[int(np.floor(onset)) : int(np.floor(onset)) + 2] *= _UNSETTLED
-    strength = float(_WALKS[number[best]])
-    warm = np.exp(-np.arange(g.size)[None, :] / (np.array(_WARM_UPS)[:, None] * g.size))
-    warms_up = scan.deviance(y, warm) < scan.deviance(y, shapes_of(fine, g.size))
-    moved, rest, lengths = _Walk(settled, strength).fit(y, shapes_of(np.array([onset]), g.size))
+    warm = warm_ups(scan.middles - 0.5, n, _WARM_UPS)
+    warms_up = scan.deviance(y, warm) < scan.deviance(y, rises(scan.middles, fine))
+    moved, rest, lengths = _Walk(settled, float(_WALKS[number[best]])).fit(y, rises(scan.middles, np.array([onset])))
     freedom = scan.freedom - 2
     scale = float(np.sqrt(rest[0, 0] / freedom))
     return WalkStep(
@@ -194,14 +196,11 @@ def find_leak_step(
         size_sd=scale / float(lengths[0]) * unit,
         freedom=freedom,
         scale=scale,
-        walk=strength,
         warms_up=warms_up,
     )
 
 
 def _upper_tail(null: Array, probability: float) -> float:
-    """The value that a sample (m,) of the null exceeds with `probability`: an order statistic in its upper tenth's
-    beginning, beyond that an exponential tail, which errs to the safe side for a maximum of t."""
     if probability >= _TAIL:
         return float(np.quantile(null, 1.0 - probability))
     start = float(np.quantile(null, 1.0 - _TAIL))

@@ -1,14 +1,13 @@
-"""Has the mean of a series of vectors changed at once, beyond its scatter and a slow drift? A scan over every instant,
-and what the scan gives when nothing has changed at once.
+"""Scan for a step in the mean of a series of vectors, beyond its scatter and a slow drift.
 
 The series x_1..x_n (blocks) is
 
     x_i = mean + B b_i + e_i,   b_i - b_{i-1} ~ N(0, I),
 
 scatter e with a covariance S, estimated from the differences of neighbours, which a single step does not inflate, and
-random walks b, whose columns B say how far a sound machine moves each quantity in a block (`Drift`; none: B = 0). For a
-step of the height h after block k, T2(k) is twice the log likelihood ratio of "the mean changed after k" against "it
-did not", by generalised least squares; without drift
+random walks b, whose columns B give the drift of each quantity of a healthy machine in a block (`HealthyDrift`; none:
+B = 0). For a step of the height h after block k, T2(k) is twice the log likelihood ratio of "the mean changed after k"
+against "it did not", by generalised least squares; without drift
 
     T2(k) = n / (k (n - k)) c_k' S^-1 c_k,   c_k = sum_{i <= k} (x_i - mean)
 
@@ -16,8 +15,8 @@ did not", by generalised least squares; without drift
 Cosines (DCT-II) make it quick: of a random walk whose level is unknown they are the Karhunen-Loeve functions, so that
 scatter and walk are independent from cosine to cosine, with the variance 1 + lambda / (4 sin^2(pi m / 2n)).
 
-The threshold is the quantile of max T2 over random orders of the same blocks with random walks of B added: without a
-change at once every order is as likely as the one observed. Pairs of neighbours are moved together, so that the short
+The threshold is the quantile of max T2 over random orders of the same blocks with random walks of B added: without an
+abrupt change every order is as likely as the one observed. Pairs of neighbours are moved together, so that the short
 memory of the blocks (the filters reach from one into the next) stays in the null distribution; longer runs would carry
 the very step that is looked for.
 """
@@ -29,12 +28,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.changepoint.shapes import least_blocks
 from sealscope.recordings.recording import Array
 
-#: 95 % of the time the likelihood ratio at the true instant is within this of its maximum: P(2 log LR <= x) = (1 -
-#: exp(-x/2))^2 (Eo & Morley, Likelihood-ratio-based confidence sets for the timing of structural breaks, Quantitative
-#: Economics 6 (2015) 463-497).
-ONSET_CUT = -2.0 * np.log(1.0 - np.sqrt(0.95))
 #: Directions whose scatter is less than this share of the largest are sums of others.
 _RANK = 1e-8
 _BATCH = 250
@@ -42,52 +38,47 @@ _RUN = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Drift:
-    """What the columns of a series do without the step that is looked for.
+class HealthyDrift:
+    """The drift of the columns of a series without the step that is looked for.
 
     `walks` (f, q): deviation by which each of q independent random walks moves each column in one block; `other` (f,
-    c): directions of steps that are none of those looked for, and fitted beside them.
+    c): directions of steps that are not looked for, and fitted beside them.
     """
 
     walks: Array
     other: Array
 
-    @classmethod
-    def none(cls, f: int) -> Drift:
-        """No drift and no other steps."""
-        return cls(np.zeros((f, 0)), np.zeros((f, 0)))
-
 
 @dataclass(frozen=True)
 class Scan:
-    """`joint`: (n - 1,) T2 for a step after block k = 1..n-1; `single`: (n - 1, f) its square root, signed, for each
-    column alone: > 0 where the mean rises; `trend`: T2 of an even drift from the first to the last block."""
+    """Statistics of one series.
+
+    `joint` (n - 1,): T2 for a step after block k = 1..n-1; `single` (n - 1, f): its square root, signed, for each
+    column alone: > 0 where the mean rises; `trend`: T2 of an even drift from the first to the last block.
+    """
 
     joint: Array
     single: Array
     trend: float
 
     def step_wins(self) -> bool:
-        """Whether a step describes the change better than an even drift does."""
+        """Return whether a step describes the change better than an even drift does."""
         return float(self.joint.max()) > self.trend
-
-
-def least_blocks(n: int) -> int:
-    """Fewest blocks on either side of a step."""
-    return max(3, round(0.03 * n))
 
 
 class StepScan:
     """The statistics of series of n blocks that scatter and drift as `x` (n, f) does.
 
-    `joint`: the columns that are judged together; `drift`: what they do without a step (default: nothing). Columns in
-    which `drift.other` has a share are read beside them. Steps nearer than `least` blocks to an end are left out.
+    `joint`: the columns that are judged together; `drift`: theirs without a step (default: none). Columns in which
+    `drift.other` has a share are read beside them. Steps nearer than `least` blocks to an end are left out.
     """
 
-    def __init__(self, x: Array, joint: list[int], drift: Drift | None = None, *, least: int | None = None) -> None:
+    def __init__(
+        self, x: Array, joint: list[int], drift: HealthyDrift | None = None, *, least: int | None = None
+    ) -> None:
         n, f = x.shape
         self.n, self.f, self.x = n, f, x
-        self.drift = Drift.none(f) if drift is None else drift
+        self.drift = HealthyDrift(np.zeros((f, 0)), np.zeros((f, 0))) if drift is None else drift
         self.least = least_blocks(n) if least is None else least
         self.used = sorted({*joint, *np.flatnonzero(np.any(self.drift.other != 0, axis=1)).tolist()})
         differences = np.diff(x, axis=0)
@@ -110,21 +101,29 @@ class StepScan:
         self.ramp_quadratic = _quadratic(self.steps, ramp_gain[None], len(joint))[0]
 
     def _passed(self, strength: Array) -> Array:
-        """Precision (n, j) of each cosine of series whose walk has the variance `strength` (j,) a block, that of the
-        scatter being 1; 0 for the mean, which is unknown."""
+        """Return the precision (n, j) of each cosine of series whose walks have the variance `strength` (j,) a block.
+
+        In units of the scatter's precision; 0 for the mean, which is unknown.
+        """
         passed = 1.0 / (1.0 + self.walk[:, None] * strength)
         passed[0] = 0.0
         return np.asarray(passed)
 
     def _gain(self, passed: Array) -> Array:
-        """Information (n - 1, j) on a step after k = 1..n-1: the cosines of a step are s_m^2 = 2/n sin^2(pi m k/n) /
-        (4 sin^2(pi m / 2n)), and the sum over passed s^2 is a Fourier transform."""
+        """Return the information (n - 1, j) on a step after k = 1..n-1.
+
+        The cosines of a step are s_m^2 = 2/n sin^2(pi m k/n) / (4 sin^2(pi m / 2n)), and the sum over passed s^2 is a
+        Fourier transform.
+        """
         share = passed * self.walk[:, None]
         return np.asarray((share.sum(axis=0) - np.fft.fft(share, axis=0).real[1:]) / self.n)
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
-        """T2 (m, n-1), single (m, n-1, f) and trend T2 (m,) of a stack of series x (m, n, f), each first brought to the
-        scatter of the series that this scan was made for: so each is judged by what itself scatters, as that one is."""
+        """Return T2 (m, n-1), single (m, n-1, f) and trend T2 (m,) of a stack of series x (m, n, f).
+
+        Each is first brought to the scatter of the series that this scan was made for, so that each is judged by its
+        own scatter, as that one is.
+        """
         from scipy.fft import idct
 
         differences = np.diff(x, axis=1)
@@ -142,40 +141,44 @@ class StepScan:
         slope = np.einsum("mnj,n->mj", passed, self.ramp) @ self.steps
         return t2, single, np.einsum("ma,ab,mb->m", slope, self.ramp_quadratic, slope)
 
-    def found(self) -> Scan:
-        """The scan of x itself."""
+    def observed(self) -> Scan:
+        """Return the statistics of x itself."""
         t2, single, trend = self(self.x[None])
         return Scan(t2[0], single[0], float(trend[0]))
 
     def orders(self, count: int, random: np.random.Generator) -> Array:
-        """`count` series (count, n, f) as x would be without a step: its blocks in a random order, and walks."""
+        """Return `count` series (count, n, f) as x would be without a step: its blocks in a random order, and walks."""
         moved = self.x[_orders(self.n, count, random)]
         walks = self.drift.walks
         if walks.any():
             moved = moved + np.cumsum(random.standard_normal((count, self.n, walks.shape[1])), axis=1) @ walks.T
         return moved
 
-    def null(self, count: int, seed: int = 0) -> tuple[Array, Array, Array]:
-        """Largest T2 (count,), largest |single| (count, f) and trend T2 (count,) of `count` series without a step."""
+    def null(self, count: int, seed: int = 0, *, after: int | None = None) -> tuple[Array, Array, Array]:
+        """Return T2 (count,), |single| (count, f) and trend T2 (count,) of `count` series without a step.
+
+        The largest over all steps, or those of a step after the block `after` alone.
+        """
         random = np.random.default_rng(seed)
         t2_max, single_max, trend = np.empty(count), np.empty((count, self.f)), np.empty(count)
+        steps = slice(None) if after is None else slice(after - 1, after)
         for first in range(0, count, _BATCH):
             here = slice(first, min(first + _BATCH, count))
             t2, single, trend[here] = self(self.orders(here.stop - first, random))
-            t2_max[here] = t2.max(axis=1)
-            single_max[here] = np.abs(single).max(axis=1)
+            t2_max[here] = t2[:, steps].max(axis=1)
+            single_max[here] = np.abs(single[:, steps]).max(axis=1)
         return t2_max, single_max, trend
 
 
 def _cosines(x: Array) -> Array:
-    """Orthonormal DCT-II over the second axis from the end."""
+    """Return the orthonormal DCT-II over the second axis from the end."""
     from scipy.fft import dct
 
     return np.asarray(dct(x, axis=-2, norm="ortho"))
 
 
 def _rescattered(z: Array) -> Array:
-    """A stack of series z (m, n, r), each turned and stretched as little as gives it the scatter I."""
+    """Return a stack of series z (m, n, r), each turned and stretched as little as gives it the scatter I."""
     differences = np.diff(z, axis=1)
     scatter = np.matmul(differences.transpose(0, 2, 1), differences) / (2.0 * differences.shape[1])
     values, vectors = np.linalg.eigh(scatter)
@@ -184,18 +187,23 @@ def _rescattered(z: Array) -> Array:
 
 
 def _independent(scatter: Array, walks: Array, unit: Array) -> tuple[Array, Array]:
-    """Sums of the columns, as columns of (u, r), that scatter by 1 and walk independently of one another, and the
-    variances (r,) of their walks: the simultaneous diagonalisation of both covariances."""
+    """Diagonalise both covariances at once.
+
+    Returns sums of the columns, as columns of (u, r), that scatter by 1 and walk independently of one another, and the
+    variances (r,) of their walks.
+    """
     values, vectors = np.linalg.eigh(scatter / np.outer(unit, unit))
-    kept = values > _RANK * max(float(values[-1]), np.finfo(float).tiny)
-    white = vectors[:, kept] / np.sqrt(values[kept]) / unit[:, None]
+    regular = values > _RANK * max(float(values[-1]), np.finfo(float).tiny)
+    white = vectors[:, regular] / np.sqrt(values[regular]) / unit[:, None]
     strength, turn = np.linalg.eigh(white.T @ walks @ white)
     return white @ turn, np.maximum(strength, 0.0)
 
 
 def _quadratic(steps: Array, gain: Array, wanted: int) -> Array:
-    """The form (k, a, a) that makes T2 of scores: the inverse of the information on all heights, less that on those
-    beyond the first `wanted` alone."""
+    """Return the form (k, a, a) that makes T2 of scores.
+
+    The inverse of the information on all heights, less that on those beyond the first `wanted` alone.
+    """
     information = np.einsum("ja,kj,jb->kab", steps, gain, steps)
     form = np.linalg.pinv(information, rcond=_RANK, hermitian=True)
     form[:, wanted:, wanted:] -= np.linalg.pinv(information[:, wanted:, wanted:], rcond=_RANK, hermitian=True)
@@ -203,7 +211,7 @@ def _quadratic(steps: Array, gain: Array, wanted: int) -> Array:
 
 
 def _orders(n: int, count: int, random: np.random.Generator) -> NDArray[np.int64]:
-    """`count` random orders of n blocks in which neighbours stay together in pairs."""
+    """Return `count` random orders of n blocks in which neighbours stay together in pairs."""
     starts = np.arange(0, n, _RUN)
     shifts, chosen = np.empty((count, 1), dtype=np.int64), np.empty((count, starts.size), dtype=np.int64)
     for k in range(count):
@@ -215,33 +223,5 @@ def _orders(n: int, count: int, random: np.random.Generator) -> NDArray[np.int64
 
 
 def permutations_for(false_alarm_probability: float) -> int:
-    """Number of random orders: at least 20 beyond the quantile, so that its own relative error is under 25 %."""
+    """Return the number of random orders: at least 20 exceed the threshold, a relative error of its tail under 25 %."""
     return max(999, int(np.ceil(20.0 / false_alarm_probability)) - 1)
-
-
-def upper_quantile(null: Array, probability: float) -> Array:
-    """Threshold that a null sample (m, ...) exceeds with `probability`: its order statistic of rank ceil((1 - p)(m +
-    1)), so that the rate is at most p."""
-    m = null.shape[0]
-    rank = min(m, int(np.ceil((1.0 - probability) * (m + 1) - 1e-9)))
-    return np.asarray(np.sort(null, axis=0)[rank - 1])
-
-
-def two_samples(x: Array, split: int, joint: list[int], count: int, seed: int = 0) -> tuple[float, Array, Array, Array]:
-    """T2 and single statistics for a step after block `split` alone, without drift, and their null samples over random
-    orders: (t2, single (f,), t2 null, |single| null)."""
-    random = np.random.default_rng(seed)
-    scan = StepScan(x, joint, least=1)
-    found = scan.found()
-    t2_null, single_null = np.empty(count), np.empty((count, x.shape[1]))
-    for first in range(0, count, _BATCH):
-        some_t2, some_single, _ = scan(scan.orders(min(_BATCH, count - first), random))
-        t2_null[first : first + len(some_t2)] = some_t2[:, split - 1]
-        single_null[first : first + len(some_t2)] = np.abs(some_single[:, split - 1])
-    return float(found.joint[split - 1]), found.single[split - 1], t2_null, single_null
-
-
-def onset_interval(joint: Array) -> tuple[int, int]:
-    """First and last step (number of blocks before it) that 95 % confidence cannot tell from the best one."""
-    near = np.flatnonzero(joint >= joint.max() - ONSET_CUT)
-    return int(near[0]) + 1, int(near[-1]) + 1
