@@ -51,12 +51,14 @@ def recorded(machine: int, day: int, seed: int, duration: float) -> Recording:
     today = draw("bench", seed + 1000 * machine + day + 1, duration=duration)
     random = np.random.default_rng((seed, machine, day))
     kelvin, seals = KELVIN * random.standard_normal(), 1.0 + SEALS * random.standard_normal()
-    values = dict(own.values)
-    values |= {name: value for name, value in today.values.items() if OF_THE_DAY.fullmatch(name)}
+    values = dict(own.overrides)
+    values |= {name: value for name, value in today.overrides.items() if OF_THE_DAY.fullmatch(name)}
     for name, share in PER_KELVIN.items():
         number = float(values.get(name, own.rig[name]))
         values[name] = number * (1.0 + share * kelvin) * (seals if name.startswith("friction") else 1.0)
-    return simulate_with_truth(replace(own, values=values, drifts=today.drifts).experiment(seed=today.seed)).recording
+    return simulate_with_truth(
+        replace(own, overrides=values, drifts=today.drifts).experiment(seed=today.seed)
+    ).recording
 
 
 def levels_of(recording: Recording) -> dict[str, Level]:
