@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -79,4 +80,43 @@ def finite_array(values: ArrayLike, name: str = "signal", ndim: int | None = Non
         raise InputError(
             f"{name} must be finite, got {array[first]} at sample {where} ({count} of {array.size} samples)"
         )
+    return array
+
+
+def whole_number(value: object, name: str, unit: str = "") -> int:
+    """Return `value` as an int; raises InputError unless it is a whole number of 1 or more."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError(f"{name} must be a whole number >= 1{unit}, got {value!r}")
+    return int(value)
+
+
+def saved_part(state: Any, name: str, what: str) -> Any:
+    """Return a part of the saved state of `what`; raises InputError where it is missing."""
+    if not isinstance(state, Mapping):
+        raise InputError(f"saved {what} must be a mapping, as state_dict returns it, got {type(state).__name__}")
+    if name not in state:
+        raise InputError(f"saved {what} must have {name!r}, got {', '.join(map(str, state)) or 'nothing'}")
+    return state[name]
+
+
+def saved_count(state: Any, name: str, what: str) -> int:
+    """Return a whole number >= 0 of the saved state of `what`; raises InputError for anything else."""
+    value = saved_part(state, name, what)
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
+        raise InputError(f"saved {what}'s {name} must be a whole number >= 0, got {value!r}")
+    return int(value)
+
+
+def saved_array(state: Any, name: str, shape: tuple[int, ...], what: str, kind: Any = np.float64) -> Any:
+    """Return a part of the saved state of `what` as an array of that shape and kind; raises InputError."""
+    value = saved_part(state, name, what)
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "bif" or (array.dtype.kind == "f" and np.dtype(kind).kind != "f"):
+            raise TypeError(f"got {array.dtype}")
+        array = array.astype(kind)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"saved {what}'s {name} must hold numbers of type {np.dtype(kind)}: {error}") from None
+    if array.shape != shape:
+        raise InputError(f"saved {what}'s {name} must have shape {shape}, got {array.shape}")
     return array

@@ -16,7 +16,15 @@ from numpy.typing import ArrayLike
 
 from sealscope.errors import InputError
 from sealscope.signals.details import Details
-from sealscope.signals.filters import Array, IntArray, finite_array
+from sealscope.signals.filters import (
+    Array,
+    IntArray,
+    finite_array,
+    saved_array,
+    saved_count,
+    saved_part,
+    whole_number,
+)
 
 WINDOW_SIZE = 1000
 WINDOW_STEP = 500
@@ -59,7 +67,7 @@ def windowed_rms(
     if isinstance(series, Details):
         inside = series.inside()
         return windowed_rms(series.values[:, inside], size, step, first=first + inside.start)
-    size, step = _checked(size, "size"), _checked(step, "step")
+    size, step = whole_number(size, "size", " sample"), whole_number(step, "step", " sample")
     x = finite_array(series, "series")
     piece = math.gcd(size, step)
     values = _rms_of_pieces(_piece_sums(x, piece), size, step)
@@ -68,16 +76,37 @@ def windowed_rms(
 
 
 class RmsStream:
-    """The streaming twin of `windowed_rms`: the same windows, bit for bit, from blocks of any size.
+    """RMS over sliding windows of live series: the windows of `windowed_rms`, bit for bit, from blocks of any size.
 
-    `skip`: how many values at the beginning of the stream to leave out; `first`: the sample number of the first value
-    kept. Behind a `DetailStream` take its `settling` and `first`: the windows are then those of
-    `windowed_rms(details)`. A value that is not finite spoils the windows it lies in and no other.
+    Behind a `DetailStream` take its `settling` and `first`: the windows are then those of ``windowed_rms(details)``. A
+    value that is not finite spoils the windows it lies in and no other.
+
+    Parameters
+    ----------
+    size, step : int
+        Samples of a window, and from one window to the next.
+    skip : int, default 0
+        How many values at the beginning of the stream to leave out.
+    first : int, default 0
+        Sample number of the first value that is kept.
+
+    Raises
+    ------
+    InputError
+        For a size or a step below 1, or a negative skip.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sealscope as ss
+    >>> stream = ss.RmsStream(100, 50)
+    >>> windows = stream.update(np.ones(120))
+    >>> windows.ends.tolist(), windows.rms.tolist()
+    ([100], [1.0])
     """
 
     def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
-        """Raises InputError for a size or a step below 1, or a negative skip."""
-        self.size, self.step = _checked(size, "size"), _checked(step, "step")
+        self.size, self.step = whole_number(size, "size", " sample"), whole_number(step, "step", " sample")
         if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
             raise InputError(f"skip must be a whole number >= 0 samples, got {skip!r}")
         self._piece = math.gcd(self.size, self.step)
@@ -87,9 +116,22 @@ class RmsStream:
         self._ahead = 0  # pieces that no window needs (step > size), still to be passed over
 
     def update(self, block: ArrayLike) -> WindowedRms:
-        """The windows that `block` (..., n) completes, possibly none; the leading axes are those of the first block.
+        """Take the next block and return the windows that it completes, possibly none.
 
-        Raises InputError when the leading axes differ from the first block's.
+        Parameters
+        ----------
+        block : array_like
+            Values (..., n); the leading axes are those of the first block.
+
+        Returns
+        -------
+        WindowedRms
+            Their `ends` (w,), the sample one past each window's last, and `rms` (..., w).
+
+        Raises
+        ------
+        InputError
+            When the leading axes differ from the first block's.
         """
         x = np.asarray(block, dtype=np.float64)
         if x.ndim == 0:
@@ -118,7 +160,7 @@ class RmsStream:
         return WindowedRms(ends, values)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the stream knows, as numbers and arrays; `from_state` goes on from it."""
+        """Return all that the stream knows, as numbers and arrays; `from_state` continues from it."""
         return {
             "size": self.size,
             "step": self.step,
@@ -131,31 +173,20 @@ class RmsStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> RmsStream:
-        """The stream that `state_dict` described; raises InputError where a part is missing."""
-        try:
-            stream = cls(state["size"], state["step"], skip=state["skip"])
-            stream._next_end, stream._ahead = int(state["next_end"]), int(state["ahead"])
-            rest, sums = (None if state[k] is None else np.array(state[k], dtype=np.float64) for k in ("rest", "sums"))
-        except KeyError as missing:
-            raise InputError(
-                f"saved RMS stream must have {missing}, got {', '.join(map(str, state)) or 'nothing'}"
-            ) from None
-        except InputError:
-            raise
-        except (TypeError, ValueError) as error:
-            raise InputError(f"saved RMS stream must hold numbers: {error}") from None
-        if (rest is None) != (sums is None) or (
-            rest is not None and sums is not None and rest.shape[:-1] != sums.shape[:-1]
-        ):
+        """Return the stream that `state_dict` described; raises InputError for another state."""
+        what = "RMS stream"
+        stream = cls(*(saved_part(state, name, what) for name in ("size", "step")), skip=saved_count(state, "skip", what))
+        stream._next_end = saved_count(state, "next_end", what)
+        stream._ahead = saved_count(state, "ahead", what)
+        rest, sums = saved_part(state, "rest", what), saved_part(state, "sums", what)
+        if rest is None and sums is None:
+            return stream
+        lead = np.shape(rest)[:-1]
+        if rest is None or sums is None or lead != np.shape(sums)[:-1]:
             raise InputError("saved RMS stream must have rest and sums of the same leading axes, got others")
-        stream._rest, stream._sums = rest, sums
+        stream._rest = saved_array(state, "rest", np.shape(rest), what)
+        stream._sums = saved_array(state, "sums", np.shape(sums), what)
         return stream
-
-
-def _checked(value: int, name: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError(f"{name} must be a whole number >= 1 sample, got {value!r}")
-    return int(value)
 
 
 def _piece_sums(x: Array, piece: int) -> Array:

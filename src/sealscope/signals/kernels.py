@@ -1,8 +1,8 @@
-"""Compiled filters over many actuators: eight side by side in a vector register, in one fixed order of sums.
+"""Compiled a trous filters over many signals: eight side by side in a vector register, in one fixed order of sums.
 
-The formulas are those of `streaming`; an output's sum runs through its taps in the same order whether it is computed
-with seven neighbours or alone, so blocks of any size give the same bits. Products and sums may be contracted (see
-`physics.lanes`): against `streaming.DetailStream` the values agree to rounding.
+An output's sum runs through its taps in the same order whether it is computed with seven neighbours or alone, so blocks
+of any size give the same bits. Products and sums may be contracted (see `physics.lanes`): the values agree with those
+of PyWavelets, behind `details.details`, to rounding.
 """
 
 from __future__ import annotations

@@ -1,0 +1,330 @@
+"""Live signals block by block, in bounded memory: their stationary details, and the windowed RMS of a fleet's.
+
+One call takes a block of all signals, and nothing is allocated for it but views. Eight signals share a vector register
+(`kernels`), so that small blocks cost little more than large ones. Results depend on the samples alone, never on how
+they were cut into blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sealscope.errors import InputError
+from sealscope.signals.filters import (
+    Array,
+    IntArray,
+    checked_levels,
+    decomposition_filters,
+    reach,
+    saved_array,
+    saved_count,
+    saved_part,
+    whole_number,
+)
+from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP, WindowedRms
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
+
+
+class DetailStream:
+    """Stationary wavelet details of live signals, block by block.
+
+    The streaming counterpart of ``details(..., transform="stationary")``, with which the values agree to rounding. A
+    causal filter can give level j of a sample only ``(L/2)(2^j - 1)`` samples later (db8: 8, 24, 56, 120). All levels
+    are given with the delay of the deepest one, so that a column holds the levels of one sample: column i of everything
+    given so far is the detail of sample ``i - delay``. The first `settling` columns still see the zeros before the
+    beginning; the first column after them is that of sample `first`.
+
+    Parameters
+    ----------
+    channels : int or tuple of int, default 1
+        Number of signals, or rows and columns of a table of signals, such as ``(2, 100)`` for the two chambers of 100
+        actuators.
+    levels : int, default 4
+        Number of levels.
+    wavelet : str, default "db8"
+        A discrete wavelet of PyWavelets.
+    threads : int, default 1
+        Groups of eight signals are shared out over so many threads; no bit depends on it.
+
+    Attributes
+    ----------
+    delay, first, settling : int
+        By how many samples the details lag the signal (db8 to level 4: 120), the first sample whose details see nothing
+        but the signal (105), and how many columns to drop at the beginning, ``first + delay`` (225).
+    samples : int
+        How many samples of each signal have come in.
+
+    Raises
+    ------
+    InputError
+        For less than one signal, and for levels or a wavelet that `details` refuses.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sealscope as ss
+    >>> signal = np.sin(np.arange(1000) / 5.0)
+    >>> stream = ss.DetailStream()
+    >>> blocks = [stream.update(signal[start : start + 250]) for start in range(0, 1000, 250)]
+    >>> d = np.concatenate(blocks, axis=-1)[:, stream.settling :]
+    >>> d.shape
+    (4, 775)
+    """
+
+    def __init__(
+        self, channels: int | tuple[int, int] = 1, levels: int = 4, *, wavelet: str = "db8", threads: int = 1
+    ) -> None:
+        from sealscope.physics.lanes import WIDTH
+        from sealscope.signals.kernels import CHUNK
+
+        rows, columns = channels if isinstance(channels, tuple) else (1, channels)
+        self._table = whole_number(rows, "channels"), whole_number(columns, "channels")
+        self.channels = self._table if isinstance(channels, tuple) else self._table[1]
+        self.levels, self.wavelet, self.threads = checked_levels(levels), wavelet, whole_number(threads, "threads")
+        self._low, self._high = decomposition_filters(wavelet)
+        self.first, self.delay = (int(samples) for samples in reach(wavelet, self.levels)[-1])
+        self.settling = self.first + self.delay
+        holes = 2 ** np.arange(self.levels)
+        late = self._low.size // 2 * (2**self.levels - 2 * holes)
+        self._history = max(self.delay, int(np.max(late + (self._low.size - 1) * holes)))
+        groups = -(-self._table[1] // WIDTH)
+        self._buffers = aligned((groups, self._table[0], self.levels, self._history + CHUNK, WIDTH))
+        self._fill, self.samples = self._history, 0
+        shares = min(self.threads, groups)
+        self._shares = list(pairwise(groups * i // shares for i in range(shares + 1)))
+        self._work = [aligned((self.levels, CHUNK, WIDTH)) for _ in self._shares]
+
+    def update(self, block: ArrayLike, out: Array | None = None) -> Array:
+        """Take the next block and return its details.
+
+        Parameters
+        ----------
+        block : array_like
+            Samples (channels, n), or (n,) of a single signal; n may be 0. A missing sample (NaN) spoils its own signal
+            alone, for `settling` columns after it.
+        out : ndarray, optional
+            C-contiguous doubles to write into, in the shape of what is returned. For a block of C-contiguous doubles
+            nothing else is allocated.
+
+        Returns
+        -------
+        ndarray
+            Details (channels, levels, n), or (levels, n) for a block (n,); row 0 is d_1.
+
+        Raises
+        ------
+        InputError
+            For a block or an `out` of another shape.
+        """
+        from sealscope.signals.kernels import advance_details
+
+        x = self.checked(block)
+        leading = np.shape(block)[:-1]
+        shape = (*leading, self.levels, x.shape[-1])
+        out = np.empty(shape) if out is None else checked_out(out, shape)
+        target = out.reshape(*self._table, self.levels, x.shape[-1])
+        self.run(x, lambda share, work: advance_details(share, x, *self.state, work, target))
+        return out
+
+    def checked(self, block: ArrayLike) -> Array:
+        """Return a block as C-contiguous doubles (rows, columns, n) that are only read; raises InputError."""
+        x = np.ascontiguousarray(block, dtype=np.float64)
+        wanted = self.channels if isinstance(self.channels, tuple) else (self.channels,)
+        single = wanted == (1,) and np.ndim(block) == 1
+        if not single and (np.ndim(block) == 0 or np.shape(block)[:-1] != wanted):
+            sizes = "" if wanted == (1,) else "".join(f"{size}, " for size in wanted)
+            raise InputError(f"block must have shape ({sizes or 'n,'}{'n' if sizes else ''}), got {np.shape(block)}")
+        x = x.reshape(*self._table, np.shape(block)[-1])
+        # one type for what is read, whether the caller's array may be written or not: one compilation
+        x = x.view()
+        x.setflags(write=False)
+        return x
+
+    @property
+    def state(self) -> tuple[Array, int, int, Array, Array]:
+        """Buffers, rows of them in use, rows needed again, and taps, as the kernels take them."""
+        return self._buffers, self._fill, self._history, self._low, self._high
+
+    def run(self, x: Array, call: Callable[[tuple[int, int], Array], int]) -> None:
+        """Make `call(groups, work)` for every share of the groups, and count the samples of `x` as taken."""
+        if x.shape[-1] == 0:
+            return
+        if len(self._shares) == 1:
+            fill = call(self._shares[0], self._work[0])
+        else:
+            fill = max(self._pool.map(call, self._shares, self._work))
+        self._fill = int(fill)
+        self.samples += x.shape[-1]
+
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        from concurrent.futures import ThreadPoolExecutor
+
+        return ThreadPoolExecutor(len(self._shares))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the stream knows: settings, samples seen, and the `history` to filter with."""
+        history = self._buffers[:, :, :, self._fill - self._history : self._fill]
+        return {
+            "channels": self.channels,
+            "levels": self.levels,
+            "wavelet": self.wavelet,
+            "samples": self.samples,
+            "history": unpacked(history, self._table[1]),
+        }
+
+    def load_state(self, state: dict[str, Any], what: str = "detail stream") -> None:
+        """Continue from what `state_dict` of a stream with the same settings returned, bit for bit.
+
+        Raises InputError for a state that is not one of such a stream.
+        """
+        for name in ("channels", "levels", "wavelet"):
+            if (value := saved_part(state, name, what)) != getattr(self, name):
+                raise InputError(f"saved {what}'s {name} must be {getattr(self, name)}, got {value}")
+        history = saved_array(state, "history", (self._table[0], self.levels, self._history, self._table[1]), what)
+        self._fill, self.samples = self._history, saved_count(state, "samples", what)
+        pack(history, self._buffers[:, :, :, : self._history])
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
+        """Return the stream that `state_dict` described, bit for bit; raises InputError for another state."""
+        channels, levels, wavelet = (saved_part(state, name, "detail stream") for name in cls._SETTINGS)
+        stream = cls(channels, levels, wavelet=wavelet, threads=threads)
+        stream.load_state(state)
+        return stream
+
+    _SETTINGS = ("channels", "levels", "wavelet")
+
+
+class FleetRms:
+    """RMS over sliding windows of every detail, of the product of the deepest two, and of the signal, of a fleet.
+
+    The windows are those of ``windowed_rms(details(signal), size, step)``: the first covers samples
+    ``first .. first + size - 1``. `quantities`: names of the rows, such as d1, d2, d3, d4, d3d4, signal. A missing
+    sample spoils the windows of its own actuator and channel in which its details lie, and no other.
+    """
+
+    def __init__(
+        self,
+        actuators: int,
+        channels: int = 2,
+        levels: int = 4,
+        *,
+        size: int = WINDOW_SIZE,
+        step: int = WINDOW_STEP,
+        wavelet: str = "db8",
+        threads: int = 1,
+    ) -> None:
+        """Raises InputError for a count below 1, fewer than two levels, or a wavelet that `details` refuses."""
+        if checked_levels(levels) < 2:
+            raise InputError(f"levels must be 2 or more for windows over a fleet, got {levels}")
+        self.actuators, self.channels, self.levels = whole_number(actuators, "actuators"), channels, levels
+        self.details = DetailStream((channels, actuators), levels, wavelet=wavelet, threads=threads)
+        self.size, self.step = whole_number(size, "size"), whole_number(step, "step")
+        names = [f"d{j}" for j in range(1, levels + 1)]
+        self.quantities = (*names, names[-2] + names[-1], "signal")
+        piece = math.gcd(self.size, self.step)
+        self._windows = np.array([piece, self.size // piece, self.step // piece], dtype=np.int64)
+        groups, _, _, _, width = self.details.state[0].shape
+        rows = len(self.quantities)
+        self._opened = aligned((groups, channels, rows, width))
+        self._pieces = aligned((groups, channels, self.size // piece, rows, width))
+
+    @property
+    def samples(self) -> int:
+        """How many samples of each channel have come in."""
+        return self.details.samples
+
+    def _windows_at(self, samples: int) -> int:
+        columns = samples - self.details.settling
+        return 0 if columns < self.size else (columns - self.size) // self.step + 1
+
+    def windows(self, samples: int) -> int:
+        """Return how many windows the next `samples` samples complete."""
+        return self._windows_at(self.samples + samples) - self._windows_at(self.samples)
+
+    def ends(self, samples: int) -> IntArray:
+        """Return, of those windows, the sample one past the last of each."""
+        before = self._windows_at(self.samples)
+        count = self.windows(samples)
+        return self.details.first + self.size + self.step * np.arange(before, before + count, dtype=np.int64)
+
+    def update(self, block: ArrayLike, out: Array | None = None) -> WindowedRms:
+        """Return the windows that `block` (channels, actuators, n) completes: rms (w, channels, quantities, actuators).
+
+        Written into `out` where one is given: C-contiguous doubles of shape (at least w, channels, quantities,
+        actuators), of which the first w are returned. Raises InputError for a wrong shape.
+        """
+        from sealscope.signals.kernels import advance_rms
+
+        inner = self.details
+        x = inner.checked(block)
+        n = x.shape[-1]
+        count = self.windows(n)
+        shape = (count, self.channels, len(self.quantities), self.actuators)
+        out = np.empty(shape) if out is None else checked_out(out, shape, at_least=True)
+        windows = WindowedRms(self.ends(n), out[:count])
+        counts = (inner.delay, inner.samples - inner.settling, self._windows, self._opened, self._pieces)
+        inner.run(x, lambda share, work: advance_rms(share, x, *inner.state, work, *counts, out))
+        return windows
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the details' state with `size`, `step`, and sums of squares so far, `opened` and `pieces`."""
+        return {
+            **self.details.state_dict(),
+            "size": self.size,
+            "step": self.step,
+            "opened": unpacked(self._opened, self.actuators),
+            "pieces": unpacked(self._pieces, self.actuators),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` of a stream with the same settings returned; raises InputError."""
+        for name in ("size", "step"):
+            if (value := saved_part(state, name, "fleet")) != getattr(self, name):
+                raise InputError(f"saved fleet's {name} must be {getattr(self, name)}, got {value}")
+        parts = [
+            (saved_array(state, name, (*own.shape[1:-1], self.actuators), "fleet"), own)
+            for name, own in (("opened", self._opened), ("pieces", self._pieces))
+        ]
+        self.details.load_state(state, "fleet")
+        for values, own in parts:
+            pack(values, own)
+
+
+def aligned(shape: tuple[int, ...]) -> Array:
+    """Return zeros that begin at a cache line, so that no row of lanes lies on two."""
+    values = np.zeros(math.prod(shape) + 8)
+    skip = -(values.ctypes.data // 8) % 8
+    return values[skip : skip + math.prod(shape)].reshape(shape)
+
+
+def checked_out(out: Array, shape: tuple[int, ...], *, at_least: bool = False) -> Array:
+    """Return `out` where it can be written to; raises InputError. `at_least`: its first axis may be longer."""
+    given = (shape[0], *out.shape[1:]) if at_least and out.ndim and out.shape[0] >= shape[0] else out.shape
+    if not (given == shape and out.dtype == np.float64 and out.flags.c_contiguous and out.flags.writeable):
+        raise InputError(f"out must be C-contiguous, writeable doubles of shape {shape}, got {out.dtype} {out.shape}")
+    return out
+
+
+def unpacked(lanes: Array, actuators: int) -> Array:
+    """Return lanes (groups, ..., WIDTH) as values (..., actuators)."""
+    last = np.moveaxis(lanes, 0, -2)
+    return last.reshape(*last.shape[:-2], -1)[..., :actuators].copy()
+
+
+def pack(values: Array, lanes: Array) -> None:
+    """Write values (..., actuators) into lanes (groups, ..., WIDTH)."""
+    groups, width = lanes.shape[0], lanes.shape[-1]
+    whole = np.zeros((*values.shape[:-1], groups * width))
+    whole[..., : values.shape[-1]] = values
+    lanes[...] = np.moveaxis(whole.reshape(*values.shape[:-1], groups, width), -2, 0)
