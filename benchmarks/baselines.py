@@ -25,7 +25,8 @@ from sealscope.diagnosis.baseline.level import DayToDay, Level, rise_of
 from sealscope.diagnosis.observer.against_baseline import day_to_day as observer_prior
 from sealscope.diagnosis.observer.against_baseline import level as observer_level
 from sealscope.diagnosis.observer.detector import Observer
-from sealscope.diagnosis.pressure_model.detector import DAY_TO_DAY, PressureModel
+from sealscope.diagnosis.observer.evidence import misfit
+from sealscope.diagnosis.pressure_model.detector import DAY_TO_DAY, PressureModel, is_followed
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.diagnosis.volume_balance.evidence import day_to_day as balance_prior
 from sealscope.diagnosis.volume_balance.evidence import level as balance_level
@@ -62,18 +63,20 @@ def recorded(machine: int, day: int, seed: int, duration: float) -> Recording:
 
 
 def levels_of(recording: Recording) -> dict[str, Level]:
-    """Return the levels of all detectors that can follow a recording."""
+    """Return the levels of all detectors that follow a recording."""
     rig = load_rig("thesis")
-    found: dict[str, Level] = {}
+    levels: dict[str, Level] = {}
     fit, _ = VolumeBalance(rig).fit(recording)
     if fit is not None:
-        found[DETECTORS[0]] = balance_level(fit)
+        levels[DETECTORS[0]] = balance_level(fit)
     followed = PressureModel(rig).follow(recording)
-    if not isinstance(followed, str):
-        found[DETECTORS[1]] = followed.level
-    for name, seen in ((DETECTORS[2], recording), (DETECTORS[3], recording.only(PRESSURES))):
-        found[name] = observer_level(Observer(rig).follow(seen))
-    return found
+    if not isinstance(followed, str) and is_followed(followed):
+        levels[DETECTORS[1]] = followed.level
+    for name, view in ((DETECTORS[2], recording), (DETECTORS[3], recording.only(PRESSURES))):
+        series = Observer(rig).follow(view)
+        if misfit(series.estimates, series.formulation, rig) is None:
+            levels[name] = observer_level(series)
+    return levels
 
 
 def prior_of(detector: str, baseline: list[Level]) -> DayToDay:

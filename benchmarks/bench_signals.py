@@ -18,7 +18,7 @@ import numpy as np
 import pywt
 
 from sealscope.signals.details import details
-from sealscope.signals.streaming import DetailStream
+from sealscope.signals.streams import DetailStream
 from sealscope.signals.windows import RmsStream, windowed_rms
 
 LEVELS = 4

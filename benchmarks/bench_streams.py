@@ -21,7 +21,7 @@ import pywt
 from bench_signals import LEVELS
 
 from sealscope.diagnosis.fleet.fleet import Fleet
-from sealscope.signals.fleet import FleetRms
+from sealscope.signals.streams import FleetRms
 
 RATE = 500.0
 #: Actuators and samples a block.

@@ -12,20 +12,28 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.diagnose import diagnose
+    from sealscope.diagnosis.fleet.fleet import Fleet
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+    from sealscope.diagnosis.volume_balance.stream import SequentialBalance
     from sealscope.parameters import Rig, load_rig
     from sealscope.recordings import Recording, inspect, read, write
     from sealscope.reporting import write_page
+    from sealscope.signals.streams import DetailStream
+    from sealscope.signals.windows import RmsStream
     from sealscope.simulation.batch.batch import simulate_batch
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.proof import prove
     from sealscope.simulation.simulate import simulate, simulate_with_truth
 
 _HOMES = {
+    "DetailStream": "signals.streams",
     "Diagnosis": "diagnosis.verdict.diagnosis",
     "Experiment": "simulation.experiment",
+    "Fleet": "diagnosis.fleet.fleet",
     "Recording": "recordings.recording",
     "Rig": "parameters",
+    "RmsStream": "signals.windows",
+    "SequentialBalance": "diagnosis.volume_balance.stream",
     "diagnose": "diagnosis.diagnose",
     "inspect": "recordings",
     "load_rig": "parameters",
@@ -39,10 +47,14 @@ _HOMES = {
 }
 
 __all__ = [
+    "DetailStream",
     "Diagnosis",
     "Experiment",
+    "Fleet",
     "Recording",
     "Rig",
+    "RmsStream",
+    "SequentialBalance",
     "__version__",
     "diagnose",
     "inspect",

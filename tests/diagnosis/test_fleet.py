@@ -198,7 +198,7 @@ def test_saved_and_restored_goes_on_the_same(cut):
     whole = fed(Fleet(RATE, 10, **SHORT), x)
     before = Fleet(RATE, 10, **SHORT)
     before.update(x[..., :cut])
-    after = Fleet.from_state(before.state(), threads=2)
+    after = Fleet.from_state(before.state_dict(), threads=2)
     assert np.array_equal(after.alarms.status, before.alarms.status)
     fed(after, x[..., cut:], 1234)
     for one, other in zip(whole.alarms[2:], after.alarms[2:], strict=True):
@@ -239,6 +239,11 @@ def test_memory_is_flat_over_a_week():
     assert left < 5_000 and most < 100_000 < block.nbytes / 50
 
 
+def saved(**changes):
+    """A fleet from a saved state in which something is wrong."""
+    return Fleet.from_state({**Fleet(500.0, 3).state_dict(), **changes})
+
+
 @pytest.mark.parametrize(
     ("call", "rule"),
     [
@@ -251,7 +256,26 @@ def test_memory_is_flat_over_a_week():
         (lambda: Fleet(500.0, 3, alarms_per_hour=0.0), "alarms_per_hour must be > 0"),
         (lambda: Fleet(500.0, 3, alarms_per_hour=1e-9), "average run length must be"),
         (lambda: Fleet(500.0, 3).relearn(["seven"]), "actuators must be of this fleet, got seven"),
+        (lambda: Fleet(500.0, "rig"), "actuators must be a list of names, got 'rig'"),
+        (lambda: Fleet(500.0, 3, alarms_per_hour="few"), "alarms_per_hour must be > 0, got 'few'"),
+        (lambda: Fleet(500.0, 3).relearn("1"), "actuators must be a list of names, got '1'"),
+        (lambda: Fleet(500.0, 3).relearn(1), "actuators must be a list of names, got 1"),
+        (lambda: Fleet(500.0, 3).relearn([1]), "actuators must be names, got 1"),
+        (lambda: Fleet(500.0, 3).relearn(["1", "1"]), "got one name twice"),
         (lambda: Fleet.from_state({}), "saved fleet must have 'names'"),
+        (lambda: Fleet.from_state(None), "saved fleet must be a mapping"),
+        (lambda: saved(names="rig"), "saved fleet's names must be a list of names, got 'rig'"),
+        (lambda: saved(names=["1", "2"]), "saved fleet's opened must have shape"),
+        (lambda: saved(rate="fast"), "rate must be > 0 Hz, got 'fast'"),
+        (lambda: saved(levels=2.5), "levels must be a whole number"),
+        (lambda: saved(rms=3), "saved fleet must be a mapping, as state_dict returns it, got int"),
+        (lambda: saved(pool=None), "saved fleet's pool must hold numbers"),
+        (lambda: saved(lost=np.ones((2, 3))), "saved fleet's lost must hold numbers of type bool: got float64"),
+        (lambda: saved(test_4=np.zeros((6, 3))), "saved fleet's test_4 must hold numbers of type int64: got float64"),
+        (lambda: saved(means=np.zeros((2, 6, 4))), r"saved fleet's means must have shape \(2, 6, 3\), got"),
+        (lambda: saved(window=-1), "saved fleet's window must be a whole number >= 0, got -1"),
+        (lambda: saved(decision=1.5), "saved fleet's decision must be a whole number >= 0, got 1.5"),
+        (lambda: saved(pooled=99), "saved fleet's pooled must be less than 5 windows, got 99"),
         (lambda: Fleet(500.0, 3).update(np.zeros((2, 4, 10))), r"block must have shape \(2, 3, n\)"),
     ],
 )

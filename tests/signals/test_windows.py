@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sealscope.errors import InputError
 from sealscope.signals.details import details
-from sealscope.signals.streaming import DetailStream
+from sealscope.signals.streams import DetailStream
 from sealscope.signals.windows import RmsStream, rms, windowed_rms
 
 

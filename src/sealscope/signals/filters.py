@@ -99,6 +99,14 @@ def saved_part(state: Any, name: str, what: str) -> Any:
     return state[name]
 
 
+def check_saved(state: Any, name: str, own: object, what: str) -> None:
+    """Raise InputError where a setting in the saved state of `what` is not the stream's `own`."""
+    value = saved_part(state, name, what)
+    value = tuple(value) if isinstance(value, list) else value
+    if type(value) is not type(own) or value != own:
+        raise InputError(f"saved {what}'s {name} must be {own}, got {value!r}")
+
+
 def saved_count(state: Any, name: str, what: str) -> int:
     """Return a whole number >= 0 of the saved state of `what`; raises InputError for anything else."""
     value = saved_part(state, name, what)
@@ -112,7 +120,7 @@ def saved_array(state: Any, name: str, shape: tuple[int, ...], what: str, kind: 
     value = saved_part(state, name, what)
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in "bif" or (array.dtype.kind == "f" and np.dtype(kind).kind != "f"):
+        if array.size and array.dtype.kind not in {"f": "fi", "i": "i", "b": "b"}[np.dtype(kind).kind]:
             raise TypeError(f"got {array.dtype}")
         array = array.astype(kind)
     except (TypeError, ValueError) as error:

@@ -20,6 +20,7 @@ from sealscope.errors import InputError
 from sealscope.signals.filters import (
     Array,
     IntArray,
+    check_saved,
     checked_levels,
     decomposition_filters,
     reach,
@@ -32,6 +33,9 @@ from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP, WindowedRms
 
 if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
+
+
+_SETTINGS = ("channels", "levels", "wavelet")
 
 
 class DetailStream:
@@ -86,8 +90,10 @@ class DetailStream:
         from sealscope.physics.lanes import WIDTH
         from sealscope.signals.kernels import CHUNK
 
-        rows, columns = channels if isinstance(channels, tuple) else (1, channels)
-        self._table = whole_number(rows, "channels"), whole_number(columns, "channels")
+        table = channels if isinstance(channels, tuple) else (1, channels)
+        if len(table) != 2:
+            raise InputError(f"channels must be a number or rows and columns of a table, got {channels}")
+        self._table = whole_number(table[0], "channels"), whole_number(table[1], "channels")
         self.channels = self._table if isinstance(channels, tuple) else self._table[1]
         self.levels, self.wavelet, self.threads = checked_levels(levels), wavelet, whole_number(threads, "threads")
         self._low, self._high = decomposition_filters(wavelet)
@@ -187,9 +193,8 @@ class DetailStream:
 
         Raises InputError for a state that is not one of such a stream.
         """
-        for name in ("channels", "levels", "wavelet"):
-            if (value := saved_part(state, name, what)) != getattr(self, name):
-                raise InputError(f"saved {what}'s {name} must be {getattr(self, name)}, got {value}")
+        for name in _SETTINGS:
+            check_saved(state, name, getattr(self, name), what)
         history = saved_array(state, "history", (self._table[0], self.levels, self._history, self._table[1]), what)
         self._fill, self.samples = self._history, saved_count(state, "samples", what)
         pack(history, self._buffers[:, :, :, : self._history])
@@ -197,12 +202,12 @@ class DetailStream:
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
         """Return the stream that `state_dict` described, bit for bit; raises InputError for another state."""
-        channels, levels, wavelet = (saved_part(state, name, "detail stream") for name in cls._SETTINGS)
-        stream = cls(channels, levels, wavelet=wavelet, threads=threads)
+        channels, levels, wavelet = (saved_part(state, name, "detail stream") for name in _SETTINGS)
+        stream = cls(
+            tuple(channels) if isinstance(channels, list) else channels, levels, wavelet=wavelet, threads=threads
+        )
         stream.load_state(state)
         return stream
-
-    _SETTINGS = ("channels", "levels", "wavelet")
 
 
 class FleetRms:
@@ -290,8 +295,7 @@ class FleetRms:
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` of a stream with the same settings returned; raises InputError."""
         for name in ("size", "step"):
-            if (value := saved_part(state, name, "fleet")) != getattr(self, name):
-                raise InputError(f"saved fleet's {name} must be {getattr(self, name)}, got {value}")
+            check_saved(state, name, getattr(self, name), "fleet")
         parts = [
             (saved_array(state, name, (*own.shape[1:-1], self.actuators), "fleet"), own)
             for name, own in (("opened", self._opened), ("pieces", self._pieces))

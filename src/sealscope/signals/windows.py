@@ -175,7 +175,8 @@ class RmsStream:
     def from_state(cls, state: dict[str, Any]) -> RmsStream:
         """Return the stream that `state_dict` described; raises InputError for another state."""
         what = "RMS stream"
-        stream = cls(*(saved_part(state, name, what) for name in ("size", "step")), skip=saved_count(state, "skip", what))
+        size, step = (saved_part(state, name, what) for name in ("size", "step"))
+        stream = cls(size, step, skip=saved_count(state, "skip", what))
         stream._next_end = saved_count(state, "next_end", what)
         stream._ahead = saved_count(state, "ahead", what)
         rest, sums = saved_part(state, "rest", what), saved_part(state, "sums", what)

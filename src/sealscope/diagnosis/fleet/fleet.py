@@ -1,8 +1,8 @@
-"""A fleet watched live: details, the thesis's windowed RMS and sequential tests over many actuators at once.
+"""Live monitoring of a fleet: details, the thesis's windowed RMS and sequential tests over many actuators at once.
 
 Each actuator is compared with itself: CUSUM and generalised likelihood ratio on the change of its details' log RMS
-against a reference that it learns at the beginning (`fleet_tests`), with thresholds from a stated rate of false alarms
-per actuator and operating hour. The duty must be the same throughout; a change of duty is a change.
+against a reference that it learns at the beginning (`sequential_tests`), with thresholds from a stated rate of false
+alarms per actuator and operating hour. The duty must be the same throughout; a change of duty is a change.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from sealscope.diagnosis.fleet.run_length import cusum_threshold, glr_threshold
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.motion import ROUNDING
-from sealscope.signals.filters import Array, IntArray
-from sealscope.signals.fleet import FleetRms, saved_array
+from sealscope.signals.filters import Array, IntArray, saved_array, saved_count, saved_part
+from sealscope.signals.streams import FleetRms
 from sealscope.signals.windows import WindowedRms
 
 #: What an actuator does: it learns its reference, is watched, or pauses: a sample is missing, a reading does not move.
@@ -29,12 +29,23 @@ DETECTORS = ("CUSUM", "likelihood ratio")
 
 
 class Alarms(NamedTuple):
-    """Where a fleet stands; arrays (actuators,), valid until the next update and written to by it.
+    """Alarms of a fleet; arrays (actuators,), valid until the next update and written to by it.
 
-    `alarm`: raised and not taken back; `new`: how many by the last block; `t` [s]: when it was raised, `onset` [s]:
-    the change was after this moment, both NaN without an alarm; `series`: index into `Fleet.series`, `direction`: +1
-    rose, -1 fell, `detector`: index into `DETECTORS`, all of the test that raised it; `score`: the largest statistic
-    over its threshold now; `status`: index into `STATUS`.
+    Attributes
+    ----------
+    alarm : ndarray of bool
+        Raised and not taken back.
+    new : int
+        How many alarms the last block raised.
+    t, onset : ndarray of float
+        When the alarm was raised, and the moment after which the change began [s]; NaN without an alarm.
+    series, direction, detector : ndarray of int
+        Of the test that raised the alarm: index into `Fleet.series`, +1 for a rise and -1 for a fall, and index into
+        `DETECTORS`.
+    score : ndarray of float
+        The largest statistic over its threshold now.
+    status : ndarray of int
+        Index into `STATUS`.
     """
 
     alarm: np.ndarray
@@ -49,17 +60,62 @@ class Alarms(NamedTuple):
 
 
 class Fleet:
-    """Live watch over many actuators: `update` takes the next block of all of them.
+    """Live monitoring of many actuators by the RMS of their pressures' wavelet details.
 
-    `rate` [Hz]; `actuators`: how many, or their names; `alarms_per_hour`: false alarms per actuator and operating hour,
-    at most, split evenly over the tests; `window_s`, `step_s` [s]: windows of the RMS that is told (`windows`);
-    `decision_s` [s]: what one decision covers, a whole number of windows, best of the duty's cycles; `learn_s` [s]:
-    how long an actuator learns; `watched`: the details that are tested, of each of `channels`; `change`: the CUSUM's
-    change looked for in standard deviations of a decision, `memory_s`: how far back the likelihood ratio looks for the
-    onset, `late_s`: by how much the reference's learning lags, in which time a change should be found.
+    Parameters
+    ----------
+    rate : float
+        Sampling rate [Hz].
+    actuators : int or sequence of str
+        How many actuators, or their names.
+    alarms_per_hour : float, default 1e-3
+        False alarms per actuator and operating hour, at most, split evenly over the tests.
+    window_s, step_s : float
+        Windows of the RMS in `windows` [s]; `step_s` is half of `window_s` by default.
+    decision_s : float, default 10
+        What one decision covers [s]: a whole number of windows, best of the duty's cycles.
+    learn_s : float, default 1200
+        How long an actuator learns its reference [s].
+    watched : sequence of str
+        The details that are tested, of each channel.
+    channels : sequence of str
+        Names of the signals of an actuator.
+    levels : int, default 4
+        Levels of the wavelet transform.
+    change : float, default 1
+        The change that the CUSUM looks for, in standard deviations of a decision.
+    memory_s : float, default 600
+        How far back the likelihood ratio looks for the onset [s].
+    late_s : float, default 100
+        By how much the reference's learning lags [s], in which time a change should be found.
+    threads : int, default 1
+        Threads that share the actuators; no bit depends on it.
 
-    Raises InputError for what cannot be: a rate of alarms that no threshold can be set for, windows that do not fit
-    into a decision, fewer than 20 decisions to learn from.
+    Attributes
+    ----------
+    names, series : tuple of str
+        The actuators, and the series of each that are tested, such as "d3 of p_A".
+    windows : WindowedRms
+        RMS (w, channels, quantities, actuators) of the windows that the last block completed; `quantities` names its
+        third axis.
+    thresholds : dict
+        Threshold of each of `DETECTORS`.
+
+    Raises
+    ------
+    InputError
+        For settings that contradict each other: a rate of alarms for which no threshold can be set, windows that do not
+        fit into a decision, fewer than 20 decisions to learn from.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sealscope as ss
+    >>> fleet = ss.Fleet(500.0, ["press 1", "press 2"])
+    >>> pressures = np.random.default_rng(0).normal(3e5, 1e4, size=(2, 2, 5000))  # p_A and p_B, 10 s
+    >>> alarms = fleet.update(pressures)
+    >>> alarms.alarm.tolist(), ss.Fleet.status_text(alarms)
+    ([False, False], ['learning', 'learning'])
     """
 
     def __init__(
@@ -80,40 +136,39 @@ class Fleet:
         late_s: float = 100.0,
         threads: int = 1,
     ) -> None:
-        if not (isinstance(rate, (int, float)) and 0 < rate < math.inf):
-            raise InputError(f"rate must be > 0 Hz, got {rate}")
-        self.names = tuple(map(str, range(actuators))) if isinstance(actuators, int) else tuple(map(str, actuators))
-        if len(set(self.names)) != len(self.names):
-            raise InputError("actuators must have names of their own, got one name twice")
-        self.rate, self.channels = float(rate), tuple(channels)
-        size = _samples(window_s, rate, "window_s")
-        step = size // 2 if step_s is None else _samples(step_s, rate, "step_s")
+        self.rate = _positive(rate, "rate", " Hz")
+        self.alarms_per_hour = _positive(alarms_per_hour, "alarms_per_hour")
+        if isinstance(actuators, int | np.integer) and not isinstance(actuators, bool):
+            actuators = [str(number) for number in range(actuators)]
+        self.names = _names(actuators, "actuators")
+        self.channels, watched = _names(channels, "channels"), _names(watched, "watched")
+        size = _samples(window_s, self.rate, "window_s")
+        step = size // 2 if step_s is None else _samples(step_s, self.rate, "step_s")
         if step < 1 or size % step:
             raise InputError(f"window_s must be a whole number of steps, got {size} samples and steps of {step}")
         self._tile = size // step
-        self._tiles = round(decision_s * rate / size)
-        if self._tiles < 1 or abs(self._tiles * size - decision_s * rate) > 0.5:
+        decision = _positive(decision_s, "decision_s", " s") * self.rate
+        self._tiles = round(decision / size)
+        if self._tiles < 1 or abs(self._tiles * size - decision) > 0.5:
             raise InputError(f"decision_s must be a whole number of windows of {window_s} s, got {decision_s} s")
-        self._learn = round(learn_s / decision_s)
+        self._learn = round(_positive(learn_s, "learn_s", " s") / decision_s)
         if self._learn < 20:
             raise InputError(f"learn_s must be 20 decisions or more, got {learn_s} s at {decision_s} s a decision")
         self._rms = FleetRms(len(self.names), len(self.channels), levels, size=size, step=step, threads=threads)
         self.quantities = self._rms.quantities
-        unknown = [one for one in watched if one not in self.quantities[:-1]]
+        unknown = [name for name in watched if name not in self.quantities[:-1]]
         if unknown or not watched:
             raise InputError(f"watched must be of {', '.join(self.quantities[:-1])}, got {', '.join(unknown) or '-'}")
         self._settings: dict[str, Any] = {
-            "rate": self.rate, "alarms_per_hour": float(alarms_per_hour), "window_s": window_s, "step_s": step / rate,
-            "decision_s": decision_s, "learn_s": learn_s, "watched": tuple(watched), "channels": self.channels,
-            "levels": levels, "change": change, "memory_s": memory_s, "late_s": late_s,
+            "rate": self.rate, "alarms_per_hour": self.alarms_per_hour, "window_s": window_s, "step_s": step / rate,
+            "decision_s": decision_s, "learn_s": learn_s, "watched": watched, "channels": self.channels,
+            "levels": levels, "change": _positive(change, "change"), "memory_s": _positive(memory_s, "memory_s", " s"),
+            "late_s": _positive(late_s, "late_s", " s"),
         }  # fmt: skip
-        self._rows = [self.quantities.index(one) for one in watched]
-        self.series = tuple(f"{one} of {channel}" for channel in self.channels for one in watched)
-        if not alarms_per_hour > 0:
-            raise InputError(f"alarms_per_hour must be > 0, got {alarms_per_hour}")
-        self.alarms_per_hour = float(alarms_per_hour)
+        self._rows = [self.quantities.index(name) for name in watched]
+        self.series = tuple(f"{name} of {channel}" for channel in self.channels for name in watched)
         #: Mean number of decisions to a false alarm of one test of one series.
-        self.run_length = 3600.0 / (alarms_per_hour * decision_s) * len(self.series) * len(DETECTORS)
+        self.run_length = 3600.0 / (self.alarms_per_hour * decision_s) * len(self.series) * len(DETECTORS)
         memory = max(1, round(memory_s / decision_s))
         h, b = cusum_threshold(self.run_length, change / 2), glr_threshold(self.run_length, memory)
         self.thresholds = {"CUSUM": h, "likelihood ratio": b}
@@ -124,8 +179,8 @@ class Fleet:
         from sealscope.diagnosis.fleet.sequential_tests import NUMBERS
 
         n, s, shape = len(self.names), len(self.series), (len(self.channels), len(self.quantities), len(self.names))
-        self._found = np.empty((1, *shape))
-        self.windows = WindowedRms(np.empty(0, dtype=np.int64), self._found[:0])
+        self._block_rms = np.empty((1, *shape))
+        self.windows = WindowedRms(np.empty(0, dtype=np.int64), self._block_rms[:0])
         self._window, self._decision, self._pooled = 0, 0, 0
         self._pool, self._squares, self._means, self._sums = (np.zeros(shape) for _ in range(4))
         self._means[:] = np.nan
@@ -146,16 +201,30 @@ class Fleet:
         self.relearn()
 
     def update(self, block: ArrayLike) -> Alarms:
-        """Take the next block [Pa], (channels, actuators, samples), NaN where a sample is missing.
+        """Take the next block of all actuators.
 
-        `windows` then holds the RMS that the block completes. Results depend on the samples alone, never on how they
-        were cut into blocks. Raises InputError for a wrong shape.
+        Results depend on the samples alone, never on how they were cut into blocks.
+
+        Parameters
+        ----------
+        block : array_like
+            Pressures (channels, actuators, n) [Pa], NaN where a sample is missing.
+
+        Returns
+        -------
+        Alarms
+            The alarms since then; `windows` holds the RMS that the block completes.
+
+        Raises
+        ------
+        InputError
+            For a block of another shape.
         """
-        x = self._rms._details.checked(block)
+        x = self._rms.details.checked(block)
         count = self._rms.windows(x.shape[-1])
-        if count > self._found.shape[0]:
-            self._found = np.empty((count, *self._found.shape[1:]))
-        self.windows = self._rms.update(x, self._found)
+        if count > self._block_rms.shape[0]:
+            self._block_rms = np.empty((count, *self._block_rms.shape[1:]))
+        self.windows = self._rms.update(x, self._block_rms)
         new = 0
         for rms in self.windows.rms:
             if self._window % self._tile == 0:
@@ -171,7 +240,7 @@ class Fleet:
 
     @property
     def alarms(self) -> Alarms:
-        """Where the fleet stands since the last block."""
+        """Alarms since the last block."""
         return self._alarms
 
     def _decide(self) -> int:
@@ -186,8 +255,8 @@ class Fleet:
         np.logical_not(self._lost, out=self._lost)
         least = np.min(means[:, :levels], axis=1)
         np.less_equal(least, ROUNDING**2 * means[:, -1], out=self._still)
-        sound = ~(self._still | self._lost)
-        learning = sound & (self._summed <= self._learn)
+        healthy = ~(self._still | self._lost)
+        learning = healthy & (self._summed <= self._learn)
         np.add(self._sums, means, out=self._sums, where=learning[:, None])
         self._summed += learning
         with np.errstate(divide="ignore", invalid="ignore"):  # a reading that does not move has no logarithm
@@ -195,25 +264,30 @@ class Fleet:
             for row, quantity in enumerate(self._rows):
                 np.log(means[:, quantity], out=y[:, row])
         y *= 0.5
-        np.copyto(y, np.nan, where=~sound[:, None])
+        np.copyto(y, np.nan, where=~healthy[:, None])
         new = int(judge(self._y, self._decision, self._learn, self._limits, *self._tests))
-        self._tell()
+        self._refresh()
         return new
 
-    def _tell(self) -> None:
+    def _refresh(self) -> None:
         """Bring the arrays of `alarms` up to date."""
         from sealscope.diagnosis.fleet.sequential_tests import PAIRS
 
-        told = self._alarms
-        np.greater_equal(self._raised[0], 0, out=told.alarm)
-        for row, out in ((self._raised[0], told.t), (self._raised[1], told.onset)):
-            out[:] = (self._rms._details.first + row * self._tiles * self._rms.size) / self.rate
-            out[~told.alarm] = np.nan
-        np.max(self._scores, axis=(0, 1), out=told.score)
+        alarms = self._alarms
+        np.greater_equal(self._raised[0], 0, out=alarms.alarm)
+        for row, out in ((self._raised[0], alarms.t), (self._raised[1], alarms.onset)):
+            out[:] = (self._rms.details.first + row * self._tiles * self._rms.size) / self.rate
+            out[~alarms.alarm] = np.nan
+        np.max(self._scores, axis=(0, 1), out=alarms.score)
         learned = np.all(self._tests[0][PAIRS] >= self._learn, axis=0)
-        told.status[:] = np.where(learned, WATCHED, LEARNING)
-        told.status[np.any(self._still, axis=0)] = STILL
-        told.status[np.any(self._lost, axis=0)] = MISSING
+        alarms.status[:] = np.where(learned, WATCHED, LEARNING)
+        alarms.status[np.any(self._still, axis=0)] = STILL
+        alarms.status[np.any(self._lost, axis=0)] = MISSING
+
+    @staticmethod
+    def status_text(alarms: Alarms) -> list[str]:
+        """Return the status of each actuator in words."""
+        return [STATUS[number] for number in alarms.status]
 
     @property
     def change_percent(self) -> Array:
@@ -225,50 +299,69 @@ class Fleet:
             return np.asarray(100.0 * (np.sqrt(self._means / (self._sums / self._summed[:, None])) - 1.0))
 
     def relearn(self, actuators: Iterable[str] | None = None) -> None:
-        """Take back alarms and begin to learn anew, for these actuators (all): repaired, or on another duty.
+        """Take back alarms and begin to learn anew: an actuator was repaired, or has another duty.
 
-        Raises InputError for a name that the fleet does not have.
+        Parameters
+        ----------
+        actuators : iterable of str, optional
+            Names of actuators, all by default.
+
+        Raises
+        ------
+        InputError
+            For anything that is not a list of names of this fleet.
         """
         from sealscope.diagnosis.fleet.sequential_tests import forget
 
         known = {name: i for i, name in enumerate(self.names)}
-        wanted = self.names if actuators is None else tuple(actuators)
+        wanted = self.names if actuators is None else _names(actuators, "actuators")
         missing = [name for name in wanted if name not in known]
         if missing:
-            raise InputError(f"actuators must be of this fleet, got {', '.join(map(str, missing))}")
+            raise InputError(f"actuators must be of this fleet, got {', '.join(missing)}")
         chosen = np.array([known[name] for name in wanted], dtype=np.int64)
         forget(chosen, *self._tests)
         self._sums[:, :, chosen], self._summed[:, chosen] = 0.0, 0
-        self._tell()
+        self._refresh()
 
-    def state(self) -> dict[str, Any]:
-        """All that the fleet knows, as plain numbers, words and arrays; `from_state` goes on from it."""
-        kept = {name: getattr(self, f"_{name}").copy() for name in _ARRAYS}
-        tests = {f"test_{i}": one.copy() for i, one in enumerate(self._tests)}
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the fleet knows, as plain numbers, texts and arrays; `from_state` continues from it."""
+        arrays = {name: getattr(self, f"_{name}").copy() for name in _ARRAYS}
+        tests = {f"test_{i}": values.copy() for i, values in enumerate(self._tests)}
         counts = {name: getattr(self, f"_{name}") for name in _COUNTS}
-        return {"names": self.names, **self._settings, "rms": self._rms.state_dict(), **kept, **tests, **counts}
+        return {"names": self.names, **self._settings, "rms": self._rms.state_dict(), **arrays, **tests, **counts}
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> Fleet:
-        """The fleet that `state` described, bit for bit; raises InputError for a state that is not one."""
-        names = ("names", *_SETTINGS, "rms", *_ARRAYS, *_COUNTS)
-        missing = [name for name in names if not isinstance(state, dict) or name not in state]
-        if missing:
-            raise InputError(f"saved fleet must have {missing[0]!r}, got a state without it")
-        settings = {name: state[name] for name in _SETTINGS if name != "rate"}
-        fleet = cls(state["rate"], [str(one) for one in state["names"]], **settings, threads=threads)
-        fleet._rms.load_state(state["rms"])
-        for name in _ARRAYS:
-            own = getattr(fleet, f"_{name}")
-            own[...] = saved_array(state, name, own.shape, own.dtype)
-        for i, own in enumerate(fleet._tests):
-            own[...] = saved_array(state, f"test_{i}", own.shape, own.dtype)
+        """Return the fleet that `state_dict` described, bit for bit.
+
+        Parameters
+        ----------
+        state : dict
+            What `state_dict` returned.
+        threads : int, default 1
+            Threads that share the actuators.
+
+        Raises
+        ------
+        InputError
+            For a state that is not one: a part that is missing or of another type, shape or range.
+        """
+        settings = {name: saved_part(state, name, _WHAT) for name in ("names", *_SETTINGS)}
+        rate, names = settings.pop("rate"), _names(settings.pop("names"), f"saved {_WHAT}'s names")
+        fleet = cls(rate, names, **settings, threads=threads)
+        fleet._rms.load_state(saved_part(state, "rms", _WHAT))
+        own = {f"test_{i}": values for i, values in enumerate(fleet._tests)}
+        for name, values in (own | {name: getattr(fleet, f"_{name}") for name in _ARRAYS}).items():
+            values[...] = saved_array(state, name, values.shape, _WHAT, values.dtype)
         for name in _COUNTS:
-            setattr(fleet, f"_{name}", int(state[name]))
-        fleet._tell()
+            setattr(fleet, f"_{name}", saved_count(state, name, _WHAT))
+        if fleet._pooled >= fleet._tiles:
+            raise InputError(f"saved fleet's pooled must be less than {fleet._tiles} windows, got {fleet._pooled}")
+        fleet._refresh()
         return fleet
 
 
+_WHAT = "fleet"
 _SETTINGS = (
     "rate", "alarms_per_hour", "window_s", "step_s", "decision_s", "learn_s", "watched", "channels", "levels",
     "change", "memory_s", "late_s",
@@ -277,8 +370,25 @@ _ARRAYS = ("pool", "means", "sums", "summed", "still", "lost")
 _COUNTS = ("window", "decision", "pooled")
 
 
+def _positive(value: object, name: str, unit: str = "") -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 < value < math.inf:
+        raise InputError(f"{name} must be > 0{unit}, got {value!r}")
+    return float(value)
+
+
+def _names(values: object, name: str) -> tuple[str, ...]:
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise InputError(f"{name} must be a list of names, got {values!r}")
+    names = tuple(values)
+    if strange := [value for value in names if not isinstance(value, str)]:
+        raise InputError(f"{name} must be names, got {strange[0]!r}")
+    if len(set(names)) != len(names):
+        raise InputError(f"{name} must have names of their own, got one name twice")
+    return names
+
+
 def _samples(seconds: float, rate: float, name: str) -> int:
-    samples = seconds * rate
+    samples = _positive(seconds, name, " s") * rate
     if not (samples >= 1 and abs(samples - round(samples)) < 1e-6 * samples):
         raise InputError(f"{name} must be a whole number of samples at {rate:g} Hz, got {seconds} s")
     return round(samples)

@@ -79,11 +79,11 @@ class PressureModel:
         within = _within(followed, recording, probability)
         if not baseline or within.score is None:
             return within
-        others = [remembered(other, (self.name, self.rig), self.follow) for other in baseline]
+        known = [remembered(other, (self.name, self.rig), self.follow) for other in baseline]
         return against_baseline(
             within,
             followed.level,
-            [other.level for other in others if not isinstance(other, str) and _same_command(followed, other)],
+            [other.level for other in known if not isinstance(other, str) and _comparable(followed, other)],
             DAY_TO_DAY,
             probability,
             part="level of G",
@@ -108,8 +108,16 @@ class PressureModel:
         return followed
 
 
-def _same_command(followed: Followed, other: Followed) -> bool:
-    return 1.0 / _ALIKE < other.command_rms / followed.command_rms < _ALIKE
+def _comparable(followed: Followed, other: Followed) -> bool:
+    """Return whether another record has the same command, and the model follows it."""
+    return 1.0 / _ALIKE < other.command_rms / followed.command_rms < _ALIKE and is_followed(other)
+
+
+def is_followed(followed: Followed) -> bool:
+    """Return whether the parameters of a record wander no more than those of a healthy machine."""
+    from sealscope.diagnosis.pressure_model.steps import excess_of
+
+    return excess_of(followed.steps) <= UNRULY
 
 
 def _mean_drop(recording: Recording, since: float = -np.inf) -> float:

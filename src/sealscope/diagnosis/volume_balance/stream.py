@@ -1,18 +1,19 @@
-"""The volume balance of a machine that runs on: block by block, with bounded memory, and alarms of a stated rate.
+"""The volume balance of a running machine, block by block, in bounded memory, with alarms of a stated rate.
 
 After each block of a few seconds the balance is fitted to the last ones (`window`), and the conductance is searched
-for a rise by the same statistic as a whole recording (`balance_search`): the generalised likelihood ratio over a window
-that moves (Lai, Sequential changepoint detection in quality control and dynamical systems, JRSS B 57 (1995) 613-658).
-The threshold is that of the probability per window
+for a rise by the same statistic as a whole recording (`fit.search`): the generalised likelihood ratio over a moving
+window (Lai, Sequential changepoint detection in quality control and dynamical systems, JRSS B 57 (1995) 613-658). The
+threshold is that of the probability per window
 
     p = alarms_per_hour * block_seconds / 3600,
 
-so a sound machine alarms at that rate at most, and its average run length is at least 1/alarms_per_hour: windows
+so a healthy machine alarms at that rate at most, and its average run length is at least 1/alarms_per_hour: windows
 overlap, so false alarms come in clusters, which leaves the true rate some 2 to 5 times below the stated one.
 """
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -45,12 +46,20 @@ _PROBABILITIES = (1e-7, 0.05)
 
 @dataclass(frozen=True)
 class BalanceState:
-    """Where a stream stands.
+    """State of a `SequentialBalance`.
 
-    `t`: end of the last whole block [s]; `blocks`: whole blocks so far, `refused`: those of them with gaps or missing
-    values; `evidence`: on the last window; `alarm`: the evidence with the highest score since the alarm was raised,
-    until it is acknowledged; `total_lpm`: mean leakage of pump and piston together over the
-    window, None where L/min cannot be given.
+    Attributes
+    ----------
+    t : float
+        End of the last whole block [s].
+    blocks, refused : int
+        Whole blocks so far, and those of them with gaps or missing values.
+    evidence : Evidence
+        Of the last window.
+    alarm : Evidence or None
+        The evidence with the highest score since the alarm was raised, until it is acknowledged.
+    total_lpm : float or None
+        Mean leakage of pump and piston together over the window [L/min], None where L/min cannot be stated.
     """
 
     t: float
@@ -62,26 +71,63 @@ class BalanceState:
 
 
 class SequentialBalance:
-    """Volume balance of a stream: `update` takes the next samples, in blocks of any size.
+    """Volume balance of a live machine, which names onset and L/min of a leak.
 
-    `rig`: gives area and displacement; `alarms_per_hour`: of a sound machine, at most; `window`: blocks looked at;
-    `block_seconds`: about how long a block is (whole cycles of the duty).
+    It needs both chamber pressures, the piston's position and the pump's angle or speed.
 
-    Raises InputError for a rate that no threshold can be set for, or a window of under 16 blocks.
+    Parameters
+    ----------
+    rig : Rig, str or path, default "thesis"
+        Gives the piston's area and the pump's displacement.
+    alarms_per_hour : float, default 0.01
+        False alarms of a healthy machine per operating hour, at most.
+    window : int, default 60
+        Blocks that are searched for a rise, 16 or more.
+    block_seconds : float, default 3
+        About how long a block is [s]: whole cycles of the duty.
+
+    Attributes
+    ----------
+    state : BalanceState
+        The state after the last update.
+
+    Raises
+    ------
+    InputError
+        For a rate of alarms for which no threshold can be set, or a window of under 16 blocks.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> recording = ss.simulate(command="3 sin(4t)", duration="2 min", leak="0.0042 L/min from 80 s", seed=1)
+    >>> balance = ss.SequentialBalance("thesis", alarms_per_hour=0.1)
+    >>> for start in range(0, 120, 10):
+    ...     state = balance.update(recording.between(start, start + 10))
+    ...     if state.alarm is not None:
+    ...         break
+    >>> round(state.alarm.onset_s), f"{state.alarm.leak_lpm:.4f} L/min"
+    (80, '0.0042 L/min')
     """
 
     def __init__(
-        self, rig: Rig, *, alarms_per_hour: float = 0.01, window: int = 60, block_seconds: float = BLOCK_SECONDS
+        self,
+        rig: Rig | str | os.PathLike[str] = "thesis",
+        *,
+        alarms_per_hour: float = 0.01,
+        window: int = 60,
+        block_seconds: float = BLOCK_SECONDS,
     ) -> None:
+        from sealscope.parameters import load_rig
+
         if window < FEWEST:
             raise InputError(f"window must be {FEWEST} blocks or more, got {window}")
         if not block_seconds > 0:
             raise InputError(f"block_seconds must be > 0 s, got {block_seconds}")
-        low, high = (one * 3600.0 / block_seconds for one in _PROBABILITIES)
+        low, high = (probability * 3600.0 / block_seconds for probability in _PROBABILITIES)
         if not low <= alarms_per_hour <= high:
             raise InputError(f"alarms_per_hour must be {low:.2g} to {high:.3g}, got {alarms_per_hour}")
         self.alarms_per_hour, self.window, self.block_seconds = alarms_per_hour, window, block_seconds
-        self._detector = VolumeBalance(rig)
+        self._detector = VolumeBalance(load_rig(rig))
         self._t: Array = np.empty(0)
         self._channels: dict[str, Array] = {}
         self._units: dict[str, str] = {}
@@ -100,9 +146,22 @@ class SequentialBalance:
         self.state = BalanceState(self.state.t, self.state.blocks, self.state.refused, waiting, None, None)
 
     def update(self, samples: Recording) -> BalanceState:
-        """Take the next samples of the stream and say where it stands; every whole block is judged in its turn.
+        """Take the next samples; every whole block is judged in its turn.
 
-        Raises InputError where channels or rate are not those of the stream's beginning.
+        Parameters
+        ----------
+        samples : Recording
+            The next samples, of any number, in order.
+
+        Returns
+        -------
+        BalanceState
+            The state after these samples.
+
+        Raises
+        ------
+        InputError
+            Where channels, units or rate are not those of the stream's beginning.
         """
         joined = self._join(samples)
         if self._length == 0:
@@ -144,8 +203,8 @@ class SequentialBalance:
         end = float(block.t[-1]) + 1.0 / block.rate
         before = self.state
         evidence, alarm, total = before.evidence, before.alarm, before.total_lpm
-        sound = len(cut) > 0 and bool(np.all(np.isfinite(cut.gram)))
-        if sound:
+        usable = len(cut) > 0 and bool(np.all(np.isfinite(cut.gram)))
+        if usable:
             window = cut if self._window is None else BalanceBlocks.joined([self._window, cut])
             self._window = window.chosen(np.arange(max(0, len(window) - self.window), len(window)))
             if len(self._window) >= FEWEST:
@@ -153,7 +212,7 @@ class SequentialBalance:
         best = alarm is None or (evidence.score or 0.0) > (alarm.score or 0.0)
         if evidence.verdict == "leak" and best:
             alarm = evidence
-        self.state = BalanceState(end, before.blocks + 1, before.refused + (not sound), evidence, alarm, total)
+        self.state = BalanceState(end, before.blocks + 1, before.refused + (not usable), evidence, alarm, total)
 
     def _judge(self, blocks: BalanceBlocks, metres: bool) -> tuple[Evidence, float | None]:
         fit = fit_balance(blocks, metres=metres)

@@ -1,0 +1,22 @@
+"""The example of docs/streams.md, as a user copies it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "streams.md"
+
+
+def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    exec(compile(code, PAGE.name, "exec"), {"__name__": "page"})
+    first, last = capsys.readouterr().out.splitlines()
+    when = re.fullmatch(r"(\d+) s: a leak", first)
+    assert when is not None and 90 < int(when[1]) < 120
+    size, low, high = map(float, re.findall(r"\d\.\d{4}", last))
+    assert low <= 0.0042 <= high
+    assert size == pytest.approx(0.0042, rel=0.05)
+    assert float(last.split()[-2]) == pytest.approx(90.0, abs=0.5)
