@@ -133,6 +133,8 @@ _NUMBER = re.compile(
     re.DOTALL | re.IGNORECASE,
 )
 _LONGEST_TEXT = 200
+#: A unit's factor is a double: its fraction has at most so many bits, and pi at most this power.
+_MOST_BITS, _MOST_PI = 900, 100
 
 
 @cache
@@ -211,8 +213,12 @@ class _Parser:
             power = Fraction(sign)
             if self.tokens and self.tokens[0][0] == "^":
                 power = sign * Fraction(self.tokens.pop(0)[1])
+            if abs(power) * max(one.factor.numerator, one.factor.denominator).bit_length() > _MOST_BITS:
+                break
             factor *= Fraction(one.factor**power)
             pi_power += one.pi_power * power
+            if max(factor.numerator, factor.denominator).bit_length() > _MOST_BITS or abs(pi_power) > _MOST_PI:
+                break
             for base, exponent in one.powers:
                 powers[base] = powers.get(base, Fraction(0)) + exponent * power
             alone = one if count == 0 and power == 1 else None

@@ -104,7 +104,7 @@ def test_units_from_attributes_and_columns_of_other_kinds() -> None:
         ({"p_A [Pa]": []}, {"rate": 1.0}, "a recording must have samples"),
         ({"p_A [Pa]": [1.0]}, {"rate": 0.0}, "rate must be > 0 Hz, got 0.0"),
         ({"p_A [Pa]": [1.0]}, {"channel_map": {"p_C": "a"}}, "a mapped channel must be one of"),
-        ({"p_A [Pa]": [1.0]}, {"rat": 1.0}, "from_pandas has no argument 'rat'; did you mean 'rate'?"),
+        ({"p_A [Pa]": [1.0]}, {"rat": 1.0}, "Recording.from_pandas has no argument 'rat'; did you mean 'rate'?"),
     ],
 )  # fmt: skip
 def test_frames_that_are_no_recordings(columns: dict, options: dict, message: str) -> None:

@@ -43,6 +43,8 @@ def read_netcdf(path: Path, choose: Choose) -> RawTable:
                 raise UnreadableFile(
                     f"{name} must have as many samples as {first} ({data.size}), got {other.size} ({place})"
                 )
+        for name, data in chosen:
+            _refuse_elsewhere(name, data, place)
         check_size(data.size, len(chosen), place)
         columns = [
             _values(data, name, time, place) for (_, time), (name, data) in zip(choice.columns, chosen, strict=True)
@@ -58,6 +60,13 @@ def _is_series(item: Any) -> bool:
         return False
     remark = item.attrs.get("NAME", b"")
     return not (isinstance(remark, bytes) and remark.startswith(b"This is a netCDF dimension but not"))
+
+
+def _refuse_elsewhere(name: str, data: Any, place: str) -> None:
+    """Raise UnreadableFile for a data set whose samples are in other files, which nobody has given to be read."""
+    if data.external or data.is_virtual:
+        what = "external storage" if data.external else "a virtual data set"
+        raise UnreadableFile(f"{name} must have its samples in the file itself, got {what} ({place})")
 
 
 def _text(value: Any) -> str | None:
