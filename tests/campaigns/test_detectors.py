@@ -85,7 +85,7 @@ class Watcher:
 def plan(tmp_path, monkeypatch):
     quick = {name: registry.DETECTORS[name] for name in ("volume balance", "rms change")}
     monkeypatch.setattr(registry, "DETECTORS", {**quick, "watcher": Watcher})
-    monkeypatch.setattr(plugins, "_found", lambda: ())
+    monkeypatch.setattr(plugins, "entry_points", lambda group: ())
     plugins.plug_ins.cache_clear()
     plan_detector.cache_clear()
     examined.clear()

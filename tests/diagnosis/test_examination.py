@@ -9,13 +9,15 @@ import pytest
 
 from sealscope.diagnosis import registry
 from sealscope.diagnosis.calibration.scorers import Look, scorer
-from sealscope.diagnosis.examination import Examination, assumed_rig
+from sealscope.diagnosis.examination import Examination
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
 seen: list[tuple[tuple[str, ...], int]] = []
+rigs: list[Rig] = []
 
 
 class Looker:
@@ -23,8 +25,8 @@ class Looker:
 
     name = "looker"
 
-    def __init__(self, rig: object) -> None:
-        self.rig = rig
+    def __init__(self, rig: Rig) -> None:
+        rigs.append(rig)
 
     def usable(self, recording: Recording) -> str | None:
         return None if "p_A" in recording else "needs p_A"
@@ -79,7 +81,7 @@ def test_who_cannot_look_does_not(recording: Recording) -> None:
         return found.reason, found.usable
 
     assert said(Examination(recording.only(["u"]), false_alarm_probability=0.05)) == ("needs p_A", False)
-    assert said(Examination(recording, false_alarm_probability=0.05, untrusted="stuck")) == ("stuck", False)
+    assert said(Examination(recording, false_alarm_probability=0.05, distrust="stuck")) == ("stuck", False)
     alone = Examination(recording, [recording.only(["u"])], false_alarm_probability=0.05)
     assert said(alone) == ("no baseline recording can be used: needs p_A", False)
     assert seen == []
@@ -108,15 +110,17 @@ def test_a_pressure_that_rests_cannot_be_its_own_baseline() -> None:
     assert found(p_A=np.rint(2.0 * noise["p_A"])) is None  # whole numbers of a converter
     with_rest = Recording(t, {**noise, "p_B": holding(1000)}, {"p_A": "Pa", "p_B": "Pa"}, 500.0)
     plain = Recording(t, noise, {"p_A": "Pa", "p_B": "Pa"}, 500.0)
-    assert Examination(with_rest, false_alarm_probability=0.05).untrusted is not None
-    assert Examination(with_rest, [plain], false_alarm_probability=0.05).untrusted is None
+    assert Examination(with_rest, false_alarm_probability=0.05).distrust is not None
+    assert Examination(with_rest, [plain], false_alarm_probability=0.05).distrust is None
 
 
 def test_it_is_made_for_the_rig_given_or_the_thesis_s(recording: Recording) -> None:
-    other = assumed_rig().with_overrides({"q_b": 1e-6})
-    for rig, expected in ((other, other), (None, assumed_rig())):
+    thesis = load_rig("thesis")
+    other = thesis.with_overrides({"q_b": 1e-6})
+    for rig, expected in ((other, other), ("thesis", thesis)):
         examination = Examination(recording, false_alarm_probability=0.05, rig=rig)
-        assert examination._detector("looker").rig == expected  # type: ignore[attr-defined]
+        examination.evidence("looker")
+        assert rigs.pop() is expected
 
 
 def test_a_detector_s_score_may_be_calibrated(recording: Recording) -> None:

@@ -14,6 +14,7 @@ from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.diagnosis import next_check
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse, Verdict
 from sealscope.diagnosis.verdict.fusion import ORDER, fuse
+from sealscope.simulation.simulate import simulate
 
 LEAK = Evidence("leak", "it leaks", 9.0, 3.0)
 NONE = Evidence("no leak", "it does not", 1.0, 3.0)
@@ -92,6 +93,22 @@ def test_a_figure_that_is_refused_is_not_lent() -> None:
         assert getattr(found, figure) is None
         assert getattr(found, other) is not None
     assert fused(volume_balance=replace(LEAK, refuses=frozenset({"leak_lpm"})), observer=lent).course is None
+
+
+def test_no_flow_is_stated_of_a_machine_with_another_geometry() -> None:
+    """0.03 L/min past a pump of 3.9 instead of 4.9 cm^3/rev: the pressure model lent 0.0086 (0.0061 to 0.0111)."""
+    recording = simulate(
+        command="3 sin(4t)",
+        leak="0.03 L/min from 60 s",
+        duration="120 s",
+        seed=1,
+        set={"pump.q_b": "3.9[cm^3/rev]"},
+    )
+    found = diagnose(recording)
+    assert (found.verdict, found.detector) == ("leak", BALANCE)
+    assert "the geometry is another" in found.reason
+    assert any(own.leak_lpm is not None for own in found.parts)
+    assert found.leak_lpm is found.leak_interval_lpm is None
 
 
 def test_no_leak_keeps_its_own_bound_and_dates_nothing() -> None:

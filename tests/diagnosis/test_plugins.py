@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.diagnosis import plugins
+from sealscope.diagnosis import detector, plugins
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.registry import DETECTORS, detectors
 from sealscope.recordings.recording import Recording
@@ -45,7 +45,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
     def forget() -> None:
         plugins.plug_ins.cache_clear()
-        plugins._told.cache_clear()
+        detector._log_once.cache_clear()
 
     before = set(sys.modules)
     yield made
@@ -56,7 +56,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
 
 def told(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [one.getMessage() for one in caplog.records if one.name == "sealscope"]
+    return [one.getMessage() for one in caplog.records if one.name.startswith("sealscope")]
 
 
 def test_the_documented_example_is_found_and_heard(install: Install, leaky: Recording) -> None:

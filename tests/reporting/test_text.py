@@ -84,6 +84,8 @@ def test_a_method_without_a_score_says_why(no_verdict, make_diagnosis):
 def test_a_leak_since_before_the_recording_and_of_unknown_size(make_diagnosis):
     text = diagnosis_text(make_diagnosis(onset_s=None, onset_interval_s=None, leak_lpm=None, leak_interval_lpm=None))
     assert "not within this recording" in text and "the channels do not allow it" in text
+    refused = make_diagnosis(leak_lpm=None, leak_interval_lpm=None, refuses=frozenset({"leak_lpm"}))
+    assert messages.how_much(refused) == "not stated: see the reason"
 
 
 def test_all_that_may_be_none_may_be_none(no_verdict):

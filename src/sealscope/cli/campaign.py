@@ -253,7 +253,7 @@ def calibrate(
         tuple(detectors or DEFAULT_DETECTORS),
         false_alarm_probability=false_alarm,
         split_share=split,
-        rig=assumed,
+        rig=assumed or "thesis",
         promise=promise,
         confidence=confidence,
         made_from={

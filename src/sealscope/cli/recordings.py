@@ -86,7 +86,10 @@ def _diagnoses(
             complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
             continue
-        yield recording, diagnose(recording, others, false_alarm_probability=false_alarm, file=str(file), rig=rig)
+        yield (
+            recording,
+            diagnose(recording, others, false_alarm_probability=false_alarm, file=file, rig=rig or "thesis"),
+        )
 
 
 def _calibrated(
@@ -105,7 +108,11 @@ def _calibrated(
         raise InputError("--calibration must stand without --baseline: its leak-free recordings are in it")
     known = load(calibration)
     for file, recording in _read_all(files, channel_map, rate):
-        yield None if recording is None else (recording, diagnose_calibrated(recording, known, file=str(file), rig=rig))
+        yield (
+            None
+            if recording is None
+            else (recording, diagnose_calibrated(recording, known, file=str(file), rig=rig or "thesis"))
+        )
 
 
 def diagnose(

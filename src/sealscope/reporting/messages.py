@@ -79,7 +79,7 @@ def how_much(diagnosis: Diagnosis) -> str | None:
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.leak_lpm is None:
-        return "not stated: the channels do not allow it"
+        return f"not stated: {'see the reason' if 'leak_lpm' in diagnosis.refuses else 'the channels do not allow it'}"
     text = f"{number(diagnosis.leak_lpm)} L/min"
     if interval is not None:
         text += f", between {number(interval[0])} and {number(interval[1])} L/min"

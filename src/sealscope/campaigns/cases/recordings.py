@@ -47,7 +47,8 @@ def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback |
 
 
 def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
-    from sealscope.diagnosis.calibration.calibrated import look_at, looked_at, place_of
+    from sealscope.diagnosis.baseline.inspection import inspected
+    from sealscope.diagnosis.calibration.calibrated import look_at, place_of
     from sealscope.recordings import read
 
     row = partial(
@@ -61,11 +62,11 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
     )
     try:
         recording = read(path, channel_map=plan.channel_map or None, rate=plan.rate_hz)
-        part, _, reason = looked_at(recording)
-        if reason is not None:
-            return row(error=f"{name}: {reason}")
-        look = look_at(part, 0.5, plan.false_alarm, plan.assumed)
+        record = inspected(recording)
+        if record.defect is not None:
+            return row(error=f"{name}: {record.defect}")
+        look = look_at(record.part, 0.5, plan.false_alarm, plan.assumed or "thesis")
         scores, statements = stated(look, plan.detectors, plan.views)
-        return row(place=asdict(place_of(part)), scores=scores, statements=statements)
+        return row(place=asdict(place_of(record.part)), scores=scores, statements=statements)
     except SealscopeError as error:
         return row(error=str(error))

@@ -37,7 +37,8 @@ def work(plan: SimulatedPlan, case: Case, keep: Path | None = None) -> CaseRow:
 
 def _work(plan: SimulatedPlan, case: Case, keep: Path | None) -> CaseRow:
     from sealscope.campaigns.cases.scoring import stated
-    from sealscope.diagnosis.calibration.calibrated import looked_at, place_of
+    from sealscope.diagnosis.baseline.inspection import inspected
+    from sealscope.diagnosis.calibration.calibrated import place_of
     from sealscope.diagnosis.calibration.scorers import Look
     from sealscope.simulation.simulate import simulate_with_truth
 
@@ -46,15 +47,15 @@ def _work(plan: SimulatedPlan, case: Case, keep: Path | None) -> CaseRow:
         from sealscope.recordings import write
 
         write(simulated.recording, keep / f"{case.id}.nc")
-    part, _, reason = looked_at(simulated.recording, INSPECTED)
-    if reason is not None:
-        raise InputError(f"the record cannot be judged: {reason}")
-    look = Look(part, plan.onset_s, plan.false_alarm, plan.assumed or plan.rig)
+    record = inspected(simulated.recording, INSPECTED)
+    if record.defect is not None:
+        raise InputError(f"the record cannot be judged: {record.defect}")
+    look = Look(record.part, plan.onset_s, plan.false_alarm, plan.assumed or plan.rig)
     scores, statements = stated(look, plan.detectors, plan.views)
     return CaseRow.of(
         case,
         flow_lpm=simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0,
-        place=asdict(place_of(part)),
+        place=asdict(place_of(record.part)),
         scores=scores,
         statements=statements,
     )

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.baseline.operating_point import operating_point
 from sealscope.diagnosis.calibration.scorers import Look, Score, scorer, split_view
 from sealscope.diagnosis.calibration.thresholds import Calibration, Group, Place, calibrate
-from sealscope.diagnosis.diagnose import analysable, why_untrusted
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.errors import InputError
-from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.quality import Finding, inspect
 from sealscope.recordings.recording import Recording
-from sealscope.signals.details import shortest
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -26,33 +23,12 @@ if TYPE_CHECKING:
 DEFAULT_DETECTORS = ("rms change", "d3 of p_A changed", "d4 of p_A changed", "d3 of p_B changed", "d4 of p_B changed")
 
 
-def looked_at(
-    recording: Recording, inspected: Container[str] | None = None
-) -> tuple[Recording, tuple[Finding, ...], str | None]:
-    """What of a recording can be judged, the findings on it, and why it cannot be trusted (None where it can).
-
-    `inspected`: channels to look at for findings, by default all.
-    """
-    looked = recording
-    if inspected is not None:
-        looked = recording.only(name for name in recording.channels if name in inspected)
-    quality = list(inspect(looked))
-    if not chambers_of(recording):
-        return recording, tuple(quality), "needs the pressure of a chamber (p_A or p_B)"
-    part, cut_down = analysable(recording)
-    if cut_down is not None:
-        quality.append(cut_down)
-    if len(part) < shortest():
-        return part, tuple(quality), f"needs {shortest()} samples or more without a gap, got {len(part)}"
-    return part, tuple(quality), why_untrusted(part, quality)
-
-
 def place_of(part: Recording) -> Place:
     """Where a recording without missing samples was made."""
     return Place(operating_point(part), part.duration)
 
 
-def look_at(part: Recording, split_share: float, rate: float, rig: Rig | None = None) -> Look:
+def look_at(part: Recording, split_share: float, rate: float, rig: Rig | str = "thesis") -> Look:
     """The recording as scorers see it, split at that share of its length; `rig`: what detectors may assume."""
     return Look(part, float(part.t[0]) + split_share * part.duration, rate, rig)
 
@@ -63,7 +39,7 @@ def calibrate_on(
     *,
     false_alarm_probability: float,
     split_share: float = 0.5,
-    rig: Rig | None = None,
+    rig: Rig | str = "thesis",
     **options: Any,
 ) -> Calibration:
     """Calibrate detectors on leak-free recordings of one machine.
@@ -78,9 +54,10 @@ def calibrate_on(
     places: list[Place] = []
     scores: dict[str, list[float | None]] = {one.name: [] for one in chosen}
     for name, recording in recordings.items():
-        part, _, reason = looked_at(recording)
-        if reason is not None:
-            raise InputError(f"a leak-free recording must be in good order, got: {reason} ({name})")
+        own = inspected(recording)
+        part, defect = own.part, own.defect
+        if defect is not None:
+            raise InputError(f"a leak-free recording must be in good order, got: {defect} ({name})")
         places.append(place_of(part))
         look = look_at(part, split_share, false_alarm_probability, rig)
         for one in chosen:
@@ -89,7 +66,7 @@ def calibrate_on(
 
 
 def diagnose_calibrated(
-    recording: Recording, calibration: Calibration, *, file: str | None = None, rig: Rig | None = None
+    recording: Recording, calibration: Calibration, *, file: str | None = None, rig: Rig | str = "thesis"
 ) -> Diagnosis:
     """Say whether oil bypasses the piston, by the thresholds of a calibration.
 
@@ -97,7 +74,8 @@ def diagnose_calibrated(
     methods. A recording outside the calibrated operating points, or one the data of which cannot be trusted, is
     `cannot tell`, with the reason. `rig`: what detectors may assume of the machine, the same as for the calibration.
     """
-    part, quality, reason = looked_at(recording)
+    judged = inspected(recording)
+    part, reason = judged.part, judged.defect
     found: Group | str = reason if reason is not None else calibration.find(place_of(part))
     look = look_at(part, calibration.split_share, calibration.rate, rig) if isinstance(found, Group) else None
     methods = []
@@ -113,7 +91,7 @@ def diagnose_calibrated(
         **vars(replace(judge, parts=tuple(methods))),
         file=file or str(recording.provenance.get("file", "recording")),
         false_alarm_probability=calibration.rate,
-        quality=quality,
+        quality=judged.findings,
     )
 
 

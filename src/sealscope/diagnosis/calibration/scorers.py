@@ -90,7 +90,7 @@ class Look:
 
     `split_s` [s]: the moment on the recording's time axis before and after which it is compared, half-way by default;
     `false_alarm_probability`: what a detector with a threshold of its own sets it for; `rig`: what detectors may
-    assume of the machine. The recording is uniformly sampled without missing samples (`diagnose.analysable`).
+    assume of the machine. The recording is uniformly sampled without missing samples (`baseline.inspection`).
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Look:
         recording: Recording,
         split_s: float | None = None,
         false_alarm_probability: float = 0.01,
-        rig: Rig | None = None,
+        rig: Rig | str = "thesis",
     ) -> None:
         self.recording = recording
         start = float(recording.t[0]) if len(recording) else 0.0

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import DayToDay, Level, against_baseline, incomparable
-from sealscope.diagnosis.baseline.operating_point import difference, operating_point
 from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, misfit, within
 from sealscope.diagnosis.observer.model import G_UNIT
 from sealscope.diagnosis.observer.stream import Formulation, formulation_of
@@ -26,7 +25,6 @@ _SHARE, _BY_RINGING, _FREEDOM = 0.08, 0.25, 4.0
 
 
 def compare(
-    recording: Recording,
     series: ConductanceSeries,
     baseline: Sequence[Recording],
     follow: Callable[[Recording], ConductanceSeries],
@@ -36,18 +34,14 @@ def compare(
 ) -> Evidence:
     """Return the evidence from the step within the recording and from its mean conductance against the baseline's.
 
-    A baseline recording can be compared where it has the same operating point and formulation, and where the model
-    describes it.
+    A baseline recording can be compared where it has the same formulation, and where the model describes it.
     """
     inner = within(series, step)
-    here = operating_point(recording)
     levels: list[Level] = []
     reasons: list[str] = []
     for other in baseline:
-        reason = difference(here, operating_point(other))
-        if reason is None and formulation_of(other) != series.formulation:
-            reason = "its channels are not the same"
-        if reason is None:
+        reason: str | None = "its channels are not the same"
+        if formulation_of(other) == series.formulation:
             followed = follow(other)
             reason = misfit(followed.estimates, followed.formulation, rig) if followed.G.size else "it is too short"
             if reason is None:

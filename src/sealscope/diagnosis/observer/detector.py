@@ -105,7 +105,7 @@ class Observer:
         def follow(other: Recording) -> ConductanceSeries:
             return remembered(other, (self.name, self.rig), self.follow)
 
-        return compare(recording, series, baseline, follow, step, probability, self.rig)
+        return compare(series, baseline, follow, step, probability, self.rig)
 
     @staticmethod
     def _step(series: ConductanceSeries, probability: float) -> WalkStep:

@@ -3,19 +3,17 @@ scatter of blocks."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingPoint, difference, operating_point
+from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingPoint, operating_point
 from sealscope.diagnosis.changepoint.scatter import StepScan, permutations_for
 from sealscope.diagnosis.changepoint.tails import upper_quantile
 from sealscope.diagnosis.rms_change.blocks import QUANTITIES, Blocks, cut, whole_log_rms
 from sealscope.diagnosis.rms_change.results import JUDGED, excess, largest_changes, method_result
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
-from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.recording import Array, Recording
 
 #: Fewest comparable baseline recordings from which the scatter between recordings is estimated ...
@@ -79,30 +77,17 @@ def _outside(level: float, levels: Array) -> bool:
 def against(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
     """Evidence from the comparison with the leak-free recordings of the same operating point."""
     point = operating_point(recording)
-    points = [operating_point(one) for one in baseline]
-    reasons = [difference(point, other) for other in points]
-    alike = [k for k, reason in enumerate(reasons) if reason is None]
-    if not alike:
-        most = Counter(reason for reason in reasons if reason).most_common(1)[0][0]
-        return Evidence("cannot tell", f"none of the {len(baseline)} baseline recordings is comparable: {most}")
-    alike = [k for place, k in enumerate(alike) if not any(_copies(baseline[j], baseline[k]) for j in alike[:place])]
-    levels = np.array([points[k].level for k in alike])
+    levels = np.array([operating_point(leak_free).level for leak_free in baseline])
     if _outside(point.level, levels):
         return Evidence(
             "cannot tell",
-            f"the pressure level, {_level(point)}, lies outside that of the {len(alike)} comparable baseline "
+            f"the pressure level, {_level(point)}, lies outside that of the {len(baseline)} comparable baseline "
             f"recordings, "
             f"{np.exp(levels.min()):.4g} to {np.exp(levels.max()):.4g}",
         )
-    chosen = [baseline[k] for k in alike]
-    if len(chosen) >= FEWEST_RECORDINGS:
-        return _by_recordings(recording, chosen, point.level, levels, probability)
-    return _by_blocks(recording, chosen, probability)
-
-
-def _copies(one: Recording, other: Recording) -> bool:
-    """Whether two recordings hold the same pressures: a file given twice says nothing about the scatter."""
-    return all(np.array_equal(one[name], other[name]) for name in chambers_of(one))
+    if len(baseline) >= FEWEST_RECORDINGS:
+        return _by_recordings(recording, baseline, point.level, levels, probability)
+    return _by_blocks(recording, baseline, probability)
 
 
 def _level(point: OperatingPoint) -> str:

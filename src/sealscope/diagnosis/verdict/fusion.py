@@ -35,6 +35,7 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     if judge.verdict == "leak":
         refused = frozenset[Figure]().union(*(own.refuses for own in usable))
         fused, lent = _with_estimates(judge, [own for own in others if own.verdict == "leak"], refused)
+        fused = replace(fused, refuses=refused)
         reasons += lent
     else:
         fused = replace(judge, onset_s=None, onset_interval_s=None)
@@ -98,9 +99,10 @@ def _no_judge(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidenc
     if len(usable) == 1:
         return usable[0]
     scored = next((own for own in usable if own.score is not None), None)
+    alike = all(own.reason == usable[0].reason for own in usable)
     return Evidence(
         "cannot tell",
-        "; ".join(f"{own.detector}: {own.reason}" for own in usable),
+        usable[0].reason if alike else "; ".join(f"{own.detector}: {own.reason}" for own in usable),
         None if scored is None else scored.score,
         None if scored is None else scored.threshold,
     )

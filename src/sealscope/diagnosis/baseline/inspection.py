@@ -1,0 +1,156 @@
+"""Inspection of recordings before any detector sees them: what of them can be analysed, trusted and compared.
+
+The judged recording and its leak-free baselines pass the same checks. Baselines that fail them, that were made at
+another operating point, or that hold the samples of another recording are left out for all detectors alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+
+import numpy as np
+
+from sealscope.diagnosis.baseline.operating_point import OperatingPoint, difference, operating_point
+from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
+from sealscope.recordings.recording import Recording, remembered
+
+#: Findings on a chamber pressure that leave no trust in its details ...
+_SPOILING = ("constant", "stuck")
+#: ... and clipping, when it takes more than this share of the samples; a chamber that empties into the tank rests at
+#: the rail for a while in any stroke.
+_MOST_CLIPPED = 0.5
+#: Most names of left-out baselines that a finding lists.
+_MOST_NAMES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """A recording as detectors see it.
+
+    `part`: its longest uniformly sampled stretch with no chamber pressure and no command missing; `findings` on the
+    whole; `distrust`: why the chamber pressures cannot be trusted, None where they can.
+    """
+
+    part: Recording
+    findings: tuple[Finding, ...]
+    distrust: str | None
+
+    @property
+    def defect(self) -> str | None:
+        """Why the recording can neither be calibrated with nor stand for a leak-free machine; None where it can."""
+        if not chambers_of(self.part):
+            return "needs the pressure of a chamber (p_A or p_B)"
+        if len(self.part) < SHORTEST:
+            return f"needs {SHORTEST} samples or more without a gap, got {len(self.part)}"
+        return self.distrust
+
+    @cached_property
+    def point(self) -> OperatingPoint:
+        """Operating point of a recording without a defect."""
+        with np.errstate(all="ignore"):
+            return operating_point(self.part)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Hash of the chamber pressures: equal for copies of a recording."""
+        return sha256(b"".join(self.part[name].tobytes() for name in chambers_of(self.part))).digest()
+
+
+def inspected(recording: Recording, channels: Iterable[str] | None = None) -> Inspection:
+    """Inspect a recording, once for all that ask; `channels`: those to look at for findings, by default all."""
+    names = tuple(name for name in recording.channels if channels is None or name in channels)
+    return remembered(recording, ("inspection", names), lambda whole: _inspection(whole, names))
+
+
+def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
+    findings = list(inspect(recording.only(names)))
+    chambers = chambers_of(recording)
+    part = recording
+    if "u" in part and not np.any(np.isfinite(part["u"])):  # `inspect` reports it; the pressures can do without
+        part = part.only(name for name in part.channels if name != "u")
+    stretches = uniform_segments(part, (*chambers, "u") if "u" in part else chambers)
+    if not stretches:
+        part = part.between(math.inf, math.inf)
+    else:
+        longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start)
+        if longest.stop - longest.start < len(part):
+            part = part.samples(longest)
+            text = (
+                f"only the longest whole stretch was analysed: {part.t[0]:.4g} s to {part.t[-1]:.4g} s, {len(part)} of "
+                f"{len(recording)} samples"
+            )
+            left_out = len(recording) - len(part)
+            findings.append(Finding("part_analysed", "warning", None, left_out, float(part.t[0]), text))
+    spoiled = next((own for own in findings if own.channel in chambers and _spoils(own, len(part))), None)
+    distrust = None if spoiled is None else f"the pressures cannot be trusted: {spoiled.text}"
+    return Inspection(part, tuple(findings), distrust)
+
+
+def _spoils(finding: Finding, samples: int) -> bool:
+    """Return whether a finding on a chamber pressure of so many samples leaves no trust in its details."""
+    return finding.code in _SPOILING or (finding.code == "clipped" and finding.count > _MOST_CLIPPED * samples)
+
+
+@dataclass(frozen=True, eq=False)
+class Baselines:
+    """Leak-free recordings that a recording can be compared with.
+
+    `parts`: what of them can be analysed; `findings`: which were left out, and why; `refusal`: why none is left, None
+    where some are, or where none was given.
+    """
+
+    parts: tuple[Recording, ...]
+    findings: tuple[Finding, ...]
+    refusal: str | None
+
+
+def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
+    """Inspect the baselines of a judged recording and choose those that can be compared with it.
+
+    Left out are baselines with a defect, the recording itself, baselines made at another operating point, and all but
+    one copy (that with the most channels) of the same recording.
+    """
+    if judged.defect is not None:  # nothing is compared, and every detector states why
+        return Baselines(tuple(inspected(recording).part for recording in baseline), (), None)
+    inspections = [inspected(recording) for recording in baseline]
+    chosen: dict[bytes, int] = {}
+    left_out: dict[tuple[Severity, str], list[int]] = {}
+    for k in sorted(range(len(baseline)), key=lambda k: -len(baseline[k].channels)):
+        own = inspections[k]
+        severity, reason = _refusal(judged, own)
+        if reason is None and own.digest in chosen:
+            severity, reason = "note", "the same samples as another baseline recording"
+        if reason is None:
+            chosen[own.digest] = k
+        else:
+            left_out.setdefault((severity, reason), []).append(k)
+    findings = tuple(
+        Finding("baseline_left_out", severity, None, len(numbers), None, _text(baseline, numbers, reason))
+        for (severity, reason), numbers in left_out.items()
+    )
+    refusal = None
+    if baseline and not chosen:
+        most = max(left_out, key=lambda kind: len(left_out[kind]))
+        refusal = f"no baseline recording can be used: {most[1]}"
+    return Baselines(tuple(inspections[k].part for k in sorted(chosen.values())), findings, refusal)
+
+
+def _refusal(judged: Inspection, own: Inspection) -> tuple[Severity, str | None]:
+    """Return why a baseline recording cannot be compared, None where it can, and how much that matters."""
+    if own.defect is not None:
+        return "warning", own.defect
+    if own.digest == judged.digest:
+        return "warning", "the same samples as the recording itself"
+    return "note", difference(judged.point, own.point)
+
+
+def _text(baseline: Sequence[Recording], numbers: Sequence[int], reason: str) -> str:
+    names = [str(baseline[k].provenance.get("file", f"number {k + 1}")) for k in sorted(numbers)]
+    listed = ", ".join(names[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
+    verb = "is" if len(names) == 1 else "are"
+    return f"{len(names)} of {len(baseline)} baseline recordings {verb} left out: {reason} ({listed})"

@@ -1,0 +1,161 @@
+"""Baselines are inspected, compared and freed of copies before any detector; a failing detector is left out."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis import detector, registry
+from sealscope.diagnosis.baseline.inspection import comparable, inspected
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Recording
+
+
+def copied(recording: Recording) -> Recording:
+    """The same samples as another object, as from a copied file."""
+    return replace(recording, provenance={"file": "copy.nc"})
+
+
+@pytest.fixture(scope="module")
+def healthy(records) -> list[Recording]:  # type: ignore[no-untyped-def]
+    return [records(seed, duration=120.0, throttled=True) for seed in range(10, 13)]
+
+
+def verdicts(diagnosis: Diagnosis) -> list[tuple[str, str, str, float | None, float | None]]:
+    return [(own.detector, own.verdict, own.reason, own.score, own.threshold) for own in diagnosis.methods]
+
+
+def test_a_baseline_equal_to_the_recording_is_refused(healthy: list[Recording]) -> None:
+    recording = healthy[0]
+    for baseline in (recording, [recording], [copied(recording)]):
+        found = diagnose(recording, baseline)
+        assert found.verdict == "cannot tell"
+        assert found.reason == "no baseline recording can be used: the same samples as the recording itself"
+        assert found.quality[-1].severity == "warning"
+    beside = diagnose(recording, [copied(recording), healthy[1]])
+    assert verdicts(beside) == verdicts(diagnose(recording, healthy[1]))
+    assert beside.quality[-1].text == (
+        "1 of 2 baseline recordings is left out: the same samples as the recording itself (copy.nc)"
+    )
+
+
+def test_a_leak_within_the_recording_is_stated_whatever_the_baseline(leaky: Recording) -> None:
+    found = diagnose(leaky, leaky)
+    assert (found.verdict, found.onset_s) == ("leak", diagnose(leaky).onset_s)
+    assert "no baseline recording can be used: the same samples as the recording itself" in found.reason
+
+
+def test_copies_count_once_for_every_detector(healthy: list[Recording]) -> None:
+    """Three copies have no scatter of their own: for the observer they were three baselines."""
+    recording, leak_free = healthy[:2]
+    found = diagnose(recording, [leak_free, copied(leak_free), leak_free])
+    assert verdicts(found) == verdicts(diagnose(recording, [leak_free]))
+    assert found.quality[-1].code == "baseline_left_out"
+    assert found.quality[-1].count == 2
+
+
+def test_of_copies_the_one_with_the_most_channels_is_kept(healthy: list[Recording]) -> None:
+    whole = healthy[1]
+    few = whole.only(["u", "p_A", "p_B"])
+    for baseline in ([few, whole], [whole, few]):
+        assert comparable(inspected(healthy[0]), baseline).parts == (whole,)
+
+
+@pytest.mark.parametrize("fault", ["stuck", "clipped", "constant", "too short", "other rate"])
+def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, healthy: list[Recording]) -> None:
+    recording, leak_free, other = healthy
+    p_A = np.array(other["p_A"])
+    if fault == "stuck":
+        p_A[20000:20400] = p_A[20000]
+    elif fault == "clipped":
+        p_A = np.minimum(p_A, np.quantile(p_A, 0.4))
+    elif fault == "constant":
+        p_A[:] = 3e5
+    faulty = replace(other, channels={**other.channels, "p_A": p_A})
+    if fault == "too short":
+        faulty = faulty.samples(slice(0, 200))
+    elif fault == "other rate":
+        faulty = replace(faulty, t=2.0 * faulty.t, rate=0.5 * faulty.rate)
+    found = diagnose(recording, [faulty, leak_free])
+    assert verdicts(found) == verdicts(diagnose(recording, [leak_free]))
+    assert found.quality[-1].text.startswith("1 of 2 baseline recordings is left out: ")
+    alone = diagnose(recording, faulty)
+    assert alone.verdict == "cannot tell"
+    assert alone.reason.startswith("no baseline recording can be used: ")
+
+
+def test_of_a_baseline_with_a_gap_the_longest_stretch_is_used(healthy: list[Recording]) -> None:
+    recording, leak_free = healthy[:2]
+    p_A = np.array(leak_free["p_A"])
+    p_A[1000] = np.nan
+    holed = replace(leak_free, channels={**leak_free.channels, "p_A": p_A})
+    (part,) = comparable(inspected(recording), [holed]).parts
+    assert len(part) == len(leak_free) - 1001
+
+
+class Failing:
+    """Raises where it examines."""
+
+    name = "observer"
+
+    def __init__(self, rig: object) -> None:
+        pass
+
+    def usable(self, recording: Recording) -> None:
+        return None
+
+    def examine(self, recording: Recording, baseline: object, probability: float) -> None:
+        raise ZeroDivisionError("float division by zero")
+
+
+def test_a_built_in_detector_that_fails_costs_its_own_evidence_alone(
+    healthy: list[Recording], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    rms_change = registry.DETECTORS["rms change"]
+    monkeypatch.setattr(registry, "DETECTORS", {"rms change": rms_change})
+    expected = diagnose(healthy[0])
+    monkeypatch.setattr(registry, "DETECTORS", {"observer": Failing, "rms change": rms_change})
+    detector._log_once.cache_clear()
+    with caplog.at_level(logging.ERROR, "sealscope"):
+        found = diagnose(healthy[0])
+    assert (found.verdict, found.score, found.reason) == (expected.verdict, expected.score, expected.reason)
+    own = next(own for own in found.parts if own.detector == "observer")
+    assert own.verdict == "cannot tell"
+    assert own.reason == "detector 'observer' is left out: ZeroDivisionError: float division by zero"
+    (record,) = caplog.records
+    assert record.getMessage() == own.reason
+    assert record.exc_info is not None  # the traceback
+
+
+def test_wrong_arguments_are_named(healthy: list[Recording], tmp_path: Path) -> None:
+    recording = healthy[0].samples(slice(0, 300))
+    wrong = (
+        (("log.csv",), {}, r"^recording must be a Recording, got str 'log\.csv'; sealscope\.read makes one of a file$"),
+        ((None,), {}, r"^recording must be a Recording, got NoneType"),
+        ((recording, "log.csv"), {}, r"^baseline must be a Recording, got str 'log\.csv'; sealscope\.read"),
+        ((recording, tmp_path), {}, r"^baseline must be a Recording, got PosixPath"),
+        ((recording, 3), {}, r"^baseline must be a Recording or a sequence of Recordings, got int$"),
+        ((recording, [recording, "b.csv"]), {}, r"^baseline\[1\] must be a Recording, got str 'b\.csv'"),
+        ((recording,), {"rig": "thesi"}, r"did you mean thesis\?"),
+        ((recording,), {"rig": 3}, r"^rig must be a Rig"),
+        ((recording,), {"false_alarm_probability": "0.01"}, r"must be 0\.0001 to 0\.2, got '0\.01'$"),
+        ((recording,), {"baselines": []}, r"^diagnose has no argument 'baselines'; did you mean 'baseline'\?$"),
+    )
+    for args, keywords, message in wrong:
+        with pytest.raises(InputError, match=message):
+            diagnose(*args, **keywords)  # type: ignore[arg-type]
+
+
+def test_rig_is_a_rig_a_name_or_a_path(healthy: list[Recording], tmp_path: Path) -> None:
+    from sealscope.parameters import load_rig
+
+    path = tmp_path / "own.toml"
+    path.write_text('[rig]\nextends = "thesis"\n', encoding="utf-8")
+    first, *others = (diagnose(healthy[0], rig=rig) for rig in ("thesis", load_rig("thesis"), path, str(path)))
+    assert all(other.as_dict() == first.as_dict() for other in others)
