@@ -4,6 +4,9 @@ Plain ``cache=True`` keys a kernel by its own file only, so an edit to a law in 
 old machine code valid and silently wrong. Here the cache directory is named by a hash over the sources of every
 room that holds compiled code, the versions of numba and Python and the processor, and lies in the user's cache folder
 (never in site-packages, which may be read-only). `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off.
+
+Compiled code is unpickled, which can run any command: only folders of the user that nobody else can write are used. A
+file of the cache that is cut off or cannot be written is a cache miss.
 """
 
 from __future__ import annotations
@@ -13,15 +16,18 @@ import logging
 import os
 import platform
 import shutil
+import stat
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 from numba.core import config
+from numba.core.caching import FunctionCache
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _COMPILED_ROOMS = ("compiled.py", "physics", "signals", "simulation", "diagnosis")
@@ -65,18 +71,45 @@ def _prune(kernels: Path, current: str) -> None:
         shutil.rmtree(entry, ignore_errors=True)
 
 
+def _check_owner(folder: Path, forbidden: int) -> None:
+    """Raise PermissionError unless `folder` is a directory, no link, of this user, without the `forbidden` bits."""
+    status = folder.lstat()
+    if not hasattr(os, "getuid"):  # Windows keeps the folders of a user to itself
+        return
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & forbidden:
+        raise PermissionError(f"{folder} must be a folder of this user alone")
+
+
+def _private(folder: Path) -> None:
+    """Make a folder with mode 0700; raise OSError where one is there that another user owns or can write."""
+    folder.mkdir(mode=0o700, exist_ok=True)
+    _check_owner(folder, 0o022)
+    if folder.lstat().st_mode & 0o077:
+        folder.chmod(0o700)
+    _check_owner(folder, 0o077)
+
+
 @cache
 def cache_directory() -> Path | None:
-    """The directory of this source's compiled code, made if need be; None where none can be written."""
+    """Return the directory of this source's compiled code, made if need be; None where none can be written safely."""
     base = _user_cache_folder()
     if base is None:
         return None
     environment = f"{numba.__version__} {platform.python_version()} {platform.machine()} {config.CPU_NAME}"
     key = hashlib.sha256((source_hash(Path(__file__).parent) + environment).encode()).hexdigest()[:20]
-    for folder in (base, Path(tempfile.gettempdir()) / f"sealscope-{os.getuid() if hasattr(os, 'getuid') else 'user'}"):
-        directory = folder / "kernels" / key
+    for temporary in (False, True):
+        directory = Path("kernels") / key
         try:
-            directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if temporary:  # anybody can make a folder of this name
+                user = os.getuid() if hasattr(os, "getuid") else "user"
+                base = Path(tempfile.gettempdir()) / f"sealscope-{user}"
+                _private(base)
+            else:
+                base.mkdir(mode=0o700, parents=True, exist_ok=True)
+                _check_owner(base.resolve(), 0o022)
+            directory = base / directory
+            _private(directory.parent)
+            _private(directory)
             os.utime(directory)
             with tempfile.TemporaryFile(dir=directory):
                 pass
@@ -85,22 +118,47 @@ def cache_directory() -> Path | None:
             _log.debug("cannot cache compiled code in %s: %s", directory, error)
         else:
             return directory
-    _log.warning("no folder for compiled code can be written: every process compiles anew (set SEALSCOPE_CACHE_DIR)")
+    _log.warning("no folder for compiled code can be used: every process compiles anew (set SEALSCOPE_CACHE_DIR)")
     return None
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """numba's cache, where a file that cannot be read or written is a cache miss."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the compiled code of a signature, None where there is none or it is damaged."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # unpickling a cut-off file raises many kinds
+            _log.debug("compiled code in %s is damaged: %s", self.cache_path, error)
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save the compiled code of a signature, if there is room for it."""
+        try:
+            super().save_overload(sig, data)
+        except Exception as error:
+            _log.debug("cannot save compiled code in %s: %s", self.cache_path, error)
 
 
 def kernel(function: _F) -> _F:
     """Compile `function` (no Python objects, GIL released) with the safe cache; errors in floats follow IEEE 754."""
     directory = cache_directory()
+    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
     if directory is None:
-        return numba.njit(nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+        return dispatcher  # type: ignore[no-any-return]
     # numba reads the folder when the decorator runs; other users of numba in this process keep theirs
     before = config.CACHE_DIR
     config.CACHE_DIR = str(directory)
     try:
-        return numba.njit(nogil=True, error_model="numpy", cache=True)(function)  # type: ignore[no-any-return]
+        dispatcher._cache = _Cache(function)  # as `cache=True` does
+    except (OSError, RuntimeError) as error:  # the folder is gone
+        _log.debug("cannot cache compiled code in %s: %s", directory, error)
     finally:
         config.CACHE_DIR = before
+    return dispatcher  # type: ignore[no-any-return]
 
 
 def law(function: _F) -> _F:

@@ -43,9 +43,10 @@ print(float(run["p_A"][-1]), sum(advance_rk4.stats.cache_hits.values()), cache_d
 """
 
 
-def ask(source: Path, code: str, cache: Path | str) -> tuple[float, int, str]:
+def ask(source: Path, code: str, cache: Path | str, **more: str) -> tuple[float, int, str]:
     environment = {
         **os.environ,
+        **more,
         "PYTHONPATH": str(source),
         "SEALSCOPE_CACHE_DIR": str(cache),
         "PYTHONDONTWRITEBYTECODE": "1",
@@ -101,6 +102,64 @@ def test_a_cache_folder_that_cannot_be_written_is_no_error(copy, tmp_path):
     value, _, folder = ask(copy, SMALL, blocked)
     assert value > 0
     assert str(blocked) not in folder
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners and modes of folders")
+@pytest.mark.parametrize("whose", ["another user's", "open to all", "kernels open to all", "a link", "kernels a link"])
+def test_no_compiled_code_is_loaded_from_a_folder_that_others_can_write(copy, tmp_path, whose):
+    temporary, home = tmp_path / "tmp", tmp_path / "home"
+    temporary.mkdir()
+    home.write_text("")  # no folder: the cache falls back to the temporary directory
+    folder = temporary / f"sealscope-{os.getuid()}"
+    target = folder / "kernels" if whose.startswith("kernels") else folder
+    target.parent.mkdir(exist_ok=True, mode=0o700)
+    if whose.endswith("link"):
+        (tmp_path / "elsewhere").mkdir(mode=0o700)
+        target.symlink_to(tmp_path / "elsewhere")
+    else:
+        target.mkdir()
+        target.chmod(0o777 if whose.endswith("all") else 0o700)
+    if whose == "another user's":
+        if os.getuid() != 0:
+            pytest.skip("only root can give a folder away")
+        os.chown(target, 12345, 12345)
+    value, hits, used = ask(copy, SMALL, home / "cache", TMPDIR=str(temporary))
+    assert value > 0
+    assert (hits, used) == (0, "None")
+    assert not list(temporary.rglob("*.nb?"))
+    assert not (tmp_path / "elsewhere").exists() or not list((tmp_path / "elsewhere").iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners and modes of folders")
+def test_the_folders_of_compiled_code_are_the_user_s_alone(copy, tmp_path):
+    for cache in (tmp_path / "cache", tmp_path / "open"):
+        (tmp_path / "open" / "kernels").mkdir(parents=True, exist_ok=True, mode=0o755)
+        _, _, folder = ask(copy, SMALL, cache)
+        for place in (Path(folder), Path(folder).parent):
+            assert place.is_relative_to(cache)
+            assert place.lstat().st_mode & 0o777 == 0o700
+    (tmp_path / "open").chmod(0o777)
+    assert not Path(ask(copy, SMALL, tmp_path / "open")[2]).is_relative_to(tmp_path / "open")
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("left", [0, 7])
+def test_a_cut_off_file_of_the_cache_is_a_miss(copy, tmp_path, suffix, left):
+    before = ask(copy, SMALL, tmp_path)
+    files = [path for path in Path(before[2]).rglob(f"*.{suffix}") if "leakage_series" in path.name]
+    assert files
+    for path in files:
+        path.write_bytes(path.read_bytes()[:left])
+    assert ask(copy, SMALL, tmp_path) == before
+    assert ask(copy, SMALL, tmp_path) == (before[0], 1, before[2])
+
+
+def test_a_full_disk_is_no_error(copy, tmp_path):
+    pytest.importorskip("resource")
+    full = "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+    full += "resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
+    value, hits, _ = ask(copy, full + SMALL, tmp_path)
+    assert (hits, ask(copy, SMALL, tmp_path)[0]) == (0, value)
 
 
 def test_an_empty_cache_folder_turns_caching_off(copy):
