@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sealscope.campaigns.prediction import bench_responses as room
-from sealscope.campaigns.prediction.bench_responses import bench_responses, stated
+from sealscope.campaigns.prediction import responses as room
 from sealscope.campaigns.prediction.detection import ChangeDetector, Responses
-from sealscope.campaigns.prediction.noise_responses import instrument_noise, responses
 from sealscope.campaigns.prediction.predict import experiment_for
+from sealscope.campaigns.prediction.responses import bench_responses, fixed_levels, instrument_noise, noise_responses
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.bench.machines import Machine
@@ -20,10 +19,6 @@ from sealscope.simulation.commands import Sine
 from sealscope.simulation.experiment import Experiment
 
 DETECTORS = (ChangeDetector("d3", "p_A", "fell"), ChangeDetector("d4", "p_B", "changed"))
-
-
-def serially(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
-    return [job() for job in jobs]
 
 
 @pytest.fixture
@@ -38,6 +33,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         return Machine(profile, seed, rig, duration, values, (), Sine(8.0, 1.0), 0.0)
 
     monkeypatch.setattr("sealscope.simulation.bench.machines.draw", draw)
+    monkeypatch.setattr(room, "in_parallel", lambda jobs, label, progress: [job() for job in jobs])
     return asked
 
 
@@ -49,11 +45,11 @@ def experiment() -> Experiment:
 
 
 def responses_of(experiment: Experiment, draws: int, seed: int = 0) -> Responses:
-    return bench_responses(experiment, "bench", draws, seed, 0.01, DETECTORS, serially, sizes=(0.01,))
+    return bench_responses(experiment, "bench", draws, seed, 0.01, DETECTORS, sizes=(0.01,))
 
 
 def test_the_callers_values_and_command_stand_against_the_draw(experiment: Experiment) -> None:
-    kept = stated(experiment)
+    kept = fixed_levels(experiment)
     assert kept["command"] == "7 sin(4t)"
     assert kept["sensors.p_A.noise"] == 3e3
     assert kept["line.orifices"] == "absent"
@@ -64,13 +60,13 @@ def test_each_machine_is_run_with_every_size(
     experiment: Experiment, bench: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs: list[Experiment] = []
-    signed = room._signed
+    changes = room._changes
 
     def watched(one: Experiment, detectors: Sequence[ChangeDetector]) -> Any:
         runs.append(one)
-        return signed(one, detectors)
+        return changes(one, detectors)
 
-    monkeypatch.setattr(room, "_signed", watched)
+    monkeypatch.setattr(room, "_changes", watched)
     found = responses_of(experiment, 8)
     assert found.records == 8
     assert found.mean.shape == found.scatter.shape == (2, 2)
@@ -99,15 +95,15 @@ def test_too_few_machines_and_machines_that_cannot_run_are_refused(
     def failing(one: Experiment, detectors: object) -> Any:
         raise SimulationFailed("p_A must stay above vacuum")
 
-    monkeypatch.setattr(room, "_signed", failing)
+    monkeypatch.setattr(room, "_changes", failing)
     with pytest.raises(SimulationFailed, match="8 of 8 machines of the bench could not be run: p_A must"):
         responses_of(experiment, 8)
 
 
 def test_the_packaged_bench_adds_drift_to_the_scatter(experiment: Experiment) -> None:
     """Same rig, same command: the changes of machines that drift within the record scatter more than noise alone."""
-    alone = responses(experiment, (0.01,), DETECTORS, instrument_noise(experiment, 8, 0))[0].scatter[0]
-    found = bench_responses(experiment, "bench", 10, 0, 0.01, DETECTORS, serially, sizes=(0.01,))
+    alone = noise_responses(experiment, (0.01,), DETECTORS, instrument_noise(experiment, 8, 0))[0].scatter[0]
+    found = bench_responses(experiment, "bench", 10, 0, 0.01, DETECTORS, sizes=(0.01,))
     assert found.records == 10
     assert np.all(np.isfinite(found.mean))
     assert found.scatter[0, 0] > alone[0]

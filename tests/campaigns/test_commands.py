@@ -41,6 +41,10 @@ def test_run_status_and_report(call, tiny, tmp_path):
     for name in ("d3 of p_A changed", "sign rule: d3 of p_A fell", "always fire", "never fire"):
         assert re.search(rf"^{name} .*%", out, re.MULTILINE)
     page = (folder / "report.html").read_text(encoding="utf-8")
+    for text in (out, page):  # these scorers compare the sides of the true onset, and the table says so
+        assert "Given the true onset, which no machine in service gives" in text
+    assert re.search(r"^d3 of p_A fell +true onset ", out, re.MULTILINE)
+    assert page.count("<td>true onset</td>") == 3
     again = call("campaign", "report", tiny, "-o", folder)
     assert again[0] == 0
     assert (folder / "report.html").read_text(encoding="utf-8") == page
@@ -160,7 +164,10 @@ def test_calibrate_on_the_own_machine_and_diagnose_by_it(call, logs, tmp_path):
     assert "outside the calibrated operating points: another command" in second["reason"]
     status, _, err = call("report", leaky, "--calibration", target, "-o", tmp_path / "page.html")
     assert status == 0, err
-    assert "leak" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "leak" in page
+    status, out, _ = call("diagnose", leaky, "--calibration", target)
+    assert (status, "true onset" in out + page) == (0, False)  # nothing is given here, other than in a campaign
     status, _, err = call("diagnose", leaky, "--calibration", target, "--baseline", sound["sound-1"])
     assert status == 2
     assert "--calibration must stand without --baseline" in err

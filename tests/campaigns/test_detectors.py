@@ -15,7 +15,7 @@ from sealscope.campaigns.cases.row import CaseRow, Statement, cause_of
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution.store import read_rows
 from sealscope.campaigns.judging.judge import calibration_of, judge
-from sealscope.campaigns.plans.detectors import check_detector, plan_detector
+from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, plan_detector
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.diagnosis import plugins, registry
@@ -140,22 +140,27 @@ def test_the_fused_verdict_is_that_of_diagnose(plan, done):
                 assert row.scores[key][0] == pytest.approx(beyond)
 
 
+def recall(confusion, fault):
+    """The share of the records with a fault that are called so."""
+    return confusion.shares[confusion.rows.index(fault)][confusion.columns.index(fault)].value
+
+
 def test_what_it_adds_up_to(plan, done):
     result = simulated_result(plan, done)
     table = {(one.detector, one.leak_lpm): one for one in result.judgement.table}
-    assert table["watcher", 0.02].detection.rate == table["watcher", 0.02].false_alarm.rate == 1.0
+    assert table["watcher", 0.02].detection.value == table["watcher", 0.02].false_alarm.value == 1.0
     assert table["watcher @ pressures", 0.02].detection.count == 0
-    flows = {(one.detector, one.leak_lpm): one for one in result.judgement.estimates}
+    flows = {(one.detector, one.leak_lpm): one for one in result.judgement.flows}
     assert flows["watcher", 0.0].errors.bias.value == pytest.approx(plan.rig.pump.q_b)
     assert flows["watcher", 0.02].errors.bias.value == pytest.approx(-0.02, rel=0.1)
-    assert flows["watcher", 0.02].errors.coverage.rate == 1.0
+    assert flows["watcher", 0.02].errors.coverage.value == 1.0
     onsets = {(one.detector, one.leak_lpm): one.errors for one in result.judgement.onsets}
     assert onsets["watcher", 0.02].median_size.value == 1.0
     assert onsets["watcher", 0.02].coverage.count == 3
-    named = {one.detector: one.confusion for one in result.judgement.named}
-    assert named["watcher @ pressures"].recall("friction change").rate == 1.0
-    assert named["watcher"].recall("piston leak").rate == 1.0
-    assert named["watcher"].recall("friction change").rate == 0.0
+    named = {one.detector: one.confusion for one in result.judgement.causes}
+    assert recall(named["watcher @ pressures"], "friction change") == 1.0
+    assert recall(named["watcher"], "piston leak") == 1.0
+    assert recall(named["watcher"], "friction change") == 0.0
     assert "watcher, calibrated @ pressures" not in named
     files = {path.name: path for path in write_result(result, done)}
     assert {"estimates.csv", "causes.csv", "onsets.csv", "records.csv"} <= set(files)
@@ -166,6 +171,16 @@ def test_what_it_adds_up_to(plan, done):
     for heading in ("How much", "Since when", "Which cause is named"):
         assert heading in page
     assert "watcher @ pressures" in campaign_text(result)
+    with files["table.csv"].open(encoding="utf-8") as file:
+        given = {line["detector"]: line for line in csv.DictReader(file)}
+    columns = ("true onset given", "channels given", "rig assumed")
+    assert [given["watcher @ pressures"][name] for name in columns] == ["no", "u p_A p_B", "thesis"]
+    assert [given["d3 of p_A changed"][name] for name in columns] == ["yes", " ".join(ALL_CHANNELS), ""]
+    assert [given["rms change, own threshold"][name] for name in columns[::2]] == ["no", "thesis"]
+    assert [given["always fire"][name] for name in columns] == ["", "", ""]
+    for words in ("splits the record where the leak opens: d3 of p_A changed.", "u, p_A, p_B to watcher @ pressures"):
+        assert words in campaign_text(result)
+        assert words in page
 
 
 def test_a_calibration_of_a_view_is_used_through_it(plan, done, tmp_path):
@@ -293,16 +308,16 @@ def test_flows_onsets_and_causes_by_hand():
         row(9, "cannot tell", fault="air 1 %"),
         replace(row(10, "leak", fault="air 1 %"), error="it failed"),
     ]
-    found = judge(rows, ["watcher"], calibration_of(rows, ["watcher"], rate=0.1), onset_s=90.0)
+    found = judge(rows, ["watcher"], calibration_of(rows, ["watcher"], false_alarm=0.1), onset_s=90.0)
     (onset,) = found.onsets
     assert (onset.errors.n, onset.errors.median.value, onset.errors.median_size.value) == (2, -6.0, 2.0)
     assert (onset.errors.coverage.count, onset.errors.coverage.n) == (1, 2)
-    free, leaky = found.estimates
-    assert (free.leak_lpm, free.errors.bias.value, free.errors.without, free.errors.coverage.rate) == (0.0, 0.1, 1, 1)
+    free, leaky = found.flows
+    assert (free.leak_lpm, free.errors.bias.value, free.errors.without, free.errors.coverage.value) == (0.0, 0.1, 1, 1)
     assert leaky.errors.bias.value == pytest.approx((0.5 - 0.1 - 0.7) / 3)
     assert (leaky.errors.without, leaky.errors.coverage.count, leaky.errors.coverage.n) == (1, 1, 2)
     assert (leaky.median.value, leaky.median_size.value) == pytest.approx((-0.1, 0.5))
-    (named,) = found.named
+    (named,) = found.causes
     said = {
         (true, name): int(named.confusion.counts[i][j])
         for i, true in enumerate(named.confusion.rows)

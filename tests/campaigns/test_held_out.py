@@ -20,7 +20,7 @@ from sealscope.campaigns.plans.model import ChosenClassifier, HeldOutPlan, Logis
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.cli import campaign as words
 from sealscope.errors import InputError
-from sealscope.evaluation.auc import auc
+from sealscope.evaluation.roc import auc
 
 
 def cloud(seed, n=200, f=3):
@@ -170,8 +170,8 @@ def test_swapped_labels_show_what_chance_reaches():
     assert first.chance == pytest.approx(np.quantile(swapped, 0.95))
     assert first.tests[0] > 0.75
     assert sum(times for _, times in second.picks) == 24
-    assert "0 reach" in first.words()
-    assert "good" in second.words()
+    assert "0 reach" in first.sentence()
+    assert "good" in second.sentence()
     useless = checks_of(HeldOutPlan("x", "x", "appendix-c", "test", (LogisticClassifier("n", ("noise",), 1.0),), 0.95,
                                     permutations=60), paired(3))  # fmt: skip
     assert useless[0].reached > 1
@@ -210,8 +210,8 @@ def test_appendix_c_with_whole_tests_held_out(sheet_folder, tmp_path, monkeypatc
         rates = {row["detector"]: row for row in csv.DictReader(file) if row["leak [L/min]"] == "any"}
     name = "logistic on d3, d4, d3d4 of both chambers"
     assert float(areas[name]["AUC"]) == pytest.approx(0.955, abs=0.001)
-    assert float(rates[name]["detected: rate"]) == pytest.approx(34 / 41)
-    assert float(rates[name]["false alarms: rate"]) == pytest.approx(4 / 41)
+    assert float(rates[name]["detected: fraction"]) == pytest.approx(34 / 41)
+    assert float(rates[name]["false alarms: fraction"]) == pytest.approx(4 / 41)
     assert {"always fire", "never fire"} <= set(rates)
     told = capsys.readouterr().out
     assert "0.955" in told

@@ -48,8 +48,8 @@ def rows_of(seed, calibrate=199, free=400, leaky=200):
     return found
 
 
-def judged(rows, rate=0.05, **options):
-    return judge(rows, (CHANGED, SIGN), calibration_of(rows, (CHANGED, SIGN), rate=rate), **options)
+def judged(rows, false_alarm=0.05, **options):
+    return judge(rows, (CHANGED, SIGN), calibration_of(rows, (CHANGED, SIGN), false_alarm=false_alarm), **options)
 
 
 def test_the_table_counts_by_hand():
@@ -65,16 +65,16 @@ def test_the_table_counts_by_hand():
     assert first.detection.count == sum(small)
     assert (first.detection.low, first.detection.high) == pytest.approx(clopper_pearson(sum(small), 200))
     assert first.per_hour.hours == pytest.approx(20.0)
-    assert table[CHANGED, 2.0].detection.rate == 1.0
-    assert table["always fire", 1.0].detection.rate == table["always fire", 1.0].false_alarm.rate == 1.0
-    assert table["never fire", 1.0].detection.rate == table["never fire", 1.0].false_alarm.rate == 0.0
-    assert table[SIGN, 1.0].false_alarm.rate == pytest.approx(0.5, abs=0.1)  # its own threshold is not calibrated
+    assert table[CHANGED, 2.0].detection.value == 1.0
+    assert table["always fire", 1.0].detection.value == table["always fire", 1.0].false_alarm.value == 1.0
+    assert table["never fire", 1.0].detection.value == table["never fire", 1.0].false_alarm.value == 0.0
+    assert table[SIGN, 1.0].false_alarm.value == pytest.approx(0.5, abs=0.1)  # its own threshold is not calibrated
 
 
 def test_the_false_alarm_rate_is_kept_on_fresh_records():
     """Over many campaigns the mean rate on fresh records is the one asked for (exact: 10 of 200 are beyond)."""
     rates = [
-        next(r for r in judged(rows_of(seed, leaky=2)).table if r.detector == CHANGED).false_alarm.rate
+        next(r for r in judged(rows_of(seed, leaky=2)).table if r.detector == CHANGED).false_alarm.value
         for seed in range(60)
     ]
     assert np.mean(rates) == pytest.approx(0.05, abs=4 * np.std(rates) / math.sqrt(60))
@@ -108,7 +108,7 @@ def test_points_have_thresholds_of_their_own():
     assert len(found.calibration.groups) == 2
     table = next(one for one in found.table if one.detector == CHANGED)
     assert table.detection.count == 1  # the same score is high at the one point and low at the other
-    assert table.false_alarm.rate == pytest.approx(0.05, abs=0.05)
+    assert table.false_alarm.value == pytest.approx(0.05, abs=0.05)
 
 
 def test_other_faults_are_not_leaks():

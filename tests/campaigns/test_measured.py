@@ -131,7 +131,7 @@ def test_rotary_strokes(real_folder):
     assert (result.judgement.calibrated_on, result.judgement.judged, len(result.judgement.failed)) == (20, 40, 0)
     assert len(result.judgement.calibration.groups) == 2  # the two directions
     table = {row.detector: row for row in result.judgement.table}
-    assert table["d3 of p_B high"].detection.rate > 0.5
+    assert table["d3 of p_B high"].detection.value > 0.5
     assert table["d3 of p_B high"].false_alarm.count <= 4
     assert {"always fire", "never fire"} <= set(table)
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sealscope.campaigns.prediction.detection import ChangeDetector, Responses, predict
-from sealscope.campaigns.prediction.noise_responses import halves, instrument_noise, responses
+from sealscope.campaigns.prediction.detection import ChangeDetector, Responses, smallest_leaks
+from sealscope.campaigns.prediction.responses import halves, instrument_noise, noise_responses
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
@@ -40,7 +40,7 @@ def noise(experiment: Experiment) -> Array:
 
 @pytest.fixture(scope="module")
 def found(experiment: Experiment, noise: Array) -> Responses:
-    return responses(experiment, SIZES, DETECTORS, noise)[0]
+    return noise_responses(experiment, SIZES, DETECTORS, noise)[0]
 
 
 def look(clean: Array, noise: Array, rate: float) -> Look:
@@ -92,11 +92,11 @@ def test_blocks_cover_what_the_scorers_compare() -> None:
 def test_the_interval_holds_the_answer_of_more_records(experiment: Experiment) -> None:
     """Nine predictions from 12 records each: their 90 % intervals hold the figure of all 108 in six or more."""
     noise = instrument_noise(experiment, 108, 8)
-    (whole,) = predict(responses(experiment, SIZES, DETECTORS[:1], noise)[0], DETECTORS[:1], 0.05)
+    (whole,) = smallest_leaks(noise_responses(experiment, SIZES, DETECTORS[:1], noise)[0], DETECTORS[:1], 0.05)
     assert whole.smallest is not None
     held = 0
     for part in np.split(noise, 9):
-        (one,) = predict(responses(experiment, SIZES, DETECTORS[:1], part)[0], DETECTORS[:1], 0.05)
+        (one,) = smallest_leaks(noise_responses(experiment, SIZES, DETECTORS[:1], part)[0], DETECTORS[:1], 0.05)
         held += one.low is not None and one.low <= whole.smallest <= (one.high or math.inf)
     assert held >= 6
 
@@ -105,7 +105,7 @@ def test_an_error_of_the_mean_widens_the_interval(found: Responses) -> None:
     def width(error: float) -> float:
         table = np.array([[0.0], [-0.02], [-0.2]])
         made = Responses(np.array([0.001, 0.01]), table, np.full((3, 1), 0.01), 400, 4000, error=error * np.abs(table))
-        (one,) = predict(made, DETECTORS[:1], 0.01)
+        (one,) = smallest_leaks(made, DETECTORS[:1], 0.01)
         assert one.low is not None and one.high is not None
         return math.log(one.high / one.low)
 

@@ -201,6 +201,26 @@ def test_a_fault_of_the_program_is_told_in_the_row(tiny, monkeypatch):
     assert work(plan, case).error == "ZeroDivisionError: by nought"
 
 
+def test_the_code_key_covers_every_source_that_a_case_runs(tiny):
+    """Whatever a worker has loaded after carrying out a case, run by run and in a batch, is in the key."""
+    code = (
+        "import sys; from sealscope.campaigns.plans.reader import load_plan\n"
+        "from sealscope.campaigns.cases.case import cases_of, sources\n"
+        "from sealscope.campaigns.cases.work import work\n"
+        "from sealscope.campaigns.execution.batches import in_batches\n"
+        "plan = load_plan(sys.argv[1]); cases = cases_of(plan)[-1:]\n"
+        "assert work(plan, cases[0]).error is None and next(in_batches(plan, cases, 1)).error is None\n"
+        "covered = {str(path) for path in sources()}\n"
+        "loaded = {m.__file__ for n, m in sys.modules.items() if n.startswith('sealscope.') and m.__file__}\n"
+        "print(sorted(loaded - covered)); print(len(loaded) > 60)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(SOURCES)}
+    found = subprocess.run(
+        [sys.executable, "-c", code, str(tiny)], env=environment, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.splitlines() == ["[]", "True"]
+
+
 def test_rows_of_another_campaign_are_not_mixed_in(tiny, text, tmp_path):
     folder = tmp_path / "mine"
     campaign.run(load_plan(tiny), folder, jobs=1)

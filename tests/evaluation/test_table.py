@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +11,7 @@ from hypothesis import strategies as st
 
 from sealscope.errors import InputError
 from sealscope.evaluation.confusion import CANNOT_TELL, confusion_matrix
-from sealscope.evaluation.rates import hourly_rate
-from sealscope.evaluation.table import ALWAYS, NEVER, Outcome, summary
+from sealscope.evaluation.table import ALWAYS, NEVER, JudgedRecord, events_per_hour, summary
 
 FAULTS = ["none", "piston leak", "pump leak"]
 names = st.lists(st.tuples(st.sampled_from(FAULTS), st.sampled_from([*FAULTS, CANNOT_TELL])), min_size=1, max_size=60)
@@ -22,26 +20,19 @@ names = st.lists(st.tuples(st.sampled_from(FAULTS), st.sampled_from([*FAULTS, CA
 def test_a_confusion_by_hand():
     truth = ["none"] * 4 + ["piston leak"] * 5 + ["pump leak"]
     said = ["none", "none", "none", "piston leak", *["piston leak"] * 3, CANNOT_TELL, "pump leak", CANNOT_TELL]
-    found = confusion_matrix(truth, said)
+    found = confusion_matrix(truth, said, FAULTS)
     assert found.rows == tuple(FAULTS)
     assert found.columns == (*FAULTS, CANNOT_TELL)
     assert found.counts.tolist() == [[3, 1, 0, 0], [0, 3, 1, 1], [0, 0, 0, 1]]
     assert (found.accuracy.count, found.accuracy.n) == (6, 10)
-    assert (found.decided.count, found.decided.n) == (6, 8)
-    assert found.balanced == pytest.approx((0.75 + 0.6 + 0.0) / 3)
-    assert (found.recall("piston leak").count, found.recall("piston leak").n) == (3, 5)
-    assert (found.precision("piston leak").count, found.precision("piston leak").n) == (3, 4)
-    assert found.rates[0][1].high == pytest.approx(0.8059, abs=5e-5)
+    assert found.shares[0][1].high == pytest.approx(0.8059, abs=5e-5)
 
 
-def test_a_verdict_that_is_no_true_fault_has_a_column_and_no_row():
-    found = confusion_matrix(["none", "none"], ["none", "air"])
-    assert (found.rows, found.columns) == (("none",), ("none", "air", CANNOT_TELL))
-    assert found.precision("air").count == 0
+def test_a_fault_without_records_has_an_empty_row():
     empty = confusion_matrix(["none"], ["none"], FAULTS)
     assert empty.counts.shape == (3, 4)
-    assert math.isnan(empty.recall("pump leak").rate)
-    assert empty.balanced == 1.0
+    assert math.isnan(empty.shares[2][2].value)
+    assert empty.accuracy.value == 1.0
 
 
 @settings(deadline=None)
@@ -51,8 +42,8 @@ def test_counts_add_up_in_any_order(pairs, random):
     found = confusion_matrix(truth, said, FAULTS)
     assert found.counts.sum() == len(pairs)
     for i, fault in enumerate(FAULTS):
-        rates = [rate.rate for rate in found.rates[i]]
-        assert fault not in truth or sum(rates) == pytest.approx(1.0)
+        shares = [share.value for share in found.shares[i]]
+        assert fault not in truth or sum(shares) == pytest.approx(1.0)
     random.shuffle(pairs)
     again = confusion_matrix(*zip(*pairs, strict=True), FAULTS)
     assert np.array_equal(again.counts, found.counts)
@@ -61,15 +52,15 @@ def test_counts_add_up_in_any_order(pairs, random):
 SIZES = (0.0, 0.0042, 0.015)
 
 
-def outcomes(detector: str, verdicts: dict[float, list[str]], **more) -> list[Outcome]:
+def outcomes(detector: str, verdicts: dict[float, list[str]], **more) -> list[JudgedRecord]:
     return [
-        Outcome(detector, f"{size} {i}", size, verdict, **more)
+        JudgedRecord(detector, f"{size} {i}", size, verdict, **more)
         for size, said in verdicts.items()
         for i, verdict in enumerate(said)
     ]
 
 
-def a_campaign() -> list[Outcome]:
+def a_campaign() -> list[JudgedRecord]:
     first = {0.0: ["leak"] + ["no leak"] * 9, 0.015: ["leak"] * 4 + [CANNOT_TELL], 0.0042: ["leak", "no leak"]}
     second = {0.0: ["no leak"] * 10, 0.015: ["leak"] * 5, 0.0042: ["no leak"] * 2}
     return outcomes("d3", first, hours=0.05) + outcomes("d4", second, hours=0.05)
@@ -83,49 +74,24 @@ def test_the_summary_by_hand():
     row = table[1]
     assert (row.n, row.detection.count, row.cannot_tell.count) == (5, 4, 1)
     assert (row.false_alarm.count, row.false_alarm.n) == (1, 10)
-    assert row.per_hour == hourly_rate(1, 0.5)
+    assert row.per_hour == events_per_hour(1, 0.5)
     assert row.informedness == pytest.approx(0.8 - 0.1)
-    assert (row.delay, row.delay_ninety, row.estimate) == (None, None, None)
 
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(SIZES), st.sampled_from(["leak", "no leak", CANNOT_TELL])), min_size=1))
 def test_the_rows_that_do_not_look_are_always_there_and_never_informed(cases):
-    table = summary([Outcome("any", i, size, verdict) for i, (size, verdict) in enumerate(cases)])
+    table = summary([JudgedRecord("any", i, size, verdict) for i, (size, verdict) in enumerate(cases)])
     own, always, never = ([row for row in table if row.detector == name] for name in ("any", ALWAYS, NEVER))
     assert [row.leak_lpm for row in own] == [row.leak_lpm for row in always] == [row.leak_lpm for row in never]
     for row, fires, silent in zip(own, always, never, strict=True):
         assert row.n == fires.n == silent.n
-        assert row.leak_lpm == 0.0 or (fires.detection.rate, silent.detection.rate) == (1.0, 0.0)
+        assert row.leak_lpm == 0.0 or (fires.detection.value, silent.detection.value) == (1.0, 0.0)
         if row.false_alarm is None:
             assert all(size > 0.0 for size, _ in cases)
         else:
-            assert (fires.false_alarm.rate, silent.false_alarm.rate) == (1.0, 0.0)
+            assert (fires.false_alarm.value, silent.false_alarm.value) == (1.0, 0.0)
             assert row.leak_lpm == 0.0 or fires.informedness == silent.informedness == 0.0
-
-
-def test_an_alarm_before_the_onset_detects_nothing():
-    rows = [Outcome("live", i, 0.01, "leak", alarm_s=alarm, onset_s=90.0) for i, alarm in enumerate((95.0, 99.0, 40.0))]
-    rows.append(Outcome("live", 3, 0.01, "no leak", onset_s=90.0))
-    row = summary(rows)[0]
-    assert (row.detection.count, row.n) == (2, 4)
-    assert (row.delay.value, row.delay_ninety.value) == (9.0, math.inf)
-    unsure = [replace(rows[0], verdict=CANNOT_TELL), *rows[1:]]
-    assert summary(unsure)[0].delay.value == math.inf
-    untimed = summary([replace(one, alarm_s=None) for one in rows])[0]
-    assert untimed.detection.count == 3
-    assert untimed.delay is None
-
-
-def test_estimates_stand_in_the_summary():
-    rows = [
-        Outcome("q", 0, 0.010, "leak", estimate_lpm=0.012, estimate_interval_lpm=(0.009, 0.015)),
-        Outcome("q", 1, 0.010, "leak", estimate_lpm=0.010, estimate_interval_lpm=(0.011, 0.012)),
-        Outcome("q", 2, 0.010, "no leak"),
-    ]
-    found = summary(rows)[0].estimate
-    assert found.bias.value == pytest.approx(0.001)
-    assert (found.coverage.count, found.coverage.n, found.without) == (1, 2, 1)
 
 
 @pytest.mark.parametrize(
@@ -133,24 +99,24 @@ def test_estimates_stand_in_the_summary():
     [
         (lambda: summary([]), "a summary needs at least one row"),
         (
-            lambda: summary([Outcome("d3", "a", 0.0, "maybe")]),
+            lambda: summary([JudgedRecord("d3", "a", 0.0, "maybe")]),
             "the verdict must be one of leak, no leak, cannot tell, got 'maybe' (a)",
         ),
-        (lambda: summary([Outcome("d3", "a", -1.0, "leak")]), "the size of the leak must be >= 0, got -1.0 (a)"),
+        (lambda: summary([JudgedRecord("d3", "a", -1.0, "leak")]), "the size of the leak must be >= 0, got -1.0 (a)"),
         (
-            lambda: summary([Outcome("d3", "a", 0.0, "leak"), Outcome("d4", "a", 0.1, "leak")]),
+            lambda: summary([JudgedRecord("d3", "a", 0.0, "leak"), JudgedRecord("d4", "a", 0.1, "leak")]),
             "a case must have one true size, got 0.0 and 0.1 (a)",
         ),
         (
-            lambda: summary([Outcome("d3", "a", 0.0, "leak")] * 2),
+            lambda: summary([JudgedRecord("d3", "a", 0.0, "leak")] * 2),
             "a case must be judged once by each detector, got two rows (d3, a)",
         ),
         (
-            lambda: summary([Outcome(NEVER, "a", 0.0, "no leak")]),
+            lambda: summary([JudgedRecord(NEVER, "a", 0.0, "no leak")]),
             "the rows 'always fire' and 'never fire' are added by the summary itself",
         ),
-        (lambda: confusion_matrix(["none"], []), "verdicts must be as many as the true faults, got 0 for 1"),
-        (lambda: confusion_matrix([CANNOT_TELL], ["none"]), "'cannot tell' is a verdict and no fault"),
+        (lambda: confusion_matrix(["none"], [], ["none"]), "verdicts must be as many as the true faults, got 0 for 1"),
+        (lambda: confusion_matrix([CANNOT_TELL], ["none"], ["none"]), "'cannot tell' is a verdict and no fault"),
         (lambda: confusion_matrix(["none"], ["rust"], ["none"]), "a fault must be one of none, got 'rust'"),
     ],
 )

@@ -1,29 +1,35 @@
-"""A campaign's result from its folder or from measured data: rows judged, calibration and tables written beside
-them."""
+"""A campaign's result, from its folder or from measured data: rows judged, calibration and tables written."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from sealscope.campaigns.cases.recordings import ProgressCallback, recorded_rows
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.execution import store
-from sealscope.campaigns.held_out.checks import HeldOutCheck, check_sheet, checks_of
+from sealscope.campaigns.held_out.checks import HeldOutCheck, checks_of
 from sealscope.campaigns.held_out.classifiers import Samples, held_out_rows
 from sealscope.campaigns.judging.judge import Judgement, calibration_of, judge
-from sealscope.campaigns.judging.tables import rows_sheet, sheets, write_sheets
+from sealscope.campaigns.judging.tables import PriorKnowledge, ResultTable, rows_table, tables_of, write_tables
+from sealscope.campaigns.plans.detectors import ALL_CHANNELS, plan_detector
 from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, SimulatedPlan
-from sealscope.diagnosis.calibration.thresholds import save
+from sealscope.diagnosis.calibration.scorers import scorer
+from sealscope.diagnosis.calibration.thresholds import Calibration, save
 from sealscope.errors import InputError
 
 CALIBRATION = "calibration.json"
 
 
 @dataclass(frozen=True)
-class Result:
-    """A campaign and what it shows; `missing`: records of the plan that have no row yet; `checks`: of classifiers that
-    were held out; `mode`: how the rows of a simulated one were made, "" for another."""
+class CampaignResult:
+    """A campaign and what it shows.
+
+    `missing`: records of the plan that have no row yet; `checks`: of classifiers that were held out; `mode`: how the
+    rows of a simulated campaign were made, "" for another; `known`: detector -> what it was given beside the record.
+    """
 
     plan: AnyPlan
     rows: tuple[CaseRow, ...]
@@ -31,79 +37,109 @@ class Result:
     judgement: Judgement
     checks: tuple[HeldOutCheck, ...] = ()
     mode: str = ""
+    known: Mapping[str, PriorKnowledge] = field(default_factory=dict)
 
 
-def simulated_result(plan: SimulatedPlan, folder: Path) -> Result:
-    """The result of a simulated campaign, complete or not; raises InputError where its rows do not suffice for one."""
-    rows = store.rows_of(plan, folder)
+def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
+    """Return what a plan gives its detectors beside the recording.
+
+    A scorer of the two sides of a split knows the true onset where the records are simulated, for they are split
+    there; in recordings it is split half-way, and nothing is known. Registered detectors assume a rig.
+    """
+    simulated = isinstance(plan, SimulatedPlan)
+    rig = plan.assumed or (plan.rig if isinstance(plan, SimulatedPlan) else None)
+    known = {}
+    for name in plan.detectors:
+        detector = plan_detector(name)
+        known[name] = PriorKnowledge(
+            onset=simulated and not detector.detector and scorer(detector.of).timing == "split",
+            channels=tuple(plan.views.get(detector.view, ALL_CHANNELS)),
+            rig=(rig.name if rig is not None else "thesis") if detector.detector else "",
+        )
+    return known
+
+
+def _calibration(
+    plan: SimulatedPlan | RecordedPlan, rows: Sequence[CaseRow], made_from: Mapping[str, Any], split_share: float
+) -> Calibration | None:
+    return calibration_of(
+        rows,
+        plan.detectors,
+        false_alarm=plan.false_alarm,
+        promise=plan.promise,
+        confidence=plan.confidence,
+        split_share=split_share,
+        made_from={"campaign": made_from},
+        views=plan.views,
+    )
+
+
+def simulated_result(plan: SimulatedPlan, folder: Path) -> CampaignResult:
+    """Return the result of a simulated campaign, complete or not; InputError where its rows do not suffice for one."""
+    rows = tuple(store.rows_of(plan, folder).values())
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
     head = store.head(folder) or store.made_from(plan)
-    calibration = calibration_of(
-        list(rows.values()),
-        plan.detectors,
-        rate=plan.false_alarm,
-        promise=plan.promise,
-        confidence=plan.confidence,
-        split_share=plan.onset_s / plan.duration_s,
-        made_from={"campaign": head},
-        views=plan.views,
-    )
     judgement = judge(
-        list(rows.values()),
+        rows,
         plan.detectors,
-        calibration,
+        _calibration(plan, rows, head, plan.onset_s / plan.duration_s),
         onset_s=plan.onset_s,
         hours=plan.duration_s / 3600.0,
         confidence=plan.confidence,
     )
-    return Result(
-        plan, tuple(rows.values()), plan.size - len(rows), judgement, mode=str(head.get("mode", store.RUN_BY_RUN))
-    )
+    mode = str(head.get("mode", store.RUN_BY_RUN))
+    return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
 
 
-def held_out_result(plan: HeldOutPlan, samples: Samples) -> Result:
-    """The result of a campaign over measured data; an alarm is log odds over 0."""
+def held_out_result(plan: HeldOutPlan, samples: Samples) -> CampaignResult:
+    """Return the result of a campaign over measured data; an alarm is log odds over 0."""
     rows = held_out_rows(plan, samples)
-    names = [one.name for one in plan.detectors]
+    names = detectors_of(plan)
     judgement = judge(rows, names, None, thresholds=dict.fromkeys(names, 0.0), confidence=plan.confidence)
-    return Result(plan, tuple(rows), 0, judgement, tuple(checks_of(plan, samples)))
+    return CampaignResult(plan, tuple(rows), 0, judgement, tuple(checks_of(plan, samples)))
 
 
-def recorded_result(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> Result:
-    """The result of a campaign over the recordings in a folder."""
+def recorded_result(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> CampaignResult:
+    """Return the result of a campaign over the recordings in a folder."""
     rows = recorded_rows(plan, folder, progress)
-    calibration = calibration_of(
-        rows,
-        plan.detectors,
-        rate=plan.false_alarm,
-        promise=plan.promise,
-        confidence=plan.confidence,
-        made_from={"campaign": {"name": plan.name, "title": plan.title, "recordings": len(rows)}},
-        views=plan.views,
-    )
-    return Result(plan, tuple(rows), 0, judge(rows, plan.detectors, calibration, confidence=plan.confidence))
+    made_from = {"name": plan.name, "title": plan.title, "recordings": len(rows)}
+    judgement = judge(rows, plan.detectors, _calibration(plan, rows, made_from, 0.5), confidence=plan.confidence)
+    return CampaignResult(plan, tuple(rows), 0, judgement, known=prior_knowledge(plan))
 
 
 def detectors_of(plan: AnyPlan) -> list[str]:
-    """Names of a plan's detectors."""
-    return [one if isinstance(one, str) else one.name for one in plan.detectors]
+    """Return the names of a plan's detectors."""
+    return [detector if isinstance(detector, str) else detector.name for detector in plan.detectors]
 
 
-def write_result(result: Result, folder: Path) -> list[Path]:
-    """Write tables (and the calibration, where there is one) into the folder; gives the files."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"a campaign's folder must be one or become one, got: {error.strerror} ({folder})") from None
-    files = write_sheets(
-        folder,
-        [
-            *sheets(result.judgement, result.plan.unit),
-            rows_sheet(result.rows, detectors_of(result.plan), result.plan.unit),
-            check_sheet(result.checks),
-        ],
-    )
+def _check_table(checks: Sequence[HeldOutCheck]) -> ResultTable:
+    """Return the checks as a table, one line a classifier."""
+    columns = (
+        "detector", "AUC, tests held out", "tests: low", "tests: high", "AUC, conditions held out", "conditions: low",
+        "conditions: high", "AUC that 5 % of swapped labels reach", "swaps that reach the true labels' AUC", "swaps",
+        "chosen",
+    )  # fmt: skip
+    rows = tuple(
+        (
+            check.detector, *check.tests, *check.conditions, check.chance, check.reached if check.swaps else None,
+            check.swaps or None, "; ".join(f"{features}: {times}" for features, times in check.picks),
+        )
+        for check in checks
+    )  # fmt: skip
+    return ResultTable("held_out", columns, rows)
+
+
+def write_result(result: CampaignResult, folder: Path) -> list[Path]:
+    """Write tables (and the calibration, where there is one) into the folder; return the files."""
+    store.make_folder(folder)
+    unit = result.plan.unit
+    tables = [
+        *tables_of(result.judgement, unit, result.known),
+        rows_table(result.rows, detectors_of(result.plan), unit),
+        _check_table(result.checks),
+    ]
+    files = write_tables(folder, tables)
     if result.judgement.calibration is not None:
         save(result.judgement.calibration, folder / CALIBRATION)
         files.append(folder / CALIBRATION)

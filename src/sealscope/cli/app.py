@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import campaign, plan, recordings, reproduction, simulation
+from sealscope.cli import campaign, prediction, recordings, reproduction, simulation
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -30,7 +30,7 @@ for command in (
     recordings.diagnose,
     recordings.report,
     simulation.parameters,
-    plan.plan,
+    prediction.predict,
     recordings.convert,
     reproduction.reproduce,
     campaign.calibrate,

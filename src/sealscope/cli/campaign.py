@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sealscope.cli.campaign_progress import bar, span
 from sealscope.cli.options import (
     AssumeOption,
     FalseAlarmOption,
@@ -21,10 +23,11 @@ from sealscope.cli.options import (
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
+    from sealscope.campaigns.cases.recordings import ProgressCallback
     from sealscope.campaigns.execution.store import CampaignProgress
     from sealscope.campaigns.held_out.classifiers import Samples
     from sealscope.campaigns.plans.model import AnyPlan
-    from sealscope.campaigns.results import Result
+    from sealscope.campaigns.results import CampaignResult
 
 campaign = typer.Typer(
     name="campaign",
@@ -34,14 +37,14 @@ campaign = typer.Typer(
 
 
 def complete_plans(incomplete: str) -> list[str]:
-    """Names of packaged plans that begin so."""
+    """Return the names of packaged plans that begin so."""
     from sealscope.campaigns.plans.reader import plan_names
 
     return [name for name in plan_names() if name.startswith(incomplete)]
 
 
 def complete_detectors(incomplete: str) -> list[str]:
-    """Names of scorers, and of detectors with a calibrated threshold, that begin so."""
+    """Return the names of scorers, and of detectors with a calibrated threshold, that begin so."""
     from sealscope.diagnosis.calibration.scorers import CALIBRATED, SCORERS
     from sealscope.diagnosis.registry import detectors
 
@@ -88,8 +91,10 @@ def run(
     sheet: SheetOption = None,
     data: DataOption = None,
 ) -> None:
-    """Carry out what is missing of a plan, then report. Interrupted, the same call goes on. Exit status 1 where a
-    record failed."""
+    """Carry out what is missing of a plan, then report.
+
+    Interrupted, the same call continues. Exit status 1 where a record failed.
+    """
     from sealscope.campaigns.execution.run import run as carry_out
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.plans.reader import load_plan
@@ -99,9 +104,9 @@ def run(
     if (batch or device != "cpu") and not isinstance(loaded, SimulatedPlan):
         raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
     if isinstance(loaded, SimulatedPlan):
-        with bar() as told:
+        with progress_bar() as progress:
             state = carry_out(
-                loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=told, batch=batch, device=device
+                loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, device=device
             )
         typer.echo(_progress_text(state))
     _report(loaded, place, sheet, data)
@@ -137,14 +142,67 @@ def _folder(plan: AnyPlan, given: Path | None) -> Path:
 
 
 def _progress_text(state: CampaignProgress) -> str:
-    words = f"records: {state.done} of {state.records} done"
+    text = f"records: {state.done} of {state.records} done"
     if state.failed:
-        words += f", {state.failed} of them failed"
+        text += f", {state.failed} of them failed"
     if state.seconds is not None:
         left = (state.records - state.done) * state.seconds
-        words += f"; {state.seconds:.2f} s of one core each"
-        words += f", about {span(left)} of one core left" if left else ""
-    return words
+        text += f"; {state.seconds:.2f} s of one core each"
+        text += f", about {_time_text(left)} of one core left" if left else ""
+    return text
+
+
+def _time_text(seconds: float) -> str:
+    if seconds > 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
+
+
+@contextmanager
+def progress_bar() -> Iterator[ProgressCallback]:
+    """Show records, failures and time left on standard error; without a terminal a line a minute, for the log."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _ProgressLines()
+        return
+    columns = (
+        TextColumn("records"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(), TextColumn("{task.description}"),
+    )  # fmt: skip
+    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
+        task = bar.add_task("", total=None)
+
+        def update(done: int, total: int, failures: int) -> None:
+            bar.update(task, completed=done, total=total, description=f"{failures} failed" if failures else "")
+
+        yield update
+
+
+class _ProgressLines:
+    """Progress without a terminal: a line a minute."""
+
+    def __init__(self) -> None:
+        self.began, self.last, self.first = time.monotonic(), time.monotonic(), -1
+
+    def __call__(self, done: int, total: int, failures: int) -> None:
+        now = time.monotonic()
+        self.first = done if self.first < 0 else self.first
+        if now - self.last < 60.0 or done == self.first:
+            return
+        self.last = now
+        left = (now - self.began) / (done - self.first) * (total - done)
+        failed = f", {failures} failed" if failures else ""
+        typer.echo(f"{done} of {total} records{failed}, about {_time_text(left)} left", err=True)
 
 
 def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> None:
@@ -161,8 +219,8 @@ def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
     typer.echo(f"page:   {folder / PAGE}")
 
 
-def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> Result:
-    """The plan's result: from the rows in its folder, or from the measured data that it is about."""
+def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> CampaignResult:
+    """Return the plan's result: from the rows in its folder, or from the measured data that it is about."""
     from sealscope.campaigns.held_out.data_sets import hydraulic_samples, needs_folder
     from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
     from sealscope.campaigns.results import held_out_result, recorded_result, simulated_result
@@ -170,15 +228,15 @@ def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
     if isinstance(plan, SimulatedPlan):
         return simulated_result(plan, folder)
     if isinstance(plan, RecordedPlan):
-        with bar() as told:
-            return recorded_result(plan, needs_folder(data, "recordings"), told)
+        with progress_bar() as progress:
+            return recorded_result(plan, needs_folder(data, "recordings"), progress)
     if plan.data == "hydraulic":
         return held_out_result(plan, hydraulic_samples(needs_folder(data, "the hydraulic data set")))
     return held_out_result(plan, _sheet_samples(sheet))
 
 
 def _sheet_samples(folder: Path | None) -> Samples:
-    """The thesis's data sheet as samples: log RMS of each detail, each test without and with its leak."""
+    """Return the thesis's data sheet as samples: log RMS of each detail, each test without and with its leak."""
     import numpy as np
 
     from sealscope.campaigns.held_out.classifiers import Samples
@@ -194,12 +252,12 @@ def _sheet_samples(folder: Path | None) -> Samples:
         for chamber, quantities in sheet.rms.items()
         for quantity, values in quantities.items()
     }
-    leaks = [one.mean_leak_lpm for one in APPENDIX_C]
+    leaks = [test.mean_leak_lpm for test in APPENDIX_C]
     return Samples(
         features=features,
         leak_lpm=np.array([0.0] * len(leaks) + leaks),
-        tests=[one.number for one in APPENDIX_C] * 2,
-        levels=[{"command": one.command, "closed": f"{one.closed_pct:g} %"} for one in APPENDIX_C] * 2,
+        tests=[test.number for test in APPENDIX_C] * 2,
+        levels=[{"command": test.command, "closed": f"{test.closed_pct:g} %"} for test in APPENDIX_C] * 2,
     )
 
 
@@ -219,7 +277,7 @@ def calibrate(
     ] = None,
     false_alarm: FalseAlarmOption = 0.01,
     promise: Annotated[
-        str, typer.Option("--promise", help="'average': the rate holds on average; 'bound': with --confidence.")
+        str, typer.Option("--promise", help="'average': the probability holds on average; 'bound': with --confidence.")
     ] = "average",
     confidence: Annotated[float, typer.Option("--confidence", help="Confidence of the stated intervals.")] = 0.95,
     split: Annotated[
@@ -248,7 +306,7 @@ def calibrate(
     channel_map = channel_map_of(maps)
     recordings = {str(path): read(path, channel_map=channel_map or None, rate=rate) for path in baseline}
     files = [{"file": path.name, "sha256": sha256(path.read_bytes()).hexdigest()} for path in baseline]
-    found = calibrate_on(
+    calibration = calibrate_on(
         recordings,
         tuple(detectors or DEFAULT_DETECTORS),
         false_alarm_probability=false_alarm,
@@ -263,19 +321,19 @@ def calibrate(
             "assumed_rig": rig or "thesis",
         },
     )
-    save(found, output)
-    for group in found.groups:
+    save(calibration, output)
+    for group in calibration.groups:
         point = group.point
-        words = [f"{group.records} recordings at {point.rate:g} Hz"]
-        words += [f"command {point.command_rms:.3g} V rms"] if point.command_rms is not None else []
-        words += [f"stroke {point.direction:+d}"] if point.direction else []
-        typer.echo(", ".join(words))
-        for name in found.detectors:
-            one = group.thresholds.get(name)
+        parts = [f"{group.records} recordings at {point.rate:g} Hz"]
+        parts += [f"command {point.command_rms:.3g} V rms"] if point.command_rms is not None else []
+        parts += [f"stroke {point.direction:+d}"] if point.direction else []
+        typer.echo(", ".join(parts))
+        for name in calibration.detectors:
+            limit = group.thresholds.get(name)
             typer.echo(
                 f"  {name}: too few recordings"
-                if one is None
-                else f"  {name}: threshold {one.value:.4g}, false alarms {100 * one.expected:.3g} % expected "
-                f"({100 * one.low:.2g} % to {100 * one.high:.2g} %)"
+                if limit is None
+                else f"  {name}: threshold {limit.value:.4g}, false alarms {100 * limit.expected:.3g} % expected "
+                f"({100 * limit.low:.2g} % to {100 * limit.high:.2g} %)"
             )
     typer.echo(f"calibration: {output}")

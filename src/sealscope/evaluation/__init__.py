@@ -1,1 +1,1 @@
-"""Alarms against truth: how often, how soon and how surely a detector finds a leak, and how often it cries wolf."""
+"""Evaluation of alarms against truth: detection, false alarms, errors of estimates, each with its interval."""

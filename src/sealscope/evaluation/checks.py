@@ -1,4 +1,4 @@
-"""What every evaluation asks of the numbers it is given, with one line of complaint."""
+"""Checks of the numbers that an evaluation is given, each with one line of complaint."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ from sealscope.errors import InputError
 Array = npt.NDArray[np.float64]
 
 
-def numbers(values: npt.ArrayLike, what: str, at_least: int = 1) -> Array:
-    """`values` as a flat array of finite doubles; InputError names the first that is not one, or that there are fewer
-    than `at_least`."""
+def numbers(values: npt.ArrayLike, what: str) -> Array:
+    """Return `values` as a flat array of one finite double or more; InputError names the first that is not one."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise InputError(f"{what} must be numbers") from None
     if array.ndim != 1:
         raise InputError(f"{what} must be one flat list, got {array.ndim} dimensions")
-    if array.size < at_least:
-        raise InputError(f"{what} must be at least {at_least}, got {array.size}")
+    if array.size < 1:
+        raise InputError(f"{what} must be at least 1, got {array.size}")
     bad = np.flatnonzero(~np.isfinite(array))
     if bad.size:
         raise InputError(f"{what} must be finite, got {array[bad[0]]} (number {bad[0] + 1} of {array.size})")
@@ -28,7 +27,7 @@ def numbers(values: npt.ArrayLike, what: str, at_least: int = 1) -> Array:
 
 
 def sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
-    """`values` as sizes of leaks, all > 0: records without a leak belong to the false alarms."""
+    """Return `values` as sizes of leaks, all > 0: records without a leak belong to the false alarms."""
     array = numbers(values, what)
     bad = np.flatnonzero(array <= 0.0)
     if bad.size:
@@ -37,7 +36,7 @@ def sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
 
 
 def flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
-    """`values` as n answers yes or no (True/False or 1/0)."""
+    """Return `values` as n answers yes or no (True/False or 1/0)."""
     array = numbers(np.asarray(values, dtype=np.float64), what)
     if array.size != n:
         raise InputError(f"{what} must be as many as the records, got {array.size} for {n}")
@@ -48,7 +47,7 @@ def flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
 
 
 def share(value: float, what: str) -> float:
-    """`value` as a probability strictly between 0 and 1."""
+    """Return `value`, a probability strictly between 0 and 1."""
     if not 0.0 < value < 1.0:
         raise InputError(f"{what} must be between 0 and 1, got {value}")
     return float(value)

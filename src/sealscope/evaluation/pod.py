@@ -1,8 +1,13 @@
-"""Probability of detection over the size of the leak, without a model: the rate at each size and what it proves."""
+"""Probability of detection over the size of the leak.
+
+The detection at each size, and the logistic curve through hits and misses with its a50, a90 and a90/95, as
+MIL-HDBK-1823A fits hit/miss data.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,60 +15,43 @@ import numpy as np
 import numpy.typing as npt
 
 from sealscope.errors import InputError
-from sealscope.evaluation.binomial import Rate, lower_bound, rate_of
-from sealscope.evaluation.checks import Array, flags, numbers, share, sizes
+from sealscope.evaluation.binomial import Proportion, lower_bound, proportion
+from sealscope.evaluation.checks import Array, flags, share, sizes
 
-#: The scale on which the size (or the signal) is modelled.
-Scale = Literal["log", "linear"]
+Estimator = Literal["maximum likelihood", "firth"]
+_FARTHEST = 1e4
 
 
 @dataclass(frozen=True)
-class SizeRate:
-    """Detection at one `size`: the `rate` with its two-sided interval and the one-sided `lower` bound, both at the
-    rate's confidence."""
+class SizeDetection:
+    """Detection at one `size`: its `proportion` with a two-sided interval, and the one-sided `lower` bound."""
 
     size: float
-    rate: Rate
+    proportion: Proportion
     lower: float
 
 
-def scaled(values: npt.ArrayLike, scale: Scale, what: str) -> Array:
-    """`values` on the model's scale: their natural logarithm (all must be > 0), or as they are."""
-    if scale == "log":
-        return np.asarray(np.log(sizes(values, what)), dtype=np.float64)
-    if scale == "linear":
-        return numbers(values, what)
-    raise InputError(f"the scale must be 'log' or 'linear', got {scale!r}")
-
-
-def unscaled(value: float, scale: Scale) -> float:
-    """The value that `scaled` would take to `value`; infinite where it is too large to be one."""
-    if scale == "linear" or math.isnan(value):
-        return value
-    return math.exp(value) if value < 709.0 else math.inf
-
-
-def by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeRate]:
-    """The detection rate at each size of leak, with Clopper-Pearson's bounds, in rising order.
+def by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeDetection]:
+    """Return the detection at each size of leak, with Clopper-Pearson's bounds, in rising order.
 
     `leaks` (n,) sizes, any unit; `hits` (n,) whether each was found. Raises InputError for sizes <= 0.
     """
-    size = sizes(leaks)
-    hit = flags(hits, size.size, "hits")
+    leak = sizes(leaks)
+    hit = flags(hits, leak.size, "hits")
     share(confidence, "confidence")
     rows = []
-    for one in np.unique(size):
-        here = hit[size == one]
+    for size in np.unique(leak):
+        here = hit[leak == size]
         k, n = int(here.sum()), int(here.size)
-        rows.append(SizeRate(float(one), rate_of(k, n, confidence), lower_bound(k, n, confidence)))
+        rows.append(SizeDetection(float(size), proportion(k, n, confidence), lower_bound(k, n, confidence)))
     return rows
 
 
-def proven_size(rows: list[SizeRate], detection: float = 0.9) -> float:
-    """The smallest size from which on every tested size has its lower bound >= `detection`; infinite where none has.
+def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
+    """Return the smallest size from which on every tested size has its lower bound >= `detection`.
 
-    With 29 hits of 29 at 95 % the size proves 90 % (a90/95 without a model). Nothing is said between the sizes, and
-    the confidence is that of each size alone. Source: Clopper and Pearson (1934), doi
+    Infinite where none has. With 29 hits of 29 at 95 % the size proves 90 % (a90/95 without a model). Nothing is said
+    between the sizes, and the confidence is that of each size alone. Source: Clopper and Pearson (1934), doi
     10.1093/biomet/26.4.404.
     """
     share(detection, "the probability of detection")
@@ -73,3 +61,251 @@ def proven_size(rows: list[SizeRate], detection: float = 0.9) -> float:
             break
         proven = row.size
     return proven
+
+
+def _log_odds(p: float) -> float:
+    return math.log(p / (1.0 - p))
+
+
+def _information(design: Array, n: Array, eta: Array) -> Array:
+    odds = np.exp(-np.abs(eta))
+    weight = n * odds / (1.0 + odds) ** 2  # n p (1 - p)
+    return np.asarray(design.T @ (design * weight[:, None]), dtype=np.float64)
+
+
+def _objective(design: Array, n: Array, k: Array, eta: Array, firth: bool) -> float:
+    """Return the log-likelihood ``sum of k eta - n ln(1 + exp eta)``, Firth's with the penalty.
+
+    The penalty is half the log determinant of the information.
+    """
+    value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
+    if not firth:
+        return value
+    sign, log_determinant = np.linalg.slogdet(_information(design, n, eta))
+    return value + 0.5 * float(log_determinant) if sign > 0 else -math.inf
+
+
+def _newton(design: Array, n: Array, k: Array, firth: bool) -> tuple[Array, float]:
+    """Return coefficients and objective at the maximum, by Fisher scoring with step halving."""
+    from scipy.special import expit
+
+    beta = np.zeros(design.shape[1])
+    beta[0] = _log_odds((k.sum() + 0.5) / (n.sum() + 1.0))
+    value = _objective(design, n, k, design @ beta, firth)
+    for _ in range(200):
+        eta = design @ beta
+        p = expit(eta)
+        inverse = np.linalg.inv(_information(design, n, eta))
+        residual = k - n * p
+        if firth:  # leverage of each size times (1/2 - p): Firth (1993), Heinze and Schemper (2002)
+            leverage = n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design)
+            residual = residual + leverage * (0.5 - p)
+        step = inverse @ (design.T @ residual)
+        length = min(1.0, 5.0 / max(1e-300, float(np.abs(step).max())))
+        while length > 1e-12:
+            trial = _objective(design, n, k, design @ (beta + length * step), firth)
+            if trial >= value - 1e-13 * abs(value):
+                break
+            length *= 0.5
+        beta = beta + length * step
+        done = float(np.abs(length * step).max()) < 1e-10
+        value = _objective(design, n, k, design @ beta, firth)
+        if done:
+            break
+    return beta, value
+
+
+def is_separated(n: Array, k: Array) -> bool:
+    """Return whether misses and hits of rising sizes (n tested, k hits at each) overlap in one size at most.
+
+    Then the likelihood has no maximum at a finite slope.
+    """
+    hits = k / n
+    mixed = np.count_nonzero((hits > 0.0) & (hits < 1.0))
+    steps = np.diff(hits)
+    return bool(mixed <= 1 and (np.all(steps >= 0.0) or np.all(steps <= 0.0)))
+
+
+@dataclass(frozen=True)
+class HitMiss:
+    """``ln(POD/(1 - POD)) = intercept + slope ln(size)``.
+
+    `covariance` (2, 2) of both; `estimator`: Firth's penalised likelihood where hits and misses are `separated`, else
+    maximum likelihood; `log_likelihood` of the fit and `null` without the size (both with the penalty where there is
+    one); `size`, `tested`, `hits` (m,): the data by size.
+    """
+
+    intercept: float
+    slope: float
+    covariance: Array
+    estimator: Estimator
+    separated: bool
+    log_likelihood: float
+    null: float
+    size: Array
+    tested: Array
+    hits: Array
+
+    def detection(self, size: npt.ArrayLike) -> Array:
+        """Return the probability of detection at each size."""
+        from scipy.special import expit
+
+        x = _log_sizes(size)
+        return np.asarray(expit(self.intercept + self.slope * x), dtype=np.float64)
+
+    def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
+        """Return the two-sided pointwise Wald interval of the probability of detection at each size.
+
+        It is made on the log odds.
+        """
+        from scipy.special import expit, ndtri
+
+        z = float(ndtri(0.5 + share(confidence, "confidence") / 2.0))
+        x = _log_sizes(size)
+        v = self.covariance
+        half = z * np.sqrt(v[0, 0] + 2.0 * v[0, 1] * x + v[1, 1] * x * x)
+        eta = self.intercept + self.slope * x
+        return np.asarray(expit(eta - half), dtype=np.float64), np.asarray(expit(eta + half), dtype=np.float64)
+
+    def size_at(self, detection: float) -> float:
+        """Return the size found with probability `detection`: ``ln(size) = (ln(p/(1-p)) - intercept)/slope``.
+
+        Infinite where detection does not rise with the size.
+        """
+        share(detection, "the probability of detection")
+        if not self.slope > 0.0:
+            return math.inf
+        return _size((_log_odds(detection) - self.intercept) / self.slope)
+
+    def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
+        """Return the one-sided upper confidence bound of `size_at(detection)`, by default a90/95.
+
+        It is the largest size whose profile log-likelihood is within ``z_c^2/2`` of the maximum (chi square, one
+        degree of freedom); infinite where there is none. Source: MIL-HDBK-1823A (2009), appendix G; Cheng and Iles,
+        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, gives the simultaneous counterparts, which
+        are wider.
+        """
+        from scipy.special import ndtri
+
+        share(detection, "the probability of detection")
+        if not 0.5 <= confidence < 1.0:
+            raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
+        if not self.slope > 0.0:
+            return math.inf
+        return _size(self._profile_bound(_log_odds(detection), 0.5 * float(ndtri(confidence)) ** 2))
+
+    @property
+    def a50(self) -> float:
+        """The size found half of the time."""
+        return self.size_at(0.5)
+
+    @property
+    def a90(self) -> float:
+        """The size found nine times in ten."""
+        return self.size_at(0.9)
+
+    @property
+    def a90_95(self) -> float:
+        """The size found nine times in ten, with 95 % confidence (likelihood ratio)."""
+        return self.size_bound()
+
+    def _profile(self) -> Callable[[float, float], float]:
+        """Return the log-likelihood at log odds `odds` in the point x, maximised over the slope."""
+        from scipy.optimize import minimize_scalar
+
+        x = _log_sizes(self.size)
+        design, n, k = np.column_stack([np.ones(x.size), x]), self.tested, self.hits
+        firth = self.estimator == "firth"
+
+        def profile(odds: float, at: float) -> float:
+            def loss(slope: float) -> float:
+                value = _objective(design, n, k, odds + slope * (x - at), firth)
+                return -value if math.isfinite(value) else 1e300
+
+            width = max(float(np.abs(x - at).max()), 1e-300)
+            return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
+
+        return profile
+
+    def _profile_bound(self, odds: float, drop: float) -> float:
+        from scipy.optimize import brentq
+
+        if self.log_likelihood - self.null <= drop:
+            return math.inf
+        profile = self._profile()
+        x = _log_sizes(self.size)
+        best, step = (odds - self.intercept) / self.slope, float(np.ptp(x)) / 8.0
+
+        def short(at: float) -> float:
+            return self.log_likelihood - profile(odds, at) - drop
+
+        near, far = best, best + step
+        while short(far) < 0.0:
+            near, step = far, 2.0 * step
+            far += step
+            if step > _FARTHEST * float(np.ptp(x)):
+                return math.inf
+        return float(brentq(short, near, far, xtol=1e-10 * max(1.0, abs(far))))
+
+
+def _log_sizes(values: npt.ArrayLike) -> Array:
+    return np.asarray(np.log(sizes(np.atleast_1d(np.asarray(values, dtype=np.float64)), "sizes")), dtype=np.float64)
+
+
+def _size(log_size: float) -> float:
+    """Return the size of this natural logarithm; infinite where it is too large to be one."""
+    return math.exp(log_size) if log_size < 709.0 else math.inf
+
+
+def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
+    """Fit the logistic curve through hits and misses over the logarithm of the size, by maximum likelihood.
+
+    `leaks` (n,) sizes > 0 in any unit; `hits` (n,) whether each was found. Where no finite
+    maximum exists (hits and misses separated by size), Firth's penalised likelihood is used and said so; its bound is
+    the penalised profile's. Raises InputError for a single size, or where all are hits or all misses. The curve goes
+    to 0 for small leaks: it does not know the false-alarm rate. Source: MIL-HDBK-1823A (2009), appendix G; Firth,
+    Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med. 21 (2002) 2409-2419, doi
+    10.1002/sim.1047.
+    """
+    x = np.log(sizes(leaks))
+    hit = flags(hits, x.size, "hits")
+    if hit.all() or not hit.any():
+        raise InputError(f"a curve needs hits and misses, got {int(hit.sum())} hits of {hit.size}")
+    values, where = np.unique(x, return_inverse=True)
+    if values.size < 2:
+        raise InputError(f"a curve needs leaks of at least 2 sizes, got {hit.size} of one size")
+    n = np.bincount(where).astype(np.float64)
+    k = np.asarray(np.bincount(where, weights=hit.astype(np.float64)), dtype=np.float64)
+    separated = is_separated(n, k)
+    # centred and scaled while fitting, so that the size's unit does not matter
+    centre, spread = float(values.mean()), float(np.ptp(values)) / 2.0
+    design = np.column_stack([np.ones(values.size), (values - centre) / spread])
+    beta, _ = _newton(design, n, k, separated)
+    back = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
+    covariance = back @ np.linalg.inv(_information(design, n, design @ beta)) @ back.T
+    intercept, slope = (float(b) for b in back @ beta)
+    plain = np.column_stack([np.ones(values.size), values])
+    null = _null(plain, n, k, separated)
+    return HitMiss(
+        intercept=intercept,
+        slope=slope,
+        covariance=np.asarray(covariance, dtype=np.float64),
+        estimator="firth" if separated else "maximum likelihood",
+        separated=separated,
+        log_likelihood=_objective(plain, n, k, intercept + slope * values, separated),
+        null=null,
+        size=np.exp(values),
+        tested=n,
+        hits=k,
+    )
+
+
+def _null(design: Array, n: Array, k: Array, firth: bool) -> float:
+    """Return the objective's maximum with slope 0.
+
+    Firth's penalty there is ln(p(1 - p)) and a constant, as one more hit and one more miss would add: ``p = (k + 1)/(n
+    + 2)``.
+    """
+    more = 1.0 if firth else 0.0
+    eta = _log_odds((k.sum() + more) / (n.sum() + 2.0 * more))
+    return _objective(design, n, k, np.full(n.size, eta), firth)

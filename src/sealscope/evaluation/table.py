@@ -1,5 +1,4 @@
-"""The table that judges detectors alike: by detector and size of leak, beside one that always fires and one that never
-does."""
+"""The summary of detectors by size of leak, beside one that always fires and one that never does."""
 
 from __future__ import annotations
 
@@ -8,22 +7,20 @@ from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 
 from sealscope.errors import InputError
-from sealscope.evaluation.binomial import Rate, rate_of
+from sealscope.evaluation.binomial import Proportion, proportion
+from sealscope.evaluation.checks import share
 from sealscope.evaluation.confusion import CANNOT_TELL
-from sealscope.evaluation.quantiles import Quantile
-from sealscope.evaluation.rates import EstimateError, HourlyRate, delays, estimate_error, hourly_rate
 
 ALWAYS, NEVER = "always fire", "never fire"
 _VERDICTS = ("leak", "no leak", CANNOT_TELL)
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What one detector said of one record, beside the truth.
+class JudgedRecord:
+    """The verdict of one detector on one record, beside the truth.
 
-    `case`: the record, the same name for each detector; `leak_lpm`: the true size, 0 without a leak, in L/min (any
-    unit, the estimate's too); `hours`: operating time of the record; `alarm_s` and `onset_s`: time of the alarm and
-    true onset in the record, where both are known; `estimate_lpm` with its interval, where there is one.
+    `case`: the record, the same name for each detector; `leak_lpm`: the true size, 0 without a leak, in L/min or any
+    other unit; `hours`: operating time of the record, None where it is not known.
     """
 
     detector: str
@@ -31,146 +28,138 @@ class Outcome:
     leak_lpm: float
     verdict: str
     hours: float | None = None
-    alarm_s: float | None = None
-    onset_s: float | None = None
-    estimate_lpm: float | None = None
-    estimate_interval_lpm: tuple[float, float] | None = None
 
-    @property
-    def premature(self) -> bool:
-        """Whether the alarm came before the leak did."""
-        timed = self.alarm_s is not None and self.onset_s is not None
-        return self.verdict == "leak" and timed and self.alarm_s < self.onset_s  # type: ignore[operator]
 
-    @property
-    def detects(self) -> bool:
-        """Whether it is an alarm, and not before the onset."""
-        return self.verdict == "leak" and not self.premature
+@dataclass(frozen=True)
+class EventsPerHour:
+    """`count` events in `hours`: events per hour with the exact interval (`low`, `high`) at `confidence`."""
+
+    count: int
+    hours: float
+    per_hour: float
+    low: float
+    high: float
+    confidence: float
 
 
 @dataclass(frozen=True)
 class SummaryRow:
     """One detector at one size of leak.
 
-    `detection`: alarms over all `n` records of that size, an alarm before the onset and `cannot tell` not among them;
-    `cannot_tell`: over the same records; `false_alarm` and `per_hour`: of that detector on its leak-free records (None
-    where there are none, or no hours); `informedness`: detection less false alarms, 0 for chance; `delay` (median) and
-    `delay_ninety` [s] over all the leaks, None where onsets are unknown; `estimate`: error in L/min, where estimated.
+    `detection`: alarms over all `n` records of that size, `cannot tell` not among them; `cannot_tell`: over the same
+    records; `false_alarm` and `per_hour`: of that detector on its leak-free records (None where there are none, or no
+    hours); `informedness`: detection less false alarms, 0 for chance.
     """
 
     detector: str
     leak_lpm: float
     n: int
-    detection: Rate
-    cannot_tell: Rate
-    false_alarm: Rate | None
-    per_hour: HourlyRate | None
+    detection: Proportion
+    cannot_tell: Proportion
+    false_alarm: Proportion | None
+    per_hour: EventsPerHour | None
     informedness: float
-    delay: Quantile | None
-    delay_ninety: Quantile | None
-    estimate: EstimateError | None
 
 
-def _checked(rows: Iterable[Outcome]) -> list[Outcome]:
-    """The rows, each sound; the same case has the same truth for each detector, and is judged once by each."""
-    sound: list[Outcome] = []
+def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the exact interval (low, high) of a Poisson mean after `count` events.
+
+    ``low = G(alpha/2; k), high = G(1 - alpha/2; k + 1)``, G the quantile of the gamma distribution of that shape; 0
+    where there was no event. Raises InputError for an impossible count or confidence. Source: Garwood, Biometrika 28
+    (1936) 437-442, doi 10.1093/biomet/28.3-4.437.
+    """
+    from scipy.special import gammainccinv, gammaincinv
+
+    if count < 0 or count != int(count):
+        raise InputError(f"a number of events must be whole and >= 0, got {count}")
+    tail = (1.0 - share(confidence, "confidence")) / 2.0
+    return 0.0 if count == 0 else float(gammaincinv(count, tail)), float(gammainccinv(count + 1, tail))
+
+
+def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> EventsPerHour:
+    """Return events per operating hour with their exact interval; InputError unless `hours` > 0."""
+    if not (math.isfinite(hours) and hours > 0.0):
+        raise InputError(f"operating hours must be > 0, got {hours}")
+    low, high = poisson_interval(count, confidence)
+    return EventsPerHour(int(count), float(hours), count / hours, low / hours, high / hours, confidence)
+
+
+def _checked(records: Iterable[JudgedRecord]) -> list[JudgedRecord]:
+    """Return the records; a case has the same truth for each detector, and is judged once by each."""
+    checked: list[JudgedRecord] = []
     truth: dict[Hashable, float] = {}
     judged: set[tuple[str, Hashable]] = set()
-    for row in rows:
-        if row.verdict not in _VERDICTS:
-            raise InputError(f"the verdict must be one of {', '.join(_VERDICTS)}, got {row.verdict!r} ({row.case})")
-        if not (math.isfinite(row.leak_lpm) and row.leak_lpm >= 0.0):
-            raise InputError(f"the size of the leak must be >= 0, got {row.leak_lpm} ({row.case})")
-        if row.detector in (ALWAYS, NEVER):
+    for record in records:
+        case, size = record.case, record.leak_lpm
+        if record.verdict not in _VERDICTS:
+            raise InputError(f"the verdict must be one of {', '.join(_VERDICTS)}, got {record.verdict!r} ({case})")
+        if not (math.isfinite(size) and size >= 0.0):
+            raise InputError(f"the size of the leak must be >= 0, got {size} ({case})")
+        if record.detector in (ALWAYS, NEVER):
             raise InputError(f"the rows {ALWAYS!r} and {NEVER!r} are added by the summary itself")
-        if truth.setdefault(row.case, row.leak_lpm) != row.leak_lpm:
-            raise InputError(f"a case must have one true size, got {truth[row.case]} and {row.leak_lpm} ({row.case})")
-        if (row.detector, row.case) in judged:
-            raise InputError(f"a case must be judged once by each detector, got two rows ({row.detector}, {row.case})")
-        judged.add((row.detector, row.case))
-        sound.append(row)
-    if not sound:
+        if truth.setdefault(case, size) != size:
+            raise InputError(f"a case must have one true size, got {truth[case]} and {size} ({case})")
+        if (record.detector, case) in judged:
+            raise InputError(f"a case must be judged once by each detector, got two rows ({record.detector}, {case})")
+        judged.add((record.detector, case))
+        checked.append(record)
+    if not checked:
         raise InputError("a summary needs at least one row")
-    return sound
+    return checked
 
 
-def _references(rows: list[Outcome]) -> list[Outcome]:
-    """The two detectors that do not look, on every case that any detector judged."""
-    cases = {row.case: row for row in rows}
+def _references(records: list[JudgedRecord]) -> list[JudgedRecord]:
+    """Return the verdicts of the two detectors that do not look, on every case that any detector judged."""
+    cases = {record.case: record for record in records}
     return [
-        Outcome(name, case, row.leak_lpm, verdict, row.hours)
+        JudgedRecord(name, case, record.leak_lpm, verdict, record.hours)
         for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))
-        for case, row in cases.items()
+        for case, record in cases.items()
     ]
 
 
-def _delay(rows: list[Outcome], confidence: float) -> tuple[Quantile | None, Quantile | None]:
-    """Delays over all rows; none where an onset is unknown, or an alarm has no time."""
-    if any(row.onset_s is None or (row.verdict == "leak" and row.alarm_s is None) for row in rows):
-        return None, None
-    alarms = [row.alarm_s if row.verdict == "leak" and row.alarm_s is not None else math.nan for row in rows]
-    found = delays(alarms, [row.onset_s or 0.0 for row in rows], confidence)
-    return found.median, found.ninety
-
-
-def _estimate(rows: list[Outcome], confidence: float) -> EstimateError | None:
-    if all(row.estimate_lpm is None for row in rows):
-        return None
-    limits = [row.estimate_interval_lpm or (math.nan, math.nan) for row in rows]
-    return estimate_error(
-        [math.nan if row.estimate_lpm is None else row.estimate_lpm for row in rows],
-        [row.leak_lpm for row in rows],
-        [low for low, _ in limits],
-        [high for _, high in limits],
-        confidence,
-    )
-
-
-def _false_alarms(leak_free: list[Outcome], confidence: float) -> tuple[Rate | None, HourlyRate | None]:
+def _false_alarms(leak_free: list[JudgedRecord], confidence: float) -> tuple[Proportion | None, EventsPerHour | None]:
     if not leak_free:
         return None, None
-    count = sum(row.verdict == "leak" for row in leak_free)
-    hours = [row.hours for row in leak_free if row.hours is not None]
-    hourly = hourly_rate(count, math.fsum(hours), confidence) if len(hours) == len(leak_free) else None
-    return rate_of(count, len(leak_free), confidence), hourly
+    count = sum(record.verdict == "leak" for record in leak_free)
+    hours = [record.hours for record in leak_free if record.hours is not None]
+    hourly = events_per_hour(count, math.fsum(hours), confidence) if len(hours) == len(leak_free) else None
+    return proportion(count, len(leak_free), confidence), hourly
 
 
-def summary(rows: Iterable[Outcome], confidence: float = 0.95) -> list[SummaryRow]:
-    """One row for each detector and size of leak, sizes rising, and the rows `always fire` and `never fire` last.
+def summary(records: Iterable[JudgedRecord], confidence: float = 0.95) -> list[SummaryRow]:
+    """Return one row for each detector and size of leak, sizes rising, `always fire` and `never fire` last.
 
-    A detector without a record with a leak has one row of size 0, with no detection. Intervals as in `rate_of`,
-    `hourly_rate`, `delays` and `estimate_error`. Raises InputError for an unknown verdict, a size < 0, a case with two
-    truths or one judged twice.
+    A detector without a record with a leak has one row of size 0, with no detection. Intervals as in `proportion` and
+    `events_per_hour`. Raises InputError for an unknown verdict, a size < 0, a case with two truths or one judged
+    twice.
     """
-    sound = _checked(rows)
-    table: list[SummaryRow] = []
-    by_detector: dict[str, list[Outcome]] = {}
-    for row in [*sound, *_references(sound)]:
-        by_detector.setdefault(row.detector, []).append(row)
+    checked = _checked(records)
+    rows: list[SummaryRow] = []
+    by_detector: dict[str, list[JudgedRecord]] = {}
+    for record in [*checked, *_references(checked)]:
+        by_detector.setdefault(record.detector, []).append(record)
     for detector, own in by_detector.items():
-        alarm, hourly = _false_alarms([row for row in own if row.leak_lpm == 0.0], confidence)
-        by_size: dict[float, list[Outcome]] = {}
-        for row in own:
-            if row.leak_lpm > 0.0:
-                by_size.setdefault(row.leak_lpm, []).append(row)
+        false_alarm, hourly = _false_alarms([record for record in own if record.leak_lpm == 0.0], confidence)
+        by_size: dict[float, list[JudgedRecord]] = {}
+        for record in own:
+            if record.leak_lpm > 0.0:
+                by_size.setdefault(record.leak_lpm, []).append(record)
         for size in sorted(by_size) or [0.0]:
             here = by_size.get(size, [])
-            detection = rate_of(sum(row.detects for row in here), len(here), confidence)
-            unsure = here or own
-            delay, ninety = _delay(here, confidence) if here else (None, None)
-            table.append(
+            detection = proportion(sum(record.verdict == "leak" for record in here), len(here), confidence)
+            counted = here or own
+            unsure = sum(record.verdict == CANNOT_TELL for record in counted)
+            rows.append(
                 SummaryRow(
                     detector=detector,
                     leak_lpm=size,
-                    n=len(unsure),
+                    n=len(counted),
                     detection=detection,
-                    cannot_tell=rate_of(sum(r.verdict == CANNOT_TELL for r in unsure), len(unsure), confidence),
-                    false_alarm=alarm,
+                    cannot_tell=proportion(unsure, len(counted), confidence),
+                    false_alarm=false_alarm,
                     per_hour=hourly,
-                    informedness=detection.rate - alarm.rate if alarm else math.nan,
-                    delay=delay,
-                    delay_ninety=ninety,
-                    estimate=_estimate(here, confidence) if here else None,
+                    informedness=detection.value - false_alarm.value if false_alarm else math.nan,
                 )
             )
-    return table
+    return rows

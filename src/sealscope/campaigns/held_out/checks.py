@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from sealscope.campaigns.held_out.classifiers import Samples, chosen_candidates, held_out_scores, places_of
-from sealscope.campaigns.judging.tables import Sheet
+from sealscope.campaigns.held_out.classifiers import Array, Samples, chosen_candidates, group_numbers, held_out_scores
 from sealscope.campaigns.plans.model import ChosenClassifier, Classifier, HeldOutPlan
-from sealscope.evaluation.auc import auc
-
-Array = npt.NDArray[np.float64]
+from sealscope.evaluation.roc import auc
 
 
 @dataclass(frozen=True)
@@ -35,27 +31,27 @@ class HeldOutCheck:
     swaps: int = 0
     picks: tuple[tuple[str, int], ...] = ()
 
-    def words(self) -> str:
-        """The check in one sentence."""
+    def sentence(self) -> str:
+        """Return the check in one sentence."""
         value, low, high = self.conditions
-        told = (
+        text = (
             f"{self.detector}: AUC {self.tests[0]:.3f} ({self.tests[1]:.3f}–{self.tests[2]:.3f}) with whole tests held "
             f"out, {value:.3f} ({low:.3f}–{high:.3f}) with whole conditions"
         )
         if self.chance is not None:
-            told += (
+            text += (
                 f"; with the labels of each test swapped by chance 5 % of {self.swaps} swaps reach {self.chance:.3f}, "
                 f"{self.reached} reach what the true labels do"
             )
         if self.picks:
-            told += "; chosen: " + ", ".join(f"{words} ({times} times)" for words, times in self.picks[:3])
-        return told + "."
+            text += "; chosen: " + ", ".join(f"{features} ({times} times)" for features, times in self.picks[:3])
+        return text + "."
 
 
 def clustered_area(
     scores: Array, leaks: npt.NDArray[np.bool_], clusters: npt.NDArray[np.intp], confidence: float = 0.95
 ) -> tuple[float, float, float]:
-    """Area under the ROC and its interval where samples of one cluster depend on each other.
+    """Return the area under the ROC and its interval where samples of one cluster depend on each other.
 
     ``var A = I/(I - 1) sum_i (U_i/m + W_i/n - (m_i/m + n_i/n) A)^2`` with U_i, W_i the sums of the placements of the
     m_i leaky and n_i leak-free samples of cluster i, of I clusters; equal to Obuchowski's estimate where every cluster
@@ -78,62 +74,46 @@ def clustered_area(
 
 
 def swapped_areas(samples: Samples, detector: Classifier, leave_out: str, times: int, seed: int) -> Array:
-    """Held-out areas with the labels of each test swapped, or not, by a fair coin, (times,): what a classifier reaches
-    that knows its test, its condition and nothing of the leak."""
+    """Return held-out areas with the labels of each test swapped, or not, by a fair coin, (times,).
+
+    It is what a classifier reaches that knows its test, its condition and nothing of the leak.
+    """
     random = np.random.default_rng(seed)
-    leaks, tests = samples.leak_lpm > 0, places_of(samples, "test")
-    found = np.empty(times)
+    leaks, tests = samples.leak_lpm > 0, group_numbers(samples, "test")
+    areas = np.empty(times)
     for k in range(times):
         swapped = leaks ^ (random.random(int(tests.max()) + 1) < 0.5)[tests]
         scores = held_out_scores(samples, detector, leave_out, swapped)
-        found[k] = auc(scores[~swapped], scores[swapped]).value
-    return found
+        areas[k] = auc(scores[~swapped], scores[swapped]).value
+    return areas
 
 
 def checks_of(plan: HeldOutPlan, samples: Samples) -> list[HeldOutCheck]:
-    """The checks of a plan's classifiers, in its order; none where the plan asks for no permutations. Labels are not
-    swapped where features are chosen anew each time."""
-    return [_check(plan, samples, one) for one in plan.detectors] if plan.permutations else []
+    """Return the checks of a plan's classifiers, in its order; none where the plan asks for no permutations.
+
+    Labels are not swapped where features are chosen anew each time.
+    """
+    return [_check(plan, samples, classifier) for classifier in plan.detectors] if plan.permutations else []
 
 
-def _check(plan: HeldOutPlan, samples: Samples, one: Classifier) -> HeldOutCheck:
-    leaks, tests = samples.leak_lpm > 0, places_of(samples, "test")
+def _check(plan: HeldOutPlan, samples: Samples, classifier: Classifier) -> HeldOutCheck:
+    name, leaks, tests = classifier.name, samples.leak_lpm > 0, group_numbers(samples, "test")
     by_test, by_condition = (
-        clustered_area(held_out_scores(samples, one, leave_out), leaks, tests, plan.confidence)
+        clustered_area(held_out_scores(samples, classifier, leave_out), leaks, tests, plan.confidence)
         for leave_out in ("test", "condition")
     )
-    if isinstance(one, ChosenClassifier):
-        chosen = chosen_candidates(samples, one, plan.leave_out)
+    if isinstance(classifier, ChosenClassifier):
+        chosen = chosen_candidates(samples, classifier, plan.leave_out)
         picks = Counter(f"{_short(pick.features)}, ridge {pick.ridge:g}" for pick in chosen).most_common()
-        return HeldOutCheck(one.name, by_test, by_condition, picks=tuple(picks))
-    swapped = swapped_areas(samples, one, plan.leave_out, plan.permutations, plan.seed)
+        return HeldOutCheck(name, by_test, by_condition, picks=tuple(picks))
+    swapped = swapped_areas(samples, classifier, plan.leave_out, plan.permutations, plan.seed)
     own = (by_test if plan.leave_out == "test" else by_condition)[0]
     reached = int(np.count_nonzero(swapped >= own))
-    return HeldOutCheck(one.name, by_test, by_condition, float(np.quantile(swapped, 0.95)), reached, plan.permutations)
-
-
-def check_sheet(checks: Sequence[HeldOutCheck]) -> Sheet:
-    """The checks as a table, one line a classifier."""
-    columns = (
-        "detector", "AUC, tests held out", "tests: low", "tests: high", "AUC, conditions held out", "conditions: low",
-        "conditions: high", "AUC that 5 % of swapped labels reach", "swaps that reach the true labels' AUC", "swaps",
-        "chosen",
-    )  # fmt: skip
-    return Sheet(
-        "held_out",
-        columns,
-        tuple(
-            (
-                one.detector, *one.tests, *one.conditions, one.chance, one.reached if one.swaps else None,
-                one.swaps or None, "; ".join(f"{words}: {times}" for words, times in one.picks),
-            )
-            for one in checks
-        ),
-    )  # fmt: skip
+    return HeldOutCheck(name, by_test, by_condition, float(np.quantile(swapped, 0.95)), reached, plan.permutations)
 
 
 def _short(features: tuple[str, ...]) -> str:
-    """Features by quantity alone where both chambers have them."""
+    """Return features by quantity alone where both chambers have them."""
     quantities = list(dict.fromkeys(name.split(" of ")[0] for name in features))
     chambers = list(dict.fromkeys(name.split(" of ")[-1] for name in features))
     whole = len(features) == len(quantities) * len(chambers)

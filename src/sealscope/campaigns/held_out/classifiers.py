@@ -25,8 +25,11 @@ _INNER = 5
 
 @dataclass(frozen=True)
 class Samples:
-    """Measured samples: `features` name -> (n,) values; `leak_lpm` (n,), 0 where nothing leaks; `tests` (n,) which test
-    each belongs to; `levels`: of each, its operating condition."""
+    """Measured samples.
+
+    `features`: name -> (n,) values; `leak_lpm` (n,), 0 where nothing leaks; `tests` (n,): which test each belongs to;
+    `levels`: of each, its operating condition.
+    """
 
     features: Mapping[str, Array]
     leak_lpm: Array
@@ -34,7 +37,7 @@ class Samples:
     levels: Sequence[Mapping[str, str | float]]
 
     def matrix(self, names: Sequence[str]) -> Array:
-        """The named features, (n, f); raises InputError for one that the data do not have."""
+        """Return the named features, (n, f); raise InputError for one that the data do not have."""
         for name in names:
             if name not in self.features:
                 raise InputError(f"a feature must be one of {', '.join(self.features)}, got {name!r}")
@@ -51,12 +54,12 @@ class LogisticFit:
     scale: Array
 
     def log_odds(self, x: Array) -> Array:
-        """Log odds of a leak for samples (n, f)."""
+        """Return the log odds of a leak for samples (n, f)."""
         return np.asarray(self.intercept + ((x - self.centre) / self.scale) @ self.weights)
 
 
 def fit_logistic(x: Array, leaks: npt.NDArray[np.bool_], ridge: float) -> LogisticFit:
-    """LogisticClassifier regression by Newton's method, maximising ``sum ln P(y|x) - ridge/2 |weights|^2``.
+    """Fit a logistic regression by Newton's method, maximising ``sum ln P(y|x) - ridge/2 |weights|^2``.
 
     `x` (n, f), each feature standardised to mean 0 and standard deviation 1 of these samples; the intercept is not
     penalised. Raises InputError for a single class, a constant feature, or where no finite maximum is reached (no
@@ -100,7 +103,7 @@ def fit_logistic(x: Array, leaks: npt.NDArray[np.bool_], ridge: float) -> Logist
 
 
 def fold_log_odds(x: Array, leaks: npt.NDArray[np.bool_], folds: npt.NDArray[np.bool_], ridge: float) -> Array:
-    """Log odds of all samples from one fit for each fold, fitted to the samples of its mask alone, (k, n).
+    """Return the log odds of all samples from one fit for each fold, fitted to the samples of its mask alone, (k, n).
 
     `x` (n, f), `folds` (k, n). The same fits as `fit_logistic`'s, all folds in one Newton iteration; folds that plain
     steps do not bring to the maximum are fitted by it one by one, and it raises what it raises.
@@ -135,10 +138,10 @@ def fold_log_odds(x: Array, leaks: npt.NDArray[np.bool_], folds: npt.NDArray[np.
     return found
 
 
-def places_of(samples: Samples, leave_out: str) -> npt.NDArray[np.intp]:
-    """Number of the test (`test`) or operating condition (`condition`) of each sample, from 0 on, (n,)."""
+def group_numbers(samples: Samples, leave_out: str) -> npt.NDArray[np.intp]:
+    """Return the number of the test (`test`) or operating condition (`condition`) of each sample, from 0 on, (n,)."""
     groups: list[Hashable] = (
-        list(samples.tests) if leave_out == "test" else [tuple(sorted(one.items())) for one in samples.levels]
+        list(samples.tests) if leave_out == "test" else [tuple(sorted(levels.items())) for levels in samples.levels]
     )
     places = {group: number for number, group in enumerate(dict.fromkeys(groups))}
     return np.array([places[group] for group in groups])
@@ -147,10 +150,12 @@ def places_of(samples: Samples, leave_out: str) -> npt.NDArray[np.intp]:
 def held_out_scores(
     samples: Samples, detector: Classifier, leave_out: str, leaks: npt.NDArray[np.bool_] | None = None
 ) -> Array:
-    """Log odds of each sample from a fit that saw no sample of its test (`test`) or of its condition (`condition`),
-    (n,); `leaks` (n,): other labels than the samples' own."""
+    """Return the log odds of each sample from a fit that saw no sample of its test or condition, (n,).
+
+    `leave_out`: `test` or `condition`; `leaks` (n,): other labels than the samples' own.
+    """
     leaks = samples.leak_lpm > 0 if leaks is None else leaks
-    of = places_of(samples, leave_out)
+    of = group_numbers(samples, leave_out)
     if of.max() < 1:
         raise InputError(f"tests to leave out in turn must be at least 2, got {of.max() + 1}")
     folds = of[None, :] != np.arange(of.max() + 1)[:, None]
@@ -161,14 +166,14 @@ def held_out_scores(
         best = _choices(samples, detector, of, leaks, folds)
         found = np.empty(folds.shape)
         for number in dict.fromkeys(best):
-            mine, one = best == number, candidates[number]
-            found[mine] = fold_log_odds(samples.matrix(one.features), leaks, folds[mine], one.ridge)
+            mine, candidate = best == number, candidates[number]
+            found[mine] = fold_log_odds(samples.matrix(candidate.features), leaks, folds[mine], candidate.ridge)
     return np.asarray(found[of, np.arange(of.size)])
 
 
 def chosen_candidates(samples: Samples, detector: ChosenClassifier, leave_out: str) -> list[LogisticClassifier]:
-    """What the training samples of each fold chose, one for each test or condition held out."""
-    of = places_of(samples, leave_out)
+    """Return what the training samples of each fold chose, one for each test or condition held out."""
+    of = group_numbers(samples, leave_out)
     folds = of[None, :] != np.arange(of.max() + 1)[:, None]
     candidates = detector.candidates()
     return [candidates[number] for number in _choices(samples, detector, of, samples.leak_lpm > 0, folds)]
@@ -181,7 +186,7 @@ def _choices(
     leaks: npt.NDArray[np.bool_],
     folds: npt.NDArray[np.bool_],
 ) -> npt.NDArray[np.intp]:
-    """Number of the candidate that loses least within each fold's training samples, (k,).
+    """Return the number of the candidate that loses least within each fold's training samples, (k,).
 
     The loss is the mean of -ln P(label) over `_INNER` parts of the places (tests or conditions) that the fold trains
     on, each held out once; what the fold leaves out takes no part.
@@ -192,29 +197,26 @@ def _choices(
     judged = np.stack([fold & (inner == part) for fold in folds for part in parts])
     sign = np.where(leaks, 1.0, -1.0)
     losses = []
-    for one in detector.candidates():
-        odds = fold_log_odds(samples.matrix(one.features), leaks, masks, one.ridge)
+    for candidate in detector.candidates():
+        odds = fold_log_odds(samples.matrix(candidate.features), leaks, masks, candidate.ridge)
         losses.append((np.logaddexp(0.0, -sign * odds) * judged).reshape(len(folds), -1).sum(axis=1))
     return np.asarray(np.argmin(np.array(losses), axis=0))
 
 
 def held_out_rows(plan: HeldOutPlan, samples: Samples) -> list[CaseRow]:
-    """A row for each sample, with the log odds that each detector gave it while it was held out, in the order of their
-    ids."""
-    scores = {one.name: held_out_scores(samples, one, plan.leave_out) for one in plan.detectors}
-    rows = []
-    for k, leak in enumerate(samples.leak_lpm):
-        name = hashlib.sha256(f"{plan.data} {k}".encode()).hexdigest()
-        rows.append(
-            CaseRow(
-                id=name[:16],
-                use="judge",
-                leak_lpm=float(leak),
-                fault="",
-                levels=samples.levels[k],
-                replicate=0,
-                flow_lpm=float(leak),
-                scores={one.name: (float(scores[one.name][k]), None) for one in plan.detectors},
-            )
+    """Return a row for each sample, with the log odds that each detector gave it while held out, in order of ids."""
+    scores = {detector.name: held_out_scores(samples, detector, plan.leave_out) for detector in plan.detectors}
+    rows = [
+        CaseRow(
+            id=hashlib.sha256(f"{plan.data} {k}".encode()).hexdigest()[:16],
+            use="judge",
+            leak_lpm=float(leak),
+            fault="",
+            levels=samples.levels[k],
+            replicate=0,
+            flow_lpm=float(leak),
+            scores={name: (float(odds[k]), None) for name, odds in scores.items()},
         )
+        for k, leak in enumerate(samples.leak_lpm)
+    ]
     return sorted(rows, key=lambda row: row.id)

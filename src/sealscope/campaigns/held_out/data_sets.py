@@ -1,4 +1,4 @@
-"""Public measured data sets as samples for classifiers that are held out; the data are the reader's own copy."""
+"""Public measured data sets as samples for held-out classifiers; the data are the caller's own copy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CYCLES, _SECONDS = 2205, 60
 
 
 def hydraulic_samples(folder: Path) -> Samples:
-    """The "condition monitoring of hydraulic systems" set: each cycle's mean and standard deviation over its seconds.
+    """Read the "condition monitoring of hydraulic systems" set: each cycle's mean and standard deviation.
 
     `folder` holds `profile.txt` and `one_hz_means/NAME_1hz.tsv`. The size of the fault is the grade of internal pump
     leakage (1 or 2), a test is an unbroken block of cycles of one condition, the operating condition the cooler's
@@ -51,7 +51,7 @@ def _table(path: Path, columns: int) -> np.ndarray:
 
 
 def needs_folder(folder: Path | None, what: str) -> Path:
-    """The folder of a data set; raises InputError that says what is needed where it was not given or is none."""
+    """Return the folder of a data set; raise InputError that says what is needed where it is not given or is none."""
     if folder is None:
         raise InputError(f"the plan needs {what}: give its folder with --data")
     if not folder.is_dir():

@@ -1,5 +1,8 @@
-"""Judge a campaign's rows: thresholds from its leak-free records, verdicts on all the others, and what they add up
-to."""
+"""Judge a campaign's rows: thresholds from its leak-free records, verdicts on all the others, and what they add up to.
+
+The verdicts give detection and false alarms by size of leak; what detectors state beyond a verdict is compared with the
+truth: when the leak began, how large it is, what the fault is.
+"""
 
 from __future__ import annotations
 
@@ -10,29 +13,40 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.estimates import Estimate, Named, Onset, estimates_of, named_of, onsets_of
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, Statement, cause_of
 from sealscope.campaigns.plans.detectors import Views, plan_detector
 from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.calibration.scorers import scorer
 from sealscope.diagnosis.calibration.thresholds import Calibration, Place, calibrate
 from sealscope.errors import InputError
-from sealscope.evaluation.auc import Area, auc
-from sealscope.evaluation.binomial import Rate, rate_of
-from sealscope.evaluation.confusion import CANNOT_TELL
-from sealscope.evaluation.hit_miss import HitMiss, fit_hit_miss
-from sealscope.evaluation.pod import SizeRate, by_size, proven_size
-from sealscope.evaluation.roc import Roc, roc_curve
-from sealscope.evaluation.table import ALWAYS, NEVER, Outcome, SummaryRow, summary
+from sealscope.evaluation.binomial import Proportion, proportion
+from sealscope.evaluation.confusion import CANNOT_TELL, Confusion, confusion_matrix
+from sealscope.evaluation.estimates import (
+    EstimateError,
+    OnsetErrors,
+    Quantile,
+    estimate_error,
+    onset_errors,
+    quantile_of,
+)
+from sealscope.evaluation.pod import HitMiss, SizeDetection, by_size, fit_hit_miss, proven_size
+from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
+from sealscope.evaluation.table import ALWAYS, NEVER, JudgedRecord, SummaryRow, summary
+
+#: (detector, row id) -> verdict
+Verdicts = Mapping[tuple[str, str], str]
 
 
 @dataclass(frozen=True)
-class Pod:
-    """One detector over the size of the leak: the rate at each size, the logistic curve through hits and misses
-    (None where there is none, `why`), and the smallest size `proven` without a curve to be found nine times in ten."""
+class DetectorPod:
+    """One detector's probability of detection over the size of the leak.
+
+    `sizes`: the detection at each size; `curve`: the logistic curve through hits and misses, None where there is none,
+    for the reason `why`; `proven`: the smallest size found nine times in ten without a curve.
+    """
 
     detector: str
-    rates: tuple[SizeRate, ...]
+    sizes: tuple[SizeDetection, ...]
     curve: HitMiss | None
     why: str
     proven: float
@@ -49,13 +63,13 @@ class SizeRoc:
 
 
 @dataclass(frozen=True)
-class Cell:
+class CellAlarms:
     """Alarms of one detector at one size of leak (0: none) in one cell of the factors."""
 
     detector: str
     leak_lpm: float
     levels: Mapping[str, str | float]
-    alarms: Rate
+    alarms: Proportion
 
 
 @dataclass(frozen=True)
@@ -64,17 +78,48 @@ class FaultAlarms:
 
     detector: str
     fault: str
-    alarms: Rate
-    cannot_tell: Rate
+    alarms: Proportion
+    cannot_tell: Proportion
+
+
+@dataclass(frozen=True)
+class OnsetAccuracy:
+    """Errors [s] of the onsets that one detector stated in its alarms at one size of leak."""
+
+    detector: str
+    leak_lpm: float
+    errors: OnsetErrors
+
+
+@dataclass(frozen=True)
+class FlowAccuracy:
+    """Errors of the flow that one detector states at one size of leak (0: leak-free records), alarm or not.
+
+    `errors`: mean, and coverage of the stated interval; `median` (signed) and `median_size` of the error.
+    """
+
+    detector: str
+    leak_lpm: float
+    errors: EstimateError
+    median: Quantile
+    median_size: Quantile
+
+
+@dataclass(frozen=True)
+class NamedCauses:
+    """Which cause one detector names for which there is; `none` where nothing leaks and no fault is put in."""
+
+    detector: str
+    confusion: Confusion
 
 
 @dataclass(frozen=True)
 class Judgement:
     """What a campaign shows.
 
-    `table` by size, `overall` with all leaks together; `estimates` of the flow, `named` causes: of detectors that state
-    them; `calibration`: None where every detector has a threshold of its own; `calibrated_on`, `judged`: records that
-    had a result; `failed`: rows that had none (they are `cannot tell` for every detector); `realised`: size -> mean and
+    `table` by size, `overall` with all leaks together; `onsets`, `flows` and `causes`: of detectors that state them;
+    `calibration`: None where every detector has a threshold of its own; `calibrated_on`, `judged`: records that had a
+    result; `failed`: rows that had none (they are `cannot tell` for every detector); `realised`: size -> mean and
     standard deviation of the flow the leaks really had [L/min].
     """
 
@@ -84,18 +129,18 @@ class Judgement:
     failed: tuple[CaseRow, ...]
     table: tuple[SummaryRow, ...]
     overall: tuple[SummaryRow, ...]
-    onsets: tuple[Onset, ...]
-    estimates: tuple[Estimate, ...]
-    named: tuple[Named, ...]
-    pods: tuple[Pod, ...]
+    onsets: tuple[OnsetAccuracy, ...]
+    flows: tuple[FlowAccuracy, ...]
+    causes: tuple[NamedCauses, ...]
+    pods: tuple[DetectorPod, ...]
     rocs: tuple[SizeRoc, ...]
-    cells: tuple[Cell, ...]
+    cells: tuple[CellAlarms, ...]
     faults: tuple[FaultAlarms, ...]
     realised: Mapping[float, tuple[float, float]]
 
 
 def place_from(tree: Mapping[str, Any]) -> Place:
-    """The place of a row, from its plain values."""
+    """Return the place of a row from its plain values."""
     point = dict(tree["point"])
     return Place(
         OperatingPoint(**{**point, **{name: tuple(point[name]) for name in ("units", "chambers")}}),
@@ -107,46 +152,46 @@ def calibration_of(
     rows: Sequence[CaseRow],
     detectors: Sequence[str],
     *,
-    rate: float,
+    false_alarm: float,
     promise: Any = "average",
     confidence: float = 0.95,
     split_share: float = 0.5,
     made_from: Mapping[str, Any] | None = None,
     views: Views | None = None,
 ) -> Calibration | None:
-    """Thresholds of the detectors that need them, from the rows that are there to calibrate; None where none needs
-    any."""
+    """Return thresholds of the detectors that need them, from the rows to calibrate; None where none needs any."""
     wanted = [name for name in detectors if plan_detector(name).needs_calibration]
-    known = [row for row in rows if row.use == "calibrate" and row.error is None]
+    leak_free = [row for row in rows if row.use == "calibrate" and row.error is None]
     if not wanted:
         return None
     return calibrate(
-        [place_from(row.place) for row in known],
-        {name: [row.scores[name][0] for row in known] for name in wanted},
-        rate=rate,
+        [place_from(row.place) for row in leak_free],
+        {name: [row.scores[name][0] for row in leak_free] for name in wanted},
+        rate=false_alarm,
         promise=promise,
         confidence=confidence,
         split_share=split_share,
-        made_from={**(made_from or {}), "records": len(known)},
+        made_from={**(made_from or {}), "records": len(leak_free)},
         views=views,
     )
 
 
 def own_threshold(name: str) -> float | None:
-    """The threshold that a scorer has of its own; None where records must set it, or a detector's verdict counts."""
-    found = plan_detector(name)
-    return None if found.detector else scorer(found.of).threshold
+    """Return a scorer's own threshold; None where records must set it, or a detector's verdict counts."""
+    detector = plan_detector(name)
+    return None if detector.detector else scorer(detector.of).threshold
 
 
 def verdict_on(row: CaseRow, detector: str, calibration: Calibration | None, own: float | None) -> str:
-    """What a detector says of a row: its own verdict, or by its own threshold, else by the calibration's at the row's
-    operating point."""
+    """Return a detector's verdict on a row.
+
+    It is the one it stated, or by its own threshold, else by the calibration's at the row's operating point.
+    """
     if row.error is not None:
         return CANNOT_TELL
     if row.statements and plan_detector(detector).own:
         return row.statements[plan_detector(detector).key].verdict
-    value = row.scores[detector][0]
-    threshold = own
+    value, threshold = row.scores[detector][0], own
     if threshold is None and calibration is not None:
         group = calibration.find(place_from(row.place))
         if isinstance(group, str) or detector not in group.thresholds:
@@ -167,71 +212,71 @@ def judge(
     hours: float | None = None,
     confidence: float = 0.95,
 ) -> Judgement:
-    """Verdicts and figures of all rows to judge.
+    """Return verdicts and figures of all rows to judge.
 
     `thresholds`: the detectors' own, by default those of their scorers; `onset_s` [s]: true onset in leaky records,
-    `hours`: operating time of a record; without them no delays or hourly rates are given. Raises InputError where
-    there is no row to judge.
+    `hours`: operating time of a record; without them no errors of onsets or alarms per hour are given. Raises
+    InputError where there is no row to judge.
     """
     own = {name: own_threshold(name) for name in detectors} if thresholds is None else thresholds
-    mine = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
-    if not mine:
+    judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
+    if not judged:
         raise InputError("a campaign needs at least one record to judge, got none")
-    said = {(name, row.id): verdict_on(row, name, calibration, own[name]) for name in detectors for row in mine}
-    plain = [row for row in mine if not row.fault]
-    outcomes = _outcomes(plain, detectors, said, hours)
+    verdicts = {(name, row.id): verdict_on(row, name, calibration, own[name]) for name in detectors for row in judged}
+    plain = [row for row in judged if not row.fault]
+    records = [
+        JudgedRecord(name, row.id, row.leak_lpm, verdicts[name, row.id], hours) for name in detectors for row in plain
+    ]
     return Judgement(
         calibration=calibration,
         calibrated_on=sum(row.use == "calibrate" and row.error is None for row in rows),
-        judged=sum(row.error is None for row in mine),
+        judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
-        table=tuple(summary(outcomes, confidence)) if plain else (),
-        overall=tuple(_any_size(outcomes, confidence)) if plain else (),
-        onsets=tuple(onsets_of(plain, detectors, said, onset_s, confidence)),
-        estimates=tuple(estimates_of(plain, detectors, confidence)),
-        named=tuple(named_of(mine, detectors, confidence)),
-        pods=tuple(_pods(plain, detectors, said, confidence)),
+        table=tuple(summary(records, confidence)) if plain else (),
+        overall=tuple(_any_size(records, confidence)) if plain else (),
+        onsets=tuple(_onsets(plain, detectors, verdicts, onset_s, confidence)),
+        flows=tuple(_flows(plain, detectors, confidence)),
+        causes=tuple(_causes(judged, detectors, confidence)),
+        pods=tuple(_pods(plain, detectors, verdicts, confidence)),
         rocs=tuple(_rocs(plain, detectors, confidence)),
-        cells=tuple(_cells(plain, detectors, said, confidence)),
-        faults=tuple(_faults(mine, detectors, said, confidence)),
+        cells=tuple(_cells(plain, detectors, verdicts, confidence)),
+        faults=tuple(_faults(judged, detectors, verdicts, confidence)),
         realised=_realised(plain),
     )
 
 
-def _outcomes(
-    rows: Sequence[CaseRow], detectors: Sequence[str], said: Mapping[tuple[str, str], str], hours: float | None
-) -> list[Outcome]:
-    return [Outcome(name, row.id, row.leak_lpm, said[name, row.id], hours) for name in detectors for row in rows]
+def _leak_sizes(rows: Sequence[CaseRow]) -> list[float]:
+    return sorted({row.leak_lpm for row in rows if row.leak_lpm > 0})
 
 
-def _any_size(outcomes: Sequence[Outcome], confidence: float) -> list[SummaryRow]:
-    """The table with all leaks in one row."""
-    found = summary([replace(one, leak_lpm=1.0 if one.leak_lpm else 0.0) for one in outcomes], confidence)
-    return [replace(row, leak_lpm=math.nan) for row in found]
+def _any_size(records: Sequence[JudgedRecord], confidence: float) -> list[SummaryRow]:
+    """Return the table with all leaks in one row."""
+    together = [replace(record, leak_lpm=1.0 if record.leak_lpm else 0.0) for record in records]
+    return [replace(row, leak_lpm=math.nan) for row in summary(together, confidence)]
 
 
 def _pods(
-    rows: Sequence[CaseRow], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
-) -> list[Pod]:
+    rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, confidence: float
+) -> list[DetectorPod]:
     leaky = [row for row in rows if row.leak_lpm > 0]
-    found = []
+    pods = []
     for name in detectors if leaky else ():
         sizes = [row.leak_lpm for row in leaky]
-        hits = [said[name, row.id] == "leak" for row in leaky]
-        rates = tuple(by_size(sizes, hits, confidence))
+        hits = [verdicts[name, row.id] == "leak" for row in leaky]
+        detections = by_size(sizes, hits, confidence)
         curve, why = None, ""
         try:
             curve = fit_hit_miss(sizes, hits)
         except InputError as error:
             why = str(error)
-        found.append(Pod(name, rates, curve, why, proven_size(list(rates))))
-    return found
+        pods.append(DetectorPod(name, tuple(detections), curve, why, proven_size(detections)))
+    return pods
 
 
 def _rocs(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[SizeRoc]:
-    """Over the scores, so that no threshold comes in; a record that cannot be told counts as the lowest score."""
-    found = []
-    sizes = sorted({row.leak_lpm for row in rows if row.leak_lpm > 0})
+    """Return curves over the scores, with no threshold; a record that cannot be judged counts as the lowest score."""
+    rocs = []
+    sizes = _leak_sizes(rows)
     for name in detectors:
         known = [value for row in rows if row.error is None and (value := row.scores[name][0]) is not None]
         if not known:
@@ -240,56 +285,139 @@ def _rocs(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) 
 
         def scores(size: float, name: str = name, lowest: float = lowest) -> list[float]:
             chosen = [row for row in rows if (row.leak_lpm > 0 if math.isnan(size) else row.leak_lpm == size)]
-            here = [row.scores[name][0] if row.error is None else None for row in chosen]
-            return [lowest if value is None else value for value in here]
+            values = [row.scores[name][0] if row.error is None else None for row in chosen]
+            return [lowest if value is None else value for value in values]
 
         free = scores(0.0)
         for size in (math.nan, *sizes) if len(free) > 1 and sizes else ():
             leaky = scores(size)
             if len(leaky) > 1:
-                found.append(SizeRoc(name, size, roc_curve(free, leaky, confidence), auc(free, leaky, confidence)))
-    return found
+                rocs.append(SizeRoc(name, size, roc_curve(free, leaky, confidence), auc(free, leaky, confidence)))
+    return rocs
 
 
 def _cells(
-    rows: Sequence[CaseRow], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
-) -> list[Cell]:
+    rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, confidence: float
+) -> list[CellAlarms]:
     groups: dict[tuple[float, tuple[tuple[str, str | float], ...]], list[CaseRow]] = {}
     for row in rows:
         groups.setdefault((row.leak_lpm, tuple(row.levels.items())), []).append(row)
-    order = sorted(groups, key=lambda key: (key[0], repr(key[1])))
-    return [
-        Cell(
-            name, size, dict(levels), rate_of(sum(said[name, row.id] == "leak" for row in here), len(here), confidence)
-        )
-        for name in detectors
-        for size, levels in order
-        for here in (groups[size, levels],)
-    ]
+    cells = []
+    for name in detectors:
+        for size, levels in sorted(groups, key=lambda key: (key[0], repr(key[1]))):
+            here = groups[size, levels]
+            count = sum(verdicts[name, row.id] == "leak" for row in here)
+            cells.append(CellAlarms(name, size, dict(levels), proportion(count, len(here), confidence)))
+    return cells
 
 
 def _faults(
-    rows: Sequence[CaseRow], detectors: Sequence[str], said: Mapping[tuple[str, str], str], confidence: float
+    rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, confidence: float
 ) -> list[FaultAlarms]:
-    found = []
+    faults = []
     by_fault: dict[str, list[CaseRow]] = {}
     for row in sorted(rows, key=lambda row: row.fault):
         if row.fault and row.leak_lpm == 0:
             by_fault.setdefault(row.fault, []).append(row)
     for name in (*detectors, ALWAYS, NEVER) if by_fault else ():
         for fault, here in by_fault.items():
-            n = len(here)
-            verdicts = [{ALWAYS: "leak", NEVER: "no leak"}.get(name) or said[name, row.id] for row in here]
-            alarms = rate_of(verdicts.count("leak"), n, confidence)
-            found.append(FaultAlarms(name, fault, alarms, rate_of(verdicts.count(CANNOT_TELL), n, confidence)))
-    return found
+            given = [{ALWAYS: "leak", NEVER: "no leak"}.get(name) or verdicts[name, row.id] for row in here]
+            alarms, unsure = (proportion(given.count(word), len(here), confidence) for word in ("leak", CANNOT_TELL))
+            faults.append(FaultAlarms(name, fault, alarms, unsure))
+    return faults
 
 
 def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
-    found = {}
-    for size in sorted({row.leak_lpm for row in rows if row.leak_lpm > 0}):
+    realised = {}
+    for size in _leak_sizes(rows):
         flows = [row.flow_lpm for row in rows if row.leak_lpm == size and row.flow_lpm is not None]
         if flows:
             spread = float(np.std(flows, ddof=1)) if len(flows) > 1 else math.nan
-            found[size] = (float(np.mean(flows)), spread)
-    return found
+            realised[size] = (float(np.mean(flows)), spread)
+    return realised
+
+
+def _statement(row: CaseRow, detector: str) -> Statement | None:
+    """Return what a detector stated on a row; None where it states nothing, or the record failed."""
+    return row.statements.get(plan_detector(detector).key) if row.statements and row.error is None else None
+
+
+def _ends(pairs: Sequence[tuple[float, float] | None]) -> tuple[list[float], list[float]]:
+    ends = [(math.nan, math.nan) if pair is None else pair for pair in pairs]
+    return [low for low, _ in ends], [high for _, high in ends]
+
+
+def _onsets(
+    rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, onset_s: float | None, confidence: float
+) -> list[OnsetAccuracy]:
+    """Return, for detectors that search for the onset, its error over the alarms, by size."""
+    onsets = []
+    for name in detectors if onset_s is not None else ():
+        for size in _leak_sizes(rows):
+            alarmed = [row for row in rows if row.leak_lpm == size and verdicts[name, row.id] == "leak"]
+            timed = [(at, row) for row in alarmed if (at := row.scores[name][1]) is not None]
+            if not timed or onset_s is None:
+                continue
+            statements = [_statement(row, name) for _, row in timed]
+            low, high = _ends([None if stated is None else stated.onset_interval_s for stated in statements])
+            errors = onset_errors([at for at, _ in timed], [onset_s] * len(timed), low, high, confidence)
+            onsets.append(OnsetAccuracy(name, size, errors))
+    return onsets
+
+
+def _flows(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[FlowAccuracy]:
+    """Return, for detectors that state a flow, its errors against the flow that the record really had, by size."""
+    flows = []
+    for name in _stating(rows, detectors):
+        for size in sorted({row.leak_lpm for row in rows}):
+            own = [(row, made) for row in rows if row.leak_lpm == size and (made := _statement(row, name)) is not None]
+            truth = [row.leak_lpm if row.flow_lpm is None else row.flow_lpm for row, _ in own]
+            given = [math.nan if made.leak_lpm is None else made.leak_lpm for _, made in own]
+            if not np.isfinite(given).any():
+                continue
+            low, high = _ends([made.leak_interval_lpm for _, made in own])
+            error = np.array(given) - np.array(truth)
+            error = error[np.isfinite(error)]
+            flows.append(
+                FlowAccuracy(
+                    name,
+                    size,
+                    estimate_error(given, truth, low, high, confidence),
+                    quantile_of(error, 0.5, confidence),
+                    quantile_of(np.abs(error), 0.5, confidence),
+                )
+            )
+    return flows
+
+
+def _causes(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[NamedCauses]:
+    """Return, for detectors judged by their own verdict, the causes they name, where there are faults.
+
+    A record with a leak and another fault is left out; one that failed is `cannot tell`.
+    """
+    single = [row for row in rows if not (row.leak_lpm > 0 and row.fault)]
+    if not any(row.fault for row in single):
+        return []
+    order = sorted({cause_of(row.fault) for row in single if row.fault})
+    truth = [PISTON_LEAK if row.leak_lpm > 0 else cause_of(row.fault) if row.fault else NO_CAUSE for row in single]
+    causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + order
+    tables = []
+    for name in _stating(rows, detectors):
+        if not plan_detector(name).own:
+            continue
+        statements = [_statement(row, name) for row in single]
+        named = [CANNOT_TELL if stated is None else stated.named for stated in statements]
+        others = sorted(set(named) - set(causes) - {CANNOT_TELL})
+        tables.append(NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], confidence)))
+    return tables
+
+
+def _stating(rows: Sequence[CaseRow], detectors: Sequence[str]) -> list[str]:
+    """Return the detectors that state evidence, each once: by a calibrated threshold it states the same."""
+    keys = {key for row in rows for key in row.statements}
+    by_key: dict[str, str] = {}
+    for name in detectors if keys else ():
+        detector = plan_detector(name)
+        if detector.key in keys and (detector.own or detector.key not in by_key):
+            by_key[detector.key] = name
+    return list(by_key.values())

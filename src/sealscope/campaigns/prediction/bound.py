@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.evaluation.checks import share
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
@@ -25,7 +26,7 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: What a machine does not tell of itself: the friction law (level, viscous slope, breakaway, its decay), the oil's
+#: Parameters that are not known of a machine: the friction law (level, viscous slope, breakaway, its decay), the oil's
 #: stiffness and the gain of the speed loop.
 UNKNOWN = (
     "friction.F_pr",
@@ -55,14 +56,14 @@ class LeakBound:
 
 
 def in_lpm(conductance: float, dp: float = REFERENCE_DP) -> float:
-    """The mean flow [L/min] of a laminar leak G [m^3/(s Pa)] under a mean pressure difference `dp` [Pa]."""
+    """Return the mean flow [L/min] of a laminar leak G [m^3/(s Pa)] under a mean pressure difference `dp` [Pa]."""
     return conductance * dp / LITRE_PER_MINUTE
 
 
 def noise_covariance(rig: Rig, channels: Sequence[str] = CHAMBERS) -> Array:
-    """Covariance (c, c) [Pa^2] of one sample of the pressure channels: own and common white noise, and the
-    conversion's step as white noise of variance step^2/12.
+    """Return the covariance (c, c) [Pa^2] of one sample of the pressure channels.
 
+    It is that of own and common white noise, and of the conversion's step as white noise of variance step^2/12.
     Raises InputError where a channel is not a pressure or has no noise at all, for then no bound exists.
     """
     sensors, daq = rig.sensors, rig.daq
@@ -77,7 +78,7 @@ def noise_covariance(rig: Rig, channels: Sequence[str] = CHAMBERS) -> Array:
 
 
 def information(slopes: Array, covariance: Array) -> Array:
-    """Fisher information (k, k) from derivatives `slopes` (k, c, n) and the covariance (c, c) of one sample.
+    """Return the Fisher information (k, k) from derivatives `slopes` (k, c, n) and the covariance (c, c) of one sample.
 
     Raises InputError where shapes do not fit or the covariance is not positive definite.
     """
@@ -97,8 +98,10 @@ def information(slopes: Array, covariance: Array) -> Array:
 
 
 def cramer_rao(fisher: Array) -> Array:
-    """The bound (k, k) on the covariance of unbiased estimates, F^-1; raises InputError where F is singular: some
-    parameter cannot be told from the others."""
+    """Return the bound (k, k) on the covariance of unbiased estimates, F^-1.
+
+    Raises InputError where F is singular: some parameter cannot be told from the others.
+    """
     fisher = np.asarray(fisher, dtype=np.float64)
     size = np.sqrt(np.diag(fisher))
     if np.all(size > 0.0):
@@ -116,7 +119,7 @@ def leak_bound(
     unknown: Sequence[str] = (),
     progress: Callable[[float], None] | None = None,
 ) -> LeakBound:
-    """The bound on a small leak that is open over the whole experiment, with its channels and their noise.
+    """Return the bound on a small leak that is open over the whole experiment, with its channels and their noise.
 
     `covariance` (c, c) of one sample, default that of the rig's sensors; `unknown`: parameters that the estimate must
     find beside the leak. The command and everything not named are taken as known.
@@ -125,31 +128,30 @@ def leak_bound(
     SimulationFailed where a derivative cannot be had.
     """
     R = noise_covariance(experiment.rig, channels) if covariance is None else covariance
-    told = progress or (lambda share: None)
-    found = [leak_sensitivity(experiment, channels)]
+    progress = progress or (lambda share: None)
+    sensitivities = [leak_sensitivity(experiment, channels)]
     for k, name in enumerate(unknown):
-        told((k + 1.0) / (len(unknown) + 1.0))
-        found.append(parameter_sensitivity(experiment, name, channels))
-    told(1.0)
-    fisher = information(np.stack([one.slope for one in found]), R)
+        progress((k + 1.0) / (len(unknown) + 1.0))
+        sensitivities.append(parameter_sensitivity(experiment, name, channels))
+    progress(1.0)
+    fisher = information(np.stack([sensitivity.slope for sensitivity in sensitivities]), R)
     return LeakBound(
         known=1.0 / math.sqrt(fisher[0, 0]),
         unknown=math.sqrt(cramer_rao(fisher)[0, 0]) if unknown else None,
         unknown_parameters=tuple(unknown),
         duration=experiment.duration,
-        nonlinearity=max(one.nonlinearity for one in found),
+        nonlinearity=max(sensitivity.nonlinearity for sensitivity in sensitivities),
     )
 
 
 def smallest_found(deviation: float, false_alarm: float, detection: float = 0.9) -> float:
-    """The leak that the best one-sided test finds with probability `detection` at this false-alarm rate, when the
-    leak's estimate is normal with this standard deviation: ``(z_{1-alpha} + z_detection) s``, in the unit of s.
+    """Return the leak that the best one-sided test finds with probability `detection`.
 
+    The leak's estimate is normal with this standard deviation s: ``(z_{1-alpha} + z_detection) s``, in the unit of s.
     Raises InputError for probabilities outside 0..1 (Neyman and Pearson, doi 10.1098/rsta.1933.0009).
     """
     from scipy.special import ndtri
 
-    for name, value in (("the false-alarm rate", false_alarm), ("the probability of detection", detection)):
-        if not 0.0 < value < 1.0:
-            raise InputError(f"{name} must be between 0 and 1, got {value}")
+    share(false_alarm, "the false-alarm probability")
+    share(detection, "the probability of detection")
     return float(ndtri(1.0 - false_alarm) + ndtri(detection)) * deviation

@@ -22,6 +22,7 @@ import numpy as np
 
 from sealscope.diagnosis.calibration.scorers import SCORERS, Look
 from sealscope.errors import InputError
+from sealscope.evaluation.checks import share
 from sealscope.recordings.recording import Array
 
 Side = Literal["fell", "rose", "changed"]
@@ -47,21 +48,21 @@ class ChangeDetector:
         return f"{self.quantity} of {self.chamber} {self.side}"
 
     def change(self, look: Look) -> float:
-        """The signed change of the log RMS; NaN where it cannot be computed."""
-        found = look.sides.of(self.chamber, self.quantity, "change")
-        return math.nan if found is None else found
+        """Return the signed change of the log RMS; NaN where it cannot be computed."""
+        change = look.sides.of(self.chamber, self.quantity, "change")
+        return math.nan if change is None else change
 
 
 def change_detector(name: str) -> ChangeDetector:
-    """The detector of that name; raises InputError, naming the form, where it is no scorer of a change."""
-    found = re.fullmatch(r"(\w+) of (\w+) (fell|rose|changed)", name.strip())
-    if not found or name.strip() not in SCORERS:
+    """Return the detector of that name; raise InputError, naming the form, where it is no scorer of a change."""
+    parts = re.fullmatch(r"(\w+) of (\w+) (fell|rose|changed)", name.strip())
+    if not parts or name.strip() not in SCORERS:
         raise InputError(
-            f"a detector to plan for must be like 'd3 of p_A fell', 'd3d4 of p_B rose' or 'd2 of p_A changed', "
+            f"a detector to predict must be like 'd3 of p_A fell', 'd3d4 of p_B rose' or 'd2 of p_A changed', "
             f"got {name!r}"
         )
-    side: Side = found[3]  # type: ignore[assignment]
-    return ChangeDetector(found[1], found[2], side)
+    side: Side = parts[3]  # type: ignore[assignment]
+    return ChangeDetector(parts[1], parts[2], side)
 
 
 #: The thesis's detectors: d3, d4 and d3d4, which fall in p_A and rise in p_B; for p_B also without a side, for in a
@@ -75,8 +76,10 @@ THESIS_DETECTORS = tuple(
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """How the changes answer to leaks: `sizes` (m,) rising [L/min]; `mean` and `scatter` (m + 1, d) over the detectors,
-    row 0 without a leak; `records`: leak-free records behind the scatter, of `freedom` degrees of freedom.
+    """How the changes answer to leaks.
+
+    `sizes` (m,) rising [L/min]; `mean` and `scatter` (m + 1, d) over the detectors, row 0 without a leak; `records`:
+    leak-free records behind the scatter, of `freedom` degrees of freedom.
 
     `samples`: the changes (n, d) themselves of each row, where they were counted; `paired`: whether sample k of every
     row is the same machine; `error` (m + 1, d): where they were not, standard errors of the means' shifts from row 0,
@@ -101,22 +104,22 @@ class Responses:
             raise InputError(f"a scatter needs 2 leak-free records or more, got {self.records}")
 
     def resampled(self, random: np.random.Generator) -> Responses:
-        """The responses that another draw of as many samples might have given (Efron, doi 10.1214/aos/1176344552)."""
-        n = [len(one) for one in self.samples]
+        """Return the responses of another draw of as many samples (Efron, doi 10.1214/aos/1176344552)."""
+        n = [len(changes) for changes in self.samples]
         same = random.integers(n[0], size=n[0])
         drawn = [
-            one[same] if self.paired else one[random.integers(k, size=k)]
-            for one, k in zip(self.samples, n, strict=True)
+            changes[same] if self.paired else changes[random.integers(k, size=k)]
+            for changes, k in zip(self.samples, n, strict=True)
         ]
         return counted(self.sizes, drawn, paired=self.paired)
 
 
 def counted(sizes: Array, samples: Sequence[Array], *, paired: bool) -> Responses:
-    """Responses from the changes (n, d) of records without a leak and with each of the `sizes`."""
+    """Return the responses from the changes (n, d) of records without a leak and with each of the `sizes`."""
     return Responses(
         sizes=sizes,
-        mean=np.stack([one.mean(axis=0) for one in samples]),
-        scatter=np.stack([one.std(axis=0, ddof=1) for one in samples]),
+        mean=np.stack([changes.mean(axis=0) for changes in samples]),
+        scatter=np.stack([changes.std(axis=0, ddof=1) for changes in samples]),
         records=len(samples[0]),
         freedom=len(samples[0]) - 1,
         samples=tuple(samples),
@@ -125,14 +128,14 @@ def counted(sizes: Array, samples: Sequence[Array], *, paired: bool) -> Response
 
 
 @dataclass(frozen=True)
-class Prediction:
-    """What one detector finds.
+class DetectorPrediction:
+    """The leaks that one detector finds.
 
     `smallest` [L/min]: the smallest leak found with the probability asked for, None where none of the sizes is;
     `low`, `high`: its interval, `CONFIDENCE` of it, from the chance in the samples (None: beyond the sizes);
     `lost_above` [L/min]: where a larger leak escapes again; `scatter`: of the leak-free change of the log RMS;
-    `threshold`: the change beyond which it fires; `rate`: the largest probability of detection over the sizes;
-    `curve`: (size, probability) at `CURVE_SIZES`, as far as they were simulated.
+    `threshold`: the change beyond which it fires; `largest_detection`: the largest probability of detection over the
+    sizes; `curve`: (size, probability) at `CURVE_SIZES`, as far as they were simulated.
     """
 
     detector: str
@@ -142,14 +145,14 @@ class Prediction:
     lost_above: float | None
     scatter: float
     threshold: float
-    rate: float
+    largest_detection: float
     curve: tuple[tuple[float, float], ...] = ()
 
 
 def probability(
     shift: Array, scatter: Array, leak_free_scatter: float, side: Side, false_alarm: float
 ) -> tuple[Array, float]:
-    """POD for shifts of the mean (m,) with scatters (m,), and the distance of the threshold from the leak-free mean.
+    """Return the POD for shifts of the mean (m,) with scatters (m,), and the threshold as a shift.
 
     Scatters are > 0 and the false-alarm probability is within 0..1.
     """
@@ -158,15 +161,15 @@ def probability(
     tails = 2.0 if side == "changed" else 1.0
     limit = float(ndtri(1.0 - false_alarm / tails)) * leak_free_scatter
     towards = -shift if side == "fell" else shift
-    found = ndtr((towards - limit) / scatter)
+    detection = ndtr((towards - limit) / scatter)
     if side == "changed":
-        found = found + ndtr((-towards - limit) / scatter)
-    return np.asarray(found, dtype=np.float64), limit
+        detection = detection + ndtr((-towards - limit) / scatter)
+    return np.asarray(detection, dtype=np.float64), limit
 
 
-def _crossing(sizes: Array, rates: Array, detection: float) -> tuple[float | None, float | None]:
-    """The first size whose rate reaches `detection`, and the next one where it falls below again."""
-    enough = rates >= detection
+def _crossing(sizes: Array, probabilities: Array, detection: float) -> tuple[float | None, float | None]:
+    """Return the first size whose probability reaches `detection`, and the next where it falls below again."""
+    enough = probabilities >= detection
     if not enough.any():
         return None, None
     first = int(np.argmax(enough))
@@ -174,32 +177,31 @@ def _crossing(sizes: Array, rates: Array, detection: float) -> tuple[float | Non
     return float(sizes[first]), float(sizes[first + lost[0]]) if lost.size else None
 
 
-def predict(
+def smallest_leaks(
     responses: Responses, detectors: Sequence[ChangeDetector], false_alarm: float, detection: float = 0.9
-) -> tuple[Prediction, ...]:
-    """The smallest leak that each detector finds with probability `detection`; its columns are those of `responses`.
+) -> tuple[DetectorPrediction, ...]:
+    """Return the smallest leak that each detector finds with probability `detection`.
 
-    Sizes below the smallest simulated one are read off the curve that goes to no change at no leak.
-    Raises InputError for probabilities outside 0..1.
+    The detectors are the columns of `responses`. Sizes below the smallest simulated one are read off the curve that
+    goes to no change at no leak. Raises InputError for probabilities outside 0..1.
     """
-    for name, value in (("the false-alarm rate", false_alarm), ("the probability of detection", detection)):
-        if not 0.0 < value < 1.0:
-            raise InputError(f"{name} must be between 0 and 1, got {value}")
+    share(false_alarm, "the false-alarm probability")
+    share(detection, "the probability of detection")
     fine = np.geomspace(responses.sizes[0] / 100.0, responses.sizes[-1], _FINE)
     shown = [size for size in CURVE_SIZES if size <= responses.sizes[-1]]
-    again = _again(responses)
-    found = []
+    redrawn = _redrawn(responses)
+    predictions = []
     for k, detector in enumerate(detectors):
         if not (np.all(np.isfinite(responses.mean[:, k])) and np.all(responses.scatter[:, k] > 0.0)):
-            found.append(Prediction(detector.name, None, None, None, None, math.nan, math.nan, math.nan))
+            predictions.append(DetectorPrediction(detector.name, None, None, None, None, math.nan, math.nan, math.nan))
             continue
-        curve = _Curve(responses, k, detector.side, false_alarm)
-        rates = curve.at(fine)
-        smallest, lost = _crossing(fine, rates, detection)
-        others = [_Curve(one, k, detector.side, false_alarm).at(fine) for one in again]
-        low, high = _interval([_crossing(fine, one, detection)[0] for one in others])
-        found.append(
-            Prediction(
+        curve = _DetectionCurve(responses, k, detector.side, false_alarm)
+        probabilities = curve.at(fine)
+        smallest, lost = _crossing(fine, probabilities, detection)
+        others = [_DetectionCurve(other, k, detector.side, false_alarm).at(fine) for other in redrawn]
+        low, high = _interval([_crossing(fine, other, detection)[0] for other in others])
+        predictions.append(
+            DetectorPrediction(
                 detector=detector.name,
                 smallest=smallest,
                 low=low,
@@ -207,16 +209,19 @@ def predict(
                 lost_above=lost,
                 scatter=curve.leak_free,
                 threshold=curve.limit,
-                rate=float(rates.max()),
+                largest_detection=float(probabilities.max()),
                 curve=tuple(zip(shown, map(float, curve.at(np.array(shown))), strict=True)),
             )
         )
-    return tuple(found)
+    return tuple(predictions)
 
 
-def _again(responses: Responses) -> list[Responses]:
-    """Responses as chance might have given them: the samples drawn again, or, where only a scatter is known, the
-    scatter as chi squared spreads it and the means shifted by their errors."""
+def _redrawn(responses: Responses) -> list[Responses]:
+    """Return the responses as chance might have given them.
+
+    The samples are drawn again, or, where only a scatter is known, the scatter is spread as chi squared and the means
+    are shifted by their errors.
+    """
     random = np.random.default_rng(0)
     if responses.samples:
         return [responses.resampled(random) for _ in range(_RESAMPLED)]
@@ -229,15 +234,15 @@ def _again(responses: Responses) -> list[Responses]:
 
 
 def _interval(sizes: Sequence[float | None]) -> tuple[float | None, float | None]:
-    """The middle `CONFIDENCE` of the sizes, None for an end that lies beyond what was tried."""
+    """Return the middle `CONFIDENCE` of the sizes, None for an end that lies beyond what was tried."""
     tail = (1.0 - CONFIDENCE) / 2.0
-    ordered = np.sort([math.inf if one is None else one for one in sizes])
-    ends = (ordered[int(share * (len(ordered) - 1))] for share in (tail, 1.0 - tail))
+    ordered = np.sort([math.inf if size is None else size for size in sizes])
+    ends = (ordered[int(order * (len(ordered) - 1))] for order in (tail, 1.0 - tail))
     low, high = (float(end) if math.isfinite(end) else None for end in ends)
     return low, high
 
 
-class _Curve:
+class _DetectionCurve:
     """One detector's probability of detection as a function of the size."""
 
     def __init__(self, responses: Responses, column: int, side: Side, false_alarm: float) -> None:
@@ -251,7 +256,7 @@ class _Curve:
         self.limit = probability(np.zeros(1), self._spread[:1], self.leak_free, side, false_alarm)[1]
 
     def at(self, sizes: Array) -> Array:
-        """POD at sizes (m,) [L/min]."""
+        """Return the POD at sizes (m,) [L/min]."""
         shift = np.asarray(self._shift(sizes), dtype=np.float64)
         spread = np.interp(sizes, self._knots, self._spread)
         return probability(shift, spread, self.leak_free, self._side, self._false_alarm)[0]

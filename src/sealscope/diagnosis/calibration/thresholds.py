@@ -17,7 +17,7 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 from sealscope.recordings.atomic import atomic_write
 
-FORMAT = "sealscope calibration 1"
+FORMAT = "sealscope calibration 2"
 #: How far outside the calibrated pressure levels a recording may lie: this share of their range, and this ratio.
 LEVEL_MARGIN = 0.25
 #: How far the length of a recording may differ from those calibrated with, as a ratio: scores of short recordings

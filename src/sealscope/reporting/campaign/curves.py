@@ -1,4 +1,4 @@
-"""Small curves as paths for the campaign's page: rates from 0 to 1 over a size or over another rate."""
+"""Small curves as SVG paths for the campaign's page: fractions from 0 to 1 over a size or another fraction."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTH, HEIGHT = 460.0, 300.0
 
 
 @dataclass(frozen=True)
-class Curve:
+class PlotCurve:
     """A line y over x, both 0..1 upwards, with a band where it has one."""
 
     label: str
@@ -25,7 +25,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class CurvePlot:
     """Paths, points and ticks in a box of WIDTH x HEIGHT; `shade`: which of six line styles each path has."""
 
     title: str
@@ -45,13 +45,13 @@ def draw(
     title: str,
     x_label: str,
     y_label: str,
-    curves: Sequence[Curve],
+    curves: Sequence[PlotCurve],
     points: Sequence[tuple[float, float, float, float]],
     marks: Sequence[tuple[float, str]],
     *,
     log: bool,
-) -> Drawing:
-    """Lay out curves, points (x, y, low, high) and marked places (x, words); x logarithmic, or linear from 0 to 1."""
+) -> CurvePlot:
+    """Lay out curves, points (x, y, low, high) and marked places (x, label); x logarithmic, or linear from 0 to 1."""
     span = (0.0, 1.0)
     if log:
         every = [*(float(x) for curve in curves for x in (curve.x[0], curve.x[-1])), *(point[0] for point in points)]
@@ -75,8 +75,8 @@ def draw(
         paths.append((curve.label, path(x, y), shade % 6))
         if low is not None and high is not None:
             bands.append(path(x, high) + path(x[::-1], low[::-1], "L") + "Z")
-    laid_marks = tuple((across(x), words, 14.0 + 14.0 * k) for k, (x, words) in enumerate(marks))
-    return Drawing(
+    laid_marks = tuple((across(x), label, 14.0 + 14.0 * k) for k, (x, label) in enumerate(marks))
+    return CurvePlot(
         title,
         x_label,
         y_label,
@@ -89,8 +89,8 @@ def draw(
     )
 
 
-def _thinned(curve: Curve, most: int = 400) -> tuple[Array, Array, Array | None, Array | None]:
-    """At most so many points of a curve, its ends among them."""
+def _thinned(curve: PlotCurve, most: int = 400) -> tuple[Array, Array, Array | None, Array | None]:
+    """Return at most so many points of a curve, its ends among them."""
     n = curve.x.size
     kept = np.arange(n) if n <= most else np.unique(np.linspace(0, n - 1, most).round().astype(np.int64))
     low = None if curve.low is None else curve.low[kept]
@@ -99,8 +99,8 @@ def _thinned(curve: Curve, most: int = 400) -> tuple[Array, Array, Array | None,
 
 
 def _log_ticks(span: tuple[float, float]) -> list[float]:
-    """1, 2 and 5 times the powers of ten within a span of decades."""
-    found = []
+    """Return 1, 2 and 5 times the powers of ten within a span of decades."""
+    ticks = []
     for power in range(math.floor(span[0]), math.ceil(span[1]) + 1):
-        found += [float(f"{m}e{power}") for m in (1, 2, 5) if span[0] <= math.log10(m) + power <= span[1]]
-    return found
+        ticks += [float(f"{m}e{power}") for m in (1, 2, 5) if span[0] <= math.log10(m) + power <= span[1]]
+    return ticks

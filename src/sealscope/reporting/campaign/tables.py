@@ -6,15 +6,15 @@ import math
 from dataclasses import dataclass
 
 from sealscope.campaigns.judging.judge import Judgement
-from sealscope.evaluation.binomial import Rate
-from sealscope.evaluation.quantiles import Quantile
+from sealscope.evaluation.binomial import Proportion
+from sealscope.evaluation.estimates import Quantile
 
 
-def percent(rate: Rate | None) -> str:
-    """A rate with its interval in per cent, a dash where nothing is known."""
-    if rate is None or rate.n == 0:
+def percent(proportion: Proportion | None) -> str:
+    """Return a proportion with its interval in per cent, a dash where nothing is known."""
+    if proportion is None or proportion.n == 0:
         return "–"
-    return f"{_p(rate.rate)} % ({_p(rate.low)}–{_p(rate.high)})"
+    return f"{_p(proportion.value)} % ({_p(proportion.low)}–{_p(proportion.high)})"
 
 
 def _p(share: float) -> str:
@@ -35,60 +35,60 @@ class CauseTable:
 
 
 def onset_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str]]:
-    """Detector, size, alarms with an onset, median size of the error [s], how often the interval holds it."""
+    """Return detector, size, alarms with an onset, median size of the error [s], coverage of the interval."""
     return [
         (
-            one.detector,
-            f"{one.leak_lpm:g}",
-            str(one.errors.n),
-            _quantile(one.errors.median_size),
-            percent(one.errors.coverage) if one.errors.coverage.n else "–",
+            onset.detector,
+            f"{onset.leak_lpm:g}",
+            str(onset.errors.n),
+            _quantile(onset.errors.median_size),
+            percent(onset.errors.coverage),
         )
-        for one in judgement.onsets
+        for onset in judgement.onsets
     ]
 
 
 def flow_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str, str]]:
-    """Detector, size, records with an estimate, its bias, its median error, how often its interval holds the flow."""
+    """Return detector, size, records with an estimate, its bias, its median error, coverage of the interval."""
     return [
         (
-            one.detector,
-            f"{one.leak_lpm:g}" if one.leak_lpm else "no leak",
-            str(one.errors.bias.n),
-            f"{one.errors.bias.value:+.2g}",
-            f"{one.median_size.value:.2g}",
-            percent(one.errors.coverage) if one.errors.coverage.n else "–",
+            flow.detector,
+            f"{flow.leak_lpm:g}" if flow.leak_lpm else "no leak",
+            str(flow.errors.bias.n),
+            f"{flow.errors.bias.value:+.2g}",
+            f"{flow.median_size.value:.2g}",
+            percent(flow.errors.coverage),
         )
-        for one in judgement.estimates
+        for flow in judgement.flows
     ]
 
 
 def cause_tables(judgement: Judgement) -> list[CauseTable]:
-    """For each detector that names causes, how often it names which."""
-    found = []
-    for one in judgement.named:
-        confusion = one.confusion
+    """Return, for each detector that names causes, how often it names which."""
+    tables = []
+    for causes in judgement.causes:
+        confusion = causes.confusion
         there = [i for i in range(len(confusion.rows)) if confusion.counts[i].any()]
         rows = tuple(
             (
                 confusion.rows[i],
                 int(confusion.counts[i].sum()),
-                tuple(_share(confusion.rates[i][j]) for j in range(len(confusion.columns))),
+                tuple(_share(confusion.shares[i][j]) for j in range(len(confusion.columns))),
             )
             for i in there
         )
-        found.append(CauseTable(one.detector, confusion.columns, rows, percent(confusion.accuracy)))
-    return found
+        tables.append(CauseTable(causes.detector, confusion.columns, rows, percent(confusion.accuracy)))
+    return tables
 
 
-def _share(rate: Rate) -> str:
-    return f"{100 * rate.rate:.0f} %" if rate.count else "·"
+def _share(proportion: Proportion) -> str:
+    return f"{100 * proportion.value:.0f} %" if proportion.count else "·"
 
 
-def _quantile(one: Quantile) -> str:
-    if not math.isfinite(one.value):
+def _quantile(quantile: Quantile) -> str:
+    if not math.isfinite(quantile.value):
         return "–"
-    if not (math.isfinite(one.low) or math.isfinite(one.high)):
-        return f"{one.value:.2g}"
-    ends = [f"{end:.2g}" if math.isfinite(end) else "–" for end in (one.low, one.high)]
-    return f"{one.value:.2g} ({ends[0]}–{ends[1]})"
+    if not (math.isfinite(quantile.low) or math.isfinite(quantile.high)):
+        return f"{quantile.value:.2g}"
+    ends = [f"{end:.2g}" if math.isfinite(end) else "–" for end in (quantile.low, quantile.high)]
+    return f"{quantile.value:.2g} ({ends[0]}–{ends[1]})"

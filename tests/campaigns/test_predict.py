@@ -16,10 +16,10 @@ from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.judging.judge import calibration_of, judge
 from sealscope.campaigns.plans.model import RecordGroup, SimulatedPlan
 from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, ChangeDetector
-from sealscope.campaigns.prediction.noise_responses import instrument_noise, responses
-from sealscope.campaigns.prediction.predict import Wish, closing_words, experiment_for, outlook, with_closing
-from sealscope.campaigns.prediction.report import Outlook
-from sealscope.cli.plan import plan
+from sealscope.campaigns.prediction.predict import DetectionTarget, closing_text, experiment_for, predict, with_closing
+from sealscope.campaigns.prediction.report import PredictionReport
+from sealscope.campaigns.prediction.responses import instrument_noise, noise_responses
+from sealscope.cli import prediction
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
@@ -54,9 +54,9 @@ def test_start_keeps_the_widest_sweep_off_the_caps(rig: Rig) -> None:
 
 
 def test_throttles_are_told_in_words(rig: Rig) -> None:
-    assert closing_words(with_closing(rig, None)) == "none"
-    assert closing_words(with_closing(rig, 0.25)) == "25 %"
-    assert closing_words(rig.with_overrides({"closed_A": 0.25})) == "25 % at A, 50 % at B"
+    assert closing_text(with_closing(rig, None)) == "none"
+    assert closing_text(with_closing(rig, 0.25)) == "25 %"
+    assert closing_text(rig.with_overrides({"closed_A": 0.25})) == "25 % at A, 50 % at B"
 
 
 def test_prediction_agrees_with_recordings_made_afresh(rig: Rig) -> None:
@@ -64,7 +64,7 @@ def test_prediction_agrees_with_recordings_made_afresh(rig: Rig) -> None:
     experiment = experiment_for(rig, "7 sin(4t)", 20.0)
     noise = instrument_noise(experiment, 24, 0)
     detectors = (FELL, ChangeDetector("d4", "p_B", "changed"), ChangeDetector("d3d4", "p_A", "fell"))
-    found, dp = responses(experiment, (0.01,), detectors, noise)
+    found, dp = noise_responses(experiment, (0.01,), detectors, noise)
     leak = Leak("laminar", coefficient=0.01 * LITRE_PER_MINUTE / dp, opening=From(10.0))
     for row, leaks in ((0, ()), (1, (leak,))):
         fresh = []
@@ -85,7 +85,7 @@ def test_scatter_falls_with_the_root_of_time_and_rises_with_noise(rig: Rig) -> N
     def scatter(duration: float, machine: Rig) -> float:
         experiment = experiment_for(machine, "3 sin(4t)", duration)
         noise = instrument_noise(experiment, 40, 1)
-        return float(responses(experiment, (0.01,), (FELL,), noise)[0].scatter[0, 0])
+        return float(noise_responses(experiment, (0.01,), (FELL,), noise)[0].scatter[0, 0])
 
     still = scatter(20.0, rig)
     assert still / scatter(80.0, rig) == pytest.approx(2.0, rel=0.4)
@@ -105,9 +105,9 @@ def test_noise_holds_what_the_instruments_add_and_loses_no_sample(rig: Rig) -> N
 
 
 @pytest.fixture(scope="module")
-def made(rig: Rig) -> Outlook:
+def made(rig: Rig) -> PredictionReport:
     told: list[tuple[str, float]] = []
-    found = outlook(
+    found = predict(
         experiment_for(rig, "7 sin(4t)", 20.0),
         commands=("7 sin(4t)", "11 sin(4t)"),
         closings=(None,),
@@ -118,31 +118,33 @@ def made(rig: Rig) -> Outlook:
     return found
 
 
-def test_plan_names_every_detector_and_keeps_the_bound_below_them(made: Outlook) -> None:
+def test_plan_names_every_detector_and_keeps_the_bound_below_them(made: PredictionReport) -> None:
     assert [one.detector for one in made.detectors] == [one.name for one in THESIS_DETECTORS]
     found = [one.smallest for one in made.detectors if one.smallest is not None]
     assert found
     bound = made.bound
-    assert bound.smallest_known < min(found)  # no detector beats the bound
-    assert bound.known < bound.unknown
-    assert bound.change_known == pytest.approx(math.sqrt(2.0) * bound.known)
+    assert bound.smallest_known_lpm < min(found)  # no detector beats the bound
+    assert bound.known_lpm < bound.unknown_lpm
+    assert bound.change_known_lpm == pytest.approx(math.sqrt(2.0) * bound.known_lpm)
     assert bound.half_s == 10.0
 
 
-def test_a_command_that_cannot_be_run_is_told_in_its_row(made: Outlook) -> None:
+def test_a_command_that_cannot_be_run_is_told_in_its_row(made: PredictionReport) -> None:
     good, bad = made.commands
     assert good.note == "" and good.smallest_known is not None
     assert "must stay within +-10 V" in bad.note and bad.best is None
     assert bad.note in made.text()
 
 
-def test_text_says_what_was_asked_and_the_best_command(made: Outlook) -> None:
+def test_text_says_what_was_asked_and_the_best_command(made: PredictionReport) -> None:
     text = made.text()
     for words in (
         "7 sin(4t), throttles 50 %, 20 s",
         "1 % false alarms, 90 % found",
         "d3d4 of p_B changed",
         "Cramer-Rao",
+        "true onset given: every detector compares the 10 s before the leak with those after",
+        "; given p_A, p_B and no rig",
     ):
         assert words in text
     assert text.splitlines()[-1] == made.advice()
@@ -151,14 +153,14 @@ def test_text_says_what_was_asked_and_the_best_command(made: Outlook) -> None:
 
 def test_same_seed_same_plan(rig: Rig) -> None:
     experiment = experiment_for(rig, "3 sin(4t)", 20.0)
-    one, other, third = (outlook(experiment, Wish(seed=seed), commands=()).as_dict() for seed in (1, 1, 2))
+    one, other, third = (predict(experiment, DetectionTarget(seed=seed), commands=()).as_dict() for seed in (1, 1, 2))
     assert one == other
     assert one["detectors"] != third["detectors"]
 
 
 runner = CliRunner()
 application = typer.Typer()
-application.command()(plan)
+application.command()(prediction.predict)
 
 
 def test_json_is_one_object_with_the_stated_fields() -> None:
@@ -193,16 +195,17 @@ def test_json_is_one_object_with_the_stated_fields() -> None:
         "unknown_parameters",
     }
     assert tree["commands"] == []
+    assert tree["given_to_detectors"] == {"onset": True, "channels": ["p_A", "p_B"], "rig": False}
 
 
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["--duration", "5"], "duration must be >= 20 s for a plan, got 5 s"),
+        (["--duration", "5"], "duration must be >= 20 s for a prediction, got 5 s"),
         (["--duration", "nan"], "duration must be"),
-        (["--false-alarm", "1"], "the false-alarm rate must be between 0 and 1, got 1.0"),
+        (["--false-alarm", "1"], "the false-alarm probability must be between 0 and 1, got 1.0"),
         (["--detection", "0"], "the probability of detection must be between 0 and 1"),
-        (["--detector", "rms change"], "a detector to plan for must be like"),
+        (["--detector", "rms change"], "a detector to predict must be like"),
         (["--command", "12 sin(t)"], "command must stay within"),
         (["--seed", "-1"], "seed must be >= 0"),
         (["--bench", "bench", "--results", "here"], "from a bench or from a campaign's results, got both"),
@@ -223,8 +226,8 @@ def test_prediction_agrees_with_a_campaigns_a90(rig: Rig) -> None:
     """300 leak-free records set the threshold, 4 x 60 leaky ones the curve through hits and misses."""
     detector = FELL
     experiment = experiment_for(rig, "7 sin(4t)", 20.0)
-    wish = Wish(false_alarm=0.02, detectors=(detector,))
-    (predicted,) = outlook(experiment, wish, commands=()).detectors
+    target = DetectionTarget(false_alarm=0.02, detectors=(detector,))
+    (predicted,) = predict(experiment, target, commands=()).detectors
     assert predicted.smallest is not None and predicted.low is not None
     sizes = [round(share * predicted.smallest, 5) for share in (0.3, 0.6, 1.0, 1.5)]
     campaign = SimulatedPlan(
@@ -248,11 +251,10 @@ def test_prediction_agrees_with_a_campaigns_a90(rig: Rig) -> None:
         factors={"command": ("7 sin(4t)",)},
     )
     rows = [work(campaign, case) for case in cases_of(campaign)]
-    calibration = calibration_of(rows, campaign.detectors, rate=0.02)
+    calibration = calibration_of(rows, campaign.detectors, false_alarm=0.02)
     (found,) = judge(rows, campaign.detectors, calibration).pods
     assert found.curve is not None
-    low, high = found.curve.size_interval(0.9, 0.95)
     assert predicted.high is not None
-    assert low < 1.1 * predicted.high  # a tenth either way for the threshold's own chance: 300 records at 2 %
-    assert high > predicted.low / 1.1
+    low, high = found.curve.detection_band([predicted.low / 1.1, 1.1 * predicted.high])
+    assert high[1] > 0.9 > low[0]  # a tenth either way for the threshold's own chance: 300 records at 2 %
     assert found.curve.a90 == pytest.approx(predicted.smallest, rel=0.3)

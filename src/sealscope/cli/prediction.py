@@ -1,4 +1,4 @@
-"""The command that plans: what a rig, its sensors and a command will let a detector find, before anyone measures."""
+"""The command that predicts: what a rig, its sensors and a command let a detector find, before anyone measures."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import typer
 from sealscope.cli.options import RigOption, SetOption, progress, rig_with
 
 
-class PlanFormat(StrEnum):
-    """How a plan is printed."""
+class PredictionFormat(StrEnum):
+    """How a prediction is printed."""
 
     text = "text"
     json = "json"
 
 
-def plan(
+def predict(
     rig: RigOption = "thesis",
     command: Annotated[str, typer.Option("--command", help="Command of the test, e.g. '3 sin(4t)'.")] = "3 sin(4t)",
     duration: Annotated[
@@ -53,14 +53,21 @@ def plan(
         bool, typer.Option("--compare/--no-compare", help="Compare the standard commands and throttles.")
     ] = True,
     seed: Annotated[int, typer.Option("--seed", help="Seed of noise and draws.")] = 0,
-    output: Annotated[PlanFormat, typer.Option("--format", help="Text, or one JSON object.")] = PlanFormat.text,
+    output: Annotated[
+        PredictionFormat, typer.Option("--format", help="Text, or one JSON object.")
+    ] = PredictionFormat.text,
 ) -> None:
     """Predict the smallest leak that each detector finds, with the Cramer-Rao bound beside it."""
     from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, change_detector
-    from sealscope.campaigns.prediction.predict import STANDARD_COMMANDS, Wish, experiment_for, outlook
+    from sealscope.campaigns.prediction.predict import (
+        STANDARD_COMMANDS,
+        DetectionTarget,
+        experiment_for,
+    )
+    from sealscope.campaigns.prediction.predict import predict as predict_leaks
     from sealscope.units import parse_quantity
 
-    wish = Wish(
+    target = DetectionTarget(
         false_alarm=false_alarm,
         detection=detection,
         detectors=tuple(change_detector(name) for name in dict.fromkeys(detectors)) if detectors else THESIS_DETECTORS,
@@ -72,14 +79,14 @@ def plan(
         parse_quantity(duration, "s", name="--duration"),
         None if start is None else parse_quantity(start, "m", name="--start-position"),
     )
-    with progress() as told:
-        made = outlook(
+    with progress() as update:
+        report = predict_leaks(
             experiment,
-            wish,
+            target,
             commands=STANDARD_COMMANDS if compare else (),
             bench=bench,
             draws=draws,
             results=results,
-            progress=told,
+            progress=update,
         )
-    typer.echo(json.dumps(made.as_dict(), allow_nan=False) if output is PlanFormat.json else made.text())
+    typer.echo(json.dumps(report.as_dict(), allow_nan=False) if output is PredictionFormat.json else report.text())

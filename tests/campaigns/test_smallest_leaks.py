@@ -13,14 +13,14 @@ from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.prediction.detection import (
     THESIS_DETECTORS,
     ChangeDetector,
-    Prediction,
+    DetectorPrediction,
     Responses,
     change_detector,
-    predict,
     probability,
+    smallest_leaks,
 )
-from sealscope.campaigns.prediction.measured_responses import measured_responses
-from sealscope.campaigns.prediction.predict import Wish, with_closing
+from sealscope.campaigns.prediction.predict import DetectionTarget, with_closing
+from sealscope.campaigns.prediction.responses import measured_responses
 from sealscope.diagnosis.calibration.scorers import SCORERS
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
@@ -38,14 +38,14 @@ def falling(slope: float, scatter: float, top: float = 0.1, records: int = 1000)
 def test_smallest_leak_of_a_straight_line_is_the_closed_form() -> None:
     """a_p = (z_{1-alpha} + z_p) s / k."""
     for alpha, p, z in ((0.01, 0.9, 2.3263 + 1.2816), (0.05, 0.5, 1.6449)):
-        (found,) = predict(falling(2.0, 0.01), [FELL], alpha, p)
+        (found,) = smallest_leaks(falling(2.0, 0.01), [FELL], alpha, p)
         assert found.smallest == pytest.approx(z * 0.01 / 2.0, rel=0.02)
         assert found.scatter == 0.01
         assert found.lost_above is None
 
 
 def test_a_side_that_does_not_move_finds_nothing_and_two_sides_cost_a_little() -> None:
-    one, none, both = predict(
+    one, none, both = smallest_leaks(
         Responses(
             np.array([0.001, 0.1]),
             np.array([[0.0] * 3, [-0.002] * 3, [-0.2] * 3]),
@@ -57,7 +57,7 @@ def test_a_side_that_does_not_move_finds_nothing_and_two_sides_cost_a_little() -
         0.01,
     )
     assert none.smallest is None
-    assert none.rate < 0.01
+    assert none.largest_detection < 0.01
     assert one.smallest is not None and both.smallest is not None
     assert both.smallest == pytest.approx((2.5758 + 1.2816) * 0.01 / 2.0, rel=0.02)
     assert one.smallest < both.smallest
@@ -76,32 +76,32 @@ def test_probability_is_that_of_normal_scores() -> None:
 def test_what_a_larger_leak_hides_again_is_told() -> None:
     sizes = np.array([0.001, 0.01, 0.1])
     table = np.array([[0.0], [-0.05], [-0.1], [0.0]])
-    (found,) = predict(Responses(sizes, table, np.full((4, 1), 0.01), 50, 49), [FELL], 0.01)
+    (found,) = smallest_leaks(Responses(sizes, table, np.full((4, 1), 0.01), 50, 49), [FELL], 0.01)
     assert found.smallest is not None and found.lost_above is not None
     assert found.smallest < 0.01 < found.lost_above < 0.1
 
 
 def test_interval_comes_from_the_scatters_own_uncertainty() -> None:
-    few, many = (predict(falling(2.0, 0.01, records=n), [FELL], 0.01)[0] for n in (10, 1000))
+    few, many = (smallest_leaks(falling(2.0, 0.01, records=n), [FELL], 0.01)[0] for n in (10, 1000))
     for one in (few, many):
         assert one.low is not None and one.smallest is not None and one.high is not None
         assert one.low < one.smallest < one.high
 
-    def width(one: Prediction) -> float:
+    def width(one: DetectorPrediction) -> float:
         assert one.low is not None and one.high is not None
         return math.log(one.high / one.low)
 
     assert width(few) > 5 * width(many)
-    (beyond,) = predict(falling(2.0, 0.01, top=0.019, records=10), [FELL], 0.01)
+    (beyond,) = smallest_leaks(falling(2.0, 0.01, top=0.019, records=10), [FELL], 0.01)
     assert beyond.smallest is not None
     assert beyond.high is None
 
 
 def test_the_size_scales_with_the_scatter_and_falls_with_more_false_alarms() -> None:
-    sizes = [predict(falling(2.0, s), [FELL], 0.01)[0].smallest for s in (0.005, 0.01, 0.02)]
+    sizes = [smallest_leaks(falling(2.0, s), [FELL], 0.01)[0].smallest for s in (0.005, 0.01, 0.02)]
     assert all(one is not None for one in sizes)
     assert sizes[1] / sizes[0] == pytest.approx(2.0, rel=0.03)  # type: ignore[operator]
-    rates = [predict(falling(2.0, 0.01), [FELL], alpha)[0].smallest for alpha in (0.001, 0.01, 0.1)]
+    rates = [smallest_leaks(falling(2.0, 0.01), [FELL], alpha)[0].smallest for alpha in (0.001, 0.01, 0.1)]
     assert rates[0] > rates[1] > rates[2]  # type: ignore[operator]
 
 
@@ -109,14 +109,14 @@ def test_detectors_are_those_that_campaigns_know() -> None:
     assert all(one.name in SCORERS for one in THESIS_DETECTORS)
     assert change_detector("d3d4 of p_B rose") == ChangeDetector("d3d4", "p_B", "rose")
     for name in ("rms change", "d3 of p_A low", "d9 of p_A fell", "d3 of x fell", ""):
-        with pytest.raises(InputError, match="a detector to plan for must be like 'd3 of p_A fell'"):
+        with pytest.raises(InputError, match="a detector to predict must be like 'd3 of p_A fell'"):
             change_detector(name)
 
 
 def test_bad_wishes_are_refused() -> None:
     for values in ({"false_alarm": 0.0}, {"false_alarm": 1.5}, {"detection": 1.0}, {"detectors": ()}, {"seed": -1}):
         with pytest.raises(InputError):
-            Wish(**values)  # type: ignore[arg-type]
+            DetectionTarget(**values)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="must be one or more, rise and be > 0"):
         Responses(np.array([0.2, 0.1]), np.zeros((3, 1)), np.ones((3, 1)), 9, 8)
 
@@ -151,7 +151,7 @@ def test_a_campaigns_rows_take_the_place_of_a_simulation(tmp_path: Path) -> None
     found = measured_responses(tmp_path, "3 sin(4t)", rig, 180.0, (FELL, CHANGED, other))
     assert found.records == 60
     assert found.sizes == pytest.approx([0.0011, 0.11])
-    predicted = predict(found, (FELL, CHANGED, other), 0.01)
+    predicted = smallest_leaks(found, (FELL, CHANGED, other), 0.01)
     expected = (2.3263 + 1.2816) * 0.01 / 2.0 * 1.1
     assert predicted[0].smallest == pytest.approx(expected, rel=0.25)
     assert predicted[1].smallest is not None and predicted[2].smallest is None

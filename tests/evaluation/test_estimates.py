@@ -1,4 +1,4 @@
-"""Rates in time, quantiles and errors of estimates: published tables, hand counts and coverage."""
+"""Quantiles, means and errors of estimates: published tables, hand counts and coverage."""
 
 from __future__ import annotations
 
@@ -10,16 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError
-from sealscope.evaluation.quantiles import order_ranks, quantile_of
-from sealscope.evaluation.rates import (
-    delays,
-    estimate_error,
-    false_alarms,
-    hourly_rate,
-    mean_of,
-    onset_errors,
-    poisson_interval,
-)
+from sealscope.evaluation.estimates import estimate_error, mean_of, onset_errors, order_ranks, quantile_of
+from sealscope.evaluation.table import events_per_hour, poisson_interval
 
 # Garwood, Biometrika 28 (1936) 437-442, as in Pearson and Hartley, Biometrika Tables for Statisticians, table 40: 95 %
 GARWOOD = [
@@ -52,21 +44,9 @@ def test_the_limits_are_those_of_the_two_tails(count, confidence):
         assert math.fsum(map(math.exp, below)) == pytest.approx(1 - tail, rel=1e-9)
 
 
-def test_false_alarms_per_record_and_hour():
-    found = false_alarms([0, 2, 0, 1, 0, 0, 0, 0], 0.5, 0.95)
-    assert (found.per_record.count, found.per_record.n) == (2, 8)
-    assert (found.hourly.count, found.hourly.hours, found.hourly.per_hour) == (3, 4.0, 0.75)
-    assert (found.hourly.low, found.hourly.high) == pytest.approx((0.6187 / 4, 8.7673 / 4), abs=1e-4)
-    assert found.run_hours == pytest.approx(4 / 3)
-    assert (found.run_low, found.run_high) == pytest.approx((4 / 8.7673, 4 / 0.6187), rel=1e-3)
-    quiet = false_alarms(np.zeros(100), np.full(100, 0.05))
-    assert (quiet.run_hours, quiet.run_high) == (math.inf, math.inf)
-    assert quiet.run_low == pytest.approx(5 / 3.6889, rel=1e-4)
-
-
 def test_the_hourly_interval_covers():
     rng = np.random.default_rng(1)
-    found = [hourly_rate(int(k), 20.0, 0.9) for k in rng.poisson(0.3 * 20.0, 400)]
+    found = [events_per_hour(int(k), 20.0, 0.9) for k in rng.poisson(0.3 * 20.0, 400)]
     assert np.mean([one.low <= 0.3 <= one.high for one in found]) >= 0.88
 
 
@@ -144,16 +124,6 @@ def test_a_constant_error_is_bias(errors, shift):
     assert found.rmse.low <= found.rmse.value <= found.rmse.high
 
 
-def test_delays_count_a_miss_as_infinite_and_an_early_alarm_as_a_miss():
-    alarms = [95.0, 100.0, math.nan, 50.0, 92.0, 91.0, 99.0, 98.0, 97.0, 96.0, 90.0]
-    found = delays(alarms, [90.0] * 11)
-    assert (found.detected.count, found.premature.count, found.n) == (9, 1, 11)
-    assert found.median.value == 7.0  # 0 1 2 5 6 | 7 | 8 9 10 inf inf
-    assert found.ninety.value == math.inf
-    late = delays([a + 3 for a in alarms], [93.0] * 11)
-    assert late == found
-
-
 def test_errors_of_an_onset():
     found = onset_errors([92.0, math.nan, 85.0, 90.0], [90.0] * 4, [88, math.nan, 80, 91], [95, math.nan, 89, 93])
     assert (found.n, found.without) == (3, 1)
@@ -166,10 +136,7 @@ def test_errors_of_an_onset():
     ("call", "line"),
     [
         (lambda: poisson_interval(-1), "a number of events must be whole and >= 0, got -1"),
-        (lambda: hourly_rate(1, 0.0), "operating hours must be > 0, got 0.0"),
-        (lambda: false_alarms([0, 0.5], 1.0), "alarms must be whole numbers >= 0, got 0.5"),
-        (lambda: false_alarms([0, 1], [1.0, -1.0]), "operating hours must be > 0 in each record"),
-        (lambda: false_alarms([0, 1], [1.0] * 3), "operating hours must be one number or as many as the records (2)"),
+        (lambda: events_per_hour(1, 0.0), "operating hours must be > 0, got 0.0"),
         (lambda: quantile_of([], 0.5), "values for a quantile must be at least 1 and none of them nan"),
         (lambda: quantile_of([1.0], 1.0), "the order of a quantile must be between 0 and 1, got 1.0"),
         (lambda: estimate_error([1.0], [1.0, 2.0]), "estimates must be as many as the true values, got (1,) for 2"),

@@ -1,0 +1,185 @@
+"""Errors of what a detector states: quantiles and means with intervals, errors of an onset and of a flow."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sealscope.errors import InputError
+from sealscope.evaluation.binomial import Proportion, proportion
+from sealscope.evaluation.checks import Array, numbers, share
+
+
+@dataclass(frozen=True)
+class Quantile:
+    """The `order` quantile of `n` values and its interval (`low`, `high`) at `confidence`.
+
+    Infinite where the sample is too small to bound it, or where that many values are infinite.
+    """
+
+    order: float
+    n: int
+    value: float
+    low: float
+    high: float
+    confidence: float
+
+
+@dataclass(frozen=True)
+class Mean:
+    """The mean of `n` values and its interval (`low`, `high`) at `confidence`; no interval from one value."""
+
+    n: int
+    value: float
+    low: float
+    high: float
+    confidence: float
+
+
+@dataclass(frozen=True)
+class EstimateError:
+    """Errors of an estimate.
+
+    `bias`: estimate less truth; `rmse`: root mean square error; `coverage`: how often the estimate's own interval held
+    the truth; `without`: records without an estimate.
+    """
+
+    bias: Mean
+    rmse: Mean
+    coverage: Proportion
+    without: int
+
+
+@dataclass(frozen=True)
+class OnsetErrors:
+    """Errors of the onset [s] over the `n` records that state one; `without` had none.
+
+    Signed `median` (late is positive), `median_size` and `ninety_size` of its size, and how often the stated interval
+    held the true onset (`coverage`).
+    """
+
+    n: int
+    without: int
+    median: Quantile
+    median_size: Quantile
+    ninety_size: Quantile
+    coverage: Proportion
+
+
+def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, int]:
+    """Return the ranks (r, s) of the order statistics that hold the `order` quantile with at least `confidence`.
+
+    r is the largest with ``P(X <= r - 1) <= alpha/2``, s the smallest with ``P(X >= s) <= alpha/2``, X binomial (n,
+    order); r = 0 and s = n + 1 stand for no bound. Raises InputError for an impossible order or confidence. Source:
+    Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2.
+    """
+    from scipy.special import betainc
+
+    share(order, "the order of a quantile")
+    tail = (1.0 - share(confidence, "confidence")) / 2.0
+    k = np.arange(1, n + 1)
+    reach = betainc(k, n + 1 - k, order)  # P(X >= k), falling in k
+    return int(np.count_nonzero(1.0 - reach <= tail)), int(np.count_nonzero(reach > tail)) + 1
+
+
+def quantile_of(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> Quantile:
+    """Return the `order` quantile of a sample, ``x_(ceil(n order))``, and its order-statistic interval.
+
+    The interval holds for any distribution. `values` (n,) may hold inf for what was not reached; nan is refused.
+    Raises InputError for an empty sample. Source: as `order_ranks`.
+    """
+    array = np.sort(np.asarray(values, dtype=np.float64).ravel())
+    if array.size == 0 or np.isnan(array).any():
+        raise InputError("values for a quantile must be at least 1 and none of them nan")
+    n = array.size
+    r, s = order_ranks(n, order, confidence)
+    padded = np.concatenate([[-math.inf], array, [math.inf]])
+    middle = min(n, max(1, math.ceil(n * order * (1.0 - 1e-12))))
+    return Quantile(order, n, float(padded[middle]), float(padded[r]), float(padded[s]), confidence)
+
+
+def mean_of(values: npt.ArrayLike, confidence: float = 0.95) -> Mean:
+    """Return the mean and its Student interval ``mean -+ t s/sqrt(n)``; infinite from one value, nan from none."""
+    from scipy.special import stdtrit
+
+    share(confidence, "confidence")
+    array = np.asarray(values, dtype=np.float64).ravel()
+    if array.size == 0:
+        return Mean(0, math.nan, math.nan, math.nan, confidence)
+    array = numbers(array, "values")
+    n, value = array.size, float(array.mean())
+    if n == 1:
+        return Mean(1, value, -math.inf, math.inf, confidence)
+    half = float(stdtrit(n - 1, 0.5 + confidence / 2.0) * array.std(ddof=1) / math.sqrt(n))
+    return Mean(n, value, value - half, value + half, confidence)
+
+
+def _coverage(low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float) -> Proportion:
+    """Return how often the stated intervals hold the truth."""
+    low, high = _beside(low, truth.size, "lower limits"), _beside(high, truth.size, "upper limits")
+    stated = ~(np.isnan(low) | np.isnan(high))
+    held = (low <= truth) & (truth <= high) & stated
+    return proportion(int(np.count_nonzero(held)), int(stated.sum()), confidence)
+
+
+def _beside(values: npt.ArrayLike | None, n: int, what: str) -> Array:
+    array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
+    if array.shape != (n,):
+        raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")
+    return array
+
+
+def estimate_error(
+    estimates: npt.ArrayLike,
+    truth: npt.ArrayLike,
+    low: npt.ArrayLike | None = None,
+    high: npt.ArrayLike | None = None,
+    confidence: float = 0.95,
+) -> EstimateError:
+    """Return bias, rmse and coverage of an estimate (a leak in L/min) with intervals.
+
+    All (n,) in one unit; nan where a record has no estimate or no interval. The interval of the rmse is the square
+    root of the Student interval of the mean square error, cut at 0. Coverage is over the records with an interval.
+    """
+    true = numbers(truth, "true values")
+    given = _beside(estimates, true.size, "estimates")
+    known = np.isfinite(given)
+    error = given[known] - true[known]
+    square = mean_of(error**2, confidence)
+    roots = [math.sqrt(max(x, 0.0)) if not math.isnan(x) else math.nan for x in (square.value, square.low, square.high)]
+    return EstimateError(
+        bias=mean_of(error, confidence),
+        rmse=Mean(square.n, roots[0], roots[1], roots[2], confidence),
+        coverage=_coverage(low, high, true, confidence),
+        without=int(true.size - known.sum()),
+    )
+
+
+def onset_errors(
+    estimates: npt.ArrayLike,
+    onsets: npt.ArrayLike,
+    low: npt.ArrayLike | None = None,
+    high: npt.ArrayLike | None = None,
+    confidence: float = 0.95,
+) -> OnsetErrors:
+    """Return the errors of the estimated onsets [s] against the true ones, with order-statistic intervals.
+
+    All (n,); nan where none was stated. Raises InputError where no record has an estimate.
+    """
+    true = numbers(onsets, "true onsets")
+    given = _beside(estimates, true.size, "estimated onsets")
+    known = np.isfinite(given)
+    if not known.any():
+        raise InputError(f"onset errors need at least one estimated onset, got none in {true.size} records")
+    error = given[known] - true[known]
+    return OnsetErrors(
+        n=int(known.sum()),
+        without=int(true.size - known.sum()),
+        median=quantile_of(error, 0.5, confidence),
+        median_size=quantile_of(np.abs(error), 0.5, confidence),
+        ninety_size=quantile_of(np.abs(error), 0.9, confidence),
+        coverage=_coverage(low, high, true, confidence),
+    )
