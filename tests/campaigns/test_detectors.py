@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.campaigns.cases.row import CaseRow, Statement, cause_of
+from sealscope.campaigns.cases.row import CaseRow, cause_of, rank_of
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution.store import read_rows
 from sealscope.campaigns.judging.judge import calibration_of, judge
@@ -135,7 +135,7 @@ def test_the_fused_verdict_is_that_of_diagnose(plan, done):
             said = row.statements[key]
             assert (said.verdict, said.cause, said.onset_s) == (found.verdict, found.cause, found.onset_s)
             assert said.score == pytest.approx(found.score)
-            if said.rank is not None:
+            if rank_of(said) is not None:
                 beyond = found.score / found.threshold if found.threshold > 0 else found.score - found.threshold
                 assert row.scores[key][0] == pytest.approx(beyond)
 
@@ -290,8 +290,8 @@ def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
 
 
 def row(number, verdict, leak=0.0, fault="", cause=None, use="judge", **stated):
-    said = Statement(verdict, 4.0 if verdict == "leak" else 1.0, 3.0, cause=cause, **stated)
-    scores = {"watcher": (said.rank, said.onset_s)}
+    said = Evidence(verdict, "", 4.0 if verdict == "leak" else 1.0, 3.0, cause=cause, **stated)
+    scores = {"watcher": (rank_of(said), said.onset_s)}
     return CaseRow(f"{number:04x}", use, leak, fault, {}, number, leak, scores=scores, statements={"watcher": said})
 
 

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 from sealscope.campaigns.held_out.checks import checks_of, clustered_area, swapped_areas
 from sealscope.campaigns.held_out.classifiers import (
-    Samples,
+    MeasuredSamples,
     chosen_candidates,
     fit_logistic,
     fold_log_odds,
@@ -78,22 +78,24 @@ def test_a_held_out_test_is_not_seen():
     tests = np.repeat(np.arange(20), 2)
     leaks = np.tile([0.0, 1.0], 20)
     noise = random.normal(size=40)
-    samples = Samples({"noise": noise}, leaks, list(tests), [{"condition": int(k % 4)} for k in tests])
+    samples = MeasuredSamples({"noise": noise}, leaks, list(tests), [{"condition": int(k % 4)} for k in tests])
     plan = LogisticClassifier("noise", ("noise",), 1.0)
     scores = held_out_scores(samples, plan, "test")
     moved = noise.copy()
     moved[0] += 100.0  # the first sample's own feature moves its own score and, through the fit, the other tests' ...
-    other = held_out_scores(Samples({"noise": moved}, leaks, list(tests), samples.levels), plan, "test")
+    other = held_out_scores(MeasuredSamples({"noise": moved}, leaks, list(tests), samples.levels), plan, "test")
     assert other[1] == scores[1]  # ... but not that of the sample held out with it
     assert np.all(other[2:] != scores[2:])
-    condition = held_out_scores(Samples({"noise": moved}, leaks, list(tests), samples.levels), plan, "condition")
+    condition = held_out_scores(
+        MeasuredSamples({"noise": moved}, leaks, list(tests), samples.levels), plan, "condition"
+    )
     same = held_out_scores(samples, plan, "condition")
     together = [k for k in range(1, 40) if tests[k] % 4 == 0]
     assert np.array_equal(condition[together], same[together])
 
 
 def test_an_unknown_feature_is_named():
-    samples = Samples({"a": np.zeros(4)}, np.array([0.0, 1.0, 0.0, 1.0]), [1, 1, 2, 2], [{}] * 4)
+    samples = MeasuredSamples({"a": np.zeros(4)}, np.array([0.0, 1.0, 0.0, 1.0]), [1, 1, 2, 2], [{}] * 4)
     with pytest.raises(InputError, match="a feature must be one of a, got 'b'"):
         held_out_scores(samples, LogisticClassifier("x", ("b",), 1.0), "test")
 
@@ -126,7 +128,7 @@ def paired(seed, tests=24, effect=1.5):
         "self": own,
         "noise": random.normal(size=2 * tests),
     }
-    return Samples(features, leaks, list(number), [{"condition": int(k % 6)} for k in number])
+    return MeasuredSamples(features, leaks, list(number), [{"condition": int(k % 6)} for k in number])
 
 
 CHOSEN = ChosenClassifier("chosen", (("good",), ("self",), ("noise",)), (0.1, 1.0))
@@ -140,7 +142,7 @@ def test_what_is_held_out_takes_no_part_in_the_choice():
     assert all("good" in pick.features for pick in picks)
     scores = held_out_scores(samples, CHOSEN, "test")
     wild = {name: values + 1e3 * (np.arange(48) == 0) for name, values in samples.features.items()}
-    other = Samples(wild, samples.leak_lpm, samples.tests, samples.levels)
+    other = MeasuredSamples(wild, samples.leak_lpm, samples.tests, samples.levels)
     assert chosen_candidates(other, CHOSEN, "test")[0] == picks[0]
     assert held_out_scores(other, CHOSEN, "test")[1] == pytest.approx(scores[1], abs=1e-12)
     assert {one.ridge for one in CHOSEN.candidates()} == {0.1, 1.0}

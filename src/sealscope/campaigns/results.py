@@ -11,7 +11,7 @@ from sealscope.campaigns.cases.recordings import ProgressCallback, recorded_rows
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.execution import store
 from sealscope.campaigns.held_out.checks import HeldOutCheck, checks_of
-from sealscope.campaigns.held_out.classifiers import Samples, held_out_rows
+from sealscope.campaigns.held_out.classifiers import MeasuredSamples, held_out_rows
 from sealscope.campaigns.judging.judge import Judgement, calibration_of, judge
 from sealscope.campaigns.judging.tables import PriorKnowledge, ResultTable, rows_table, tables_of, write_tables
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, plan_detector
@@ -92,7 +92,7 @@ def simulated_result(plan: SimulatedPlan, folder: Path) -> CampaignResult:
     return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
 
 
-def held_out_result(plan: HeldOutPlan, samples: Samples) -> CampaignResult:
+def held_out_result(plan: HeldOutPlan, samples: MeasuredSamples) -> CampaignResult:
     """Return the result of a campaign over measured data; an alarm is log odds over 0."""
     rows = held_out_rows(plan, samples)
     names = detectors_of(plan)

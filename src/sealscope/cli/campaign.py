@@ -25,7 +25,7 @@ from sealscope.errors import InputError
 if TYPE_CHECKING:
     from sealscope.campaigns.cases.recordings import ProgressCallback
     from sealscope.campaigns.execution.store import CampaignProgress
-    from sealscope.campaigns.held_out.classifiers import Samples
+    from sealscope.campaigns.held_out.classifiers import MeasuredSamples
     from sealscope.campaigns.plans.model import AnyPlan
     from sealscope.campaigns.results import CampaignResult
 
@@ -235,11 +235,11 @@ def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
     return held_out_result(plan, _sheet_samples(sheet))
 
 
-def _sheet_samples(folder: Path | None) -> Samples:
+def _sheet_samples(folder: Path | None) -> MeasuredSamples:
     """Return the thesis's data sheet as samples: log RMS of each detail, each test without and with its leak."""
     import numpy as np
 
-    from sealscope.campaigns.held_out.classifiers import Samples
+    from sealscope.campaigns.held_out.classifiers import MeasuredSamples
     from sealscope.thesis.conditions import APPENDIX_C
     from sealscope.thesis.sheet import MISSING, find_sheet, read_sheet
 
@@ -253,7 +253,7 @@ def _sheet_samples(folder: Path | None) -> Samples:
         for quantity, values in quantities.items()
     }
     leaks = [test.mean_leak_lpm for test in APPENDIX_C]
-    return Samples(
+    return MeasuredSamples(
         features=features,
         leak_lpm=np.array([0.0] * len(leaks) + leaks),
         tests=[test.number for test in APPENDIX_C] * 2,

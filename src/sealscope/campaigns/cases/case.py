@@ -29,7 +29,7 @@ _NOT_IN_ROWS = (
 
 
 @dataclass(frozen=True)
-class Case:
+class CampaignCase:
     """One record to make and judge; `id` and seeds derive from its content alone, so they are the same anywhere.
 
     `levels`: factor -> level; `leak_lpm` [L/min] and `fault`: what is put in at the plan's onset; `replicate` counts
@@ -71,7 +71,7 @@ def world(plan: SimulatedPlan) -> dict[str, Any]:
     }
 
 
-def cases_of(plan: SimulatedPlan) -> list[Case]:
+def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
     """Return all cases of a plan: records of each kind go round the cells one by one, the last round may be short."""
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = world(plan)
@@ -89,7 +89,7 @@ def cases_of(plan: SimulatedPlan) -> list[Case]:
             }
             name = digest({"world": shared, **content})
             machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
-            cases.append(Case(name[:16], int(machine >> np.uint64(1)), int(noise >> np.uint64(1)), **content))
+            cases.append(CampaignCase(name[:16], int(machine >> np.uint64(1)), int(noise >> np.uint64(1)), **content))
     return cases
 
 

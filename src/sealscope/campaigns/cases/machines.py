@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from sealscope.campaigns.cases.case import Case
+from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.plans.duty import closing_values, fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 SIZING_SECONDS = 13.0
 
 
-def leak_of(plan: SimulatedPlan, case: Case) -> tuple[Leak, ...]:
+def leak_of(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
     """Return the case's leak, open from the plan's onset on; its size still a mean flow."""
     from sealscope.simulation.faults.faults import From, Leak
     from sealscope.units import LITRE_PER_MINUTE
@@ -30,7 +30,7 @@ def leak_of(plan: SimulatedPlan, case: Case) -> tuple[Leak, ...]:
     return (Leak(law, mean=case.leak_lpm * LITRE_PER_MINUTE, opening=From(plan.onset_s)),)
 
 
-def unsized(plan: SimulatedPlan, case: Case, profile: Profile | None = None) -> Experiment:
+def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
     """Return the experiment of a case with the size of its leak still a mean flow.
 
     The machine is the one that the case's seed draws from the bench (or the plan's rig), with the case's levels on
@@ -56,7 +56,7 @@ def unsized(plan: SimulatedPlan, case: Case, profile: Profile | None = None) -> 
     return machine.experiment(seed=case.noise_seed, fault=fault, leak=leak_of(plan, case))
 
 
-def experiment_of(plan: SimulatedPlan, case: Case) -> Experiment:
+def experiment_of(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
     """Return the experiment of a case (`unsized`) with its leak sized on its machine."""
     experiment = unsized(plan, case)
     return replace(experiment, leaks=sized_once(experiment))

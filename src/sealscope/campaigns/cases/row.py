@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
-from sealscope.campaigns.cases.case import Case
+from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.diagnosis.verdict.evidence import LEAKS, Evidence
+from sealscope.errors import SealscopeError
 from sealscope.evaluation.confusion import CANNOT_TELL
 
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
@@ -24,6 +25,10 @@ _CAUSES = (
 )
 #: detector -> (score, None where it cannot tell; onset [s], None where it finds none)
 Scores = Mapping[str, tuple[float | None, float | None]]
+#: The figures of a detector's evidence that a row stores.
+STATED = (
+    "verdict", "score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "cause",
+)  # fmt: skip
 
 
 def cause_of(fault: str) -> str:
@@ -43,56 +48,49 @@ def _pair(pair: Any) -> tuple[float, float] | None:
     return None if low is None or high is None else (low, high)
 
 
-@dataclass(frozen=True)
-class Statement:
-    """One detector's evidence on one record as plain values: its verdict by its own threshold, and its estimates."""
+def stated_evidence(values: Mapping[str, Any]) -> Evidence:
+    """Return the part of evidence that a row stores, from its `STATED` values; a number that is not finite is None.
 
-    verdict: str
-    score: float | None = None
-    threshold: float | None = None
-    onset_s: float | None = None
-    onset_interval_s: tuple[float, float] | None = None
-    leak_lpm: float | None = None
-    leak_interval_lpm: tuple[float, float] | None = None
-    cause: str | None = None
+    Raises TypeError, KeyError or ValueError where they are no such values.
+    """
+    return Evidence(
+        verdict=values["verdict"],
+        reason="",
+        score=finite(values["score"]),
+        threshold=finite(values["threshold"]),
+        onset_s=finite(values["onset_s"]),
+        onset_interval_s=_pair(values["onset_interval_s"]),
+        leak_lpm=finite(values["leak_lpm"]),
+        leak_interval_lpm=_pair(values["leak_interval_lpm"]),
+        cause=values["cause"],
+    )
 
-    @classmethod
-    def of(cls, evidence: Evidence) -> Statement:
-        """Return what a row keeps of evidence; a number that is not finite becomes None."""
-        return cls(
-            evidence.verdict,
-            finite(evidence.score),
-            finite(evidence.threshold),
-            finite(evidence.onset_s),
-            _pair(evidence.onset_interval_s),
-            finite(evidence.leak_lpm),
-            _pair(evidence.leak_interval_lpm),
-            evidence.cause,
-        )
 
-    @classmethod
-    def from_dict(cls, tree: Mapping[str, Any]) -> Statement:
-        """Return the statement of plain values; raise TypeError, KeyError or ValueError where they are none."""
-        pairs = {name: _pair(tree[name]) for name in ("onset_interval_s", "leak_interval_lpm")}
-        return cls(**{**tree, **pairs})
+def named_cause(evidence: Evidence) -> str:
+    """Return the cause that evidence names.
 
-    @property
-    def named(self) -> str:
-        """The cause that it names.
+    A leak of the piston for `leak` (or of the pump, where it says so), `none` for a plain `no leak`, else `cannot
+    tell`.
+    """
+    if evidence.verdict == "leak":
+        return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK
+    if evidence.cause is not None and evidence.cause not in LEAKS:
+        return evidence.cause
+    return CANNOT_TELL if evidence.verdict == CANNOT_TELL else NO_CAUSE
 
-        A leak of the piston for `leak` (or of the pump, where it says so), `none` for a plain `no leak`, else
-        `cannot tell`.
-        """
-        if self.verdict == "leak":
-            return self.cause if self.cause in LEAKS else PISTON_LEAK
-        if self.cause is not None and self.cause not in LEAKS:
-            return self.cause
-        return CANNOT_TELL if self.verdict == CANNOT_TELL else NO_CAUSE
 
-    @property
-    def rank(self) -> float | None:
-        """The score by which records can be ordered; None where it cannot tell, or names another cause."""
-        return self.score if self.named in (*LEAKS, NO_CAUSE) else None
+def rank_of(evidence: Evidence) -> float | None:
+    """Return the score by which records are ordered; None where it cannot tell, or names another cause."""
+    return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
+
+
+def error_text(error: Exception) -> str:
+    """Return what a row says of an error, in one line."""
+    if isinstance(error, SealscopeError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "out of memory"
+    return f"{type(error).__name__}: {error}".splitlines()[0]
 
 
 @dataclass(frozen=True)
@@ -100,8 +98,8 @@ class CaseRow:
     """What a campaign stores of a case: its inputs, where the record was made, the scores; or the `error` of it.
 
     `flow_lpm`: mean leak [L/min] while open, as the run really had it; `place`: operating point and length of the
-    record, plain values; `scores` by the plan's name of a detector, `statements` by `PlanDetector.key`; `seconds`:
-    processor time, which takes no part in the result and is not in the final table.
+    record, plain values; `scores` by the plan's name of a detector, `statements` (evidence with the `STATED` figures
+    alone) by `PlanDetector.key`; `seconds`: processor time, which takes no part in the result.
     """
 
     id: str
@@ -115,14 +113,17 @@ class CaseRow:
     scores: Scores = field(default_factory=dict)
     error: str | None = None
     seconds: float = 0.0
-    statements: Mapping[str, Statement] = field(default_factory=dict)
+    statements: Mapping[str, Evidence] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON values."""
-        return asdict(self)
+        statements = {
+            key: {name: getattr(evidence, name) for name in STATED} for key, evidence in self.statements.items()
+        }
+        return {**self.__dict__, "statements": statements}
 
     @classmethod
-    def of(cls, case: Case, **values: Any) -> CaseRow:
+    def of(cls, case: CampaignCase, **values: Any) -> CaseRow:
         """Return the row of a case, with its results or its `error`."""
         return cls(case.id, case.use, case.leak_lpm, case.fault, case.levels, case.replicate, **values)
 
@@ -130,7 +131,7 @@ class CaseRow:
     def from_dict(cls, tree: Mapping[str, Any]) -> CaseRow:
         """Return the row of plain values; raise TypeError, KeyError or ValueError where they are none."""
         scores = {str(name): (_number(score), _number(onset)) for name, (score, onset, *_) in tree["scores"].items()}
-        statements = {str(name): Statement.from_dict(plain) for name, plain in tree.get("statements", {}).items()}
+        statements = {str(key): stated_evidence(plain) for key, plain in tree.get("statements", {}).items()}
         return cls(**{**tree, "scores": scores, "statements": statements})
 
 

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sealscope.campaigns.cases.row import Scores, Statement, finite
+from sealscope.campaigns.cases.row import STATED, Scores, finite, rank_of, stated_evidence
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, Views, plan_detector
 from sealscope.diagnosis.calibration.scorers import Look, Sides, scorer, split_view
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 
 
-def stated(look: Look, names: Sequence[str], views: Views) -> tuple[Scores, dict[str, Statement]]:
+def stated(look: Look, names: Sequence[str], views: Views) -> tuple[Scores, dict[str, Evidence]]:
     """Return score and onset of each detector, and its statement under its key; every detector is run once."""
     detectors = [plan_detector(name) for name in names]
     looks = {view: look.through(views.get(view, ALL_CHANNELS)) for view in {d.view: None for d in detectors}}
     scores: dict[str, tuple[float | None, float | None]] = {}
-    statements: dict[str, Statement] = {}
+    statements: dict[str, Evidence] = {}
     for detector in detectors:
         seen = looks[detector.view]
         if detector.detector and detector.key not in statements:
             examination = seen.examination
             evidence = examination.fused() if detector.of == DIAGNOSE else examination.evidence(detector.of)
-            statements[detector.key] = Statement.of(evidence)
+            statements[detector.key] = stated_evidence({name: getattr(evidence, name) for name in STATED})
         if detector.own:
             statement = statements[detector.key]
-            score = _share(statement) if detector.of == DIAGNOSE else statement.rank
+            score = _share(statement) if detector.of == DIAGNOSE else rank_of(statement)
             scores[detector.name] = (score, statement.onset_s)
         else:
             found = scorer(split_view(detector.name)[0]).score(seen)
@@ -45,10 +46,9 @@ def scored(sides: Sides, names: Sequence[str], views: Views) -> Scores:
     return scores
 
 
-def _share(statement: Statement) -> float | None:
+def _share(evidence: Evidence) -> float | None:
     """Return the fused verdict's score over its threshold: the deciding detector differs between records."""
-    if statement.rank is None or statement.threshold is None:
+    rank, threshold = rank_of(evidence), evidence.threshold
+    if rank is None or threshold is None:
         return None
-    if statement.threshold > 0:
-        return statement.rank / statement.threshold
-    return statement.rank - statement.threshold
+    return rank / threshold if threshold > 0 else rank - threshold

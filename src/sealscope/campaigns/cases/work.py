@@ -6,26 +6,17 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from sealscope.campaigns.cases.case import Case
+from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import experiment_of
-from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.row import CaseRow, error_text
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.errors import InputError, SealscopeError
+from sealscope.errors import InputError
 
 #: Channels that are inspected for findings: those that can spoil a verdict.
 INSPECTED = ("u", "x", "p_A", "p_B")
 
 
-def error_text(error: Exception) -> str:
-    """Return what a row says of an error, in one line."""
-    if isinstance(error, SealscopeError):
-        return str(error)
-    if isinstance(error, MemoryError):
-        return "out of memory"
-    return f"{type(error).__name__}: {error}".splitlines()[0]
-
-
-def work(plan: SimulatedPlan, case: Case, keep: Path | None = None) -> CaseRow:
+def work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None = None) -> CaseRow:
     """Carry out one case; an error of any kind becomes the row's error. `keep`: folder to write the recording into."""
     started = time.process_time()
     try:
@@ -35,7 +26,7 @@ def work(plan: SimulatedPlan, case: Case, keep: Path | None = None) -> CaseRow:
     return replace(row, seconds=round(time.process_time() - started, 4))
 
 
-def _work(plan: SimulatedPlan, case: Case, keep: Path | None) -> CaseRow:
+def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow:
     from sealscope.campaigns.cases.scoring import stated
     from sealscope.diagnosis.baseline.inspection import inspected
     from sealscope.diagnosis.calibration.calibrated import place_of

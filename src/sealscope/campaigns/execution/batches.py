@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.campaigns.cases.case import Case, digest, world
+from sealscope.campaigns.cases.case import CampaignCase, digest, world
 from sealscope.campaigns.cases.machines import sized_once, sizing_run, unsized
-from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.row import CaseRow, error_text
 from sealscope.campaigns.cases.scoring import scored
-from sealscope.campaigns.cases.work import error_text
 from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.campaigns.plans.duty import fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
@@ -59,7 +58,7 @@ def bounds_of(plan: SimulatedPlan) -> IntArray:
     return side_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
 
-def check_plan(plan: SimulatedPlan, cases: Sequence[Case]) -> None:
+def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     """Raise InputError for what a plan asks that no batch can do, naming it."""
     from sealscope.simulation.batch.layout import refuse
 
@@ -103,7 +102,7 @@ def check_device(plan: SimulatedPlan, device: str) -> None:
 
 
 def in_batches(
-    plan: SimulatedPlan, cases: Sequence[Case], threads: int, device: str = "cpu"
+    plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int, device: str = "cpu"
 ) -> Generator[CaseRow, None, None]:
     """Yield the rows of the cases, batch by batch; a case that cannot be carried out costs no other.
 
@@ -125,9 +124,9 @@ class _Batches:
         self._steps = StepChooser(plan, self._profile)
         self._bounds = bounds_of(plan)
 
-    def rows(self, cases: Sequence[Case]) -> list[CaseRow]:
+    def rows(self, cases: Sequence[CampaignCase]) -> list[CaseRow]:
         started = time.process_time()
-        drawn: list[tuple[Case, Experiment]] = []
+        drawn: list[tuple[CampaignCase, Experiment]] = []
         rows: list[CaseRow] = []
         for case in cases:
             try:
@@ -139,7 +138,7 @@ class _Batches:
         seconds = round((time.process_time() - started) / max(1, len(cases)), 4)
         return [replace(row, seconds=seconds) for row in rows]
 
-    def _carried_out(self, drawn: Sequence[tuple[Case, Experiment]]) -> list[CaseRow]:
+    def _carried_out(self, drawn: Sequence[tuple[CampaignCase, Experiment]]) -> list[CaseRow]:
         """Return the rows of one batch; where it fails, of its halves, down to the run that is to blame."""
         try:
             return self._made(drawn) if drawn else []
@@ -149,7 +148,7 @@ class _Batches:
         middle = len(drawn) // 2
         return self._carried_out(drawn[:middle]) + self._carried_out(drawn[middle:])
 
-    def _made(self, drawn: Sequence[tuple[Case, Experiment]]) -> list[CaseRow]:
+    def _made(self, drawn: Sequence[tuple[CampaignCase, Experiment]]) -> list[CaseRow]:
         from sealscope.simulation.batch.batch import simulate_batch
 
         cases = [case for case, _ in drawn]
@@ -207,7 +206,7 @@ class StepChooser:
         self._world = digest(world(plan))
         self._cells: dict[str, dict[str, float]] = {}
 
-    def of(self, case: Case, experiment: Experiment) -> float:
+    def of(self, case: CampaignCase, experiment: Experiment) -> float:
         """Return the step of a case, no longer than its own machine allows.
 
         It is what `integrate` chooses by error on `SCOUTS` machines of the case's cell with seeds of their own, the
@@ -229,7 +228,7 @@ class StepChooser:
             steps: dict[str, float] = {}
             for number in range(SCOUTS):
                 seed = int(digest([self._world, dict(levels), f"scout {number}"])[:15], 16)
-                scout = Case("", seed, 0, "calibrate", 0.0, "laminar", "", levels, number)
+                scout = CampaignCase("", seed, 0, "calibrate", 0.0, "laminar", "", levels, number)
                 try:
                     method, step = _chosen(unsized(self._plan, scout, self._profile))
                 except SealscopeError:  # a machine of the bench that cannot do this duty

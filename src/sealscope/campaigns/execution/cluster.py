@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from sealscope.campaigns.cases.case import Case, code_key
+from sealscope.campaigns.cases.case import CampaignCase, code_key
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.errors import InputError, MissingExtra
 
@@ -13,7 +13,9 @@ from sealscope.errors import InputError, MissingExtra
 _AHEAD = 4
 
 
-def on_cluster(task: Callable[[Case], CaseRow], cases: Sequence[Case], address: str) -> Iterator[CaseRow]:
+def on_cluster(
+    task: Callable[[CampaignCase], CaseRow], cases: Sequence[CampaignCase], address: str
+) -> Iterator[CaseRow]:
     """Yield the rows of the cases from the workers of the scheduler at `address` (`tcp://host:8786`), as they end.
 
     The workers need the same Sealscope, and the folder where recordings are stored. Raises MissingExtra without Dask,
@@ -32,9 +34,9 @@ def on_cluster(task: Callable[[Case], CaseRow], cases: Sequence[Case], address: 
         _check_code(client, address)
         shared = client.scatter(task, broadcast=True)
         waiting = iter(cases)
-        by_key: dict[str, Case] = {}
+        by_key: dict[str, CampaignCase] = {}
 
-        def submit(case: Case) -> Any:
+        def submit(case: CampaignCase) -> Any:
             by_key[f"case-{case.id}"] = case
             return client.submit(_carry_out, shared, case, key=f"case-{case.id}", pure=False, retries=1)
 
@@ -53,7 +55,7 @@ def on_cluster(task: Callable[[Case], CaseRow], cases: Sequence[Case], address: 
                 futures.add(submit(following))
 
 
-def _carry_out(task: Callable[[Case], CaseRow], case: Case) -> CaseRow:
+def _carry_out(task: Callable[[CampaignCase], CaseRow], case: CampaignCase) -> CaseRow:
     return task(case)
 
 

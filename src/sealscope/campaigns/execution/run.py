@@ -9,7 +9,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-from sealscope.campaigns.cases.case import Case, cases_of
+from sealscope.campaigns.cases.case import CampaignCase, cases_of
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
@@ -21,7 +21,7 @@ from sealscope.errors import InputError
 #: Called with how many records have their row, how many there are, and how many of those failed.
 ProgressCallback = Callable[[int, int, int], None]
 #: Carries out one case of a plan; the last argument is the folder to write its recording into, None for none.
-Task = Callable[[SimulatedPlan, Case, "Path | None"], CaseRow]
+Task = Callable[[SimulatedPlan, CampaignCase, "Path | None"], CaseRow]
 RECORDINGS = "recordings"
 
 
@@ -86,12 +86,12 @@ def run(
     return store.progress_of(plan, place)
 
 
-def _carry_out(task: Task, plan: SimulatedPlan, keep: Path | None, case: Case) -> CaseRow:
+def _carry_out(task: Task, plan: SimulatedPlan, keep: Path | None, case: CampaignCase) -> CaseRow:
     return task(plan, case, keep)
 
 
 def _rows(
-    task: Callable[[Case], CaseRow], cases: Sequence[Case], jobs: int, cluster: str | None
+    task: Callable[[CampaignCase], CaseRow], cases: Sequence[CampaignCase], jobs: int, cluster: str | None
 ) -> Generator[CaseRow, None, None]:
     """Yield the rows of the cases as they end."""
     if cases and cluster is not None:
@@ -102,7 +102,9 @@ def _rows(
         yield from _in_processes(task, cases, min(jobs, len(cases)))
 
 
-def _in_processes(task: Callable[[Case], CaseRow], cases: Sequence[Case], jobs: int) -> Generator[CaseRow, None, None]:
+def _in_processes(
+    task: Callable[[CampaignCase], CaseRow], cases: Sequence[CampaignCase], jobs: int
+) -> Generator[CaseRow, None, None]:
     """Yield the rows of the cases from `jobs` processes; a case whose process dies twice is a failed row."""
     waiting, died = deque(cases), set[str]()
     with Workers(jobs, task) as workers:

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sealscope.campaigns.held_out.classifiers import Array, Samples, chosen_candidates, group_numbers, held_out_scores
+from sealscope.campaigns.held_out.classifiers import (
+    Array,
+    MeasuredSamples,
+    chosen_candidates,
+    group_numbers,
+    held_out_scores,
+)
 from sealscope.campaigns.plans.model import ChosenClassifier, Classifier, HeldOutPlan
 from sealscope.evaluation.roc import auc
 
@@ -73,7 +79,7 @@ def clustered_area(
     return value, max(0.0, value - reach), min(1.0, value + reach)
 
 
-def swapped_areas(samples: Samples, detector: Classifier, leave_out: str, times: int, seed: int) -> Array:
+def swapped_areas(samples: MeasuredSamples, detector: Classifier, leave_out: str, times: int, seed: int) -> Array:
     """Return held-out areas with the labels of each test swapped, or not, by a fair coin, (times,).
 
     It is what a classifier reaches that knows its test, its condition and nothing of the leak.
@@ -88,7 +94,7 @@ def swapped_areas(samples: Samples, detector: Classifier, leave_out: str, times:
     return areas
 
 
-def checks_of(plan: HeldOutPlan, samples: Samples) -> list[HeldOutCheck]:
+def checks_of(plan: HeldOutPlan, samples: MeasuredSamples) -> list[HeldOutCheck]:
     """Return the checks of a plan's classifiers, in its order; none where the plan asks for no permutations.
 
     Labels are not swapped where features are chosen anew each time.
@@ -96,7 +102,7 @@ def checks_of(plan: HeldOutPlan, samples: Samples) -> list[HeldOutCheck]:
     return [_check(plan, samples, classifier) for classifier in plan.detectors] if plan.permutations else []
 
 
-def _check(plan: HeldOutPlan, samples: Samples, classifier: Classifier) -> HeldOutCheck:
+def _check(plan: HeldOutPlan, samples: MeasuredSamples, classifier: Classifier) -> HeldOutCheck:
     name, leaks, tests = classifier.name, samples.leak_lpm > 0, group_numbers(samples, "test")
     by_test, by_condition = (
         clustered_area(held_out_scores(samples, classifier, leave_out), leaks, tests, plan.confidence)

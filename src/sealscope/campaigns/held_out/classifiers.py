@@ -24,7 +24,7 @@ _INNER = 5
 
 
 @dataclass(frozen=True)
-class Samples:
+class MeasuredSamples:
     """Measured samples.
 
     `features`: name -> (n,) values; `leak_lpm` (n,), 0 where nothing leaks; `tests` (n,): which test each belongs to;
@@ -138,7 +138,7 @@ def fold_log_odds(x: Array, leaks: npt.NDArray[np.bool_], folds: npt.NDArray[np.
     return found
 
 
-def group_numbers(samples: Samples, leave_out: str) -> npt.NDArray[np.intp]:
+def group_numbers(samples: MeasuredSamples, leave_out: str) -> npt.NDArray[np.intp]:
     """Return the number of the test (`test`) or operating condition (`condition`) of each sample, from 0 on, (n,)."""
     groups: list[Hashable] = (
         list(samples.tests) if leave_out == "test" else [tuple(sorted(levels.items())) for levels in samples.levels]
@@ -148,7 +148,7 @@ def group_numbers(samples: Samples, leave_out: str) -> npt.NDArray[np.intp]:
 
 
 def held_out_scores(
-    samples: Samples, detector: Classifier, leave_out: str, leaks: npt.NDArray[np.bool_] | None = None
+    samples: MeasuredSamples, detector: Classifier, leave_out: str, leaks: npt.NDArray[np.bool_] | None = None
 ) -> Array:
     """Return the log odds of each sample from a fit that saw no sample of its test or condition, (n,).
 
@@ -171,7 +171,7 @@ def held_out_scores(
     return np.asarray(found[of, np.arange(of.size)])
 
 
-def chosen_candidates(samples: Samples, detector: ChosenClassifier, leave_out: str) -> list[LogisticClassifier]:
+def chosen_candidates(samples: MeasuredSamples, detector: ChosenClassifier, leave_out: str) -> list[LogisticClassifier]:
     """Return what the training samples of each fold chose, one for each test or condition held out."""
     of = group_numbers(samples, leave_out)
     folds = of[None, :] != np.arange(of.max() + 1)[:, None]
@@ -180,7 +180,7 @@ def chosen_candidates(samples: Samples, detector: ChosenClassifier, leave_out: s
 
 
 def _choices(
-    samples: Samples,
+    samples: MeasuredSamples,
     detector: ChosenClassifier,
     of: npt.NDArray[np.intp],
     leaks: npt.NDArray[np.bool_],
@@ -203,7 +203,7 @@ def _choices(
     return np.asarray(np.argmin(np.array(losses), axis=0))
 
 
-def held_out_rows(plan: HeldOutPlan, samples: Samples) -> list[CaseRow]:
+def held_out_rows(plan: HeldOutPlan, samples: MeasuredSamples) -> list[CaseRow]:
     """Return a row for each sample, with the log odds that each detector gave it while held out, in order of ids."""
     scores = {detector.name: held_out_scores(samples, detector, plan.leave_out) for detector in plan.detectors}
     rows = [

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.campaigns.held_out.classifiers import Samples
+from sealscope.campaigns.held_out.classifiers import MeasuredSamples
 from sealscope.errors import InputError, UnreadableFile
 
 #: Channels of the hydraulic set and their files; the means of each second over cycles of 60 s.
@@ -14,7 +14,7 @@ HYDRAULIC = ("PS1", "PS2", "PS3", "PS4", "PS5", "PS6", "EPS1", "FS1", "FS2")
 _CYCLES, _SECONDS = 2205, 60
 
 
-def hydraulic_samples(folder: Path) -> Samples:
+def hydraulic_samples(folder: Path) -> MeasuredSamples:
     """Read the "condition monitoring of hydraulic systems" set: each cycle's mean and standard deviation.
 
     `folder` holds `profile.txt` and `one_hz_means/NAME_1hz.tsv`. The size of the fault is the grade of internal pump
@@ -30,7 +30,7 @@ def hydraulic_samples(folder: Path) -> Samples:
         features[f"scatter of {name}"] = values.std(axis=1)
     changed = np.any(np.diff(labels[:, :4], axis=0) != 0, axis=1)
     blocks = np.concatenate([[0], np.cumsum(changed)])
-    return Samples(
+    return MeasuredSamples(
         features=features,
         leak_lpm=labels[:, 2],
         tests=[int(block) for block in blocks],

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, Statement, cause_of
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, named_cause
 from sealscope.campaigns.plans.detectors import Views, plan_detector
 from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.calibration.scorers import scorer
 from sealscope.diagnosis.calibration.thresholds import Calibration, Place, calibrate
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import Proportion, proportion
 from sealscope.evaluation.confusion import CANNOT_TELL, Confusion, confusion_matrix
@@ -337,7 +338,7 @@ def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
     return realised
 
 
-def _statement(row: CaseRow, detector: str) -> Statement | None:
+def _statement(row: CaseRow, detector: str) -> Evidence | None:
     """Return what a detector stated on a row; None where it states nothing, or the record failed."""
     return row.statements.get(plan_detector(detector).key) if row.statements and row.error is None else None
 
@@ -406,7 +407,7 @@ def _causes(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float
         if not plan_detector(name).own:
             continue
         statements = [_statement(row, name) for row in single]
-        named = [CANNOT_TELL if stated is None else stated.named for stated in statements]
+        named = [CANNOT_TELL if stated is None else named_cause(stated) for stated in statements]
         others = sorted(set(named) - set(causes) - {CANNOT_TELL})
         tables.append(NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], confidence)))
     return tables

@@ -8,8 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sealscope.campaigns.cases.row import CaseRow, Statement
+from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.judging.judge import Judgement
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.evaluation.binomial import Proportion
 from sealscope.recordings.atomic import atomic_write
 
@@ -193,7 +194,7 @@ _STATED = (
 )  # fmt: skip
 
 
-def _stated(statement: Statement | None) -> tuple[Value, ...]:
+def _stated(statement: Evidence | None) -> tuple[Value, ...]:
     if statement is None:
         return (None,) * len(_STATED)
     onset, flow = statement.onset_interval_s or (None, None), statement.leak_interval_lpm or (None, None)

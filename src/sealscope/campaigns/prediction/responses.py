@@ -18,7 +18,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from sealscope.campaigns.cases.case import Case
+from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.execution.store import read_rows
@@ -255,7 +255,7 @@ def bench_responses(
         changes, flows = [], []
         try:
             for size in (0.0, *sizes):
-                case = Case("prediction", machine, noise, "judge", size, "laminar", "", levels, 0)
+                case = CampaignCase("prediction", machine, noise, "judge", size, "laminar", "", levels, 0)
                 change, flow = _changes(replace(experiment_of(plan, case), x_0=experiment.x_0), detectors)
                 changes.append(change)
                 flows.append(flow)
