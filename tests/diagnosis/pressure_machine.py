@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from sealscope.diagnosis.pressure_model.laws import G
+from sealscope.diagnosis.pressure_model.model import G
 from sealscope.diagnosis.pressure_model.track import Track, wander
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.changes.drifts import Drift, Linear

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.pressure_model.duty import Duty, differences, duty_of, moving
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
-from sealscope.diagnosis.pressure_model.laws import (
+from sealscope.diagnosis.pressure_model.model import (
     F_C,
     F_CFR,
     F_V,
@@ -16,9 +15,10 @@ from sealscope.diagnosis.pressure_model.laws import (
     RUNS,
     STATES,
     STROKE,
+    DrivenModel,
     G,
     K,
-    machine_of,
+    assumed_numbers,
     nominal,
     stiffening,
 )
@@ -45,9 +45,9 @@ def truth_of(rig: Rig) -> np.ndarray:
     return theta
 
 
-def driven(u: np.ndarray, slope: np.ndarray, h: float, every: int) -> Duty:
-    """A duty in mid-stroke under a command and its slope at every half step."""
-    return Duty(np.column_stack([u, slope, np.zeros((u.size, 2))]), h, every)
+def driven(rig: Rig, u: np.ndarray, slope: np.ndarray, h: float, every: int) -> DrivenModel:
+    """The model in mid-stroke under a command and its slope at every half step."""
+    return DrivenModel(np.column_stack([u, slope, np.zeros((u.size, 2))]), h, every, assumed_numbers(rig))
 
 
 def followed(rig: Rig, recording: Recording) -> Followed:
@@ -64,15 +64,15 @@ def test_the_reduced_rig_shows_what_the_whole_rig_shows(command: str, thesis: Ri
     """p_A - p_B of five states against the full simulation: within 200 Pa rms at steps of 1 ms (the noise has 12 kPa),
     and within 2 Pa at half of that, the simulation's own step: the error is the step's and not the reduction's."""
     u, true = true_difference(command=command)
-    theta, machine = truth_of(thesis)[None], machine_of(thesis)
-    coarse = differences(duty_of(u, 500.0), theta, machine)[0]
+    theta = truth_of(thesis)[None]
+    coarse = DrivenModel.of(u, 500.0, assumed_numbers(thesis)).run(theta)[0]
     assert np.sqrt(np.mean((coarse - true) ** 2)) < 200.0
     at = np.arange(8 * u.size + 1) / 8.0
     fine = np.interp(at, np.arange(u.size), u)
-    duty = driven(fine, np.gradient(fine, 0.25e-3), 0.5e-3, 4)
-    assert np.sqrt(np.mean((differences(duty, theta, machine)[0] - true) ** 2)) < 2.0
+    model = driven(thesis, fine, np.gradient(fine, 0.25e-3), 0.5e-3, 4)
+    assert np.sqrt(np.mean((model.run(theta)[0] - true) ** 2)) < 2.0
     theta[0, F_V] *= 1.001
-    assert np.sqrt(np.mean((differences(duty, theta, machine)[0] - true) ** 2)) > 4.0
+    assert np.sqrt(np.mean((model.run(theta)[0] - true) ** 2)) > 4.0
 
 
 def test_stiffness_follows_the_volumes_of_both_chambers() -> None:
@@ -95,17 +95,17 @@ def test_long_strokes_show_what_the_whole_rig_shows(thesis: Rig) -> None:
     difference is off by more. (What is left is mid-stroke's drift, which blocks of the record follow.)"""
     u, states = true_states(**LONG_STROKES)
     p_A, p_B, x = (states[name] for name in ("p_A", "p_B", "x"))
-    theta, machine = truth_of(thesis), machine_of(thesis)
+    theta, numbers = truth_of(thesis), assumed_numbers(thesis)
     theta[GAIN], theta[STROKE] = 14.0, 1.0
     level = float(np.mean(p_A + p_B)) - 2.0 * P_CHARGE
     theta[F_C] += theta[F_CFR] * level
-    duty = moving(duty_of(u, 500.0, p_A + p_B), theta, machine)
-    place = machine.A * x / machine.V
+    model = DrivenModel.of(u, 500.0, numbers, p_A + p_B).with_travel(theta)
+    place = numbers.A_A * x / numbers.V
     centred = place - np.polynomial.Polynomial.fit(np.arange(x.size), place, 1)(np.arange(x.size))
-    assert np.sqrt(np.mean((duty.travel[:-1:4] - centred) ** 2)) < 0.01 * np.std(place)
-    theta[OFFSET] = float(np.mean(place - duty.travel[:-1:4]))
+    assert np.sqrt(np.mean((model.travel[:-1:4] - centred) ** 2)) < 0.01 * np.std(place)
+    theta[OFFSET] = float(np.mean(place - model.travel[:-1:4]))
     sets = np.array([theta, theta * (np.arange(12) != STROKE), theta * (np.arange(12) != F_CFR)])
-    misfits = np.sqrt(np.mean((differences(duty, sets, machine) - p_A + p_B)[:, 500:] ** 2, axis=1))
+    misfits = np.sqrt(np.mean((model.run(sets) - p_A + p_B)[:, 500:] ** 2, axis=1))
     assert misfits[0] < 700.0
     assert misfits[1] > 1.8 * misfits[0]
     assert misfits[2] > 1.3 * misfits[0]
@@ -116,11 +116,11 @@ def _steady(thesis: Rig, every: int, seconds: float = 1.0) -> np.ndarray:
     h = 0.01 / every
     t = np.arange(round(2 * seconds / h) + 1) * 0.5 * h
     n = round(seconds * 100)
-    duty = driven(5.0 + np.sin(4.0 * t), 4.0 * np.cos(4.0 * t), h, every)
-    theta, machine = truth_of(thesis), machine_of(thesis)
+    model = driven(thesis, 5.0 + np.sin(4.0 * t), 4.0 * np.cos(4.0 * t), h, every)
+    theta = truth_of(thesis)
     omega = theta[GAIN] * 5.0
-    v = omega * machine.q_b / (2.0 * np.pi) / machine.A
-    return differences(duty, theta[None], machine, start=np.array([[1e5, v, omega, 0.5, 30.0]]))[0][:n]
+    v = model.piston_speed(omega)
+    return model.run(theta[None], start=np.array([[1e5, v, omega, 0.5, 30.0]]))[0][:n]
 
 
 def test_the_solver_is_of_fourth_order(thesis: Rig) -> None:
@@ -133,27 +133,27 @@ def test_the_solver_is_of_fourth_order(thesis: Rig) -> None:
 def test_lanes_are_runs_of_their_own(thesis: Rig) -> None:
     """Eleven sets in two calls of eight lanes are what each gives alone, whatever stands in the lanes beside it."""
     u, _ = true_difference()
-    duty, machine = duty_of(u[:3000], 500.0), machine_of(thesis)
+    model = DrivenModel.of(u[:3000], 500.0, assumed_numbers(thesis))
     random = np.random.default_rng(4)
     sets = truth_of(thesis) * random.uniform(0.8, 1.2, (RUNS + 3, 12))
-    together = differences(duty, sets, machine)
+    together = model.run(sets)
     for one, theta in zip(together, sets, strict=True):
-        np.testing.assert_array_equal(one, differences(duty, theta[None], machine)[0])
+        np.testing.assert_array_equal(one, model.run(theta[None])[0])
     assert np.ptp(together, axis=0).max() > 1e4
 
 
 def test_a_run_goes_on_where_it_stopped(thesis: Rig) -> None:
     """Two parts with the state handed on, and segments of equal parameters, are the whole run."""
     u, _ = true_difference()
-    duty, machine, theta = duty_of(u[:4000], 500.0), machine_of(thesis), truth_of(thesis)[None]
-    whole = differences(duty, theta, machine)[0]
+    model, theta = DrivenModel.of(u[:4000], 500.0, assumed_numbers(thesis)), truth_of(thesis)[None]
+    whole = model.run(theta)[0]
     state = np.zeros((1, STATES))
-    parts = [differences(duty.part(first, n), theta, machine, start=state)[0] for first, n in ((0, 1700), (1700, 2300))]
+    parts = [model.part(first, n).run(theta, start=state)[0] for first, n in ((0, 1700), (1700, 2300))]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
     segment = (np.arange(4000) > 2500).astype(np.int64)
-    np.testing.assert_array_equal(differences(duty, np.stack([theta, theta], axis=1), machine, segment)[0], whole)
+    np.testing.assert_array_equal(model.run(np.stack([theta, theta], axis=1), segment)[0], whole)
     other = np.stack([theta, 1.05 * theta], axis=1)
-    shown = differences(duty, other, machine, segment)[0]
+    shown = model.run(other, segment)[0]
     np.testing.assert_array_equal(shown[:2502], whole[:2502])
     assert np.abs(shown[2600:] - whole[2600:]).max() > 1e3
 
@@ -169,8 +169,8 @@ def test_the_fit_finds_a_machine_far_from_the_rig_that_is_assumed(
     values = {name.replace(".", "__"): factor * float(thesis[name]) for name, factor in truth.items()}
     command = "3 sin(4t)" if gain > 1.0 else "7 sin(4t)"
     theta = followed(thesis, recorded(3, command=command, **values)).path.mean(axis=0)
-    machine = machine_of(thesis)
-    v = machine.q_b / (2.0 * np.pi) / machine.A * theta[GAIN] * 4.0
+    numbers = assumed_numbers(thesis)
+    v = numbers.q_b / (2.0 * np.pi) / numbers.A_A * theta[GAIN] * 4.0
     assert theta[GAIN] == pytest.approx(values["motor__omega_per_volt"], rel=0.01)
     assert theta[K] == pytest.approx(values["fluid__K_oil"], rel=0.01)
     coulomb = values["friction__F_pr"] + 2.0 * P_CHARGE * values["friction__F_cfr"]

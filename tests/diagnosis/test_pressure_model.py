@@ -10,11 +10,9 @@ import pytest
 from scipy.stats import norm
 
 from sealscope.diagnosis.pressure_model.detector import PressureModel, threshold_of
-from sealscope.diagnosis.pressure_model.duty import duty_of
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
-from sealscope.diagnosis.pressure_model.laws import GAIN, STATES, G, machine_of, nominal
-from sealscope.diagnosis.pressure_model.steps import steps_in
-from sealscope.diagnosis.pressure_model.track import Track, track
+from sealscope.diagnosis.pressure_model.model import GAIN, STATES, DrivenModel, G, assumed_numbers, nominal
+from sealscope.diagnosis.pressure_model.track import Track, steps_in, track
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import COUNTS, Recording
@@ -69,10 +67,11 @@ def truth_of(rig: Rig) -> np.ndarray:
 @pytest.fixture(scope="module")
 def linear(thesis: Rig, sound: Recording) -> tuple[Track, np.ndarray, float]:
     """The information that a real record gives, for records drawn from it."""
-    machine, theta = machine_of(thesis), truth_of(thesis)
+    theta = truth_of(thesis)
     edges = np.round(np.arange(3.0, 120.0, 2.0 * np.pi) * 500.0).astype(np.int64)
     dp = sound["p_A"] - sound["p_B"]
-    found = track(duty_of(sound["u"], 500.0), dp, edges, theta, machine, np.zeros(STATES), 1500, 500.0)
+    model = DrivenModel.of(sound["u"], 500.0, assumed_numbers(thesis))
+    found = track(model, dp, edges, theta, np.zeros(STATES), 1500)
     return found, theta, float(np.sqrt(2.0) * theta[GAIN] * np.std(sound["u"]))
 
 

@@ -49,7 +49,7 @@ class Details:
         return int(self.values.shape[0])
 
     def __len__(self) -> int:
-        """The number of samples of the signal, and of each level."""
+        """Return the number of samples of the signal, and of each level."""
         return int(self.values.shape[1])
 
     def _row(self, level: int) -> int:
@@ -63,18 +63,18 @@ class Details:
         return row
 
     def product(self, first: int = 3, second: int = 4) -> Array:
-        """The sample product d_first * d_second, (n,) [unit^2], edges included; the thesis's d3d4 by default."""
+        """Return the sample product d_first * d_second, (n,) [unit^2], edges included; the thesis's d3d4 by default."""
         return self[first] * self[second]
 
     def inside(self, *levels: int) -> slice:
-        """The samples at which none of the named levels (default: all of them) touches the padding."""
+        """Return the samples at which none of the named levels (default: all of them) touches the padding."""
         rows = [self._row(level) for level in levels] or list(range(self.levels))
         before, after = self.edges[rows].max(axis=0)
         return slice(int(before), len(self) - int(after))
 
 
 def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
-    """How many samples at the beginning and the end of each level touch the padding, (levels, 2).
+    """Return how many samples at the beginning and the end of each level touch the padding, (levels, 2).
 
     Stationary: the filters' reach. Decimated: from sample ``2^j ceil(2 before_j / 2^j) - before_j`` the first held
     coefficient that saw no padding. Reconstructed: analysis and synthesis together reach ``(L - 1)(2^j - 1)`` to both
@@ -93,7 +93,7 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def shortest(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """The least number of samples that leaves every level one sample free of padding; db8 to level 4 needs 226."""
+    """Return the least number of samples that leaves each level a sample free of padding; db8 to level 4 needs 226."""
     return int(edge_samples(wavelet, levels, transform)[-1].sum()) + 1
 
 
@@ -105,7 +105,7 @@ def details(
     transform: Transform = "stationary",
     edge: Edge = "symmetric",
 ) -> Details:
-    """The wavelet details d_1 .. d_levels of `signal`, (n,), all at its length and on its time base.
+    """Return the wavelet details d_1 .. d_levels of `signal`, (n,), all at its length and on its time base.
 
     ``a_0 = signal, d_j[n] = sum_k g[k] a_(j-1)[n + 2^(j-1)(L/2 - k)]``, a_j the same with h (stationary; `reach` says
     how far each level looks). This is PyWavelets' alignment; the energy of an event stands 5, 7, 9 and 13 samples

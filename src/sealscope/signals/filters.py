@@ -21,7 +21,7 @@ MAX_LEVELS = 12
 
 @cache
 def discrete_wavelet(name: str) -> Any:
-    """PyWavelets' discrete wavelet of that name; raises InputError for a name it does not know."""
+    """Return PyWavelets' discrete wavelet of that name; raises InputError for a name it does not know."""
     import pywt
 
     if not isinstance(name, str) or name not in pywt.wavelist(kind="discrete"):
@@ -32,7 +32,7 @@ def discrete_wavelet(name: str) -> Any:
 
 
 def decomposition_filters(wavelet: str = "db8") -> tuple[Array, Array]:
-    """The low-pass and high-pass taps h, g of the analysis, in the order of a causal convolution.
+    """Return the low-pass and high-pass taps h, g of the analysis, in the order of a causal convolution.
 
     ``a_j[n] = sum_k h[k] a_(j-1)[n - 2^(j-1) k]``, the same with g for d_j. Each of shape (taps,); for an orthogonal
     wavelet both have unit l2 norm. Source: Daubechies, Ten Lectures on Wavelets (1992), Table 6.1, as PyWavelets
@@ -43,14 +43,14 @@ def decomposition_filters(wavelet: str = "db8") -> tuple[Array, Array]:
 
 
 def checked_levels(levels: int) -> int:
-    """`levels` as an int between 1 and MAX_LEVELS; raises InputError otherwise."""
+    """Return `levels` as an int between 1 and MAX_LEVELS; raises InputError otherwise."""
     if isinstance(levels, bool) or not isinstance(levels, (int, np.integer)) or not 1 <= levels <= MAX_LEVELS:
         raise InputError(f"levels must be a whole number from 1 to {MAX_LEVELS}, got {levels!r}")
     return int(levels)
 
 
 def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
-    """How many samples before and after its own a detail of the stationary transform reads, (levels, 2).
+    """Return how many samples before and after its own a detail of the stationary transform reads, (levels, 2).
 
     ``before_j = (L/2 - 1)(2^j - 1)``, ``after_j = (L/2)(2^j - 1)`` with L taps, PyWavelets' alignment. For db8: 7, 21,
     49, 105 before and 8, 24, 56, 120 after.
@@ -61,7 +61,7 @@ def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
 
 
 def finite_array(values: ArrayLike, name: str = "signal", ndim: int | None = None) -> Array:
-    """`values` as doubles; raises InputError unless they are real, finite and (where asked) of `ndim` dimensions."""
+    """Return `values` as doubles; raises InputError unless real, finite and (where given) of `ndim` dimensions."""
     try:
         array = np.asarray(values)
         if np.iscomplexobj(array) or array.dtype.kind in "SUMm":

@@ -215,7 +215,8 @@ class FleetRms:
 
     The windows are those of ``windowed_rms(details(signal), size, step)``: the first covers samples
     ``first .. first + size - 1``. `quantities`: names of the rows, such as d1, d2, d3, d4, d3d4, signal. A missing
-    sample spoils the windows of its own actuator and channel in which its details lie, and no other.
+    sample spoils the windows of its own actuator and channel in which its details lie, and no other. Raises InputError
+    for a count below 1, fewer than two levels, or a wavelet that `details` refuses.
     """
 
     def __init__(
@@ -229,7 +230,6 @@ class FleetRms:
         wavelet: str = "db8",
         threads: int = 1,
     ) -> None:
-        """Raises InputError for a count below 1, fewer than two levels, or a wavelet that `details` refuses."""
         if checked_levels(levels) < 2:
             raise InputError(f"levels must be 2 or more for windows over a fleet, got {levels}")
         self.actuators, self.channels, self.levels = whole_number(actuators, "actuators"), channels, levels

@@ -42,7 +42,7 @@ class WindowedRms(NamedTuple):
 
 
 def rms(series: ArrayLike) -> Any:
-    """``sqrt(mean(x^2))`` over the last axis [unit of x]; a float for one series, (...,) for several.
+    """Return ``sqrt(mean(x^2))`` over the last axis [unit of x]; a float for a single series, (...,) for several.
 
     Raises InputError for an empty series or one that is not finite.
     """
@@ -56,7 +56,7 @@ def rms(series: ArrayLike) -> Any:
 def windowed_rms(
     series: ArrayLike | Details, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, first: int = 0
 ) -> WindowedRms:
-    """RMS of each window of `size` samples, one every `step` samples, over the last axis of `series` (..., n).
+    """Return the RMS of each window of `size` samples, every `step` samples, over the last axis of `series` (..., n).
 
     `first` is the sample number of the series' first value and moves `ends` alone. Of `Details` every level is taken,
     only where no level touches the padding, and `ends` counts samples of the signal. A series shorter than one window
@@ -191,14 +191,14 @@ class RmsStream:
 
 
 def _piece_sums(x: Array, piece: int) -> Array:
-    """Sum of squares of each full piece, (..., n // piece); each is summed pairwise along its own contiguous row."""
+    """Return the sum of squares of each full piece, (..., n // piece), summed pairwise along a contiguous row."""
     pieces = x.shape[-1] // piece
     whole = np.ascontiguousarray(x[..., : pieces * piece])
     return np.asarray(np.add.reduce(np.square(whole.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], pieces)
 
 
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
-    """RMS of each whole window from its pieces' sums of squares (..., pieces), added one by one in their order."""
+    """Return the RMS of each whole window from its pieces' sums of squares (..., pieces), added in their order."""
     piece = math.gcd(size, step)
     per_window, per_step = size // piece, step // piece
     windows = max(0, (sums.shape[-1] - per_window) // per_step + 1)

@@ -43,8 +43,7 @@ class Level:
 
 @dataclass(frozen=True)
 class DayToDay:
-    """Prior on the standard deviation of the level from day to day: its `scale`, known with so many degrees of
-    `freedom`."""
+    """Prior on the standard deviation of the level from day to day: a `scale` with degrees of `freedom`."""
 
     scale: float
     freedom: float

@@ -18,7 +18,7 @@ SHORTEST, LONGEST = 50.0, 1e10
 
 
 def cusum_run_length(threshold: float, reference: float) -> float:
-    """Average run length of the one-sided CUSUM ``S = max(0, S + z - k)`` until ``S >= h``, z ~ N(0, 1).
+    """Return the average run length of the one-sided CUSUM ``S = max(0, S + z - k)`` until ``S >= h``, z ~ N(0, 1).
 
     Solves ``L(s) = 1 + L(0) Phi(k - s) + int_0^h L(x) phi(x + k - s) dx`` on Gauss-Legendre nodes.
     Source: E. S. Page, Continuous inspection schemes, Biometrika 41 (1954) 100-115.
@@ -36,7 +36,7 @@ def cusum_run_length(threshold: float, reference: float) -> float:
 
 
 def glr_run_length(threshold: float, window: int) -> float:
-    """Average run length of ``max_{1 <= n <= W} |z_(k-n+1) + .. + z_k| / sqrt(n)`` until it reaches b, z ~ N(0, 1).
+    """Return the average run length of ``max_{1 <= n <= W} |z_(k-n+1) + .. + z_k| / sqrt(n)`` to b, z ~ N(0, 1).
 
     ``1 / (2 phi(b)/b sum_n (x_n^2/2)^2 nu(x_n)^2)`` with ``x_n = b/sqrt(n)``: the discrete form, over a window, of
     ``sqrt(2 pi) exp(b^2/2) / (b int x nu(x)^2 dx)``. Source: D. Siegmund, E. S. Venkatraman, Using the generalized
@@ -53,7 +53,7 @@ def glr_run_length(threshold: float, window: int) -> float:
 
 @cache
 def cusum_threshold(average_run_length: float, reference: float = 0.5) -> float:
-    """h of the two-sided CUSUM (one for either direction) whose average run length is the stated one.
+    """Return h of the two-sided CUSUM (one for either direction) of the stated average run length.
 
     `reference`: k, half the change looked for, in standard deviations. Raises InputError for a run length or a
     reference out of range.
@@ -66,7 +66,7 @@ def cusum_threshold(average_run_length: float, reference: float = 0.5) -> float:
 
 @cache
 def glr_threshold(average_run_length: float, window: int = 60) -> float:
-    """b of the generalised likelihood ratio test over a window, for either direction, at that average run length.
+    """Return b of the generalised likelihood ratio test over a window, for either direction, at that run length.
 
     Raises InputError for a run length out of range or a window below 1.
     """
@@ -82,7 +82,7 @@ def _check_run_length(wanted: float) -> None:
 
 
 def _solved(run_length: Callable[[float], float], wanted: float, low: float) -> float:
-    """Where an increasing run length reaches the wanted one, by bisection of its logarithm."""
+    """Return where an increasing run length reaches the wanted value, by bisection."""
     high = low + 1.0
     while run_length(high) < wanted:
         low, high = high, high + 1.0

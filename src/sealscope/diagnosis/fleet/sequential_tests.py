@@ -1,6 +1,6 @@
 """Sequential tests on many series of many actuators: each against a reference it learns itself.
 
-Model of a sound machine: each series (a log RMS, one value a decision) is a level plus an AR(1) process with normal
+Model of a healthy machine: each series (a log RMS, one value a decision) is a level plus an AR(1) process with normal
 innovations, ``y_k = c + phi y_(k-1) + e_k``. phi is learned from the pairs of neighbours so far, its bias taken out and
 one standard error added on the cautious side; the innovations are then turned into
 
@@ -36,7 +36,7 @@ CUSUM, GLR = 0, 1
 
 @law
 def standard_normal(t: float, freedom: float) -> float:
-    """z with the probability of Student's t: ``sign(t) (8 f + 1)/(8 f + 3) sqrt(f ln(1 + t^2/f))``.
+    """Return z with the probability of Student's t: ``sign(t) (8 f + 1)/(8 f + 3) sqrt(f ln(1 + t^2/f))``.
 
     Within 0.02 for f >= 8 and |z| <= 5. Source: D. L. Wallace, Bounds on normal approximations to Student's and the
     chi-square distributions, Annals of Mathematical Statistics 30 (1959) 1121-1130.
@@ -78,7 +78,7 @@ def _learn_held(numbers: Array, s: int, a: int, now: float, before: float) -> No
 
 @law
 def _standard(numbers: Array, s: int, a: int, now: float, before: float) -> float:
-    """z of a value after `before`, against the reference so far."""
+    """Return z of a value after `before`, against the reference so far."""
     n = numbers[PAIRS, s, a]
     e = now - numbers[MEAN, s, a] - numbers[PHI, s, a] * before
     t = e / math.sqrt(numbers[SQUARES, s, a] / (n - 1.0) * (1.0 + 1.0 / n))
@@ -112,7 +112,7 @@ def judge(
     turn, late = paths.shape[0], past.shape[0]
     new = 0
     for a in range(actuators):
-        sound = alarms[0, a] < 0
+        quiet = alarms[0, a] < 0
         for s in range(series):
             value = y[s, a]
             if not math.isfinite(value):
@@ -133,7 +133,7 @@ def judge(
             z = _standard(numbers, s, a, value, last)
             past[decision % late, s, a] = value
             older, old = past[(decision + 1) % late, s, a], past[(decision + 2) % late, s, a]
-            if sound and not (math.isnan(old) or math.isnan(older)):
+            if quiet and not (math.isnan(old) or math.isnan(older)):
                 _learn_held(numbers, s, a, old, older)
             for side in range(2):
                 before = numbers[UP + side, s, a]
@@ -144,23 +144,23 @@ def judge(
             path = paths[n % turn, s, a] + z
             steps[s, a] = n + 1
             paths[(n + 1) % turn, s, a] = path
-            best, length, way = 0.0, 0, 1
+            best, length, sign = 0.0, 0, 1
             for m in range(1, min(turn - 1, n + 1) + 1):
                 rise = path - paths[(n + 1 - m) % turn, s, a]
                 ratio = rise * rise / m
                 if ratio > best:
-                    best, length, way = ratio, m, 1 if rise > 0 else -1
+                    best, length, sign = ratio, m, 1 if rise > 0 else -1
             side = 0 if numbers[UP, s, a] >= numbers[DOWN, s, a] else 1
             scores[CUSUM, s, a] = numbers[UP + side, s, a] / h
             scores[GLR, s, a] = math.sqrt(best) / b
-            if sound and max(scores[CUSUM, s, a], scores[GLR, s, a]) >= 1.0:
-                sound = False
+            if quiet and max(scores[CUSUM, s, a], scores[GLR, s, a]) >= 1.0:
+                quiet = False
                 new += 1
                 first = scores[CUSUM, s, a] >= 1.0
                 alarms[0, a] = decision
                 alarms[1, a] = began[side, s, a] - 1 if first else decision - length
                 alarms[2, a] = s
-                alarms[3, a] = (1 - 2 * side) if first else way
+                alarms[3, a] = (1 - 2 * side) if first else sign
                 alarms[4, a] = CUSUM if first else GLR
     return new
 

@@ -1,10 +1,10 @@
 """Pressures and command alone: a model of the machine, fitted to the pressure difference, shows when G rises.
 
 A leak past the piston damps the ringing after each reversal; friction does so too, but moves the mean pressure
-difference of the strokes as well, and a softer oil changes the ringing's frequency. The reduced rig (`pressure_laws`)
-knows these ties. It is fitted to the record (`pressure_fit`), its parameters are followed block by block
-(`pressure_track`), and a leak is a rise of the conductance G that the wandering of all other parameters does not
-explain. Pump and piston leak in parallel here, so that the level of G says nothing of the piston: only its rise does.
+difference of the strokes as well, and a softer oil changes the ringing's frequency. The reduced rig (`model`) knows
+these ties. It is fitted to the record (`fit`), its parameters are followed block by block (`track`), and a leak is a
+rise of the conductance G that the wandering of all other parameters does not explain. Pump and piston leak in parallel
+here, so that the level of G says nothing of the piston: only its rise does, or its level against a baseline.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ class PressureModel:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
+        """Return None where the record has what the model needs, else the reason why not."""
         missing = [name for name in (*CHAMBERS, "u") if name not in recording]
         if missing:
             return f"needs p_A, p_B and the command u, got no {' and no '.join(missing)}"
@@ -92,6 +93,7 @@ class PressureModel:
         )
 
     def follow(self, recording: Recording) -> Followed | str:
+        """Return the record as the model follows it, or the reason why it does not."""
         from sealscope.diagnosis.pressure_model.follow import follow
 
         cycle = find_cycle(recording)
@@ -115,19 +117,19 @@ def _comparable(followed: Followed, other: Followed) -> bool:
 
 def is_followed(followed: Followed) -> bool:
     """Return whether the parameters of a record wander no more than those of a healthy machine."""
-    from sealscope.diagnosis.pressure_model.steps import excess_of
+    from sealscope.diagnosis.pressure_model.track import excess_of
 
     return excess_of(followed.steps) <= UNRULY
 
 
 def _mean_drop(recording: Recording, since: float = -np.inf) -> float:
-    """Mean |p_A - p_B| [Pa] from an instant on."""
+    """Return the mean |p_A - p_B| [Pa] from an instant on."""
     late = recording.t >= since
     return float(np.mean(np.abs(recording["p_A"][late] - recording["p_B"][late])))
 
 
 def threshold_of(correlation: Array, probability: float) -> float:
-    """What the largest of standard normal z with this correlation exceeds with the stated probability."""
+    """Return the value that the largest of standard normal z of this correlation exceeds with the probability."""
     draws = int(np.clip(60.0 / probability, 6000, 200_000))
     root = np.linalg.cholesky(correlation + 1e-9 * np.eye(len(correlation)))
     random = np.random.default_rng(_SEED)
@@ -135,8 +137,8 @@ def threshold_of(correlation: Array, probability: float) -> float:
 
 
 def _within(followed: Followed, recording: Recording, probability: float) -> Evidence:
-    """The evidence on a rise of G within the record."""
-    from sealscope.diagnosis.pressure_model.steps import excess_of
+    """Return the evidence on a rise of G within the record."""
+    from sealscope.diagnosis.pressure_model.track import excess_of
 
     steps, begin = followed.steps, float(recording.t[0])
     inner = slice(LEAST - 1, followed.blocks - LEAST)
@@ -154,7 +156,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
         return Evidence(
             "cannot tell",
             f"the model of the rig does not follow this record: its parameters wander {excess:.2f} times as much as "
-            f"those of a sound machine may, {UNRULY:g} are allowed{seen}",
+            f"those of a healthy machine may, {UNRULY:g} are allowed{seen}",
             cause=cause,
         )
     scatter = float(np.sqrt(max(1.0, excess)))
@@ -163,16 +165,16 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     onset = float(edges[inner.start + 1 + best])
     size, deviation = float(steps.size[inner][best]), scatter * float(steps.deviation[inner][best])
     figures = f"z {score:.2f}, threshold {threshold:.2f}"
-    found = score > threshold
-    part = Evidence("leak" if found else "no leak", "", score, threshold, detector="rise of G")
-    if not found:
-        words = {
+    alarm = score > threshold
+    part = Evidence("leak" if alarm else "no leak", "", score, threshold, detector="rise of G")
+    if not alarm:
+        reason = {
             None: f"no rise of the leakage conductance beyond its scatter ({figures}); a leak that was there from the "
             f"start would need a --baseline to be seen",
             "friction change": f"the friction changed, the leakage conductance did not ({figures})",
             "air in the oil": f"the oil became softer, the leakage conductance did not change ({figures})",
         }[cause]
-        return Evidence("no leak", words, score, threshold, parts=(part,), cause=cause)
+        return Evidence("no leak", reason, score, threshold, parts=(part,), cause=cause)
     near = near_best(z * np.abs(z), scatter**2)
     interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
     lpm = _mean_drop(recording, onset) / LITRE_PER_MINUTE
@@ -187,7 +189,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
         why = "the friction" if cause == "friction change" else "the oil's stiffness"
         return Evidence(
             "cannot tell",
-            f"{reason}, but {why} changed more than it does in a sound machine",
+            f"{reason}, but {why} changed more than it does in a healthy machine",
             score,
             threshold,
             parts=(part,),
@@ -209,7 +211,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
 
 
 def _other_cause(followed: Followed) -> Cause | None:
-    """What else changed more than a sound machine's drift, or None."""
+    """Return what else changed more than a healthy machine's drift, or None."""
     if abs(followed.friction_change) > _OTHER_CAUSE["friction"]:
         return "friction change"
     if followed.stiffness_change < -_OTHER_CAUSE["stiffness"]:

@@ -1,20 +1,19 @@
-"""The reduced rig fitted to a recorded pressure difference: where all later linearisation starts from.
+"""Fit of the reduced rig to a recorded pressure difference: where all later linearisation starts.
 
 The fit is a maximum a posteriori estimate: least squares over a window of the record beside a wide normal prior around
 the numbers of a rig that is assumed. The ringing after each reversal makes many local minima (a ring too many or too
-few fits nearly as well), so the way there has three stages: gain, lead and friction from the slow part of the pressure,
+few fits nearly as well), so the fit has three stages: gain, lead and friction from the slow part of the pressure,
 which has one minimum; the oil's stiffness from starts all over its range; then all parameters together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sealscope.diagnosis.pressure_model.duty import SLOW_WIDTH, Duty, differences, gaussian
-from sealscope.diagnosis.pressure_model.laws import (
+from sealscope.diagnosis.pressure_model.model import (
     BIAS,
     C_C,
     F_C,
@@ -25,11 +24,13 @@ from sealscope.diagnosis.pressure_model.laws import (
     LEAD,
     OFFSET,
     PARAMETERS,
+    SLOW_WIDTH,
     STATES,
     STROKE,
+    DrivenModel,
     G,
     K,
-    Machine,
+    gaussian,
 )
 from sealscope.recordings.recording import Array
 
@@ -62,7 +63,7 @@ _NEAR, _SAME = 50.0, 0.01
 
 
 def steps_of(theta: Array) -> Array:
-    """Steps (12,) of the forward differences, small against what the data can tell and large against rounding."""
+    """Return the steps (12,) of the forward differences, small against the data's errors and large against rounding."""
     return np.array(
         [
             1e-3 * theta[GAIN],
@@ -81,7 +82,7 @@ def steps_of(theta: Array) -> Array:
     )
 
 
-def _sound(theta: Array) -> bool:
+def _valid(theta: Array) -> bool:
     return bool(
         np.all(np.isfinite(theta)) and min(theta[GAIN], theta[K], theta[F_C], theta[C_C]) > 0.0 and theta[K_BRK] > 1.0
     )
@@ -89,35 +90,36 @@ def _sound(theta: Array) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A stretch of the record to fit: dp (n,) [Pa] after `settle` samples of command alone, the speed loop's integral
-    over the gain at its beginning, noise variance [Pa^2] of a sample; `width` > 0: samples of the Gaussian that takes
-    the ringing out."""
+    """A part of the record to fit.
 
-    duty: Duty
+    dp (n,) [Pa] after `settle` samples of command alone, the speed loop's integral over the gain at its beginning,
+    noise variance [Pa^2] of a sample; `width` > 0: samples of the Gaussian that takes the ringing out.
+    """
+
+    model: DrivenModel
     dp: Array
     settle: int
     integral: float
     variance: float
-    machine: Machine
     width: float = 0.0
 
     def slow(self, dp: Array) -> Array:
-        """The slow part of dp (..., n), its mean taken out."""
+        """Return the slow part of dp (..., n), its mean taken out."""
         if self.width > 0:
             dp = np.apply_along_axis(np.convolve, -1, dp, gaussian(self.width), "valid")
         return np.asarray(dp - dp.mean(axis=-1, keepdims=True))
 
     def runs(self, thetas: Array) -> Array:
-        """What the model shows in the window for parameter sets (runs, 12), as `slow` leaves it."""
+        """Return what the model shows in the window for parameter sets (runs, 12), as `slow` leaves it."""
         start = np.zeros((len(thetas), STATES))
         start[:, 4] = self.integral * thetas[:, GAIN]
-        start[:, 2] = 0.9 * self.duty.u[0] * thetas[:, GAIN]
-        start[:, 1] = start[:, 2] * self.machine.q_b / (2.0 * np.pi) / self.machine.A
-        return self.slow(differences(self.duty, thetas, self.machine, start=start)[:, self.settle :])
+        start[:, 2] = 0.9 * self.model.u[0] * thetas[:, GAIN]
+        start[:, 1] = self.model.piston_speed(start[:, 2])
+        return self.slow(self.model.run(thetas, start=start)[:, self.settle :])
 
     @property
     def weight(self) -> float:
-        """What a squared Pa of misfit costs."""
+        """Cost of a squared Pa of misfit."""
         return (_SLOW_WEIGHT if self.width > 0 else 1.0) / self.variance
 
 
@@ -129,13 +131,13 @@ class Prior:
     deviation: Array
 
     def cost(self, theta: Array, free: Sequence[int]) -> float:
-        """Minus twice its logarithm, but for a constant."""
+        """Return minus twice its logarithm, but for a constant."""
         off = (theta - self.centre)[list(free)] / self.deviation[list(free)]
         return float(off @ off)
 
 
 def prior_of(centre: Array) -> Prior:
-    """How far a machine may be from the rig that is assumed of it."""
+    """Return how far a machine may be from the assumed rig."""
     deviation = np.array([PRIOR.get(k, 0.0) * centre[k] for k in range(len(PARAMETERS))])
     deviation[LEAD], deviation[G], deviation[BIAS] = PRIOR_LEAD, PRIOR_G, 0.1 * centre[GAIN]
     deviation[STROKE], deviation[OFFSET] = PRIOR_STROKE, PRIOR_OFFSET
@@ -146,8 +148,10 @@ def prior_of(centre: Array) -> Prior:
 def _fit(
     window: Window, thetas: Array, prior: Prior, free: Sequence[int], most: int, enough: float
 ) -> tuple[Array, Array]:
-    """Levenberg-Marquardt over the free parameters from several starts (m, 12) side by side: the sets that are reached,
-    cheapest first, and their costs (m,); `enough`: gain of cost to go on for."""
+    """Minimise the cost over the free parameters by Levenberg-Marquardt from several starts (m, 12) side by side.
+
+    Returns the sets that are reached, cheapest first, and their costs (m,); `enough`: gain of cost to continue for.
+    """
     free = list(free)
     data = window.slow(window.dp)
     thetas = thetas.copy()
@@ -164,62 +168,65 @@ def _fit(
             break
         # slopes of all starts, and then all their tries, fill the vector registers together
         dampings = _DAMPINGS if len(active) == 1 else _FEWER_DAMPINGS
-        h = np.array([steps_of(thetas[one]) for one in active])[:, free]
+        h = np.array([steps_of(thetas[start]) for start in active])[:, free]
         sets = np.repeat(thetas[active], len(free), axis=0).reshape(len(active), len(free), -1)
         sets[:, range(len(free)), free] += h
         moved = window.runs(sets.reshape(-1, thetas.shape[1])).reshape(len(active), len(free), -1)
         tries = np.repeat(thetas[active], len(dampings), axis=0).reshape(len(active), len(dampings), -1)
-        for row, one in enumerate(active):
-            slopes = moved[row] - shown[one]
+        for row, start in enumerate(active):
+            slopes = moved[row] - shown[start]
             scale = h[row] / prior.deviation[free]
-            off = (thetas[one] - prior.centre)[free] / prior.deviation[free]
+            off = (thetas[start] - prior.centre)[free] / prior.deviation[free]
             H = window.weight * (slopes @ slopes.T) + np.diag(scale**2)
-            g = window.weight * (slopes @ (data - shown[one])) - off * scale
+            g = window.weight * (slopes @ (data - shown[start])) - off * scale
             for k, factor in enumerate(dampings):
                 if np.all(np.isfinite(H)):
                     tries[row, k, free] += np.linalg.solve(H + factor * np.diag(np.diag(H)), g) * h[row]
-                if not _sound(tries[row, k]):
-                    tries[row, k] = thetas[one]
+                if not _valid(tries[row, k]):
+                    tries[row, k] = thetas[start]
         tried = window.runs(tries.reshape(-1, thetas.shape[1])).reshape(len(active), len(dampings), -1)
         going = []
-        for row, one in enumerate(active):
+        for row, start in enumerate(active):
             reached = [cost_of(here, at) for here, at in zip(tried[row], tries[row], strict=True)]
             best = int(np.argmin(reached))
-            gained = costs[one] - reached[best]
+            gained = costs[start] - reached[best]
             if gained > 0.0:
-                thetas[one], costs[one], shown[one] = tries[row, best], reached[best], tried[row, best]
+                thetas[start], costs[start], shown[start] = tries[row, best], reached[best], tried[row, best]
             if gained >= enough:
-                going.append(one)
+                going.append(start)
         active = going
     order = np.argsort(costs, kind="stable")
     return thetas[order], costs[order]
 
 
 def first_guess(short: Window, prior: Prior) -> Array:
-    """Parameters (12,) of which gain, lead, bias and friction fit the slow part of the pressure, the others the
-    prior's."""
+    """Return parameters (12,) of which gain, lead, bias and friction fit the slow part of the pressure.
+
+    The others are the prior's.
+    """
     centre = prior.centre
-    slow = Window(
-        short.duty, short.dp, short.settle, short.integral, short.variance, short.machine, SLOW_WIDTH * _rate(short)
-    )
+    slow = replace(short, width=SLOW_WIDTH * short.model.rate)
     starts = np.tile(centre, (_GAINS.size, 1))
     starts[:, GAIN] *= _GAINS
     data = slow.slow(slow.dp)
     misfit = np.sum((slow.runs(starts) - data) ** 2, axis=1)
     slowly = (GAIN, LEAD, BIAS, F_C, F_V, K_BRK)
-    found, _ = _fit(slow, starts[[int(np.nanargmin(misfit))]], prior, slowly, 12, 1e-2)
-    return np.asarray(found[0])
+    fitted, _ = _fit(slow, starts[[int(np.nanargmin(misfit))]], prior, slowly, 12, 1e-2)
+    return np.asarray(fitted[0])
 
 
 def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Array, float, list[Array]]:
-    """The parameters (12,) of the best fit, its cost per sample, and other starts for a record that this one does not
-    lead through; `short`: part of the window, for the many starts about the first `guess`."""
+    """Return the parameters (12,) of the best fit, its cost per sample, and other starts.
+
+    The other starts are for a record that the model does not follow from the first; `short`: part of the window, for
+    the many starts about the first `guess`.
+    """
     centre = prior.centre
-    long = float(np.max(np.abs(short.duty.travel))) > _LONG_STROKE
+    long = float(np.max(np.abs(short.model.travel))) > _LONG_STROKE
     starts = np.tile(guess, (_STIFFNESSES.size, 1))
     starts[:, K] = centre[K] * _STIFFNESSES
     if long:
-        # the stiffness may follow long strokes or not, and mid-stroke may lie anywhere: the two likeliest ways of each
+        # the stiffness may follow long strokes or not, and mid-stroke may lie anywhere: the two likeliest of each
         starts = np.repeat(starts, len(_STROKES), axis=0)
         starts[:, [STROKE, OFFSET]] = np.tile(_STROKES, (_STIFFNESSES.size, 1))
         misfit = np.sum((short.runs(starts) - short.slow(short.dp)) ** 2, axis=1).reshape(_STIFFNESSES.size, -1)
@@ -240,11 +247,7 @@ def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Arra
 
 
 def refit(window: Window, start: Array, prior: Prior) -> tuple[Array, float]:
-    """The best fit that is reached from another start, and its cost per sample."""
-    found, _ = _fit(window, start[None], prior, (GAIN, K), 6, 1.0)
-    found, costs = _fit(window, found, prior, range(len(PARAMETERS)), 20, 0.1)
-    return found[0], float(costs[0]) / window.dp.size
-
-
-def _rate(window: Window) -> float:
-    return 1.0 / (window.duty.h * window.duty.every)
+    """Return the best fit that is reached from another start, and its cost per sample."""
+    fitted, _ = _fit(window, start[None], prior, (GAIN, K), 6, 1.0)
+    fitted, costs = _fit(window, fitted, prior, range(len(PARAMETERS)), 20, 0.1)
+    return fitted[0], float(costs[0]) / window.dp.size

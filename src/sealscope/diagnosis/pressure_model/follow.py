@@ -1,4 +1,4 @@
-"""From a record to its followed parameters: noise, window, first fit, blocks, and how G steps."""
+"""From a record to its followed parameters: window, first fit, blocks, and the steps of G."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.baseline.level import Level
-from sealscope.diagnosis.pressure_model.duty import Duty, differences, duty_of, moving
 from sealscope.diagnosis.pressure_model.fit import (
     LONG_WINDOW,
     SETTLE,
@@ -20,9 +19,18 @@ from sealscope.diagnosis.pressure_model.fit import (
     prior_of,
     refit,
 )
-from sealscope.diagnosis.pressure_model.laws import F_C, F_V, GAIN, STATES, G, K, Machine, machine_of, nominal
-from sealscope.diagnosis.pressure_model.steps import Steps, excess_of, steps_in
-from sealscope.diagnosis.pressure_model.track import Track, leap, track
+from sealscope.diagnosis.pressure_model.model import (
+    F_C,
+    F_V,
+    GAIN,
+    STATES,
+    DrivenModel,
+    G,
+    K,
+    assumed_numbers,
+    nominal,
+)
+from sealscope.diagnosis.pressure_model.track import ConductanceSteps, Track, excess_of, leap, steps_in, track
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array
 
@@ -42,13 +50,16 @@ _AS_GOOD = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A record as the model sees it. `theta` (12,): first fit; `path` (b, 12); `steps` of G; `edges` (b + 1,) [samples]
+    """A record as the model sees it.
+
+    `theta` (12,): first fit; `path` (b, 12); `steps` of G; `edges` (b + 1,) [samples]
     from the first sample; `seconds` of a block; `explained`: share of dp's variance; `level` [m^3/(s Pa)]: mean
-    G; `friction_change`, `stiffness_change`: from the first to the last third, as shares."""
+    G; `friction_change`, `stiffness_change`: from the first to the last third, as shares.
+    """
 
     theta: Array
     path: Array
-    steps: Steps
+    steps: ConductanceSteps
     edges: NDArray[np.int64]
     seconds: float
     explained: float
@@ -65,30 +76,29 @@ class Followed:
 
 
 def noise_variance(dp: Array) -> float:
-    """Variance [Pa^2] of white noise on dp, from its third differences: ringing and strokes hardly reach them."""
+    """Return the variance [Pa^2] of white noise on dp, from its third differences, which hardly hold the ringing."""
     return float(np.var(np.diff(dp, 3)) / 20.0)
 
 
-def _window(duty: Duty, dp: Array, integral: float, first: int, n: int, settle: int, machine: Machine) -> Window:
-    return Window(duty.part(first, n), dp[first + settle : first + n], settle, integral, noise_variance(dp), machine)
-
-
-def _windows(duty: Duty, dp: Array, theta: Array, machine: Machine, rate: float, cycle: float) -> tuple[Window, Window]:
-    """The long window of the fit and its beginning, the short one, with the speed loop's integral at their start."""
+def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple[Window, Window]:
+    """Return the long window of the fit and its beginning, the short one."""
     n = dp.size
     long, short = (
-        min(n, int(np.clip(cycles * cycle, least, most) * rate)) for cycles, least, most in (LONG_WINDOW, SHORT_WINDOW)
+        min(n, int(np.clip(cycles * cycle, least, most) * model.rate))
+        for cycles, least, most in (LONG_WINDOW, SHORT_WINDOW)
     )
     first = max(0, min(int(_WINDOW_AT * n), n - long))
     state = np.zeros((1, STATES))
     if first > 0:
-        differences(duty.part(0, first), theta[None], machine, start=state)
+        model.part(0, first).run(theta[None], start=state)
     integral = float(state[0, _INTEGRAL] / theta[GAIN])
-    settle = int(SETTLE * rate)
-    return (
-        _window(duty, dp, integral, first, long, settle, machine),
-        _window(duty, dp, integral, first, min(short, long), settle, machine),
-    )
+    settle, noise = int(SETTLE * model.rate), noise_variance(dp)
+
+    def window(length: int) -> Window:
+        here = dp[first + settle : first + length]
+        return Window(model.part(first, length), here, settle, integral, noise)
+
+    return window(long), window(min(short, long))
 
 
 def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float | None) -> Followed | None:
@@ -96,18 +106,17 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
 
     `cycle` [s]: length of the duty's cycle, None where it does not repeat.
     """
-    machine = machine_of(rig)
     dp = p_A - p_B
-    dp = dp * (1.0 if _same_way(u, dp) else -1.0)
+    dp = dp * (1.0 if _same_sense(u, dp) else -1.0)
     centre = nominal(rig)
     centre[G] = max(centre[G], USUAL_G)
-    duty = duty_of(u, rate, p_A + p_B)
+    model = DrivenModel.of(u, rate, assumed_numbers(rig), p_A + p_B)
     span = BLOCK if cycle is None else cycle
-    _, short = _windows(duty, dp, centre, machine, rate, span)
+    _, short = _windows(model, dp, centre, span)
     prior = prior_of(centre)
     guess = first_guess(short, prior)
-    duty = moving(duty, guess, machine)
-    long, short = _windows(duty, dp, guess, machine, rate, span)
+    model = model.with_travel(guess)
+    long, short = _windows(model, dp, guess, span)
     theta, cost, anew = fit(long, short, prior, guess)
     if not np.isfinite(cost):
         return None
@@ -117,18 +126,18 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
         return None
     speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(u))
     skip = int(FIRST * rate)
-    followed, steps = _tracked(duty, dp, edges, theta, machine, skip, rate, speed)
+    followed, steps = _tracked(model, dp, edges, theta, skip, speed)
     if excess_of(steps) > RESTLESS:
         for first in anew:
             other, dearer = refit(long, first, prior)
             if dearer > cost * (1.0 + _AS_GOOD):
                 continue
-            again = _tracked(duty, dp, edges, other, machine, skip, rate, speed)
+            again = _tracked(model, dp, edges, other, skip, speed)
             if excess_of(again[1]) < excess_of(steps) - 0.05:
                 theta, (followed, steps) = other, again
     third = max(1, len(followed.path) // 3)
     early, late = followed.path[:third].mean(axis=0), followed.path[-third:].mean(axis=0)
-    friction = _friction(late, machine, speed) / _friction(early, machine, speed) - 1.0
+    friction = _friction(late, model, speed) / _friction(early, model, speed) - 1.0
     return Followed(
         theta,
         followed.path,
@@ -144,29 +153,22 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
     )
 
 
-def _same_way(u: Array, dp: Array) -> bool:
-    """Whether dp follows the command, as it does where both are counted the same way."""
+def _same_sense(u: Array, dp: Array) -> bool:
+    """Return whether dp follows the command, as it does where both count in the same sense."""
     return float(np.dot(u - u.mean(), dp - dp.mean())) >= 0.0
 
 
 def _tracked(
-    duty: Duty,
-    dp: Array,
-    edges: NDArray[np.int64],
-    theta: Array,
-    machine: Machine,
-    skip: int,
-    rate: float,
-    speed: float,
-) -> tuple[Track, Steps]:
-    """The record followed from a first fit, and the steps of G in it.
+    model: DrivenModel, dp: Array, edges: NDArray[np.int64], theta: Array, skip: int, speed: float
+) -> tuple[Track, ConductanceSteps]:
+    """Follow the record from a first fit, and estimate the steps of G in it.
 
     Where G seems to rise the blocks are linearised once more with that rise allowed: under the usual leash a leak pulls
     friction and gain off their values, which makes it smaller than it is. Sizes are taken from there; z, which a second
     look at what was chosen for being large would raise, is not.
     """
     followed, start = min(
-        ((track(duty, dp, edges, theta, machine, one, skip, rate), one) for one in _starts(duty, theta, machine)),
+        ((track(model, dp, edges, theta, start, skip), start) for start in _starts(model, theta)),
         key=lambda both: float(both[0].block_variance[:_EARLY].mean()),
     )
     steps = steps_in(followed, theta, speed)
@@ -174,30 +176,26 @@ def _tracked(
     if steps.z[after] < _CLEAR:
         return followed, steps
     jumps = leap(edges.size - 1, after, G)
-    anew = track(duty, dp, edges, theta, machine, start, skip, rate, jumps, followed.path)
-    fresh = steps_in(anew, theta, speed)
+    fresh = steps_in(track(model, dp, edges, theta, start, skip, jumps, followed.path), theta, speed)
     if excess_of(fresh) < max(1.0, excess_of(steps)) + 0.05:
         steps = replace(steps, size=fresh.size, deviation=fresh.deviation)
     return followed, steps
 
 
-def _friction(theta: Array, machine: Machine, speed: float) -> float:
-    """Friction [N] in mid-stroke."""
-    v = machine.q_b / (2.0 * np.pi) / machine.A * speed
-    return float(theta[F_C] + theta[F_V] * v)
+def _friction(theta: Array, model: DrivenModel, speed: float) -> float:
+    """Return the friction [N] in mid-stroke."""
+    return float(theta[F_C] + theta[F_V] * model.piston_speed(speed))
 
 
-def _starts(duty: Duty, theta: Array, machine: Machine) -> list[Array]:
-    """States (5,) that the record may begin with: at rest, or on its way for long where the command does not begin at
-    nought."""
+def _starts(model: DrivenModel, theta: Array) -> list[Array]:
+    """Return the states (5,) that the record may begin with: at rest, or in motion where the command is not at zero."""
     rest = np.zeros(STATES)
-    grid = 2 * duty.every
-    if abs(duty.u[0]) <= 0.02 * float(np.max(np.abs(duty.u))) and abs(duty.slope[0]) > 0.0:
+    u, slope = (model.inputs[: -1 : 2 * model.every, column] for column in (0, 1))
+    if abs(u[0]) <= 0.02 * float(np.max(np.abs(model.u))) and abs(slope[0]) > 0.0:
         return [rest]
-    n = (len(duty.inputs) - 1) // grid
-    u, slope = duty.u[:-1:grid], duty.slope[:-1:grid]
+    n = model.samples
     apart = np.abs(u - u[0]) / np.std(u) + np.abs(slope - slope[0]) / np.std(slope)
     same = n // 2 + int(np.argmin(apart[n // 2 :]))
     state = np.zeros((1, STATES))
-    differences(duty.part(0, same), theta[None], machine, start=state)
+    model.part(0, same).run(theta[None], start=state)
     return [rest, state[0]]

@@ -1,9 +1,14 @@
-"""The fitted parameters followed through a record, block by block.
+"""The fitted parameters followed through a record, block by block, and a step of the leak's conductance in them.
 
 In every block the model is linear about the block's own parameters: its information matrix N_b and right side r_b come
 from the slopes of dp. The parameters theta_b wander from block to block (a random walk, each with a strength that
-machines have), so that the whole record is one normal model with precision matrix Lambda (block tridiagonal).
-Source: A. C. Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, ch. 4.
+machines have), so that the whole record is one normal model with precision matrix Lambda (block tridiagonal). A step d
+of G after block k adds N_b e_G d to the right sides of all later blocks; with everything else eliminated its estimate
+is s_k / I_k with variance 1 / I_k, and z_k = s_k / sqrt(I_k) is standard normal where nothing steps, with a known
+correlation between any two instants.
+
+Sources: A. C. Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, ch. 4; P. de Jong, J.
+Penzer, Diagnosing shocks in time series, JASA 93 (1998) 796-806.
 """
 
 from __future__ import annotations
@@ -14,9 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.pressure_model.duty import Duty, differences
 from sealscope.diagnosis.pressure_model.fit import steps_of
-from sealscope.diagnosis.pressure_model.laws import (
+from sealscope.diagnosis.pressure_model.model import (
     BIAS,
     C_C,
     F_C,
@@ -28,9 +32,9 @@ from sealscope.diagnosis.pressure_model.laws import (
     OFFSET,
     PARAMETERS,
     STROKE,
+    DrivenModel,
     G,
     K,
-    Machine,
 )
 from sealscope.recordings.recording import Array
 
@@ -44,9 +48,9 @@ _WANDER_BIAS = 0.003
 ANCHOR = {GAIN: 0.02, K: 0.1, F_C: 0.1, F_V: 0.15, K_BRK: 0.1, C_C: 0.15}
 ANCHOR_REST = {LEAD: 5e-4, G: 1.5e-12, F_CFR: 5e-7, STROKE: 0.3, OFFSET: 0.2}
 _PASSES = 10
-#: Blocks are stuck beside the way whose residual is by so many of its deviations larger than the others', or before or
-#: after which the stiffness leaps by so many deviations of its walk: they are set between their neighbours, at one of
-#: these biases of the speed, in units of the bias's own wandering, and followed once more.
+#: Blocks are stuck whose residual is by so many of its deviations larger than the others', or before or after which
+#: the stiffness leaps by so many deviations of its walk: they are set between their neighbours, at one of these biases
+#: of the speed, in units of the bias's own wandering, and followed once more.
 _STUCK, _LEAPS, _BIASES = 3.0, 1.7, np.array([0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, 2.0])
 #: A jump: so many times the wandering from block to block.
 _LEAP = 50.0
@@ -54,17 +58,22 @@ _LEAP = 50.0
 _SHARES = np.array([1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 1.4])
 _ENOUGH = 1.0
 #: How far the parameters may wander in the first passes, times the usual: the record's mean comes first, so that what
-#: is left to find in a block is small and the model is linear over it.
+#: is left in a block is small and the model is linear over it.
 _LEASHES = (0.1, 0.3, 1.0)
+#: Wandering that is tried, times the usual one: the likelihood chooses.
+SCALES = (1.0, 2.0, 4.0)
 _CONSTANT = len(PARAMETERS)
 SIZE = _CONSTANT + 1
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A record followed: blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 12) about which the model is
+    """Parameters of a record, followed.
+
+    Blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 12) about which the model is
     linear; `N` (b, p, p), `r` (b, p) information in units of `units` (p,), the last a constant of dp; `variance`
-    [Pa^2] of the residual and of each block's (b,)."""
+    [Pa^2] of the residual and of each block's (b,).
+    """
 
     edges: NDArray[np.int64]
     path: Array
@@ -82,7 +91,7 @@ def _deviations(theta: Array, shares: dict[int, float], rest: dict[int, float]) 
 
 
 def wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
-    """Standard deviation (p,) of the walk from block to block, in `units`."""
+    """Return the standard deviation (p,) of the walk from block to block, in `units`."""
     walk = _deviations(theta, WANDER, WANDER_REST)
     walk *= np.sqrt(seconds / _WANDER_SECONDS)
     walk[BIAS] = _WANDER_BIAS * speed * np.sqrt(seconds / 6.0)
@@ -90,7 +99,7 @@ def wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
 
 
 def _anchor(theta: Array, units: Array) -> Array:
-    """Weight (p,) of the first fit on the record's mean parameters."""
+    """Return the weight (p,) of the first fit on the record's mean parameters."""
     deviation = _deviations(theta, ANCHOR, ANCHOR_REST)
     weight = np.zeros(SIZE)
     known = deviation > 0
@@ -99,37 +108,35 @@ def _anchor(theta: Array, units: Array) -> Array:
 
 
 def precision(N: Array, walk: Array, anchor: Array) -> Array:
-    """Lambda (b p, b p) of all blocks' parameters; `walk` (b - 1, p) from each block to the next."""
+    """Return Lambda (b p, b p) of all blocks' parameters; `walk` (b - 1, p) from each block to the next."""
     blocks, p, _ = N.shape
-    found = np.zeros((blocks, p, blocks, p))
+    matrix = np.zeros((blocks, p, blocks, p))
     for b in range(blocks):
-        found[b, :, b] += N[b]
+        matrix[b, :, b] += N[b]
         if b:
             steps = np.diag(1.0 / walk[b - 1] ** 2)
-            found[b, :, b] += steps
-            found[b - 1, :, b - 1] += steps
-            found[b - 1, :, b] -= steps
-            found[b, :, b - 1] -= steps
+            matrix[b, :, b] += steps
+            matrix[b - 1, :, b - 1] += steps
+            matrix[b - 1, :, b] -= steps
+            matrix[b, :, b - 1] -= steps
     for k in np.flatnonzero(anchor > 0):
-        found[:, k, :, k] += anchor[k] / blocks**2
-    found[0, range(p), 0, range(p)] += 1e-10 * np.diagonal(N[0])
-    return found.reshape(blocks * p, blocks * p)
+        matrix[:, k, :, k] += anchor[k] / blocks**2
+    matrix[0, range(p), 0, range(p)] += 1e-10 * np.diagonal(N[0])
+    return matrix.reshape(blocks * p, blocks * p)
 
 
 def right_sides(r: Array, anchor: Array, centre: Array) -> Array:
-    """Right sides (b, p) of the blocks with the first fit's weight `anchor` (p,) on `centre` (p,) in them."""
+    """Return the right sides (b, p) of the blocks with the first fit's weight `anchor` (p,) on `centre` (p,)."""
     return r + anchor * centre / len(r)
 
 
 def track(
-    duty: Duty,
+    model: DrivenModel,
     dp: Array,
     edges: NDArray[np.int64],
     theta: Array,
-    machine: Machine,
     start: Array,
     skip: int,
-    rate: float,
     jumps: Array | None = None,
     from_path: Array | None = None,
 ) -> Track:
@@ -145,8 +152,8 @@ def track(
     segment = np.clip(np.searchsorted(edges, np.arange(n), side="right") - 1, 0, blocks - 1).astype(np.int64)
     h = steps_of(theta)
     units = np.append(h, 1.0)
-    seconds = float(np.median(np.diff(edges))) / rate
-    speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(duty.u))
+    seconds = float(np.median(np.diff(edges))) / model.rate
+    speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(model.u))
     walk = np.tile(wander(theta, units, seconds, speed), (blocks - 1, 1))
     if jumps is not None:
         walk *= jumps
@@ -157,7 +164,7 @@ def track(
     limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
 
     def misfits(shown: Array) -> Array:
-        return np.array([here.size * np.var(here) for here in (dp[one] - shown[one] for one in limits)])
+        return np.array([rest.size * np.var(rest) for rest in (dp[block] - shown[block] for block in limits)])
 
     def strain(at: Array, walk: Array) -> float:
         steps = np.diff(at, axis=0) / h / walk[:, :-1]
@@ -165,13 +172,13 @@ def track(
         return float(np.sum(steps**2)) + float(anchor[:-1] @ off**2)
 
     def freed(path: Array, stuck: NDArray[np.bool_]) -> Array:
-        """The path with stuck blocks set between their neighbours, at the speed's bias that suits each best."""
-        at, sound = np.arange(blocks), np.flatnonzero(np.logical_not(stuck))
-        between = np.column_stack([np.interp(at, sound, path[sound, k]) for k in range(_CONSTANT)])
+        """Return the path with stuck blocks set between their neighbours, at the speed's bias that suits each best."""
+        at, free = np.arange(blocks), np.flatnonzero(np.logical_not(stuck))
+        between = np.column_stack([np.interp(at, free, path[free, k]) for k in range(_CONSTANT)])
         tries = np.tile(between, (_BIASES.size, 1, 1))
         tries[:, :, BIAS] += _BIASES[:, None] * _WANDER_BIAS * speed
-        seen = differences(duty, tries, machine, segment, np.tile(start, (_BIASES.size, 1)))
-        best = np.argmin([misfits(one) for one in seen], axis=0)
+        seen = model.run(tries, segment, np.tile(start, (_BIASES.size, 1)))
+        best = np.argmin([misfits(shown) for shown in seen], axis=0)
         return np.where(stuck[:, None], tries[best, at], path)
 
     before: tuple[float, float, Track] | None = None
@@ -181,10 +188,10 @@ def track(
         sets = np.tile(path, (_CONSTANT + 1, 1, 1))
         for k in range(_CONSTANT):
             sets[k + 1, :, k] += h[k]
-        shown = differences(duty, sets, machine, segment, np.tile(start, (_CONSTANT + 1, 1)))
+        shown = model.run(sets, segment, np.tile(start, (_CONSTANT + 1, 1)))
         N, r, squares, counts = _normal(dp, shown, limits, path / h)
         variance = float(squares.sum() / counts.sum())
-        found = Track(
+        followed = Track(
             edges,
             path,
             N / variance,
@@ -196,11 +203,13 @@ def track(
             seconds,
         )
         allowed = leashes[min(number, len(leashes) - 1)] * walk
-        solved = np.linalg.solve(precision(found.N, allowed, anchor), right_sides(found.r, anchor, centre).reshape(-1))
+        solved = np.linalg.solve(
+            precision(followed.N, allowed, anchor), right_sides(followed.r, anchor, centre).reshape(-1)
+        )
         fresh = _held(solved.reshape(blocks, SIZE)[:, :_CONSTANT] * h, theta)
         tries = path + _SHARES[:, None, None] * (fresh - path)
-        seen = differences(duty, tries, machine, segment, np.tile(start, (_SHARES.size, 1)))
-        apart = np.array([misfits(one).sum() for one in seen])
+        seen = model.run(tries, segment, np.tile(start, (_SHARES.size, 1)))
+        apart = np.array([misfits(each).sum() for each in seen])
         costs = apart / variance + np.array([strain(at, allowed) for at in tries])
         best = int(np.nanargmin(costs))
         gained = float(misfits(shown[0]).sum()) / variance + strain(path, allowed) - costs[best]
@@ -210,20 +219,21 @@ def track(
         if number < len(leashes) or (gained > _ENOUGH and number < last):
             continue
         if before is not None:
-            return before[2] if before[0] / variance + before[1] < costs[best] else found
-        stuck = _stuck(found, counts, walk if jumps is None else None)
+            return before[2] if before[0] / variance + before[1] < costs[best] else followed
+        stuck = _stuck(followed, counts, walk if jumps is None else None)
         if not np.any(stuck) or np.all(stuck):
-            return found
-        before = float(apart[best]), strain(tries[best], allowed), found
+            return followed
+        before = float(apart[best]), strain(tries[best], allowed), followed
         path = freed(path, stuck)
         last = number + _PASSES
 
 
 def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Array, Array, Array]:
-    """Of each block between `limits`: N (b, p, p) and r (b, p) of the model that is linear about `at` (b, 12) [units],
-    the sum of squares (b,) that no parameters explain, and its degrees of freedom (b,).
+    """Return the normal equations of each block between `limits`.
 
-    `shown` (13, n): the model there, and a unit more of each parameter. The trend of the speed's bias is eliminated.
+    They are N (b, p, p) and r (b, p) of the model that is linear about `at` (b, 12) [units], the sum of squares (b,)
+    that no parameters explain, and its degrees of freedom (b,). `shown` (13, n): the model there, and a unit more of
+    each parameter. The trend of the speed's bias is eliminated.
     """
     blocks = len(limits)
     N, r = np.empty((blocks, SIZE, SIZE)), np.empty((blocks, SIZE))
@@ -243,14 +253,16 @@ def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tupl
     return N, r, squares, counts
 
 
-def _stuck(found: Track, counts: Array, walk: Array | None) -> NDArray[np.bool_]:
-    """Blocks (b,) that turns of Gauss and Newton left beside the way: their residual is larger than that of the others,
-    or the stiffness leaps, and then those on the shorter side of the leap; `walk` (b - 1, p) [units]: None where leaps
-    are allowed."""
-    here = found.block_variance
+def _stuck(followed: Track, counts: Array, walk: Array | None) -> NDArray[np.bool_]:
+    """Return the blocks (b,) that Gauss-Newton steps left in another minimum.
+
+    Their residual is larger than that of the others, or the stiffness leaps, and then those on the shorter side of the
+    leap; `walk` (b - 1, p) [units]: None where leaps are allowed.
+    """
+    here = followed.block_variance
     stuck = here > np.median(here) * (1.0 + _STUCK * np.sqrt(2.0 / counts))
     if walk is not None:
-        leaps = np.abs(np.diff(found.path[:, K])) / found.units[K] / walk[:, K]
+        leaps = np.abs(np.diff(followed.path[:, K])) / followed.units[K] / walk[:, K]
         after = int(np.argmax(leaps)) + 1
         if leaps[after - 1] > _LEAPS:
             stuck[after if 2 * after >= here.size else 0 : None if 2 * after >= here.size else after] = True
@@ -258,15 +270,89 @@ def _stuck(found: Track, counts: Array, walk: Array | None) -> NDArray[np.bool_]
 
 
 def leap(blocks: int, after: int, *parameters: int) -> Array:
-    """What lets some parameters jump after a block: factors (b - 1, p) on the walk."""
+    """Return factors (b - 1, p) on the walk that let some parameters jump after a block."""
     factors = np.ones((blocks - 1, SIZE))
     factors[after, list(parameters)] = _LEAP
     return factors
 
 
 def _held(path: Array, theta: Array) -> Array:
-    """The path within what the laws can be evaluated for."""
+    """Hold the path within what the laws can be evaluated for."""
     for k in (GAIN, K, F_C, C_C):
         path[:, k] = np.clip(path[:, k], 0.3 * theta[k], 3.0 * theta[k])
     path[:, K_BRK] = np.maximum(path[:, K_BRK], 1.05)
     return path
+
+
+@dataclass(frozen=True, eq=False)
+class ConductanceSteps:
+    """A step of G after each block.
+
+    `size`, `deviation` (b - 1,) [m^3/(s Pa)], `z` and their `correlation`; `level`
+    (b,) the wandering G with no step, and its `level_deviation`; `scale` of the wandering that was chosen; `excess`:
+    chi square of the blocks against the wandering, and its degrees of freedom.
+    """
+
+    size: Array
+    deviation: Array
+    z: Array
+    correlation: Array
+    level: Array
+    level_deviation: Array
+    scale: float
+    excess: tuple[float, float]
+
+
+def excess_of(steps: ConductanceSteps) -> float:
+    """Return the chi square of the blocks over its degrees of freedom, beside the best step (Birge's ratio)."""
+    chi_square, freedom = steps.excess
+    return float((chi_square - np.max(np.abs(steps.z)) ** 2) / freedom)
+
+
+def steps_in(followed: Track, theta: Array, speed: float, scales: Sequence[float] = SCALES) -> ConductanceSteps:
+    """Estimate a step of G after each block, everything else free to wander as far as the likelihood chooses."""
+    anchor, centre = np.split(followed.anchor, 2)
+    walk = np.tile(wander(theta, followed.units, followed.seconds, speed), (len(followed.N) - 1, 1))
+    right = right_sides(followed.r, anchor, centre).reshape(-1)
+    blocks = len(followed.N)
+    best: tuple[float, float, Array, float] | None = None
+    for scale in scales:
+        L = np.asarray(np.linalg.cholesky(precision(followed.N, scale * walk, anchor)), dtype=np.float64)
+        half = np.linalg.solve(L, right)
+        fit = float(half @ half)
+        likelihood = fit - 2.0 * np.sum(np.log(np.diagonal(L)))
+        likelihood -= 2.0 * np.sum(np.log(scale * walk))
+        if best is None or likelihood > best[0] + 2.0:
+            best = (float(likelihood), scale, L, fit)
+    assert best is not None
+    _, scale, L, fit = best
+    free, ranks = float(np.sum(anchor * centre**2)), 0
+    for N, r in zip(followed.N, followed.r, strict=True):
+        solution, _, rank, _ = np.linalg.lstsq(N, r, rcond=1e-12)
+        free += float(r @ solution)
+        ranks += int(rank)
+    later_blocks = np.zeros((blocks, SIZE, blocks - 1))
+    for k in range(1, blocks):
+        later_blocks[k:, :, k - 1] = followed.N[k:, :, G]
+    inner = later_blocks.reshape(blocks * SIZE, blocks - 1)
+    level_rows = np.zeros((blocks * SIZE, blocks))
+    level_rows[np.arange(blocks) * SIZE + G, np.arange(blocks)] = 1.0
+    solved = np.linalg.solve(L, np.column_stack([inner, right, level_rows]))
+    steps, half, levels = solved[:, : blocks - 1], solved[:, blocks - 1], solved[:, blocks:]
+    later = np.cumsum(followed.N[::-1, G, G])[::-1]
+    at = np.arange(1, blocks)
+    information = later[np.maximum(at[:, None], at[None, :])] - steps.T @ steps
+    right_sum = np.cumsum(followed.r[::-1, G])[::-1][1:]
+    score = right_sum - steps.T @ half
+    own = np.sqrt(np.diagonal(information))
+    unit = followed.units[G]
+    return ConductanceSteps(
+        score / own**2 * unit,
+        unit / own,
+        score / own,
+        information / np.outer(own, own),
+        levels.T @ half * unit,
+        np.sqrt(np.sum(levels**2, axis=0)) * unit,
+        scale,
+        (free - fit, float(ranks - SIZE + np.count_nonzero(anchor))),
+    )

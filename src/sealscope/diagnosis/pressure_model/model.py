@@ -1,0 +1,289 @@
+"""Pressure difference of a machine under its command: the rig reduced to what p_A - p_B depends on.
+
+Where both pistons' areas are alike, p_A and p_B move against each other, so the rig of eqs. (4.1)-(4.22) leaves five
+states: the difference dp, the piston's velocity v, the motor's speed omega, its current i and the integral I of its
+speed loop. Long strokes change the chambers' volumes, and with them the stiffness and the pressures' sum, on which
+friction depends: the sum is taken from the record, the piston's place from the model itself. Throttles and lines are
+left out: at the piston they act as more volume (a softer oil) and a little more damping, which the fit finds. The laws
+are those of `sealscope.physics`; the numbers are the detector's own, from a rig it may assume, and none of them is the
+recorded machine's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.compiled import contracted, kernel
+from sealscope.parameters import Rig
+from sealscope.physics.cylinder import piston_acceleration, pressure_rate
+from sealscope.physics.friction import coulomb_friction, stribeck_friction
+from sealscope.physics.lanes import WIDTH, load, spread, store
+from sealscope.physics.leakage import laminar_leakage
+from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
+from sealscope.physics.pump import pump_flow, pump_torque
+from sealscope.physics.rig import RigNumbers, rig_numbers
+from sealscope.recordings.recording import Array
+
+#: What is estimated: speed per volt of the command [rad/(s V)], lead of the command [s], what the speed has beyond it
+#: [rad/s], stiffness of the oil [Pa], conductance past the piston and the pump [m^3/(s Pa)], Coulomb friction [N],
+#: viscous friction [N s/m], breakaway over Coulomb friction [1], decay of the breakaway [s/m]; Coulomb friction per
+#: pressure [N/Pa]; share of the stiffness that follows the stroke [1], mid-stroke's offset as a share of V [1].
+PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c", "F_cfr", "stroke", "offset")
+GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C, F_CFR, STROKE, OFFSET = range(len(PARAMETERS))
+#: Runs that one call makes side by side.
+RUNS = WIDTH
+STATES = 5
+State = tuple[float, float, float, float, float]
+Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+#: Largest share of V that a stroke takes away, squared.
+_LARGEST_SHARE = 0.75
+#: Longest step of the solver [s]: a tenth of a radian at the ringing of the thesis's rig would be 2e-4 s; RK4 at 1e-3 s
+#: is within 100 Pa, far under the transducers' noise.
+LONGEST_STEP = 1.01e-3
+#: The slow part of a pressure: a Gaussian of this width [s] takes the ringing (60 to 80 Hz) out.
+SLOW_WIDTH = 0.008
+
+
+def assumed_numbers(rig: Rig) -> RigNumbers:
+    """Return the numbers of the assumed machine.
+
+    The area of both sides of the piston is their mean; air in the oil and make-up valves are left out.
+    """
+    numbers = rig_numbers(rig)
+    area = 0.5 * (numbers.A_A + numbers.A_B)
+    return numbers._replace(A_A=area, A_B=area, aerated=(), open_circuit=())
+
+
+def nominal(rig: Rig) -> Array:
+    """Return the parameters (12,) that a rig has about its charge pressure with no leak past the piston."""
+    friction = rig.friction
+    coulomb = coulomb_friction(
+        rig.fluid.p_charge,
+        rig.fluid.p_charge,
+        friction.F_pr,
+        friction.F_cfr,
+        friction.coulomb_pressure == "difference",
+    )
+    return np.array(
+        [
+            rig.motor.omega_per_volt,
+            0.0,
+            0.0,
+            rig.fluid.K_oil,
+            rig.pump.G_pump,
+            coulomb,
+            friction.F_v,
+            friction.K_brk,
+            friction.C_c,
+            friction.F_cfr,
+            0.5,
+            0.0,
+        ]
+    )
+
+
+@contracted
+def stiffening(travel: float, theta: Parameters) -> float:
+    """Return the stiffness of both chambers together at a place of the stroke over that at mid-stroke [1].
+
+    1 + s (1 / (1 - q^2) - 1), q = `travel` + o: with V_A = V + A x, V_B = V - A x and A x = q V, 1/V_A + 1/V_B = 2 /
+    (V (1 - q^2)); s is 0 for a machine whose volumes are fixed. The inverse is its series up to q^12.
+    """
+    q = travel + theta[OFFSET]
+    square = min(q * q, _LARGEST_SHARE)
+    more = square * (1.0 + square * (1.0 + square * (1.0 + square * (1.0 + square * (1.0 + square)))))
+    return 1.0 + theta[STROKE] * more
+
+
+@contracted
+def reduced_rates(y: State, u: float, stiffness: float, coulomb: float, theta: Parameters, m: RigNumbers) -> State:
+    """Return dy/dt of y = (dp, v, omega, i, I) under the command u [V], `stiffness` [Pa] and `coulomb` friction [N]."""
+    dp, v, omega, i, integral = y
+    error = theta[GAIN] * u + theta[BIAS] - omega
+    voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
+    friction = stribeck_friction(v, coulomb, theta[K_BRK], theta[C_C], theta[F_V], m.v_th, False)
+    flow = pump_flow(omega, dp, m.q_b, 0.0) - m.A_A * v - laminar_leakage(dp, theta[G])
+    return (
+        2.0 * pressure_rate(flow, m.V, stiffness),
+        piston_acceleration(0.5 * dp, -0.5 * dp, friction, 0.0, 0.0, m.A_A, m.A_A, m.M_eq),
+        shaft_acceleration(i, omega, pump_torque(dp, m.q_b), m.C_m, m.B_M, m.J_M),
+        winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
+        error,
+    )
+
+
+@contracted
+def _moved(y: State, h: float, k: State) -> State:
+    return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4]
+
+
+@kernel
+def pressure_differences(
+    inputs: np.ndarray,
+    h: float,
+    every: int,
+    theta: np.ndarray,
+    segment: np.ndarray,
+    m: RigNumbers,
+    state: np.ndarray,
+    out: np.ndarray,
+    speeds: bool,
+) -> None:
+    """Write dp [Pa], or v [m/s] if `speeds`, of RUNS runs at each sample into `out` (n, RUNS).
+
+    The method is RK4 in steps of h [s], `every` to a sample. `inputs`: (2 every n + 1, 4) at every half step: command
+    [V], its derivative [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa]; `theta`: (segments, 12,
+    RUNS) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, RUNS) at the first sample, in place.
+    """
+    y = (load(state, 0), load(state, 1), load(state, 2), load(state, 3), load(state, 4))
+    for sample in range(segment.size):
+        store(out, sample, y[1] if speeds else y[0])
+        row = 12 * segment[sample]
+        lead = load(theta, row + LEAD)
+        now = (
+            load(theta, row + GAIN),
+            lead,
+            load(theta, row + BIAS),
+            load(theta, row + K),
+            load(theta, row + G),
+            load(theta, row + F_C),
+            load(theta, row + F_V),
+            load(theta, row + K_BRK),
+            load(theta, row + C_C),
+            load(theta, row + F_CFR),
+            load(theta, row + STROKE),
+            load(theta, row + OFFSET),
+        )
+        for step in range(every):
+            at = 2 * (sample * every + step)
+            u_0 = inputs[at, 0] + lead * inputs[at, 1]
+            u_1 = inputs[at + 1, 0] + lead * inputs[at + 1, 1]
+            u_2 = inputs[at + 2, 0] + lead * inputs[at + 2, 1]
+            # place and pressures change little within a step: they hold as they are in its middle
+            stiff = now[K] * stiffening(inputs[at + 1, 2], now)
+            coulomb = now[F_C] + now[F_CFR] * inputs[at + 1, 3]
+            k_1 = reduced_rates(y, u_0, stiff, coulomb, now, m)
+            k_2 = reduced_rates(_moved(y, 0.5 * h, k_1), u_1, stiff, coulomb, now, m)
+            k_3 = reduced_rates(_moved(y, 0.5 * h, k_2), u_1, stiff, coulomb, now, m)
+            k_4 = reduced_rates(_moved(y, h, k_3), u_2, stiff, coulomb, now, m)
+            y = _moved(_moved(_moved(_moved(y, h / 6.0, k_1), h / 3.0, k_2), h / 3.0, k_3), h / 6.0, k_4)
+    for state_row in range(5):
+        store(state, state_row, y[state_row] + spread(0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenModel:
+    """The reduced rig under a recorded command, run for many sets of parameters.
+
+    `inputs` (m, 4) at every half step, as `pressure_differences` takes them; `every` steps of `h` [s] to a sample;
+    `numbers` of the assumed rig.
+    """
+
+    inputs: Array
+    h: float
+    every: int
+    numbers: RigNumbers
+
+    @staticmethod
+    def of(u: Array, rate: float, numbers: RigNumbers, pressures: Array | None = None) -> DrivenModel:
+        """Return the model under a command (n,) [V], with the piston in mid-stroke.
+
+        The command ramps from one sample to the next. `pressures` (n,): p_A + p_B [Pa], constant by default.
+        """
+        every = int(np.ceil(1.0 / rate / LONGEST_STEP))
+        n = u.size
+        at = np.arange(2 * every * n + 1) / (2.0 * every)
+        fine = np.interp(at, np.arange(n), u)
+        h = 1.0 / rate / every
+        lift = np.zeros(at.size) if pressures is None else np.interp(at, np.arange(n), smoothed(pressures, rate))
+        inputs = np.column_stack([fine, np.gradient(fine, 0.5 * h), np.zeros(at.size), lift - lift.mean()])
+        return DrivenModel(inputs, h, every, numbers)
+
+    def with_travel(self, theta: Array) -> DrivenModel:
+        """Return the model with the piston's place that it shows itself for parameters `theta` (12,).
+
+        Mean and trend of the place are removed: mid-stroke is not known, and a piston that stays in its cylinder has no
+        trend for long.
+        """
+        n = self.samples
+        place = np.cumsum(self.run(theta[None], speeds=True)[0]) * self.h * self.every
+        place = place * self.numbers.A_A / self.numbers.V
+        middle = np.arange(n) - 0.5 * (n - 1)
+        place -= place.mean() + middle * (middle @ place) / (middle @ middle)
+        inputs = self.inputs.copy()
+        inputs[:, 2] = np.interp(np.arange(len(inputs)) / (2.0 * self.every), np.arange(n), place)
+        return replace(self, inputs=inputs)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples n."""
+        return (len(self.inputs) - 1) // (2 * self.every)
+
+    @property
+    def rate(self) -> float:
+        """Sampling rate [Hz]."""
+        return 1.0 / (self.h * self.every)
+
+    @property
+    def u(self) -> Array:
+        """The command (m,) [V]."""
+        return self.inputs[:, 0]
+
+    @property
+    def travel(self) -> Array:
+        """The piston's place (m,), A x / V."""
+        return self.inputs[:, 2]
+
+    def part(self, first: int, n: int) -> DrivenModel:
+        """Return the model over n samples from `first` on."""
+        return replace(self, inputs=self.inputs[2 * self.every * first : 2 * self.every * (first + n) + 1])
+
+    def piston_speed(self, omega: float | Array) -> float | Array:
+        """Return the piston's speed [m/s] at a speed of the motor [rad/s], without leakage and stored oil."""
+        return omega * self.numbers.q_b / (2.0 * np.pi) / self.numbers.A_A
+
+    def run(
+        self,
+        thetas: Array,
+        segment: NDArray[np.int64] | None = None,
+        start: Array | None = None,
+        speeds: bool = False,
+    ) -> Array:
+        """Return dp [Pa], or v [m/s] if `speeds`, (runs, n) of parameter sets `thetas`.
+
+        `thetas` (runs, 12), or (runs, segments, 12) with `segment` (n,), which of them holds at a sample; `start`
+        (runs, 5): the state at the first sample, at rest by default, which becomes the last.
+        """
+        sets = thetas[:, None, :] if thetas.ndim == 2 else thetas
+        runs, n = len(sets), self.samples
+        which = np.zeros(n, dtype=np.int64) if segment is None else segment
+        shown = np.empty((runs, n))
+        for first in range(0, runs, RUNS):
+            lanes = np.minimum(np.arange(first, first + RUNS), runs - 1)
+            table = np.ascontiguousarray(np.moveaxis(sets[lanes], 0, -1))
+            state = np.zeros((STATES, RUNS))
+            if start is not None:
+                state[:] = start[lanes].T
+            out = np.empty((n, RUNS))
+            pressure_differences(self.inputs, self.h, self.every, table, which, self.numbers, state, out, speeds)
+            here = lanes[: min(RUNS, runs - first)]
+            shown[here] = out.T[: here.size]
+            if start is not None:
+                start[here] = state.T[: here.size]
+        return shown
+
+
+def gaussian(width: float) -> Array:
+    """Return a Gaussian of that width in samples, to three widths either side."""
+    reach = int(3.0 * width)
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    return np.asarray(taps / taps.sum())
+
+
+def smoothed(values: Array, rate: float) -> Array:
+    """Return the slow part of a signal (n,): the ringing taken out, its ends held."""
+    taps = gaussian(SLOW_WIDTH * rate)
+    return np.convolve(np.pad(values, taps.size // 2, mode="edge"), taps, "valid")
