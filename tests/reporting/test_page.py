@@ -8,13 +8,13 @@ from base64 import b64decode, b64encode
 from dataclasses import replace
 from hashlib import sha256
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
 from sealscope.errors import InputError
+from sealscope.parameters import load_rig
 from sealscope.recordings.quality import Finding
 from sealscope.reporting import Mark, render_page, write_page
 
@@ -162,12 +162,14 @@ def test_counts_stay_counts(recording, make_diagnosis):
     assert np.nanmax(drawn(chart["series"][0])) == pytest.approx(counts["p_A"].max(), rel=1e-6)
 
 
-def test_names_that_try_to_be_markup_are_text(recording, make_diagnosis):
+def test_names_that_try_to_be_markup_are_text(recording, make_diagnosis, tmp_path):
     bad = Finding(EVIL, "warning", EVIL, 1, 0.0, EVIL)
     method = Evidence("leak", EVIL, 1.0, 2.0, detector=EVIL)
     hostile = replace(recording, provenance={EVIL: EVIL, "deep": {"er": [EVIL]}}, history=(EVIL,))
     diagnosis = make_diagnosis(file=EVIL, reason=EVIL, quality=(bad,), parts=(method,))
-    read = Reader(render_page(hostile, diagnosis, marks=[Mark(1.0, EVIL)], rig=SimpleNamespace(title=EVIL)))
+    file = tmp_path / "evil.toml"
+    file.write_text(f"[rig]\nextends = 'thesis'\ntitle = '{EVIL}'\n", encoding="utf-8")
+    read = Reader(render_page(hostile, diagnosis, marks=[Mark(1.0, EVIL)], rig=file))
     assert len(read.scripts) == 3 and read.handlers == []
     assert read.text.count(EVIL) > 5  # in full and as it is: not run, not filled in
     assert chart_data(read)["marks"][0]["label"] == EVIL and "<" not in read.scripts[0]
@@ -218,18 +220,11 @@ def test_the_schematic_highlights_the_leak_path_only_for_a_leak(recording, make_
 def test_the_schematic_tells_recorded_sensors_from_others_and_shows_the_rigs_values(recording, make_diagnosis):
     page = render_page(recording.only(["p_A"]), make_diagnosis())
     assert "in chamber A, p_A, in this recording" in page and "in chamber B, p_B, not in this recording" in page
-    rig = SimpleNamespace(
-        title="bench 4", cylinder=SimpleNamespace(A_A=633e-6, A_B=500e-6, L=0.6), pump=SimpleNamespace(q_b=4.9e-6)
-    )
+    rig = load_rig("thesis").with_overrides({"cylinder.A_B": 500e-6})
     text = Reader(render_page(recording, make_diagnosis(), rig=rig)).text
-    for value in ("633 mm²", "500 mm²", "600 mm", "4.9 cm³/rev", "Values: bench 4."):
+    for value in ("633 mm²", "500 mm²", "600 mm", "4.9 cm³/rev", f"Values: {rig.title}."):
         assert value in text
-
-
-def test_the_packaged_rig_labels_the_schematic(recording, make_diagnosis):
-    rig = pytest.importorskip("sealscope.parameters").load_rig("thesis")
-    text = Reader(render_page(recording, make_diagnosis(), rig=rig)).text
-    assert "633 mm²" in text and "4.9 cm³/rev" in text
+    assert "4.9 cm³/rev" in Reader(render_page(recording, make_diagnosis(), rig="thesis")).text
 
 
 def test_three_minutes_at_500_hz_stay_under_two_megabytes(make_recording, make_diagnosis):
@@ -261,8 +256,16 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path, recording, make_diagnos
 
 
 def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path, recording, make_diagnosis):
-    with pytest.raises(InputError, match=r"page must go to a folder .*absent"):
+    with pytest.raises(InputError, match=r"^cannot write .*absent.*No such file or directory"):
         write_page(tmp_path / "absent" / "page.html", recording, make_diagnosis())
+
+
+@pytest.mark.parametrize("name", ["page.pdf", "page.PNG", "page.html.gz", "page"])
+def test_a_page_is_an_html_file_and_nothing_else(tmp_path, recording, make_diagnosis, name):
+    with pytest.raises(InputError, match=rf"^a page must be a file \.html or \.htm, got .*{name}$"):
+        write_page(tmp_path / name, recording, make_diagnosis())
+    assert list(tmp_path.iterdir()) == []
+    assert write_page(tmp_path / "page.HTM", recording, make_diagnosis()).is_file()
 
 
 def test_a_mark_must_stand_at_a_time():

@@ -154,6 +154,7 @@ def report(
 ) -> None:
     """Diagnose each file and write a self-contained HTML page of it."""
     from sealscope.reporting import write_page
+    from sealscope.reporting.template import check_page
 
     several = len(files) > 1 or output.is_dir()
     read_too = {path.resolve() for path in (*files, *(baseline or ()))}
@@ -168,7 +169,7 @@ def report(
     if several:
         make_folder(output)
     else:
-        check_folder(output)
+        check_folder(check_page(output))
     complete = True
     assumed = assumed_rig(rig)
     for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed):

@@ -1,16 +1,16 @@
-"""What a person reads of a diagnosis: the page and the terminal text (names only, loaded when first used)."""
+"""Pages and texts of diagnoses, campaigns and the reproduced thesis (names only, loaded when first used)."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sealscope.reporting.contract import Mark
+    from sealscope.reporting.charts import Mark
+    from sealscope.reporting.messages import diagnosis_text
     from sealscope.reporting.page import render_page, write_page
-    from sealscope.reporting.text import diagnosis_text
 
 __all__ = ["Mark", "diagnosis_text", "render_page", "write_page"]
 
-_HOMES = {"Mark": "contract", "diagnosis_text": "text", "render_page": "page", "write_page": "page"}
+_HOMES = {"Mark": "charts", "diagnosis_text": "messages", "render_page": "page", "write_page": "page"}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,22 +1,19 @@
-"""The charts of the page: what each shows, in which unit and how drawn: data for the script, and still pictures."""
+"""Charts of the page: what each shows, in which unit, as data for the script and as a still picture."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError
-from sealscope.recordings.recording import COUNTS, Recording
-from sealscope.reporting.contract import Mark
+from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
-from sealscope.reporting.series import Base, coded, coded_times, time_base
-
-Array = NDArray[np.float64]
+from sealscope.reporting.series import TimeBase, coded, coded_times, time_base
 
 SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
@@ -40,7 +37,24 @@ _SHOWN = {
 
 
 @dataclass(frozen=True)
-class Series:
+class Mark:
+    """A moment to see on every chart: `t` [s] on the recording's own time axis, and its label.
+
+    `known=True` says that the moment is known from elsewhere (the leak was put in on purpose); it is drawn apart from
+    the onset of the diagnosis. Raises InputError when `t` is not finite.
+    """
+
+    t: float
+    label: str
+    known: bool = False
+
+    def __post_init__(self) -> None:
+        if not isfinite(self.t):
+            raise InputError(f"time of the mark {self.label!r} must be finite, got {self.t}")
+
+
+@dataclass(frozen=True)
+class ChartLine:
     """One line of a chart: its label, the style's name in the style sheet, and its values in the chart's unit."""
 
     label: str
@@ -50,22 +64,24 @@ class Series:
 
 @dataclass(frozen=True)
 class Chart:
-    """One chart; `base` names the time axis its series share (all samples, the centres of the RMS windows, or the
-    instants of the leak's course); `band`: whether the second and third series are the ends of the first one's
-    interval."""
+    """One chart.
+
+    `base`: the time axis of its lines (all samples, the centres of the RMS windows, or the instants of the leak's
+    course); `band`: whether the second and third lines are the ends of the first one's interval.
+    """
 
     key: str
     group: str
     title: str
     unit: str
-    series: tuple[Series, ...]
+    lines: tuple[ChartLine, ...]
     base: str = SAMPLES
     height: int = 150
     band: bool = False
 
 
 def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
-    """The unit in which a channel is shown, and how many of the channel's own units it holds.
+    """Return the unit in which a channel is shown, and how many of the channel's own units it holds.
 
     Raises InputError for an unknown pressure unit.
     """
@@ -79,9 +95,22 @@ def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[
     return _SHOWN.get(unit, (unit, 1.0))
 
 
+def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
+    """Return the unit in which a detail of a channel is shown (squared for d3d4), and its size in the channel's own."""
+    shown, size = shown_unit(unit, pressure_unit, detail=True)
+    return (f"{shown}²", size**2) if name == PRODUCT else (shown, size)
+
+
+def label_of(name: str) -> str:
+    """Return a detail's name as it is shown."""
+    return "d3·d4" if name == PRODUCT else name
+
+
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """The charts of the recorded channels, those of one kind and unit together; one without samples is left out."""
-    plan = [
+    """Return the charts of the recorded channels, those of one kind and unit together, channels without samples left
+    out.
+    """
+    kinds = [
         ("u", "Command", (("u", "a"),)),
         ("x", "Piston position", (("x", "a"),)),
         ("omega", "Motor speed", (("omega", "a"),)),
@@ -90,15 +119,15 @@ def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
         ("q_leak", "Flow meter in the bypass", (("q_leak", "a"),)),
     ]
     charts = []
-    for key, title, members in plan:
-        units: dict[str, list[Series]] = {}
+    for key, title, members in kinds:
+        units: dict[str, list[ChartLine]] = {}
         for name, style in members:
             if name in recording and np.isfinite(recording[name]).any():
                 unit, size = shown_unit(recording.units[name], pressure_unit)
-                units.setdefault(unit, []).append(Series(name, style, recording[name] / size))
-        for i, (unit, series) in enumerate(units.items()):
+                units.setdefault(unit, []).append(ChartLine(name, style, recording[name] / size))
+        for i, (unit, lines) in enumerate(units.items()):
             height = 210 if key == "p_AB" else 140
-            charts.append(Chart(f"{key}-{i}", "channels", title, unit, tuple(series), height=height))
+            charts.append(Chart(f"{key}-{i}", "channels", title, unit, tuple(lines), height=height))
     return charts
 
 
@@ -107,22 +136,19 @@ def _axis(channel: str) -> str:
 
 
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Windowed RMS: d1..d4 of each chamber, and d3d4 of each."""
+    """Return the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
     charts = []
-    for chamber in chambers:
-        if not chamber.window_t.size:
-            continue
-        unit, size = shown_unit(chamber.unit, pressure_unit, detail=True)
+    windowed = [chamber for chamber in chambers if chamber.window_t.size]
+    for chamber in windowed:
         name = chamber.channel
-        lines = tuple(Series(d, d, chamber.window_rms[d] / size) for d in NAMES if d != PRODUCT)
+        unit, size = detail_unit(chamber.unit, "d1", pressure_unit)
+        lines = tuple(ChartLine(d, d, chamber.window_rms[d] / size) for d in NAMES if d != PRODUCT)
         charts.append(Chart(f"rms-{name}", "rms", f"RMS of the details of {name}", unit, lines, _axis(name), 230))
-    for chamber in chambers:
-        if chamber.window_t.size:
-            unit, size = shown_unit(chamber.unit, pressure_unit, detail=True)
-            name = chamber.channel
-            line = Series("d3·d4", "d3d4", chamber.window_rms[PRODUCT] / size**2)
-            title = f"RMS of d3·d4 of {name}"
-            charts.append(Chart(f"rms-{name}-d3d4", "rms", title, f"{unit}²", (line,), _axis(name), 150))
+    for chamber in windowed:
+        name, label = chamber.channel, label_of(PRODUCT)
+        unit, size = detail_unit(chamber.unit, PRODUCT, pressure_unit)
+        line = ChartLine(label, PRODUCT, chamber.window_rms[PRODUCT] / size)
+        charts.append(Chart(f"rms-{name}-d3d4", "rms", f"RMS of {label} of {name}", unit, (line,), _axis(name), 150))
     return charts
 
 
@@ -130,36 +156,34 @@ COURSE = "course"
 
 
 def course_charts(course: LeakCourse | None) -> list[Chart]:
-    """The leak over the recording with its interval, where a detector follows it."""
+    """Return the chart of the leak over the recording with its interval, where a detector follows it."""
     if course is None or not np.isfinite(course.lpm).any():
         return []
-    ends = [np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high)]
-    lines = (Series("leak", "a", course.lpm), Series("95 %: low", "d1", ends[0]), Series("95 %: high", "d1", ends[1]))
+    low, high = (np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high))
+    lines = (ChartLine("leak", "a", course.lpm), ChartLine("95 %: low", "d1", low), ChartLine("95 %: high", "d1", high))
     return [Chart(COURSE, COURSE, "Leak past the piston", "L/min", lines, COURSE, 190, band=True)]
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """The details themselves, one chart each, the chambers side by side."""
+    """Return the charts of the details themselves, one each, the chambers side by side."""
     charts = []
     for d in NAMES:
         for chamber in chambers:
-            unit, size = shown_unit(chamber.unit, pressure_unit, detail=True)
-            size, unit = (size**2, f"{unit}²") if d == PRODUCT else (size, unit)
-            label = "d3·d4" if d == PRODUCT else d
+            unit, size = detail_unit(chamber.unit, d, pressure_unit)
             style = "b" if chamber.channel == "p_B" else "a"
-            line = Series(label, style, chamber.values[d] / size)
-            title = f"{label} of {chamber.channel}"
+            line = ChartLine(label_of(d), style, chamber.values[d] / size)
+            title = f"{label_of(d)} of {chamber.channel}"
             charts.append(Chart(f"{d}-{chamber.channel}", "details", title, unit, (line,), height=130))
     return charts
 
 
 @dataclass(frozen=True)
-class Drawing:
+class DrawnCharts:
     """All charts: `data` for the script (plain JSON values), `still` by chart key for the template, and their base."""
 
     data: dict[str, Any]
     still: dict[str, dict[str, Any]]
-    base: Base
+    base: TimeBase
 
 
 def draw(
@@ -168,13 +192,13 @@ def draw(
     charts: list[Chart],
     diagnosis: Diagnosis,
     marks: list[Mark],
-) -> Drawing:
-    """Decimate and code every chart's series, and lay out the still picture of each.
+) -> DrawnCharts:
+    """Decimate and code every chart's lines, and lay out the still picture of each.
 
     Peaks are kept: each bucket contributes its least and its greatest sample.
     """
     middle = float(recording.t[len(recording) // 2])
-    near = diagnosis.onset_s if diagnosis.onset_s is not None and np.isfinite(diagnosis.onset_s) else middle
+    near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
     base = time_base(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
     few = time_base(recording.t, recording.rate, STILL_POINTS)
     span = (float(base.t[0]), float(base.t[-1]))
@@ -193,7 +217,6 @@ def draw(
     still = {}
     for chart in charts:
         sampled = chart.base == SAMPLES
-        lines = [base.reduce(s.values) if sampled else s.values for s in chart.series]
         data["charts"].append(
             {
                 "key": chart.key,
@@ -203,29 +226,30 @@ def draw(
                 "height": chart.height,
                 "band": chart.band,
                 "series": [
-                    {"label": s.label, "style": s.style} | coded(line)
-                    for s, line in zip(chart.series, lines, strict=True)
+                    {"label": line.label, "style": line.style}
+                    | coded(base.reduce(line.values) if sampled else line.values)
+                    for line in chart.lines
                 ],
             }
         )
-        few_lines = [few.reduce(s.values) if sampled else s.values for s in chart.series]
-        still[chart.key] = still_chart(chart, few.t if sampled else axes[chart.base], few_lines, span)
-    return Drawing(data, still, base)
+        points = [few.reduce(line.values) if sampled else line.values for line in chart.lines]
+        still[chart.key] = still_chart(chart, few.t if sampled else axes[chart.base], points, span)
+    return DrawnCharts(data, still, base)
 
 
 def onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """The onset and its interval [s] as drawn: an end that lies outside the recording, or is unbounded, is cut."""
+    """Return the onset and its interval [s] as drawn: an end outside the recording, or unbounded, is cut."""
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
-    if onset is None or not np.isfinite(onset):
+    if onset is None or not isfinite(onset):
         return None, None
-    if interval is None or np.isnan(interval[0]) or np.isnan(interval[1]):
+    if interval is None or np.isnan(interval).any():
         return float(onset), None
     low, high = (float(np.clip(end, *span)) for end in interval)
     return float(onset), (low, high)
 
 
 def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, float]) -> dict[str, Any]:
-    """Paths, ticks and scales of the still picture, in a box 860 wide and `chart.height` high."""
+    """Return paths, ticks and scales of the still picture, in a box 860 wide and `chart.height` high."""
     width, height = 860.0, float(chart.height)
     stacked = np.concatenate(lines)
     finite = stacked[np.isfinite(stacked)]
@@ -240,12 +264,12 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
         return (seconds - start) / (stop - start) * width
 
     paths = []
-    for series, line in zip(chart.series, lines, strict=True):
+    for drawn_line, line in zip(chart.lines, lines, strict=True):
         drawn = np.isfinite(line)
         pen = drawn & ~np.append(False, drawn[:-1])
         points = zip(pen[drawn], across(t)[drawn], height * (high - line[drawn]) / (high - low), strict=True)
         steps = [f"{'M' if begins else 'L'}{x:.0f} {y:.0f}" for begins, x, y in points]
-        paths.append({"label": series.label, "style": series.style, "d": "".join(steps)})
+        paths.append({"label": drawn_line.label, "style": drawn_line.style, "d": "".join(steps)})
     band = ""
     if chart.band:
         there = np.isfinite(lines[1]) & np.isfinite(lines[2])
@@ -265,7 +289,7 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
 
 
 def ticks(low: float, high: float, about: int) -> list[float]:
-    """Round values (1, 2 or 5 times a power of ten apart) between low and high, about as many as asked."""
+    """Return round values (1, 2 or 5 times a power of ten apart) between low and high, `about` so many."""
     raw = (high - low) / about
     power = 10.0 ** np.floor(np.log10(raw))
     step = float(next(m for m in (1, 2, 5, 10) if m * power >= raw * 0.999) * power)

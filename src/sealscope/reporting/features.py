@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.quality import uniform_segments
+from sealscope.recordings.recording import Array, Recording
 from sealscope.reporting.series import ordered_time
-
-Array = NDArray[np.float64]
+from sealscope.signals.details import details, shortest
+from sealscope.signals.windows import rms, windowed_rms
 
 LEVELS = 4
 PRODUCT = "d3d4"
@@ -38,7 +38,7 @@ class ChamberDetails:
 
 
 @dataclass(frozen=True)
-class Change:
+class DetailChange:
     """RMS of one detail before and after, in the channel's unit (d3d4: its square); `percent` as in the thesis."""
 
     channel: str
@@ -59,10 +59,6 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
 
     Raises nothing for bad data: the reason is returned in words, with None.
     """
-    from sealscope.recordings.quality import uniform_segments
-    from sealscope.signals.details import details, shortest
-    from sealscope.signals.windows import windowed_rms
-
     if channel not in recording:
         return None, f"{channel} is not in this recording."
     n, series = len(recording), recording[channel]
@@ -146,19 +142,17 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
     return Parts(middle, middle, ("First half", "Second half"), text)
 
 
-def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[Change]:
+def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[DetailChange]:
     """RMS in the first and the second part for each detail of each chamber; None where a part has no samples."""
     t = ordered_time(recording.t, recording.rate)[0]
     early, late = t < parts.end, t >= parts.start
     return [
-        Change(chamber.channel, name, _rms(values[early]), _rms(values[late]))
+        DetailChange(chamber.channel, name, _rms(values[early]), _rms(values[late]))
         for chamber in chambers
         for name, values in chamber.values.items()
     ]
 
 
 def _rms(values: Array) -> float | None:
-    from sealscope.signals.windows import rms
-
     finite = values[np.isfinite(values)]
     return float(rms(finite)) if finite.size else None

@@ -1,8 +1,9 @@
-"""The diagnosis in words an engineer can act on; the one home of these sentences for page and terminal."""
+"""Sentences on a diagnosis for page and terminal, and the terminal text."""
 
 from __future__ import annotations
 
 from math import floor, isfinite, isnan, log10
+from textwrap import fill
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS
@@ -151,3 +152,45 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
             steps.append(f"Findings on the data: {faults}.")
         steps.append("Record p_A and p_B at 500 Hz or more for some minutes under one command, or give a baseline.")
     return tuple(steps)
+
+
+def quality_summary(diagnosis: Diagnosis) -> str:
+    """Return how many findings there are, and the worst severity among them."""
+    count = len(diagnosis.quality)
+    severities = {finding.severity for finding in diagnosis.quality}
+    worst = next((f" ({severity})" for severity in ("fatal", "warning") if severity in severities), "")
+    return f"{count} finding{'s' if count != 1 else ''}{worst},"
+
+
+def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
+    """Return the verdict and its figures as plain text of a few lines, the first being `FILE: verdict`.
+
+    `width`: columns [1]. Without colours, and without control characters that a file name or header could bring.
+    """
+    lines = [f"{_printable(diagnosis.file)}: {diagnosis.verdict}"]
+    rows = [
+        ("since", since(diagnosis)),
+        ("how much", how_much(diagnosis)),
+        ("cause", cause(diagnosis)),
+        ("how sure", how_sure(diagnosis)),
+        ("reason", diagnosis.reason or None),
+    ]
+    lines += [_row(label, text, width) for label, text in rows if text]
+    for method in diagnosis.methods:
+        figures = f"{method.verdict} (score {number(method.score)}, threshold {number(method.threshold)})"
+        if method.score is None and method.reason:
+            figures = f"{method.verdict} ({method.reason})"
+        lines.append(_row("method", f"{method.detector}: {figures}", width))
+    lines += [_row(finding.severity, finding.text, width) for finding in diagnosis.quality]
+    lines += [_row("next" if i == 0 else "", step, width) for i, step in enumerate(next_steps(diagnosis)[:2])]
+    return "\n".join(lines)
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def _row(label: str, text: str, width: int) -> str:
+    return fill(
+        _printable(text), width, initial_indent=f"  {label:<10}", subsequent_indent=" " * 12, break_on_hyphens=False
+    )

@@ -1,4 +1,4 @@
-"""Samples made fit to draw: min-max decimation that keeps every peak, and the compact coding for the page."""
+"""Decimation of samples for drawing, which keeps every peak, and their compact coding for the page."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from sealscope.recordings.recording import Array
 
 _GAP = 5.0  # a step this many times the nominal one breaks the drawn line
 _MISSING = -32768
 
 
 @dataclass(frozen=True)
-class Base:
-    """The points of time at which all series of one recording are drawn.
+class TimeBase:
+    """Points of time at which all series of one recording are drawn.
 
     `t`: (m,) [s], never decreasing; `starts`, `stops`: (k,) first sample of each bucket and the one after its last;
     `width`: samples in a full bucket (1: every sample is drawn); `fine`: the samples drawn one by one whatever the
@@ -34,7 +34,7 @@ class Base:
     by_sample: bool
 
     def reduce(self, values: Array) -> Array:
-        """The least and the greatest value of each bucket, (n,) -> (m,), in the order in which they are met.
+        """Return the least and the greatest value of each bucket, (n,) -> (m,), in the order of their samples.
 
         A bucket of one sample gives one point. NaN where a bucket holds no finite sample and at each gap: no line is
         drawn there.
@@ -48,23 +48,23 @@ class Base:
 
 
 def _paired(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
-    """Both points of each bucket in turn, the second left out where the bucket is one sample."""
+    """Return both points of each bucket in turn, the second left out where the bucket is one sample."""
     both = np.stack([first, second], axis=1)
     kept = np.stack([np.ones(sizes.size, dtype=bool), sizes > 1], axis=1)
     return np.asarray(both[kept])
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
-    """The time stamps (n,) [s], or, and True, the samples' numbers over the rate where the stamps do not increase."""
+    """Return the time stamps (n,) [s], or the samples' numbers over the rate and True where they do not increase."""
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
 
 
-def time_base(t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0) -> Base:
-    """The drawing base of n samples with about `points` points, and every sample drawn round the time `near` [s].
+def time_base(t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0) -> TimeBase:
+    """Return the drawing base of n samples with about `points` points, and every sample near the time `near` [s].
 
     `t`: (n,) [s]; `rate`: nominal rate [Hz]; `near_samples`: how many samples are drawn one by one there. Buckets hold
-    an equal count of samples; a drawn extreme stands at most one bucket away from its true time.
+    an equal count of samples; a drawn extreme lies at most one bucket away from its true time.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
@@ -82,11 +82,11 @@ def time_base(t: Array, rate: float, points: int, *, near: float | None = None, 
     before = np.append(0, np.cumsum(np.where(sizes > 1, 2, 1)))  # points drawn ahead of each bucket
     breaks = before[np.searchsorted(starts, gaps)]
     drawn = np.insert(_paired(t[starts], t[stops - 1], sizes), breaks, t[gaps - 1])
-    return Base(drawn, starts, stops, width, fine, breaks, by_sample)
+    return TimeBase(drawn, starts, stops, width, fine, breaks, by_sample)
 
 
 def coded(values: Array) -> dict[str, Any]:
-    """The values on a grid of 65 534 steps between their extremes, as base64 of 16-bit integers (NaN: -32768).
+    """Return the values on a grid of 65 534 steps between their extremes, as base64 of 16-bit integers (NaN: -32768).
 
     Decoded as `low + (q + 32767) * step`; the extremes themselves are exact to rounding.
     """
@@ -102,5 +102,5 @@ def coded(values: Array) -> dict[str, Any]:
 
 
 def coded_times(t: Array) -> str:
-    """The times as base64 of little-endian doubles [s]."""
+    """Return the times as base64 of little-endian doubles [s]."""
     return b64encode(np.ascontiguousarray(t, dtype="<f8").tobytes()).decode()

@@ -20,10 +20,9 @@ from sealscope.diagnosis.calibration.scorers import SCORERS
 from sealscope.diagnosis.registry import detectors
 from sealscope.evaluation.roc import Area
 from sealscope.evaluation.table import SummaryRow
-from sealscope.recordings.atomic import atomic_write
+from sealscope.reporting import template
 from sealscope.reporting.campaign.curves import CurvePlot, PlotCurve, draw
 from sealscope.reporting.campaign.tables import cause_tables, flow_lines, onset_lines, percent
-from sealscope.reporting.page import _packaged, _version
 
 PAGE = "report.html"
 #: More sizes than this are shown together: a column for each could not be read.
@@ -218,25 +217,14 @@ def write_campaign_page(result: CampaignResult, path: Path, files: Sequence[str]
 
     Raises InputError where it cannot be written.
     """
-    text = render_campaign_page(result, files)
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return path
+    return template.write(path, render_campaign_page(result, files))
 
 
 def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> str:
     """Return the page as text, with nothing outside it but links to the tables beside it."""
-    import jinja2
-    from markupsafe import Markup
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sealscope.reporting"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-    )
     judgement = result.judgement
-    return environment.get_template("campaign.html.j2").render(
+    return template.render(
+        "campaign.html.j2",
         title=result.plan.title,
         name=result.plan.name,
         heads=_heads(result),
@@ -258,9 +246,7 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
         ],
         failed_count=len(judgement.failed),
         files=list(files),
-        version=_version(),
-        page_css=Markup(_packaged("templates/page.css")),
-        campaign_css=Markup(_packaged("templates/campaign.css")),
+        campaign_css=template.packaged("templates/campaign.css"),
     )
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from sealscope.recordings.atomic import atomic_write
-from sealscope.reporting.page import _hash, _packaged, _version
+from sealscope.reporting import template
 from sealscope.reporting.thesis.plot_style import caption
 from sealscope.reporting.thesis.plots import UNRESOLVED
 from sealscope.thesis.engine.items import Entry
@@ -54,9 +53,7 @@ def write_thesis_page(
     written.
     """
     target = folder / "index.html"
-    with atomic_write(target) as temporary:
-        temporary.write_text(render_thesis_page(folder, shown, quick=quick, sheet=sheet), encoding="utf-8")
-    return target
+    return template.write(target, render_thesis_page(folder, shown, quick=quick, sheet=sheet))
 
 
 def render_thesis_page(
@@ -67,8 +64,6 @@ def render_thesis_page(
     sheet: bool = False,
 ) -> str:
     """The page as text, with nothing outside it but links to the files beside it."""
-    import jinja2
-    from markupsafe import Markup
 
     entries: list[Entry] = []
     found: list[tuple[Entry, Figure | Table, str]] = []
@@ -84,19 +79,14 @@ def render_thesis_page(
     by_chapter: dict[int, list[Shown]] = {}
     for entry, product, picture in found:
         by_chapter.setdefault(entry.item.chapter, []).append(_shown(entry, product, picture, claims))
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sealscope.reporting"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-    )
-    script = _packaged("templates/thesis.js")
+    script = template.packaged("templates/thesis.js")
     absent = [entry for entry in entries if not entry.there]
     bearing: dict[str, list[str]] = {}
     for _, product, _ in found:
         for name in product.claims:
             bearing.setdefault(name, []).append(product.id)
-    return environment.get_template("thesis.html.j2").render(
+    return template.render(
+        "thesis.html.j2",
         thesis=THESIS,
         chapters=[(number, CHAPTERS.get(number, f"Chapter {number}"), some) for number, some in by_chapter.items()],
         claims=list(claims.values()),
@@ -114,11 +104,9 @@ def render_thesis_page(
         cell=cell,
         is_number=_is_number,
         long_table=_LONG_TABLE,
-        version=_version(),
-        page_css=Markup(_packaged("templates/page.css")),
-        thesis_css=Markup(_packaged("templates/thesis.css")),
-        script=Markup(script),
-        script_hash=Markup(_hash(script)),
+        thesis_css=template.packaged("templates/thesis.css"),
+        script=script,
+        script_hash=template.script_hash(script),
     )
 
 

@@ -1,0 +1,73 @@
+"""Rendering and writing of the pages: each is one HTML file with nothing outside it."""
+
+from __future__ import annotations
+
+import os
+from base64 import b64encode
+from functools import cache
+from hashlib import sha256
+from importlib import metadata, resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sealscope.errors import InputError
+from sealscope.recordings.atomic import atomic_write
+
+if TYPE_CHECKING:
+    import jinja2
+    from markupsafe import Markup
+
+_SUFFIXES = (".html", ".htm")
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    import jinja2
+
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("sealscope.reporting"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+
+
+def render(template: str, **context: Any) -> str:
+    """Return a template of this room filled in; beside `context` it sees `version` and `page_css`."""
+    page_css = packaged("templates/page.css")
+    return _environment().get_template(template).render(context, version=_version(), page_css=page_css)
+
+
+def packaged(name: str) -> Markup:
+    """Return a file of this room that goes into a page as it is."""
+    from markupsafe import Markup
+
+    return Markup((resources.files("sealscope.reporting") / name).read_text(encoding="utf-8"))
+
+
+def script_hash(code: str) -> Markup:
+    """Return the source of a script as a content security policy names it."""
+    from markupsafe import Markup
+
+    return Markup(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'")
+
+
+def check_page(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a page to write; raises InputError for another kind of file."""
+    if Path(path).suffix.lower() not in _SUFFIXES:
+        raise InputError(f"a page must be a file {' or '.join(_SUFFIXES)}, got {os.fspath(path)}")
+    return Path(path)
+
+
+def write(path: str | os.PathLike[str], page: str) -> Path:
+    """Write a page as UTF-8, whole or not at all; raises InputError where it cannot be written."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, encoding="utf-8", newline="\n")
+    return Path(path)
+
+
+def _version() -> str:
+    try:
+        return metadata.version("sealscope")
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
