@@ -180,7 +180,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
             missed = f"{counted(holes.samples, 'sample')} missing in {counted(holes.runs, 'stretch')}"
             text = f"{missed}, the longest {holes.longest / rate:g} s"
             add("missing", "warning", holes.samples, holes.first, text)
-    extreme = infinite(values)
+    extreme = np.flatnonzero(np.isinf(values))
     if extreme.size:
         add("infinite", "warning", extreme.size, int(extreme[0]), f"{counted(extreme.size, 'infinite sample')}")
     present = np.flatnonzero(np.isfinite(values))
@@ -279,11 +279,6 @@ def missing(values: Array) -> Holes | None:
         if usual >= 2 and np.mean(spacing == usual) > 0.95:
             every = usual
     return Holes(int(absent.sum()), int(runs[0, 0]), len(runs), int(runs[:, 1].max()), every)
-
-
-def infinite(values: Array) -> NDArray[np.intp]:
-    """Return the indices of infinite samples."""
-    return np.flatnonzero(np.isinf(values))
 
 
 def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = True) -> list[Rail]:

@@ -23,7 +23,7 @@ FORMAT_VERSION = 1
 Choose = Callable[[Sequence[Label]], ColumnMap]
 
 
-class Samples(NamedTuple):
+class RecordingFields(NamedTuple):
     """What a recording is made of, in the order of its arguments."""
 
     t: Array
@@ -48,7 +48,7 @@ class RawTable:
     description: Mapping[str, Any] | None = None
     notes: tuple[str, ...] = ()
 
-    def samples(self, source: Mapping[str, Any], *, rate: float | None, infer_rate: bool) -> Samples:
+    def samples(self, source: Mapping[str, Any], *, rate: float | None, infer_rate: bool) -> RecordingFields:
         """Convert to SI. `source`: begins the provenance of a foreign table; `rate` [Hz]: where there is no time.
 
         `infer_rate`: from the time, although the description has one. Raises InputError.
@@ -74,8 +74,8 @@ class RawTable:
             t, rate, start, more = time_base(self.columns[-1], label.unit, label.whole)
             notes += more
         if own is not None:
-            return Samples(t, channels, units, rate, own["provenance"], (*own["history"], *notes))
-        return Samples(t, channels, units, rate, {**source, "format": self.kind, **start}, notes)
+            return RecordingFields(t, channels, units, rate, own["provenance"], (*own["history"], *notes))
+        return RecordingFields(t, channels, units, rate, {**source, "format": self.kind, **start}, notes)
 
 
 def check_size(rows: int, columns: int, place: str) -> None:
@@ -118,12 +118,12 @@ def _plain(value: Any) -> Any:
 def parse_description(text: str | bytes, place: str) -> dict[str, Any]:
     """Parse the JSON text of a `description_of`; raise UnreadableFile where it is damaged."""
     try:
-        found = json.loads(text)
+        parsed = json.loads(text)
         description: dict[str, Any] = {
-            "rate": float(found["rate"]),
-            "provenance": dict(found["provenance"]),
-            "history": [str(line) for line in found["history"]],
-            "format": int(found["format"]),
+            "rate": float(parsed["rate"]),
+            "provenance": dict(parsed["provenance"]),
+            "history": [str(line) for line in parsed["history"]],
+            "format": int(parsed["format"]),
         }
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise UnreadableFile(f"the recording's description must be whole, got damaged JSON ({place})") from error
