@@ -7,12 +7,11 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c import simulated_sheet
+from sealscope.thesis.chapters.appendix_c import simulation
 from sealscope.thesis.chapters.appendix_c import tables as appendix_c
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import QUANTITIES, Drift, drift_of, log_change, sheet_of
-from sealscope.thesis.conditions import APPENDIX_C
-from sealscope.thesis.engine.products import Product, Table
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.chapters.appendix_c.simulation import RigDrift, drift_of, sheet_of
+from sealscope.thesis.engine.products import Product, ResultTable
+from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
 
 TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
 
@@ -22,7 +21,7 @@ class Made:
 
     quick = True
 
-    def __init__(self, products: dict[str, tuple[Product, ...]], sheet: Sheet | None) -> None:
+    def __init__(self, products: dict[str, tuple[Product, ...]], sheet: DataSheet | None) -> None:
         self.products, self.sheet = products, sheet
 
     def product(self, item: str) -> tuple[Product, ...]:
@@ -33,10 +32,10 @@ class Made:
 
 
 @pytest.fixture(scope="module")
-def tables() -> dict[str, tuple[Table, ...]]:
+def tables() -> dict[str, tuple[ResultTable, ...]]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulated_sheet, "APPENDIX_C", TWO)
-        patch.setattr(simulated_sheet, "QUICK_HALF", 20.0)
+        patch.setattr(simulation, "APPENDIX_C", TWO)
+        patch.setattr(simulation, "QUICK_HALF", 20.0)
         context = Made({}, None)
         items = {item.id: item for item in appendix_c.ITEMS}
         makers = {
@@ -47,7 +46,7 @@ def tables() -> dict[str, tuple[Table, ...]]:
         return {name: make(context, items[name]) for name, make in makers.items()}  # type: ignore[arg-type]
 
 
-def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[Table, ...]]) -> None:
+def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[ResultTable, ...]]) -> None:
     (table,) = tables["appendix-c-leak"]
     sheet = sheet_of(table)
     row = dict(zip(table.columns, table.rows[2], strict=True))
@@ -57,26 +56,28 @@ def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[Table,
     assert sheet.rms["p_A"]["d3d4"][2, 1] == row["p_A d3d4 leak [psi^2]"]
 
 
-def test_the_same_condition_gives_the_same_truth_and_other_noise(tables: dict[str, tuple[Table, ...]]) -> None:
+def test_the_same_condition_gives_the_same_truth_and_other_noise(tables: dict[str, tuple[ResultTable, ...]]) -> None:
     sheet = sheet_of(tables["appendix-c-no-leak"][0])
     first, second = (sheet.rms["p_A"]["d1"][k] for k in (0, 1))
     assert np.all(first != second)
     np.testing.assert_allclose(first, second, rtol=0.05)
-    ranges = simulated_sheet.column(tables["appendix-c-no-leak"][0], "p_A range [MPa]")
+    ranges = simulation.column(tables["appendix-c-no-leak"][0], "p_A range [MPa]")
     assert ranges[0] == ranges[1] != ranges[2]
 
 
-def test_nothing_moves_without_a_leak_beyond_the_noise_of_the_estimate(tables: dict[str, tuple[Table, ...]]) -> None:
+def test_nothing_moves_without_a_leak_beyond_the_noise_of_the_estimate(
+    tables: dict[str, tuple[ResultTable, ...]],
+) -> None:
     sheet = sheet_of(tables["appendix-c-no-leak"][0])
     for chamber in CHAMBERS:
-        assert np.abs(log_change(sheet, chamber, "d1")).max() < 0.05  # 7500 samples: deviation about 1 % a difference
-        assert np.abs(log_change(sheet, chamber, "d3")).max() < 0.25
+        assert np.abs(sheet.log_change(chamber, "d1")).max() < 0.05  # 7500 samples: deviation about 1 % a difference
+        assert np.abs(sheet.log_change(chamber, "d3")).max() < 0.25
 
 
-def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[Table, ...]]) -> None:
+def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[ResultTable, ...]]) -> None:
     sheet = sheet_of(tables["appendix-c-drift"][0])
     drawn = [np.log(drift_of(condition.number).noise) for condition in TWO]
-    moved = np.mean([log_change(sheet, chamber, "d1") for chamber in CHAMBERS], axis=0)
+    moved = np.mean([sheet.log_change(chamber, "d1") for chamber in CHAMBERS], axis=0)
     np.testing.assert_allclose(moved, drawn, atol=0.03)  # deviation under 1 % where both chambers are averaged
     assert all("friction x" in str(row[3]) for row in tables["appendix-c-drift"][0].rows)
 
@@ -93,7 +94,7 @@ def test_drifts_keep_within_their_bounds_and_go_both_ways() -> None:
 
 def test_a_drifted_rig_differs_in_friction_bulk_modulus_and_noise_alone() -> None:
     rig = load_rig("thesis")
-    moved = rig.with_overrides(Drift(1.05, 0.97, 1.04).values(rig))
+    moved = rig.with_overrides(RigDrift(1.05, 0.97, 1.04).values(rig))
     before = {row.name: row.value for row in rig.table()}
     ratios = {
         row.name: float(row.value) / float(before[row.name]) for row in moved.table() if row.value != before[row.name]
@@ -106,7 +107,7 @@ def test_a_drifted_rig_differs_in_friction_bulk_modulus_and_noise_alone() -> Non
     )  # fmt: skip
 
 
-def made_sheet(seed: int, shift: float) -> Sheet:
+def made_sheet(seed: int, shift: float) -> DataSheet:
     """41 tests whose every change is `shift` and noise."""
     random = np.random.default_rng(seed)
     rms = {}
@@ -115,12 +116,12 @@ def made_sheet(seed: int, shift: float) -> Sheet:
         for name in QUANTITIES:
             before = np.exp(random.normal(0.5, 0.2, 41))
             rms[chamber][name] = np.column_stack([before, before * np.exp(random.normal(shift, 0.01, 41))])
-    return Sheet(rms)
+    return DataSheet(rms)
 
 
-def full_table(sheet: Sheet, item: str) -> Table:
+def full_table(sheet: DataSheet, item: str) -> ResultTable:
     rows = [
-        simulated_sheet.Row(
+        simulation.SimulatedTest(
             condition,
             {c: {q: (sheet.rms[c][q][k, 0], sheet.rms[c][q][k, 1]) for q in QUANTITIES} for c in CHAMBERS},
             condition.mean_leak_lpm,
@@ -129,13 +130,13 @@ def full_table(sheet: Sheet, item: str) -> Table:
         )
         for k, condition in enumerate(APPENDIX_C)
     ]
-    return simulated_sheet.table_of(rows, item, "made")
+    return simulation.table_of(rows, item, "made")
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["with sheet", "without sheet"])
 def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) -> None:
     measured = made_sheet(1, -0.2)
-    twice = Sheet({c: {q: 2.0 * pairs for q, pairs in of.items()} for c, of in measured.rms.items()})
+    twice = DataSheet({c: {q: 2.0 * pairs for q, pairs in of.items()} for c, of in measured.rms.items()})
     leak = full_table(twice, "appendix-c-leak")
     still = full_table(made_sheet(2, 0.0), "appendix-c-no-leak")
     products: dict[str, tuple[Product, ...]] = {"appendix-c-leak": (leak,), "appendix-c-no-leak": (still,)}
@@ -169,7 +170,7 @@ def test_the_thesis_s_rule_fires_like_a_coin_where_nothing_leaks() -> None:
     leak = sheet_of(appendix_c.leak_table(context, items["appendix-c-leak"])[0])  # type: ignore[arg-type]
     for sheet in (still, drift):  # beyond 9 to 32 one column in 4000 of coins
         for chamber in CHAMBERS:
-            assert 9 <= np.sum(log_change(sheet, chamber, "d1") < 0) <= 32, chamber
-        assert 9 <= np.sum(log_change(sheet, "p_A", "d3") < 0) <= 32
-    assert np.sum(log_change(leak, "p_A", "d3") < 0) >= 35
-    assert log_change(leak, "p_A", "d3").mean() < -5 * abs(log_change(still, "p_A", "d3").mean())
+            assert 9 <= np.sum(sheet.log_change(chamber, "d1") < 0) <= 32, chamber
+        assert 9 <= np.sum(sheet.log_change("p_A", "d3") < 0) <= 32
+    assert np.sum(leak.log_change("p_A", "d3") < 0) >= 35
+    assert leak.log_change("p_A", "d3").mean() < -5 * abs(still.log_change("p_A", "d3").mean())

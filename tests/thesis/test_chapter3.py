@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
-
 import numpy as np
 import pytest
 
 from sealscope.parameters import load_rig
-from sealscope.thesis.chapters.chapter3 import figures as chapter3
-from sealscope.thesis.chapters.chapter3.continuous_wavelet import (
+from sealscope.thesis.chapters import chapter3
+from sealscope.thesis.chapters.chapter3 import (
     continuous_transform,
     inverse_gain,
     scales_for,
     wavelet_centre,
     wavelet_spectrum,
 )
-from sealscope.thesis.claims.judging import verdict_of
+from sealscope.thesis.claims import chapter3 as chapter3_claims
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
-from sealscope.thesis.engine.products import Claim, Figure
-from sealscope.thesis.engine.runs import experiment_of, simulated
+from sealscope.thesis.engine.products import Claim, Figure, verdict_of
+from sealscope.thesis.engine.runs import experiment_of, simulated_run
 
 
 class Kept:
@@ -33,7 +31,7 @@ class Kept:
 
     def run(self, spec: RunSpec) -> SimulatedRun:
         if spec not in self.runs:
-            self.runs[spec] = simulated(spec, experiment_of(spec))
+            self.runs[spec] = simulated_run(spec, experiment_of(spec))
         return self.runs[spec]
 
     def product(self, item: str) -> tuple[Figure | Claim, ...]:
@@ -43,9 +41,8 @@ class Kept:
 @pytest.fixture(scope="module")
 def made() -> dict[str, tuple[Figure | Claim, ...]]:
     context, found = Kept(), {}
-    for item in chapter3.ITEMS:
-        module, name = item.make.split(":")
-        found[item.id] = getattr(importlib.import_module(module), name)(context, item)
+    for item in (*chapter3.ITEMS, *chapter3_claims.ITEMS):
+        found[item.id] = item.make(context, item)
     return found
 
 
@@ -170,8 +167,6 @@ def test_claims_are_judged_by_their_numbers(made: dict) -> None:
 def test_a_pressure_that_drops_makes_claim_3_6_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     from dataclasses import replace
 
-    from sealscope.thesis.claims.chapter3 import claims
-
     class Dropping(Kept):
         def run(self, spec: RunSpec) -> SimulatedRun:
             run = super().run(spec)
@@ -179,7 +174,7 @@ def test_a_pressure_that_drops_makes_claim_3_6_hold(monkeypatch: pytest.MonkeyPa
                 return run
             return replace(run, outputs={name: 0.5 * values for name, values in run.outputs.items()})
 
-    found = {claim.id: claim.verdict for claim in claims(Dropping(), chapter3.ITEMS[-1])}
+    found = {claim.id: claim.verdict for claim in chapter3_claims.claims(Dropping(), chapter3_claims.ITEMS[0])}
     assert found["claim-3.6"] == "holds"
 
 

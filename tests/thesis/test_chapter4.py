@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from dataclasses import fields, replace
 
@@ -16,26 +15,27 @@ from sealscope.thesis.chapters.chapter4.cases import (
     AS_PRINTED,
     CASES,
     OURS,
+    PERIOD,
     READINGS,
     THESIS_STEP,
     Reading,
-    literal,
+    SolverPair,
     mean_difference,
-    pair,
+    numbers_of,
+    piston_drift,
+    run_pair,
     settled,
     span,
     spec,
     visible_pressure,
 )
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold
-from sealscope.thesis.chapters.chapter4.variants import PERIOD, drift, throttled
-from sealscope.thesis.claims.chapter4 import summary as chapter4_claims
-from sealscope.thesis.claims.chapter4.plain import ringing, sine_fit
+from sealscope.thesis.claims import chapter4 as chapter4_claims
+from sealscope.thesis.claims.chapter4 import ringing, sine_fit
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
-from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Claim, Figure, Table
-from sealscope.thesis.engine.registry import check
-from sealscope.thesis.engine.runs import experiment_of, simulated
+from sealscope.thesis.engine.items import Item, check
+from sealscope.thesis.engine.products import Claim, Figure, ResultTable
+from sealscope.thesis.engine.runs import experiment_of, simulated_run
 
 
 class Kept:
@@ -49,10 +49,10 @@ class Kept:
 
     def run(self, spec: RunSpec) -> SimulatedRun:
         if spec not in self.runs:
-            self.runs[spec] = simulated(spec, experiment_of(spec))
+            self.runs[spec] = simulated_run(spec, experiment_of(spec))
         return self.runs[spec]
 
-    def product(self, item: str) -> tuple[Figure | Table | Claim, ...]:
+    def product(self, item: str) -> tuple[Figure | ResultTable | Claim, ...]:
         raise AssertionError(f"no item of chapter 4 needs another, asked for {item}")
 
 
@@ -64,14 +64,17 @@ def kept() -> Kept:
 ALL = {item.id: item for item in (*chapter4.ITEMS, *chapter4_claims.ITEMS)}
 
 
-def make(context: Kept, item: Item) -> tuple[Figure | Table | Claim, ...]:
-    module, name = item.make.split(":")
-    return getattr(importlib.import_module(module), name)(context, item)
+def make(context: Kept, item: Item) -> tuple[Figure | ResultTable | Claim, ...]:
+    return item.make(context, item)
 
 
 @pytest.fixture(scope="module")
 def claims(kept: Kept) -> dict[str, Claim]:
     return {one.id: one for one in make(kept, ALL["chapter-4-claims"]) if isinstance(one, Claim)}
+
+
+def of_case(context: Kept, name: str) -> SolverPair:
+    return run_pair(context, CASES[name].command, CASES[name].closed_pct)
 
 
 def numbers(product: Figure) -> dict[str, float]:
@@ -100,7 +103,7 @@ def test_every_simulated_figure_and_case_has_an_item() -> None:
 
 def test_measured_only_figures_are_listed(kept: Kept) -> None:
     (table,) = make(kept, ALL["chapter-4-measured"])
-    assert isinstance(table, Table)
+    assert isinstance(table, ResultTable)
     assert [row[0] for row in table.rows] == [f"Fig. 4.{n}" for n in (15, 16, 37, 38, 39, 40)]
     assert {str(row[2]) for row in table.rows} <= ALL.keys()
 
@@ -125,14 +128,14 @@ def test_readings_are_all_different_and_open_throttles_do_not_know_them() -> Non
 
 @pytest.mark.parametrize("name", ["4.2-a", "4.3-a"])
 def test_the_literal_run_has_the_thesis_s_own_method_and_step(kept: Kept, name: str) -> None:
-    run = pair(kept, CASES[name]).literal
+    run = of_case(kept, name).literal
     assert run.recording is not None
     solver = run.recording.provenance["solver"]
     assert (solver["method"], solver["step_s"]) == ("rk4", pytest.approx(THESIS_STEP, rel=1e-12))
 
 
 def test_without_orifices_the_step_is_fine(kept: Kept) -> None:
-    both = pair(kept, CASES["4.2-c"])
+    both = of_case(kept, "4.2-c")
     assert both.resolved
     gap = settled(both.literal, "p_A") - settled(both.converged, "p_A")
     assert np.sqrt(np.mean(gap**2)) < 10.0
@@ -141,7 +144,7 @@ def test_without_orifices_the_step_is_fine(kept: Kept) -> None:
 
 
 def test_with_orifices_it_is_not_and_the_figure_says_so(kept: Kept) -> None:
-    both = pair(kept, CASES["4.3-a"])
+    both = of_case(kept, "4.3-a")
     assert both.converged.resolved is True
     assert both.literal.resolved is False
     for name in ("fig-4.10", "fig-4.12", "fig-4.13", "fig-4.33", "table-4.3-a"):
@@ -152,7 +155,7 @@ def test_with_orifices_it_is_not_and_the_figure_says_so(kept: Kept) -> None:
 
 
 def test_the_converged_drop_is_the_orifice_s(kept: Kept) -> None:
-    run = pair(kept, CASES["4.3-i"]).converged
+    run = of_case(kept, "4.3-i").converged
     c = throttle_coefficients(experiment_of(spec("7 sin(4t)", 75.0)).rig)
     drop, flow = settled(run, "p_1") - settled(run, "p_A"), settled(run, "Q_A")
     assert drop.min() == pytest.approx(-((flow.min() / c[1]) ** 2), rel=1e-3)
@@ -182,7 +185,7 @@ def rk4_of_the_drop(forward: float, back: float, Q: float, h: float, seconds: fl
 
 def test_what_rk4_shows_at_the_orifice_is_a_fixed_point_of_the_method(kept: Kept) -> None:
     c = 0.92 * math.pi / 4.0 * 0.007**2 * math.sqrt(2.0 / 847.0)
-    run = pair(kept, CASES["4.3-a"]).literal
+    run = of_case(kept, "4.3-a").literal
     far, near = (rk4_of_the_drop(0.75 * c, c, Q, 1e-4, 0.5) for Q in (-1e-6, 1e-6))  # the method has two, the rig none
     assert far == pytest.approx(775e3, rel=0.01)
     assert near == pytest.approx(-130e3, rel=0.01)
@@ -195,7 +198,7 @@ def test_what_rk4_shows_at_the_orifice_is_a_fixed_point_of_the_method(kept: Kept
 
 def test_case_table_holds_both_runs(kept: Kept) -> None:
     (table,) = make(kept, ALL["table-4.3-a"])
-    both = pair(kept, CASES["4.3-a"])
+    both = of_case(kept, "4.3-a")
     assert len(table.columns) == 8
     rows = {str(row[0]): row for row in table.rows}
     assert list(rows) == [
@@ -233,7 +236,7 @@ def test_a_run_that_diverged_leaves_its_reason_and_no_curve(kept: Kept) -> None:
     assert [len(panel.curves) for panel in figure.panels] == [1, 1]
     (table,) = make(failing, ALL["table-4.3-a"])
     assert table.rows[0][1:4] == (None, None, None)
-    assert math.isnan(throttled(failing.run(literal(spec("3 sin(4t)", 25.0)))).p_1_less_p_A)
+    assert math.isnan(numbers_of(failing.run(spec("3 sin(4t)", 25.0, solver="literal"))).p_1_less_p_A)
     (openings,) = make(failing, ALL["fig-4.33"])
     assert len(openings.panels[0].curves) == 3
     assert len(openings.panels[1].curves) == 0
@@ -258,7 +261,7 @@ def test_sine_fit_and_drift_find_what_was_put_in() -> None:
     assert sine_fit(t, np.sin(4.0 * t) + 0.1 * np.sin(12.0 * t), 4.0)[1] == pytest.approx(0.1, rel=0.02)
     x = np.sin(2.0 * t) + 1e-3 * t
     run = SimulatedRun(None, t, {"x": x}, 0.0, True)
-    assert drift(run) == pytest.approx(1e-3 * 18 * PERIOD, rel=0.02)
+    assert piston_drift(run) == pytest.approx(1e-3 * 18 * PERIOD, rel=0.02)
 
 
 def test_ringing_is_what_follows_a_reversal() -> None:
@@ -279,7 +282,7 @@ def test_every_claim_is_there_once_and_says_something(kept: Kept, claims: dict[s
     assert named <= claims.keys()
 
 
-def make_quietly(kept: Kept, item: Item) -> tuple[Figure | Table, ...]:
+def make_quietly(kept: Kept, item: Item) -> tuple[Figure | ResultTable, ...]:
     """What an item of few runs gives; the rest is left to the reproduction itself."""
     few = ("fig-4.2", "fig-4.3", "fig-4.4", "fig-4.5", "fig-4.10", "fig-4.11", "fig-4.12", "fig-4.13", "fig-4.33")
     return make(kept, item) if item.id in few else ()  # type: ignore[return-value]
@@ -300,7 +303,7 @@ def test_verdicts_on_the_thesis_s_rig(claims: dict[str, Claim]) -> None:
 
 
 def test_the_table_of_readings_marks_what_the_step_made(kept: Kept) -> None:
-    table = next(one for one in make(kept, ALL["chapter-4-claims"]) if isinstance(one, Table))
+    table = next(one for one in make(kept, ALL["chapter-4-claims"]) if isinstance(one, ResultTable))
     tested = {(row[2], row[-1]) for row in table.rows}
     assert tested == {("converged", "passed"), ("RK4 1e-4 s", "not passed")}
     assert len(table.rows) == 2 * 2 * 4

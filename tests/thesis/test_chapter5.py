@@ -12,16 +12,22 @@ import pytest
 
 from sealscope.errors import SimulationFailed
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import PSI, detail_rms
-from sealscope.thesis.chapters.chapter5.shown_tests import best_step, shown
-from sealscope.thesis.chapters.chapter5.tests import ITEMS, TESTS, test_of
-from sealscope.thesis.chapters.chapter5.views import figure, mean_slope, omega_of, spec_of, windowed
-from sealscope.thesis.conditions import APPENDIX_C
+from sealscope.thesis.chapters.appendix_c.simulation import detail_rms
+from sealscope.thesis.chapters.chapter5 import (
+    ITEMS,
+    TESTS,
+    ShownTest,
+    best_step,
+    figure,
+    mean_slope,
+    measure_test,
+    spec_of,
+    windowed,
+)
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure
-
-test_of.__test__ = False  # a function of the package, not a test
+from sealscope.thesis.sheet import APPENDIX_C, PSI
 
 THESIS = sorted((Path(__file__).resolve().parents[3] / "shared" / "thesis").glob("0*.txt"))
 
@@ -98,7 +104,7 @@ def test_each_number_shows_what_the_thesis_s_caption_says() -> None:
             views[number] = ("input", "", False)
         elif "level of internal leakage" in caption:
             views[number] = ("leak", "", False)
-            assert caption.split()[0].lower() == test_of(str(item(number).input("test"))).level
+            assert caption.split()[0].lower() == TESTS[str(item(number).input("test"))].level
         elif caption.startswith("Four-level detail"):
             chamber = f"p_{re.search(r'of P_([AB])', caption)[1]}"  # type: ignore[index]
             views[number] = ("details", chamber, False)
@@ -114,18 +120,18 @@ def test_each_number_shows_what_the_thesis_s_caption_says() -> None:
 
 
 def test_the_row_of_a_test_is_the_one_nearest_to_the_level_s_nominal_leak() -> None:
-    assert {test.section: test.condition.number for test in TESTS} == {
+    assert {test.section: test.condition.number for test in TESTS.values()} == {
         "5.2a": 39, "5.2b": 31, "5.3a": 37, "5.3b": 21, "5.4a": 35,
         "5.4b": 13, "5.5a": 11, "5.5b": 5, "5.5c": 7, "5.5d": 1,
     }  # fmt: skip
-    assert [row.number for row in test_of("5.5d").candidates] == [1, 2, 3, 4]
+    assert [row.number for row in TESTS["5.5d"].candidates] == [1, 2, 3, 4]
 
 
 def test_one_run_serves_all_figures_of_a_test() -> None:
-    assert len({spec_of(test) for test in TESTS}) == 10
-    assert spec_of(TESTS[0]).duration == 120.0
-    assert {spec_of(test).duration for test in TESTS[1:]} == {180.0}
-    assert all(spec_of(test).prove for test in TESTS)
+    assert len({spec_of(test) for test in TESTS.values()}) == 10
+    assert spec_of(TESTS["5.2a"]).duration == 120.0
+    assert {spec_of(test).duration for test in list(TESTS.values())[1:]} == {180.0}
+    assert all(spec_of(test).prove for test in TESTS.values())
 
 
 def test_command_speed_and_displacement(context: Direct) -> None:
@@ -164,7 +170,7 @@ def test_details_are_pywavelets_in_psi_and_split_at_the_onset(context: Direct) -
         "d1 [psi]", "d2 [psi]", "d3 [psi]", "d4 [psi]", "d3d4 [psi^2]",
     ]  # fmt: skip
     assert [curve.role for curve in made.panels[2].curves] == ["no leak", "leak"]
-    recording = context.run(spec_of(test_of("5.2a"))).recording
+    recording = context.run(spec_of(TESTS["5.2a"])).recording
     assert recording is not None
     pressure = recording["p_A"] / PSI
     n = pressure.size // 16 * 16
@@ -187,7 +193,7 @@ def test_the_numbers_of_details_and_of_their_rms_agree(context: Direct) -> None:
 
 
 def test_windows_are_a_thousand_samples_five_hundred_apart(context: Direct) -> None:
-    recording = context.run(spec_of(test_of("5.2a"))).recording
+    recording = context.run(spec_of(TESTS["5.2a"])).recording
     assert recording is not None
     centres, curves = windowed(recording, "p_A")
     np.testing.assert_allclose(np.diff(centres), 500 / recording.rate)
@@ -199,8 +205,8 @@ def test_windows_are_a_thousand_samples_five_hundred_apart(context: Direct) -> N
 
 
 def test_the_drift_of_the_piston_has_a_control_without_the_leak(context: Direct) -> None:
-    test = test_of("5.2a")
-    leaking, control = shown(context, test), shown(context, test, leak=False)
+    test = TESTS["5.2a"]
+    leaking, control = measure_test(context, test), measure_test(context, test, leak=False)
     assert leaking.drift[0] == control.drift[0]
     assert leaking.drift[1] != control.drift[1]
     assert control.velocity[1] > leaking.velocity[1]  # what bypasses the piston does not move it
@@ -257,7 +263,7 @@ def test_the_mean_slope_is_that_beside_the_sine() -> None:
 
 @pytest.mark.parametrize(("command", "omega"), [("3 sin(4t)", 4.0), ("8 sin(t)", 1.0)])
 def test_omega_of_a_command(command: str, omega: float) -> None:
-    assert omega_of(command) == omega
+    assert ShownTest("5.2a", command, "large", 1).omega == omega
 
 
 def test_best_step_finds_a_step_and_no_end_effect() -> None:

@@ -10,20 +10,16 @@ import numpy as np
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import QUANTITIES, Row, table_of
-from sealscope.thesis.chapters.chapter5.shown_tests import Shown
-from sealscope.thesis.chapters.chapter5.tests import TESTS, test_of
+from sealscope.thesis.chapters.appendix_c.simulation import SimulatedTest, table_of
+from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures
 from sealscope.thesis.claims import detection as claims
 from sealscope.thesis.claims import rates as claims_rates
 from sealscope.thesis.claims import rig as claims_rig
 from sealscope.thesis.claims import tests as claims_tests
 from sealscope.thesis.claims import trends as claims_trends
-from sealscope.thesis.claims.evidence import NO_SHEET, Evidence, correlated
-from sealscope.thesis.conditions import APPENDIX_C
+from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, correlated
 from sealscope.thesis.engine.products import Claim, Product
-from sealscope.thesis.sheet import Sheet
-
-test_of.__test__ = False  # a function of the package, not a test
+from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
 needs_sheet = pytest.mark.skipif(
@@ -34,7 +30,7 @@ AS_SAID = {("p_A", "d3"): -0.3, ("p_A", "d4"): -0.3, ("p_A", "d3d4"): -0.6}
 AS_SAID |= {("p_B", "d3"): 0.3, ("p_B", "d4"): 0.3, ("p_B", "d3d4"): 0.6}
 
 
-def made(seed: int, shifts: dict[tuple[str, str], float] | None = None) -> Sheet:
+def made(seed: int, shifts: dict[tuple[str, str], float] | None = None) -> DataSheet:
     random = np.random.default_rng(seed)
     rms: dict[str, dict[str, np.ndarray]] = {}
     for chamber in CHAMBERS:
@@ -43,21 +39,21 @@ def made(seed: int, shifts: dict[tuple[str, str], float] | None = None) -> Sheet
             before = np.exp(random.normal(0.5, 0.2, 41))
             change = random.normal((shifts or {}).get((chamber, name), 0.0), 0.03, 41)
             rms[chamber][name] = np.column_stack([before, before * np.exp(change)])
-    return Sheet(rms)
+    return DataSheet(rms)
 
 
-def one_shown(section: str, step_s: float | None = None) -> Shown:
-    test = test_of(section)
+def one_shown(section: str, step_s: float | None = None) -> ShownMeasures:
+    test = TESTS[section]
     rms = {chamber: {name: (2.0, 1.5) for name in QUANTITIES} for chamber in CHAMBERS}
     pairs = {chamber: (0.12, 0.118) for chamber in CHAMBERS}
     steps = {chamber: test.half + 1.0 if step_s is None else step_s for chamber in CHAMBERS}
-    return Shown(test, rms, (14.0, 14.01), (0.04, 0.002), (17.0, 16.5), pairs, pairs, steps, test.half, True)
+    return ShownMeasures(test, rms, (14.0, 14.01), (0.04, 0.002), (17.0, 16.5), pairs, steps, test.half)
 
 
-def evidence(measured: Sheet | None, leak: Sheet | None = None) -> Evidence:
+def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> ClaimEvidence:
     leak = leak or made(11, AS_SAID)
     rows = [
-        Row(
+        SimulatedTest(
             row,
             {c: {q: (leak.rms[c][q][k, 0], leak.rms[c][q][k, 1]) for q in QUANTITIES} for c in CHAMBERS},
             row.mean_leak_lpm,
@@ -65,18 +61,18 @@ def evidence(measured: Sheet | None, leak: Sheet | None = None) -> Evidence:
         )
         for k, row in enumerate(APPENDIX_C)
     ]
-    return Evidence(
+    return ClaimEvidence(
         measured,
         leak,
         made(12),
         made(13),
         table_of(rows, "appendix-c-leak", "made"),
-        {test.section: one_shown(test.section) for test in TESTS},
+        {section: one_shown(section) for section in TESTS},
         one_shown("5.2a"),
     )
 
 
-def every_claim(of: Evidence) -> dict[str, Claim]:
+def every_claim(of: ClaimEvidence) -> dict[str, Claim]:
     found = (
         *claims_rates.claims(of),
         *claims_trends.claims(of),
@@ -152,9 +148,9 @@ def test_verdicts_on_the_thesis_s_own_sheet(measured: dict[str, Claim]) -> None:
 
 
 def test_leak_sizes_are_judged_by_the_conditions() -> None:
-    from sealscope.thesis.claims import levels as claims_levels
+    from sealscope.thesis.claims import tests as claims_tests
 
-    found = {claim.id: claim for claim in claims_levels.claims()}
+    found = {claim.id: claim for claim in claims_tests.levels()}
     assert found["claim-5.1.2"].verdict == "does not hold"
     assert found["claim-5.1.3"].verdict == "does not hold"
     assert "0.0163" in found["claim-5.1.3"].sheet

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sealscope.errors import InputError
-from sealscope.thesis.engine import registry
+from sealscope.thesis.engine.items import collect
 from sealscope.thesis.sheet import FILES, MISSING, find_sheet, read_sheet
 
 WriteSheet = Callable[..., Path]
@@ -87,8 +87,8 @@ def test_the_list_names_every_item(
     monkeypatch.delenv("SEALSCOPE_SHEET", raising=False)
     assert command("reproduce", "--list", monkeypatch=monkeypatch) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [one.id for one in registry.collect()]
-    assert any(MISSING in line for line in lines) == any(one.needs_sheet for one in registry.collect())
+    assert [line.split()[0] for line in lines] == [one.id for one in collect()]
+    assert any(MISSING in line for line in lines) == any(one.needs_sheet for one in collect())
 
 
 @pytest.mark.parametrize("words", [["reproduce", "fig-3.33"], ["reproduce"], ["reproduce", "fig-3.3", "--jobs", "0"]])

@@ -13,28 +13,25 @@ from hypothesis import strategies as st
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import QUANTITIES
 from sealscope.thesis.chapters.appendix_c.success_rates import (
     CLAIMED,
     RATES,
     UNCLAIMED,
     column_tests,
+    counts,
     d1_threshold,
     drift_threshold,
-    rates,
     thresholds,
 )
-from sealscope.thesis.claims.leak_size import (
-    area_under_curve,
+from sealscope.thesis.claims.regressions import (
     change_columns,
     condition_columns,
-    condition_groups,
     left_out_r2,
     mean_leaks,
     partial_correlation,
-    told_by_levels,
+    told_apart_by_levels,
 )
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.sheet import QUANTITIES, DataSheet
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
 needs_sheet = pytest.mark.skipif(
@@ -43,13 +40,15 @@ needs_sheet = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def measured() -> Sheet:
+def measured() -> DataSheet:
     from sealscope.thesis.sheet import read_sheet
 
     return read_sheet(FOLDER)[0]
 
 
-def made(seed: int, shifts: dict[tuple[str, str], float] | None = None, scatter: float = 0.05, n: int = 41) -> Sheet:
+def made(
+    seed: int, shifts: dict[tuple[str, str], float] | None = None, scatter: float = 0.05, n: int = 41
+) -> DataSheet:
     """Sheets whose log changes scatter about the stated shifts (0 elsewhere)."""
     random = np.random.default_rng(seed)
     rms: dict[str, dict[str, np.ndarray]] = {}
@@ -59,7 +58,7 @@ def made(seed: int, shifts: dict[tuple[str, str], float] | None = None, scatter:
             before = np.exp(random.normal(0.5, 0.2, n))
             change = random.normal((shifts or {}).get((chamber, name), 0.0), scatter, n)
             rms[chamber][name] = np.column_stack([before, before * np.exp(change)])
-    return Sheet(rms)
+    return DataSheet(rms)
 
 
 # Newcombe, Statistics in Medicine 17 (1998) 857-872, Table I, method 5 (Clopper-Pearson).
@@ -116,7 +115,7 @@ def test_impossible_input_is_refused(call: object) -> None:
 
 
 @needs_sheet
-def test_table_5_1_from_the_sheet(measured: Sheet) -> None:
+def test_table_5_1_from_the_sheet(measured: DataSheet) -> None:
     counts = {rule.name: int(rule.fires(measured).sum()) for rule in (*CLAIMED, *UNCLAIMED)}
     assert counts == {
         "P_A d3 down": 41, "P_A d4 down": 27, "P_A d3d4 down": 35,
@@ -126,7 +125,7 @@ def test_table_5_1_from_the_sheet(measured: Sheet) -> None:
 
 
 @needs_sheet
-def test_what_the_columns_of_the_sheet_show_beyond_chance(measured: Sheet) -> None:
+def test_what_the_columns_of_the_sheet_show_beyond_chance(measured: DataSheet) -> None:
     rows = {(row[0], row[1]): row for row in column_tests(measured)}
     assert {key for key, row in rows.items() if row[-1] == "yes"} == {
         ("p_A", "d2"), ("p_A", "d3"), ("p_A", "d3d4"), ("p_B", "d4"), ("p_B", "d3d4"),
@@ -136,14 +135,14 @@ def test_what_the_columns_of_the_sheet_show_beyond_chance(measured: Sheet) -> No
 
 
 @needs_sheet
-def test_with_a_threshold_from_d1_the_sheet_s_d3_finds_35_of_41(measured: Sheet) -> None:
+def test_with_a_threshold_from_d1_the_sheet_s_d3_finds_35_of_41(measured: DataSheet) -> None:
     rows = {row[0]: row for row in thresholds(measured, made(1), made(2))}
     assert rows["P_A d3 down"][2] == "35/41"
     assert d1_threshold(measured, "p_A") == pytest.approx(0.0723, abs=5e-4)
 
 
 @needs_sheet
-def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured: Sheet) -> None:
+def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured: DataSheet) -> None:
     leak, given_condition = mean_leaks(), condition_columns()
     change = np.log(measured.rms["p_A"]["d3"][:, 1] / measured.rms["p_A"]["d3"][:, 0])
     assert abs(partial_correlation(change, leak, given_condition)) < 0.1
@@ -153,19 +152,19 @@ def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured: She
 
 
 @needs_sheet
-def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured: Sheet) -> None:
-    by_test = told_by_levels(measured, np.arange(41))
-    by_condition = told_by_levels(measured, condition_groups())
-    assert by_test.accuracy > 0.9
-    assert by_test.auc > 0.95
-    assert by_condition.auc <= by_test.auc
-    assert by_condition.accuracy > 0.85
+def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured: DataSheet) -> None:
+    accuracy, auc = told_apart_by_levels(measured, "test")
+    accuracy_by_condition, auc_by_condition = told_apart_by_levels(measured, "condition")
+    assert accuracy > 0.9
+    assert auc > 0.95
+    assert auc_by_condition <= auc
+    assert accuracy_by_condition > 0.85
 
 
 def test_rates_stand_beside_their_controls() -> None:
     leak = made(1, {("p_A", "d3"): -0.3, ("p_A", "d3d4"): -0.5, ("p_B", "d3d4"): 0.5})
     drift = made(3, n=123)
-    rows = {str(row[0]): dict(zip(RATES, row, strict=True)) for row in rates(None, leak, made(2), drift)}
+    rows = {str(row[0]): dict(zip(RATES, row, strict=True)) for row in counts(None, leak, made(2), drift)}
     assert rows["P_A d3 down"]["simulated leak: fires"] == "41/41"
     assert rows["both d3d4"]["simulated leak: rate [%]"] == 100.0
     assert rows["P_A d3 down"]["sheet: fires"] is None
@@ -218,9 +217,5 @@ def test_partial_correlation_takes_the_common_cause_out() -> None:
 
 
 def test_levels_without_information_tell_nothing() -> None:
-    told = told_by_levels(made(8, scatter=0.4), np.arange(41))
-    assert 0.3 < told.auc < 0.7
-
-
-def test_area_under_the_curve_by_hand() -> None:
-    assert area_under_curve(np.array([3.0, 2.0]), np.array([1.0, 2.0])) == (1 + 1 + 1 + 0.5) / 4
+    _, auc = told_apart_by_levels(made(8, scatter=0.4), "test")
+    assert 0.3 < auc < 0.7

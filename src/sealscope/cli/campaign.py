@@ -236,29 +236,14 @@ def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
 
 
 def _sheet_samples(folder: Path | None) -> MeasuredSamples:
-    """Return the thesis's data sheet as samples: log RMS of each detail, each test without and with its leak."""
-    import numpy as np
-
-    from sealscope.campaigns.held_out.classifiers import MeasuredSamples
-    from sealscope.thesis.conditions import APPENDIX_C
+    """Return the thesis's data sheet as samples; raise InputError where there is none."""
+    from sealscope.thesis.claims.regressions import samples_of
     from sealscope.thesis.sheet import MISSING, find_sheet, read_sheet
 
     found = find_sheet(folder)
     if found is None:
         raise InputError(MISSING)
-    sheet, _ = read_sheet(found)
-    features = {
-        f"{quantity} of {chamber}": np.log(values).T.ravel()
-        for chamber, quantities in sheet.rms.items()
-        for quantity, values in quantities.items()
-    }
-    leaks = [test.mean_leak_lpm for test in APPENDIX_C]
-    return MeasuredSamples(
-        features=features,
-        leak_lpm=np.array([0.0] * len(leaks) + leaks),
-        tests=[test.number for test in APPENDIX_C] * 2,
-        levels=[{"command": test.command, "closed": f"{test.closed_pct:g} %"} for test in APPENDIX_C] * 2,
-    )
+    return samples_of(read_sheet(found)[0])
 
 
 def calibrate(

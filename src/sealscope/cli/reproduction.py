@@ -12,16 +12,16 @@ import typer
 from sealscope.cli.options import complain
 
 if TYPE_CHECKING:
-    from sealscope.thesis.engine.reproduce import Outcome, Progress
+    from sealscope.thesis.engine.build import Progress, Reproduction
 
 
 def complete_items(incomplete: str) -> list[str]:
-    """Ids that begin so."""
-    from sealscope.thesis.engine.registry import collect
+    """Complete the id of an item."""
+    from sealscope.thesis.engine.items import collect
 
     items = collect()
-    words = ["all", *(f"chapter-{number}" for number in sorted({item.chapter for item in items}))]
-    return [word for word in (*words, *(item.id for item in items)) if word.startswith(incomplete)]
+    groups = ["all", *(f"chapter-{number}" for number in sorted({item.chapter for item in items}))]
+    return [name for name in (*groups, *(item.id for item in items)) if name.startswith(incomplete)]
 
 
 def reproduce(
@@ -56,41 +56,42 @@ def reproduce(
     from sealscope.reporting.thesis.files import publish
     from sealscope.reporting.thesis.page import write_thesis_page
     from sealscope.reporting.thesis.plots import require_drawing
-    from sealscope.thesis.engine.reproduce import reproduce as carry_out
+    from sealscope.thesis.engine.build import reproduce as build
 
     if not ids:
         raise InputError("an item must be named: an id, chapter-N or all (sealscope reproduce --list)")
     require_drawing()
-    with _progress() as told:
-        outcome = carry_out(ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish, progress=told)
-    page = write_thesis_page(output, outcome.shown(), quick=quick, sheet=outcome.job.sheet is not None)
-    _summarise(outcome, page)
-    if outcome.among("failed"):
+    with _progress() as progress:
+        made = build(ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish, progress=progress)
+    products = ((status, made.products(status)) for status in made.statuses)
+    page = write_thesis_page(output, products, quick=quick, sheet=made.job.sheet is not None)
+    _summarise(made, page)
+    if made.among("failed"):
         raise typer.Exit(1)
 
 
-def _summarise(outcome: Outcome, page: Path) -> None:
-    for entry in outcome.among("failed"):
-        complain(f"{entry.item.id} failed: {entry.reason}")
+def _summarise(made: Reproduction, page: Path) -> None:
+    for status in made.among("failed"):
+        complain(f"{status.item.id} failed: {status.reason}")
     counts = {
-        "made": len(outcome.among("made")),
-        "drawn anew": len(outcome.among("drawn")),
-        "kept from before": len(outcome.among("kept")),
-        "failed": len(outcome.among("failed")),
+        "made": len(made.among("made")),
+        "drawn anew": len(made.among("drawn")),
+        "kept from before": len(made.among("kept")),
+        "failed": len(made.among("failed")),
     }
-    typer.echo("items: " + ", ".join(f"{count} {word}" for word, count in counts.items() if count))
-    left_out = outcome.among("left out")
+    typer.echo("items: " + ", ".join(f"{count} {state}" for state, count in counts.items() if count))
+    left_out = made.among("left out")
     if left_out:
         typer.echo(f"left out: {len(left_out)} ({left_out[0].reason})")
     typer.echo(f"page:  {page}")
 
 
-def _list(words: Sequence[str], sheet: Path | None) -> None:
-    from sealscope.thesis.engine.registry import collect, select
+def _list(patterns: Sequence[str], sheet: Path | None) -> None:
+    from sealscope.thesis.engine.items import collect, select
     from sealscope.thesis.sheet import MISSING, find_sheet
 
     given = find_sheet(sheet) is not None
-    items = select(collect(), words)
+    items = select(collect(), patterns)
     width = max(len(item.id) for item in items)
     for item in items:
         note = f"  ({MISSING})" if item.needs_sheet and not given else ""
@@ -99,7 +100,7 @@ def _list(words: Sequence[str], sheet: Path | None) -> None:
 
 @contextmanager
 def _progress() -> Iterator[Progress]:
-    """One bar on standard error with the items in work and the time left; silent where nobody looks."""
+    """Show one bar on standard error with the items in work and the time left; nothing where it is no terminal."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -118,7 +119,7 @@ def _progress() -> Iterator[Progress]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=None)
 
-        def told(ended: int, total: int, in_work: Sequence[str]) -> None:
+        def update(ended: int, total: int, in_work: Sequence[str]) -> None:
             bar.update(task, completed=ended, total=total, description=", ".join(in_work))
 
-        yield told
+        yield update

@@ -1,4 +1,7 @@
-"""The thesis's own data sheet, its Appendix C, read from the two files of it where somebody has them."""
+"""Appendix C of the thesis: the 41 leakage tests, and the data sheet of what was measured in them.
+
+Only the inputs of the tests are part of the package. The measured values are read from two files where a user has them.
+"""
 
 from __future__ import annotations
 
@@ -9,52 +12,152 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.recording import Array
-from sealscope.thesis.conditions import APPENDIX_C, Condition
 
-FILES = {"p_A": "appendix_c_pa.csv", "p_B": "appendix_c_pb.csv"}
+Level = Literal["extra-small", "small", "medium", "large"]
+#: Columns of the sheet: RMS of the details of a chamber's pressure and of the product of the third and the fourth.
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
+#: Units of the columns. The sheet names none; it is taken to be in psi.
+UNITS = {name: "psi^2" if name == "d3d4" else "psi" for name in QUANTITIES}
+#: Pascals in a pound per square inch.
+PSI = 6894.757293168361
+#: The packaged rig that stands for the bench of Appendix C: fitted to its leak-free columns.
+BENCH_RIG = "thesis-calibrated"
+#: File of each chamber, the environment variable that names their folder, and the note on an item left out.
+FILES = {"p_A": "appendix_c_pa.csv", "p_B": "appendix_c_pb.csv"}
 VARIABLE = "SEALSCOPE_SHEET"
 MISSING = "needs the data sheet: give --sheet"
+_HALVES = ("no_leak", "leak")
 _CONDITION = ("mean_leak_lpm", "input_amplitude_v", "input_omega_rad_s", "orifice_closed_pct", "leakage_level")
 
 
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """The thesis's own data sheet (its Appendix C), read from the two files of it where they are given.
+@dataclass(frozen=True)
+class Condition:
+    """One test of Appendix C; `number` counts the rows from 1, in the order printed.
 
-    `rms[chamber][quantity]`: (41, 2) RMS without and with the leak, chambers "p_A", "p_B", quantities d1..d4, d3d4;
-    rows in the order of `conditions.APPENDIX_C`.
+    `command` in the words of `parse_command`; `closed_pct` [%] of both throttles; `mean_leak_lpm` [L/min] after the
+    bypass valve was opened; `level` the needle's position, which is not a measure of the leak (a "large" needle leaks
+    10 to 16 mL/min, an "extra-small" one 4 to 14).
+    """
+
+    number: int
+    command: str
+    closed_pct: float
+    mean_leak_lpm: float
+    level: Level
+
+    @property
+    def group(self) -> tuple[str, float]:
+        """Command and throttle: tests that share it are repeats of one operating condition."""
+        return self.command, self.closed_pct
+
+
+def experiment_values(condition: Condition) -> dict[str, str | float]:
+    """Return the rig's parameters that a test sets, by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
+
+    Both throttles are closed alike. A test with the throttles fully open leaves `line.orifices` as the rig has it:
+    absent in the thesis's model (section 4.2.1), present in a rig whose open valve bodies stay in the line.
+    """
+    closed = condition.closed_pct / 100.0
+    values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
+    if closed > 0:
+        values["line.orifices"] = "present"
+    return values
+
+
+#: The tests of Appendix C of "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation
+#: Systems", in its order.
+APPENDIX_C: tuple[Condition, ...] = (
+    Condition(1, "8 sin(t)", 50.0, 0.0042, "extra-small"),
+    Condition(2, "8 sin(t)", 25.0, 0.0047, "extra-small"),
+    Condition(3, "8 sin(t)", 25.0, 0.0048, "extra-small"),
+    Condition(4, "8 sin(t)", 50.0, 0.0048, "extra-small"),
+    Condition(5, "7 sin(4t)", 75.0, 0.0051, "extra-small"),
+    Condition(6, "7 sin(4t)", 75.0, 0.0055, "extra-small"),
+    Condition(7, "5 sin(2t)", 75.0, 0.0057, "extra-small"),
+    Condition(8, "5 sin(2t)", 75.0, 0.0062, "extra-small"),
+    Condition(9, "5 sin(2t)", 50.0, 0.0067, "extra-small"),
+    Condition(10, "5 sin(2t)", 50.0, 0.0071, "extra-small"),
+    Condition(11, "3 sin(4t)", 75.0, 0.0071, "extra-small"),
+    Condition(12, "3 sin(4t)", 75.0, 0.0073, "extra-small"),
+    Condition(13, "8 sin(t)", 0.0, 0.0074, "small"),
+    Condition(14, "7 sin(4t)", 50.0, 0.0077, "extra-small"),
+    Condition(15, "7 sin(4t)", 50.0, 0.0078, "extra-small"),
+    Condition(16, "7 sin(4t)", 25.0, 0.0081, "extra-small"),
+    Condition(17, "7 sin(4t)", 25.0, 0.0084, "extra-small"),
+    Condition(18, "5 sin(2t)", 25.0, 0.0085, "extra-small"),
+    Condition(19, "5 sin(2t)", 25.0, 0.0087, "extra-small"),
+    Condition(20, "7 sin(4t)", 0.0, 0.0092, "extra-small"),
+    Condition(21, "8 sin(t)", 0.0, 0.0095, "medium"),
+    Condition(22, "8 sin(t)", 0.0, 0.0096, "small"),
+    Condition(23, "5 sin(2t)", 0.0, 0.0097, "extra-small"),
+    Condition(24, "8 sin(t)", 0.0, 0.0103, "large"),
+    Condition(25, "7 sin(4t)", 0.0, 0.0108, "small"),
+    Condition(26, "3 sin(4t)", 50.0, 0.0112, "extra-small"),
+    Condition(27, "3 sin(4t)", 50.0, 0.0113, "extra-small"),
+    Condition(28, "5 sin(2t)", 0.0, 0.012, "small"),
+    Condition(29, "3 sin(4t)", 25.0, 0.0132, "extra-small"),
+    Condition(30, "3 sin(4t)", 25.0, 0.0135, "extra-small"),
+    Condition(31, "5 sin(2t)", 0.0, 0.0139, "large"),
+    Condition(32, "3 sin(4t)", 0.0, 0.014, "extra-small"),
+    Condition(33, "7 sin(4t)", 0.0, 0.0144, "medium"),
+    Condition(34, "7 sin(4t)", 0.0, 0.0145, "large"),
+    Condition(35, "3 sin(4t)", 0.0, 0.0152, "small"),
+    Condition(36, "7 sin(4t)", 0.0, 0.0156, "medium"),
+    Condition(37, "3 sin(4t)", 0.0, 0.0159, "medium"),
+    Condition(38, "3 sin(4t)", 0.0, 0.016, "medium"),
+    Condition(39, "3 sin(4t)", 0.0, 0.0163, "large"),
+    Condition(40, "5 sin(2t)", 0.0, 0.0163, "medium"),
+    Condition(41, "5 sin(2t)", 0.0, 0.0185, "medium"),
+)
+
+
+def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, float], ...]:
+    """Return the different operating conditions (command, closed [%]) in order of first appearance."""
+    return tuple(dict.fromkeys(condition.group for condition in conditions))
+
+
+@dataclass(frozen=True, eq=False)
+class DataSheet:
+    """The data sheet of Appendix C, measured or simulated.
+
+    `rms[chamber][quantity]`: RMS without and with the leak, (tests, 2), of the chambers "p_A" and "p_B" and of
+    `QUANTITIES`; rows in the order of `APPENDIX_C`.
     """
 
     rms: Mapping[str, Mapping[str, Array]]
 
+    def log_change(self, chamber: str, quantity: str) -> Array:
+        """Return log(RMS with leak / RMS without) of each test, (tests,)."""
+        pairs = self.rms[chamber][quantity]
+        return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))
+
 
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """The folder of the sheet: `folder`, else the environment's SEALSCOPE_SHEET, else `./data` where it lies there.
+    """Find the folder of the sheet: `folder`, else the environment's SEALSCOPE_SHEET, else `./data` where it is there.
 
-    Raises InputError where a folder was named that does not hold both files.
+    Raises InputError where a named folder does not hold both files.
     """
     named = folder if folder is not None else os.environ.get(VARIABLE) or None
-    found = Path(named) if named is not None else Path("data")
-    missing = [name for name in FILES.values() if not (found / name).is_file()]
-    if not missing:
-        return found
+    candidate = Path(named if named is not None else "data")
+    if all((candidate / name).is_file() for name in FILES.values()):
+        return candidate
     if named is None:
         return None
-    place = "--sheet" if folder is not None else VARIABLE
-    raise InputError(f"{place} must name a folder with {' and '.join(FILES.values())}, got {found}")
+    source = "--sheet" if folder is not None else VARIABLE
+    raise InputError(f"{source} must name a folder with {' and '.join(FILES.values())}, got {candidate}")
 
 
-def read_sheet(folder: Path) -> tuple[Sheet, str]:
-    """The sheet in `folder`, and a hash of its bytes.
+def read_sheet(folder: Path) -> tuple[DataSheet, str]:
+    """Read the sheet in `folder`; return it with a hash of its bytes.
 
     Raises UnreadableFile where a file cannot be read, InputError where a column or a row is missing, a value is not a
-    positive number, or a row is not the test that stands in `conditions.APPENDIX_C`.
+    positive number, or a row is another test than `APPENDIX_C` has at its place.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()
@@ -66,48 +169,41 @@ def read_sheet(folder: Path) -> tuple[Sheet, str]:
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             raise UnreadableFile(f"a sheet must be a CSV file in UTF-8, got: {error} ({path})") from None
         digest.update(raw)
-        wanted = (*_CONDITION, *(f"{quantity}_{when}" for quantity in QUANTITIES for when in ("no_leak", "leak")))
-        missing = [column for column in wanted if not rows or column not in rows[0]]
-        if missing:
-            raise InputError(f"the sheet must have the column {missing[0]} ({path})")
+        for column in (*_CONDITION, *(f"{quantity}_{half}" for quantity in QUANTITIES for half in _HALVES)):
+            if not rows or column not in rows[0]:
+                raise InputError(f"the sheet must have the column {column} ({path})")
         if len(rows) != len(APPENDIX_C):
             raise InputError(f"the sheet must have {len(APPENDIX_C)} rows, got {len(rows)} ({path})")
         for row, condition in zip(rows, APPENDIX_C, strict=True):
-            _check(row, condition, path)
+            _check_condition(row, condition, path)
         rms[chamber] = {
-            quantity: np.array([[_positive(row, f"{quantity}_{w}", n, path) for w in ("no_leak", "leak")]
-                                for n, row in enumerate(rows, 1)])
+            quantity: np.array(
+                [[_positive(row, f"{quantity}_{half}", n, path) for half in _HALVES] for n, row in enumerate(rows, 1)]
+            )
             for quantity in QUANTITIES
-        }  # fmt: skip
-    return Sheet(rms), digest.hexdigest()
+        }
+    return DataSheet(rms), digest.hexdigest()
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return math.nan
 
 
 def _positive(row: dict[str, str], column: str, number: int, path: Path) -> float:
-    text = row[column]
-    try:
-        value = float(text)
-    except (TypeError, ValueError):
-        value = math.nan
+    value = _number(row[column])
     if not (math.isfinite(value) and value > 0):
-        raise InputError(f"{column} must be a number > 0, got {text!r} ({path}, row {number})")
+        raise InputError(f"{column} must be a number > 0, got {row[column]!r} ({path}, row {number})")
     return value
 
 
-def _check(row: dict[str, str], condition: Condition, path: Path) -> None:
-    """Refuse a row that is another test than the one expected at its place."""
-    values = [_positive(row, column, condition.number, path) for column in _CONDITION[:3]]
-    leak, amplitude, omega = values
-    try:
-        closed = float(row["orifice_closed_pct"])
-    except (TypeError, ValueError):
-        closed = math.nan
+def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
+    leak, amplitude, omega = (_positive(row, column, condition.number, path) for column in _CONDITION[:3])
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"
-    given = (command, closed, leak, (row["leakage_level"] or "").strip())
+    given = (command, _number(row["orifice_closed_pct"]), leak, (row["leakage_level"] or "").strip())
     expected = (condition.command, condition.closed_pct, condition.mean_leak_lpm, condition.level)
     if given != expected:
-        raise InputError(f"row {condition.number} must be the test {_words(expected)}, got {_words(given)} ({path})")
-
-
-def _words(test: tuple[str, float, float, str]) -> str:
-    command, closed, leak, level = test
-    return f"{command!r}, {closed:g} % closed, {leak:g} L/min, {level}"
+        wanted, got = ("{!r}, {:g} % closed, {:g} L/min, {}".format(*test) for test in (expected, given))
+        raise InputError(f"row {condition.number} must be the test {wanted}, got {got} ({path})")

@@ -12,16 +12,16 @@ from pathlib import Path
 from sealscope.recordings.atomic import atomic_write
 from sealscope.reporting.thesis.plots import draw, visible
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Claim, Figure, Product, Table
+from sealscope.thesis.engine.products import Claim, Figure, Product, ResultTable
 
 _NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
 
 
 def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tuple[str, ...]:
-    """Write an item's products into `folder`: `figures/ID.svg`, `figures/ID.png`, `tables/ID.csv`; claims go to
-    `tables/ID.csv` of their item (`tables/ID-claims.csv` where a table has that name).
+    """Write an item's products into `folder`; return the files written, relative to it.
 
-    Gives the files written, relative to the folder. Raises ValueError for an id that is no file name.
+    `figures/ID.svg`, `figures/ID.png`, `tables/ID.csv`; claims go to `tables/ID.csv` of their item
+    (`tables/ID-claims.csv` where a table has that name). Raises ValueError for an id that is no file name.
     """
     for name in ("figures", "tables"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
             put(f"figures/{product.id}.svg", svg)
             put(f"figures/{product.id}.png", png)
             put_rows(f"tables/{product.id}.csv", figure_rows(product))
-        elif isinstance(product, Table):
+        elif isinstance(product, ResultTable):
             put_rows(f"tables/{product.id}.csv", table_rows(product))
     claims = [product for product in products if isinstance(product, Claim)]
     if claims:
@@ -54,20 +54,20 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
     return tuple(files)
 
 
-def table_rows(table: Table) -> Iterable[Sequence[object]]:
-    """A table's head and rows; numbers in full, an empty cell for no value."""
+def table_rows(table: ResultTable) -> Iterable[Sequence[object]]:
+    """Yield a table's head and rows; numbers in full, an empty cell for no value."""
     yield table.columns
     yield from table.rows
 
 
 def claim_rows(claims: Sequence[Claim]) -> Iterable[Sequence[object]]:
-    """The claims as a table."""
+    """Yield the claims as a table."""
     yield [field.name for field in fields(Claim)]
     yield from (astuple(claim) for claim in claims)
 
 
 def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
-    """What a figure plots: a pair of columns (x, y) for each curve, three (x, y, value) for an image, as drawn."""
+    """Yield what a figure plots: columns (x, y) for each curve, (x, y, value) for an image, as drawn."""
     heads: list[str] = []
     columns: list[list[str]] = []
     for number, panel in enumerate(figure.panels, 1):

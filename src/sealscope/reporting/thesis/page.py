@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
 from sealscope.reporting import template
 from sealscope.reporting.thesis.plot_style import caption
 from sealscope.reporting.thesis.plots import UNRESOLVED
-from sealscope.thesis.engine.items import Entry
-from sealscope.thesis.engine.products import Claim, Figure, Product, Table, Verdict
+from sealscope.thesis.engine.build import ItemStatus
+from sealscope.thesis.engine.products import Claim, Figure, Product, ResultTable, Verdict
 
 THESIS = "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems"
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
@@ -28,76 +28,78 @@ _LONG_TABLE = 45
 
 
 @dataclass(frozen=True)
-class Shown:
-    """One figure or table as the page shows it."""
+class PageProduct:
+    """A figure or table as the page shows it."""
 
     id: str
     heading: str
-    product: Figure | Table
+    product: Figure | ResultTable
     picture: str
     links: tuple[tuple[str, str], ...]
     claims: tuple[Claim, ...]
-    words: str
+    search_text: str
 
 
 def write_thesis_page(
     folder: Path,
-    shown: Iterable[tuple[Entry, Sequence[Product | Claim]]],
+    products: Iterable[tuple[ItemStatus, Sequence[Product | Claim]]],
     *,
     quick: bool = False,
     sheet: bool = False,
 ) -> Path:
-    """Write `index.html` into `folder` from every entry and its products, whose files lie in the folder; give its path.
+    """Write `index.html` into `folder` from the status of every item and its products; return its path.
 
-    `quick`: made with shorter runs; `sheet`: the measured sheet was given. Raises InputError where it cannot be
-    written.
+    The drawn files lie in the folder. `quick`: made with shorter runs; `sheet`: the measured sheet was given. Raises
+    InputError where the page cannot be written.
     """
     target = folder / "index.html"
-    return template.write(target, render_thesis_page(folder, shown, quick=quick, sheet=sheet))
+    return template.write(target, render_thesis_page(folder, products, quick=quick, sheet=sheet))
 
 
 def render_thesis_page(
     folder: Path,
-    shown: Iterable[tuple[Entry, Sequence[Product | Claim]]],
+    products: Iterable[tuple[ItemStatus, Sequence[Product | Claim]]],
     *,
     quick: bool = False,
     sheet: bool = False,
 ) -> str:
-    """The page as text, with nothing outside it but links to the files beside it."""
-
-    entries: list[Entry] = []
-    found: list[tuple[Entry, Figure | Table, str]] = []
+    """Return the page as text; it refers to nothing outside it but the files beside it."""
+    statuses: list[ItemStatus] = []
+    shown: list[tuple[ItemStatus, Figure | ResultTable, str]] = []
     claims: dict[str, Claim] = {}
-    for entry, products in shown:
-        entries.append(entry)
-        for product in products:
+    for status, made in products:
+        statuses.append(status)
+        for product in made:
             if isinstance(product, Claim):
                 claims.setdefault(product.id, product)
-            elif entry.item.id != "claims":  # the claims have a section of their own
-                picture = _picture(folder, product.id) if isinstance(product, Figure) else ""
-                found.append((entry, _light(product), picture))
-    by_chapter: dict[int, list[Shown]] = {}
-    for entry, product, picture in found:
-        by_chapter.setdefault(entry.item.chapter, []).append(_shown(entry, product, picture, claims))
-    script = template.packaged("templates/thesis.js")
-    absent = [entry for entry in entries if not entry.there]
+            elif status.item.id != "claims":  # the claims have a section of their own
+                # the picture of a figure takes the place of its arrays
+                if isinstance(product, Figure):
+                    shown.append((status, replace(product, panels=()), _picture(folder, product.id)))
+                else:
+                    shown.append((status, product, ""))
+    by_chapter: dict[int, list[PageProduct]] = {}
     bearing: dict[str, list[str]] = {}
-    for _, product, _ in found:
+    for status, product, picture in shown:
+        by_chapter.setdefault(status.item.chapter, []).append(_page_product(status, product, picture, claims))
         for name in product.claims:
             bearing.setdefault(name, []).append(product.id)
+    claims_files = [name for status in statuses if status.item.id == "claims" for name in status.files]
+    absent = [status for status in statuses if not status.available]
+    script = template.packaged("templates/thesis.js")
     return template.render(
         "thesis.html.j2",
         thesis=THESIS,
-        chapters=[(number, CHAPTERS.get(number, f"Chapter {number}"), some) for number, some in by_chapter.items()],
+        chapters=[(number, CHAPTERS.get(number, f"Chapter {number}"), of) for number, of in by_chapter.items()],
         claims=list(claims.values()),
         bearing={name: ids for name, ids in bearing.items() if name in claims},
-        counts=[(verdict, sum(one.verdict == verdict for one in claims.values())) for verdict in VERDICTS],
-        slug=_slug,
+        counts=[(verdict, sum(claim.verdict == verdict for claim in claims.values())) for verdict in VERDICTS],
+        slug=lambda verdict: verdict.replace(" ", "-"),
         tone=_TONES,
-        claims_csv=_claims_csv(entries),
+        claims_csv=next((name for name in claims_files if name.endswith(".csv")), ""),
         absent=_grouped(absent),
         absent_count=len(absent),
-        total=len(entries),
+        total=len(statuses),
         unresolved=UNRESOLVED,
         quick=quick,
         sheet=sheet,
@@ -110,58 +112,39 @@ def render_thesis_page(
     )
 
 
-_TONES = {
-    "holds": "ok",
-    "holds in part": "open",
-    "does not hold": "leak",
-    "cannot be tested": "none",
-}
+_TONES = {"holds": "ok", "holds in part": "open", "does not hold": "leak", "cannot be tested": "none"}
 
 
-def _slug(verdict: str) -> str:
-    return verdict.replace(" ", "-")
-
-
-def _claims_csv(entries: Sequence[Entry]) -> str:
-    files = [name for entry in entries if entry.item.id == "claims" for name in entry.files if name.endswith(".csv")]
-    return files[0] if files else ""
-
-
-def _light(product: Figure | Table) -> Figure | Table:
-    """A figure without the arrays that its picture shows."""
-    if isinstance(product, Table):
-        return product
-    return Figure(product.id, product.title, (), product.numbers, product.claims, product.resolved, product.notes)
-
-
-def _shown(entry: Entry, product: Figure | Table, picture: str, claims: dict[str, Claim]) -> Shown:
+def _page_product(
+    status: ItemStatus, product: Figure | ResultTable, picture: str, claims: dict[str, Claim]
+) -> PageProduct:
     about = tuple(claims[name] for name in product.claims if name in claims)
     stem = f"/{product.id}."
-    links = tuple((Path(name).suffix[1:].upper(), name) for name in entry.files if stem in f"/{name}")
+    links = tuple((Path(name).suffix[1:].upper(), name) for name in status.files if stem in f"/{name}")
     heading = caption(product.id, product.title)
-    numbers = [one.name for one in product.numbers] if isinstance(product, Figure) else list(product.columns)
-    words = " ".join([product.id, heading, product.notes, *numbers, *(f"{one.id} {one.claim}" for one in about)])
-    return Shown(product.id, heading, product, picture, links, about, words.casefold())
+    numbers = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)
+    text = " ".join([product.id, heading, product.notes, *numbers, *(f"{claim.id} {claim.claim}" for claim in about)])
+    return PageProduct(product.id, heading, product, picture, links, about, text.casefold())
 
 
 def _picture(folder: Path, name: str) -> str:
-    """The figure's picture as a data URI: SVG or PNG, whichever is smaller; empty where neither is there."""
+    """Return the figure's picture as a data URI: SVG or PNG, whichever is smaller; empty where neither exists."""
     kinds = (("svg+xml", folder / "figures" / f"{name}.svg"), ("png", folder / "figures" / f"{name}.png"))
-    found = [(path.read_bytes(), kind) for kind, path in kinds if path.is_file()]
-    if not found:
+    pictures = [(path.read_bytes(), kind) for kind, path in kinds if path.is_file()]
+    if not pictures:
         return ""
-    content, kind = min(found, key=lambda one: len(one[0]))
+    content, kind = min(pictures, key=lambda picture: len(picture[0]))
     return f"data:image/{kind};base64,{b64encode(content).decode()}"
 
 
-def _grouped(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
-    """Entries that are not shown, by what became of them and why."""
-    groups: dict[str, list[Entry]] = {}
-    for entry in entries:
-        why = {"not made": "not made yet, or from other sources", "left out": f"left out: {entry.reason}"}.get(
-            entry.state, ""
+def _grouped(absent: Sequence[ItemStatus]) -> list[tuple[str, list[ItemStatus]]]:
+    """Group the items that are not shown by state and reason."""
+    groups: dict[str, list[ItemStatus]] = {}
+    for status in absent:
+        why = (
+            "not made yet, or from other sources" if status.state == "not made" else f"{status.state}: {status.reason}"
         )
-        groups.setdefault(why or f"failed: {entry.reason}", []).append(entry)
+        groups.setdefault(why, []).append(status)
     return list(groups.items())
 
 
@@ -170,7 +153,7 @@ def _is_number(value: Any) -> bool:
 
 
 def cell(value: Any) -> str:
-    """A table's value as text: numbers to five digits, a dash for none."""
+    """Return a table's value as text: numbers to five digits, a dash for none."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, float):

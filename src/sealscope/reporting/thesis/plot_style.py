@@ -19,13 +19,10 @@ class Style:
     filled: bool = True
 
 
-_DARK, _MID, _LIGHT = "#12365c", "#a84a0c", "#9aa3ad"
 STYLES: dict[Role, Style] = {
     "command": Style("#59616b", (6, 1.5, 1, 1.5), 1.0),
     "A": Style("#0d4f8b", (), 1.2),
     "B": Style("#e08a2c", (5, 1.6), 1.2, "s", False),
-    "line 1": Style("#0d4f8b", (), 0.9, "^"),
-    "line 2": Style("#e08a2c", (2, 1.4), 1.1, "v", False),
     "literal": Style("#d99a5b", (), 0.8, "s", False),
     "converged": Style("#0b2f55", (), 1.3),
     "no leak": Style("#7f8a95", (), 1.1, "o", False),
@@ -35,12 +32,6 @@ STYLES: dict[Role, Style] = {
     "25 %": Style("#79aeda", (5, 1.5), 1.1, "^"),
     "50 %": Style("#2f73b5", (5, 1.5, 1, 1.5), 1.2, "s"),
     "75 %": Style("#0b2f55", (1.2, 1.2), 1.5, "D"),
-    "open": Style("#b8bfc6", (), 1.4, "o"),
-    "d1": Style(_LIGHT, (), 0.9, "o", False),
-    "d2": Style("#4f93cf", (5, 1.6), 1.1, "s", False),
-    "d3": Style(_DARK, (), 1.6, "D"),
-    "d4": Style(_MID, (1.3, 1.3), 1.4, "^"),
-    "d3d4": Style("#5b2a6e", (5, 1.5, 1, 1.5), 1.3, "v"),
     "reference": Style("#59616b", (3, 2), 0.8, "x"),
     "other": Style("#1b1f24", (), 1.0, "o"),
 }
@@ -73,7 +64,7 @@ SETTINGS = {
 
 
 def caption(figure_id: str, title: str) -> str:
-    """The thesis's number and the title, such as "Fig. 4.22. Pressures in the chambers"."""
+    """Return the thesis's number and the title, such as "Fig. 4.22. Pressures in the chambers"."""
     kind, _, number = figure_id.partition("-")
     words = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)
     title = title.rstrip(".")
@@ -85,7 +76,7 @@ def caption(figure_id: str, title: str) -> str:
 
 
 def typeset(label: str) -> str:
-    """A label with the thesis's symbols set as symbols: p_A, d3, omega, m^3/s, leaving all other words."""
+    """Set the thesis's symbols in a label as symbols: p_A, d3, omega, m^3/s; all other words stay."""
     text = label.replace("$", r"\$")
     text = re.sub(r"\bd3d4\b", r"$d_3 d_4$", text)
     text = re.sub(r"\bd([1-9])\b", r"$d_\1$", text)

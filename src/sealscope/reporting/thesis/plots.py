@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.errors import MissingExtra
 from sealscope.reporting.thesis.plot_style import SAME_ROLE, SETTINGS, STYLES, caption, typeset
-from sealscope.thesis.engine.products import Curve, Figure, Panel, Role, thinned
+from sealscope.thesis.engine.products import Figure, Panel, PlotCurve, Role, thinned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,7 +43,7 @@ def require_drawing() -> None:
 
 
 def draw(figure: Figure) -> tuple[bytes, bytes]:
-    """The figure as SVG (text as text, the same bytes each time) and as PNG (200 dpi, with a palette).
+    """Draw the figure as SVG (text as text) and as PNG (200 dpi, with a palette).
 
     Raises MissingExtra where matplotlib is not installed.
     """
@@ -101,8 +101,10 @@ def grid_of(panels: int) -> tuple[int, int]:
 
 
 def _canvas(figure: Figure) -> Canvas:
-    """The figure laid out: from the top the mark of an unresolved run, a legend that serves all panels, the panels,
-    the caption."""
+    """Lay the figure out.
+
+    From the top: the mark of an unresolved run, a legend that serves all panels, the panels, the caption.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
@@ -177,10 +179,8 @@ def _panel(canvas: Canvas, ax: Axes, panel: Panel, *, mark_words: bool) -> None:
         ax.set_title(typeset(panel.title), loc="left", pad=4)
     if panel.x_range is not None:
         ax.set_xlim(*panel.x_range)
-    elif panel.image is None and all(curve.kind in ("line", "steps") for curve in panel.curves):
+    elif panel.image is None and all(curve.kind == "line" for curve in panel.curves):
         ax.margins(x=0)
-    if panel.y_range is not None:
-        ax.set_ylim(*panel.y_range)
     ax.tick_params(width=0.6, length=3)
 
 
@@ -195,8 +195,8 @@ def _plain_numbers(axis: Axis) -> None:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def visible(curve: Curve, x_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The points of a curve as drawn: those in the range with a neighbour on each side, a long line thinned."""
+def visible(curve: PlotCurve, x_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points of a curve as drawn: in the range with a neighbour on each side, a long line thinned."""
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _POINTS and np.all(np.diff(x) >= 0):
         first, last = np.searchsorted(x, sorted(x_range))
@@ -204,7 +204,7 @@ def visible(curve: Curve, x_range: tuple[float, float] | None) -> tuple[np.ndarr
     return thinned(x, y, _POINTS) if curve.kind == "line" else (x, y)
 
 
-def _curve(ax: Axes, curve: Curve, again: int, x_range: tuple[float, float] | None, alone: bool) -> None:
+def _curve(ax: Axes, curve: PlotCurve, again: int, x_range: tuple[float, float] | None, alone: bool) -> None:
     style = STYLES["other" if alone and curve.role == "reference" else curve.role]
     x, y = visible(curve, x_range)
     dense = x.size > _DENSE
@@ -225,8 +225,6 @@ def _curve(ax: Axes, curve: Curve, again: int, x_range: tuple[float, float] | No
         ax.vlines(x, 0, y, color=style.colour, linewidth=0.8)
         ax.plot(x, y, linestyle="none", label=line["label"], **{**marker, "markersize": 3})
         ax.axhline(0, color="#444b52", linewidth=0.6)
-    elif curve.kind == "steps":
-        ax.plot(x, y, drawstyle="steps-post", **line)
     else:
         ax.plot(x, y, **line)
 

@@ -5,19 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.chapter3.continuous_wavelet import inverse_gain, wavelet_centre
-from sealscope.thesis.chapters.chapter3.figures import (
+from sealscope.thesis.chapters.chapter3 import (
     RATE,
     TONES,
     amplitude_spectrum,
+    inverse_gain,
+    mother_wavelet,
+    nearest,
     two_tone_signal,
     vanishing_moments,
+    wavelet_centre,
 )
 from sealscope.thesis.chapters.chapter4.cases import visible_pressure
-from sealscope.thesis.claims.judging import verdict_of
 from sealscope.thesis.engine.context import Context, RunSpec
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Claim
+from sealscope.thesis.engine.products import Claim, verdict_of
 
 _ABSENT = "not a matter of the sheet"
 #: Pressures without a leak and with the largest mean leak among the tests at 3 sin(4t).
@@ -26,17 +28,16 @@ _LEAK = RunSpec(command="3 sin(4t)", duration=40.0, rig="thesis", leaks=("0.0163
 
 
 def claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Claims 3.1 to 3.6."""
+    """Judge claims 3.1 to 3.6."""
     return (*_fourier(), *_wavelet(), _leak(context))
 
 
 def _fourier() -> tuple[Claim, ...]:
     t = np.arange(round(RATE)) / RATE
     frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
-    tones = [int(np.abs(frequency - tone).argmin()) for tone, _ in TONES]
+    tones = [nearest(frequency, tone) for tone, _ in TONES]
     elsewhere = np.delete(amplitude, tones).max()
-    shown = all(abs(amplitude[k] - height) < 1e-6 for k, (_, height) in zip(tones, TONES, strict=True))
-    cosines = [bool(abs(phase[k]) < 1e-3) for k in tones]
+    present = all(abs(amplitude[k] - height) < 1e-6 for k, (_, height) in zip(tones, TONES, strict=True))
     return (
         Claim(
             "claim-3.1",
@@ -45,7 +46,7 @@ def _fourier() -> tuple[Claim, ...]:
             _ABSENT,
             f"amplitudes {amplitude[tones[0]]:.6f} at 100 Hz and {amplitude[tones[1]]:.6f} at 30 Hz, at most "
             f"{elsewhere:.1e} elsewhere",
-            verdict_of([shown, bool(elsewhere < 1e-6)]),
+            verdict_of([present, elsewhere < 1e-6]),
             "A record of whole periods leaves no leakage between the DFT's lines.",
         ),
         Claim(
@@ -54,16 +55,14 @@ def _fourier() -> tuple[Claim, ...]:
             "The example consists of two cosines.",
             _ABSENT,
             f"phases against a cosine: {phase[tones[0]]:.1f} degrees at 100 Hz, {phase[tones[1]]:.1f} degrees at 30 Hz",
-            verdict_of(cosines),
+            verdict_of([abs(phase[k]) < 1e-3 for k in tones]),
             "Eq. (3.3) has a cosine at 100 Hz and a sine at 30 Hz; the amplitude spectrum cannot tell them apart.",
         ),
     )
 
 
 def _wavelet() -> tuple[Claim, ...]:
-    from sealscope.signals.filters import discrete_wavelet
-
-    _, psi, t = discrete_wavelet("db8").wavefun(level=10)
+    _, psi, t = mother_wavelet()
     step = float(t[1] - t[0])
     mean, energy = float(psi.sum() * step), float((psi**2).sum() * step)
     scaled = []
@@ -73,7 +72,6 @@ def _wavelet() -> tuple[Claim, ...]:
     both = np.array([30.0, 100.0])
     proper, printed = inverse_gain(both, weight=2.0), inverse_gain(both, weight=0.0)
     spread, falls = float(proper[0] / proper[1]), float(printed[0] / printed[1])
-    _, centre = wavelet_centre("db8")
     return (
         Claim(
             "claim-3.3",
@@ -81,8 +79,8 @@ def _wavelet() -> tuple[Claim, ...]:
             "A wavelet is of limited duration and has a mean of zero.",
             _ABSENT,
             f"db8: {t[-1] - t[0]:g} sampling intervals long, integral {mean:.1e}, {vanishing_moments(psi, t)} "
-            f"vanishing moments, strongest at {centre:.3f} of the sampling rate at scale 1",
-            verdict_of([bool(abs(mean) < 1e-9), bool(np.isfinite(t[-1]))]),
+            f"vanishing moments, strongest at {wavelet_centre()[1]:.3f} of the sampling rate at scale 1",
+            verdict_of([abs(mean) < 1e-9, np.isfinite(t[-1])]),
             "Its integrals with 1, t, ..., t^7 are zero, so slow changes of a record leave no trace in the details.",
         ),
         Claim(
@@ -90,8 +88,8 @@ def _wavelet() -> tuple[Claim, ...]:
             "section 3.2.2.1, eq. (3.6)",
             "The factor |a|^(-1/2) keeps the length of the scaled wavelet at one.",
             _ABSENT,
-            f"integral of psi^2 {energy:.6f}; scaled by 0.5, 2 and 10: {', '.join(f'{one:.4f}' for one in scaled)}",
-            verdict_of([bool(abs(one - 1.0) < 1e-3) for one in (energy, *scaled)]),
+            f"integral of psi^2 {energy:.6f}; scaled by 0.5, 2 and 10: {', '.join(f'{of:.4f}' for of in scaled)}",
+            verdict_of([abs(of - 1.0) < 1e-3 for of in (energy, *scaled)]),
             "Follows from substituting (t - b)/a in the integral.",
         ),
         Claim(
@@ -101,10 +99,10 @@ def _wavelet() -> tuple[Claim, ...]:
             _ABSENT,
             f"gain at 30 Hz over gain at 100 Hz after going forth and back: {falls:.2f} with the measure da db as "
             f"printed, {spread:.4f} with da db / a^2",
-            verdict_of([bool(abs(falls - 1.0) < 0.01)]),
+            verdict_of([abs(falls - 1.0) < 0.01]),
             f"The measure da db / a^2 and the division by the admissibility constant ({proper[0]:.3f} for db8) are "
-            "missing in eq. (3.5); as printed, low frequencies come back too large, as 1/f^2. The complex "
-            "conjugate belongs in eq. (3.4), not in eq. (3.5).",
+            "missing in eq. (3.5); as printed, low frequencies come back too large, as 1/f^2. The complex conjugate "
+            "belongs in eq. (3.4), not in eq. (3.5).",
         ),
     )
 
@@ -115,22 +113,23 @@ def _leak(context: Context) -> Claim:
     if without.diverged or leaking.diverged:
         text = without.diverged or leaking.diverged
         return Claim("claim-3.6", where, claim, _ABSENT, text, "cannot be tested", "a run failed")
-    visible = visible_pressure()
-    told, drops = [], []
+    changes: dict[str, list[float]] = {}
+    late = without.t > 10.0
     for name in CHAMBERS:
-        one, other = without.outputs[name], leaking.outputs[name]
-        late = without.t > 10.0
-        change = [float(f(other[late]) - f(one[late])) for f in (np.mean, np.max, np.ptp)]
-        told.append(f"{name}: mean {change[0]:+.0f} Pa, peak {change[1]:+.0f} Pa, range {change[2]:+.0f} Pa")
-        drops += [change[0] < -visible, change[1] < -visible, change[2] < -visible]
+        before, after = without.outputs[name][late], leaking.outputs[name][late]
+        changes[name] = [float(of(after) - of(before)) for of in (np.mean, np.max, np.ptp)]
+    moved = ["{}: mean {:+.0f} Pa, peak {:+.0f} Pa, range {:+.0f} Pa".format(name, *of) for name, of in changes.items()]
     return Claim(
         "claim-3.6",
         where,
         claim,
         "the sheet holds RMS values of wavelet details only, no pressures",
-        f"{leaking.mean_leak_lpm:.4f} L/min at 3 sin(4t) against none: " + "; ".join(told),
-        verdict_of([bool(one) for one in drops]),
-        "A drop counts when it exceeds a transducer's noise. Oil that passes the piston stays in "
-        "the closed circuit: what chamber A loses chamber B gains, and the load is friction alone. What falls is the "
-        "ringing of the oil columns.",
+        f"{leaking.mean_leak_lpm:.4f} L/min at 3 sin(4t) against none: {'; '.join(moved)}",
+        verdict_of([change < -visible_pressure() for of in changes.values() for change in of]),
+        "A drop counts when it exceeds a transducer's noise. Oil that passes the piston stays in the closed circuit: "
+        "what chamber A loses chamber B gains, and the load is friction alone. What falls is the ringing of the oil "
+        "columns.",
     )
+
+
+ITEMS: tuple[Item, ...] = (Item("chapter-3-claims", 3, "claims", "What chapter 3 claims", claims),)

@@ -6,28 +6,25 @@ import re
 from collections import Counter
 from typing import get_args
 
-from sealscope.thesis.claims import levels, rates, rig, tests, trends
+from sealscope.thesis.claims import rates, rig, tests, trends
 from sealscope.thesis.claims.evidence import gather
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Claim, Table, Verdict
-
-#: Items that judge the claims of the earlier chapters.
-EARLIER = ("chapter-3-claims", "chapter-4-claims")
+from sealscope.thesis.engine.products import Claim, ResultTable, Verdict
 
 
 def detection(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Claims of the abstract and of chapters 1, 5 and 6, in the thesis's order."""
+    """Judge the claims of the abstract and of chapters 1, 5 and 6, in the thesis's order."""
     evidence = gather(context)
-    made = (
-        *levels.claims(),
+    claims = (
+        *tests.levels(),
         *rates.claims(evidence),
         *trends.claims(evidence),
         *tests.curves(evidence),
         tests.consistent(evidence),
         *rig.claims(evidence),
     )
-    return tuple(sorted(made, key=_place))
+    return tuple(sorted(claims, key=_place))
 
 
 def _place(claim: Claim) -> tuple[int, ...]:
@@ -35,29 +32,19 @@ def _place(claim: Claim) -> tuple[int, ...]:
     return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
 
 
-def table(context: Context, item: Item) -> tuple[Table, ...]:
-    """Every claim of every chapter as a table, and how many have each verdict."""
-    found = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
-    found.sort(key=_place)
-    verdicts = Counter(claim.verdict for claim in found)
-    rows = tuple((c.id, c.where, c.claim, c.sheet, c.simulation, c.verdict, c.why) for c in found)
+def table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+    """Tabulate every claim of every chapter, and how many have each verdict."""
+    claims = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
+    claims.sort(key=_place)
+    verdicts = Counter(claim.verdict for claim in claims)
+    rows = tuple((c.id, c.where, c.claim, c.sheet, c.simulation, c.verdict, c.why) for c in claims)
     heads = ("id", "where", "claim", "what the sheet says", "what the simulation says", "verdict", "why")
     missing = "" if context.sheet else " The data sheet was not given: claims that rest on it could not be tested."
+    notes = f"Claims in our own words. A claim holds where every part of it does.{missing}"
+    counts = tuple((verdict, verdicts.get(verdict, 0)) for verdict in get_args(Verdict))
     return (
-        Table(
-            item.id,
-            item.title,
-            heads,
-            rows,
-            claims=tuple(claim.id for claim in found),
-            notes=f"Claims in our own words. A claim holds where every part of it does.{missing}",
-        ),
-        Table(
-            f"{item.id}-verdicts",
-            "How many claims have each verdict",
-            ("verdict", "claims"),
-            tuple((verdict, verdicts.get(verdict, 0)) for verdict in get_args(Verdict)),
-        ),
+        ResultTable(item.id, item.title, heads, rows, claims=tuple(claim.id for claim in claims), notes=notes),
+        ResultTable(f"{item.id}-verdicts", "How many claims have each verdict", ("verdict", "claims"), counts),
     )
 
 
@@ -67,7 +54,7 @@ ITEMS: tuple[Item, ...] = (
         6,
         "claims",
         "What the abstract and chapters 1, 5 and 6 claim",
-        f"{__name__}:detection",
+        detection,
         needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
     ),
     Item(
@@ -75,7 +62,7 @@ ITEMS: tuple[Item, ...] = (
         6,
         "table",
         "Every claim of the thesis and its verdict",
-        f"{__name__}:table",
-        needs=(*EARLIER, "detection-claims"),
+        table,
+        needs=("chapter-3-claims", "chapter-4-claims", "detection-claims"),
     ),
 )

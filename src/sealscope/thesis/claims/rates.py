@@ -1,4 +1,4 @@
-"""What abstract, section 5.6 and the conclusions say of success rates and trends, judged by the sheet."""
+"""What abstract, section 5.6 and the conclusions say of success rates, judged by the sheet."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ import numpy as np
 
 from sealscope.evaluation.binomial import at_least
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import log_change
-from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED, WAY, Rule, d1_threshold
-from sealscope.thesis.chapters.chapter5.tests import NOMINAL_LPM
-from sealscope.thesis.claims.evidence import Evidence, SheetTest, fired, on_sheet, percent, share
-from sealscope.thesis.claims.leak_size import condition_groups, mean_leaks, told_by_levels
-from sealscope.thesis.conditions import APPENDIX_C
+from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED, DIRECTION, Rule, d1_threshold
+from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM
+from sealscope.thesis.claims.evidence import SENSITIVE, ClaimEvidence, SheetTest, fired, on_sheet, percent, share
+from sealscope.thesis.claims.regressions import mean_leaks, told_apart_by_levels
 from sealscope.thesis.engine.products import Claim
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.sheet import APPENDIX_C, DataSheet
 
 _N = len(APPENDIX_C)
 _A_D3, _A_D4, _A_BOTH, _B_D3, _B_D4, _B_BOTH, _TOGETHER = CLAIMED
@@ -32,43 +30,43 @@ _CELLS: tuple[tuple[Rule, str, tuple[int, ...]], ...] = (
 )
 
 
-def _past_noise(sheet: Sheet, chamber: str, name: str) -> np.ndarray:
-    """Tests whose change goes the chamber's way beyond what d1's scatter does one time in twenty."""
-    return np.asarray(log_change(sheet, chamber, name) * WAY[chamber] > d1_threshold(sheet, chamber))
+def _past_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
+    """Return the tests whose change moves in the chamber's direction beyond what d1 does one time in twenty."""
+    return np.asarray(sheet.log_change(chamber, name) * DIRECTION[chamber] > d1_threshold(sheet, chamber))
 
 
 def _by_chance(rule: Rule) -> float:
     return 0.5 ** len(rule.details)
 
 
-def _controls(evidence: Evidence, rule: Rule) -> str:
+def _controls(evidence: ClaimEvidence, rule: Rule) -> str:
     return (
         f"In simulation the rule fires in {fired(evidence.still, rule)} with no leak and in "
         f"{fired(evidence.drift, rule)} with drift alone"
     )
 
 
-def _cell(evidence: Evidence, number: int, rule: Rule, where: str, printed: Sequence[int]) -> Claim:
-    def test(sheet: Sheet) -> tuple[str, list[bool]]:
-        found = rule.fires(sheet)
-        k, rate = int(found.sum()), 100.0 * float(found.mean())
-        p = at_least(k, found.size, _by_chance(rule))
-        parts = [any(abs(rate - one) <= 1.0 for one in printed), p < 0.05 / 10]
+def _cell(evidence: ClaimEvidence, number: int, rule: Rule, where: str, printed: Sequence[int]) -> Claim:
+    def test(sheet: DataSheet) -> tuple[str, list[bool]]:
+        fires = rule.fires(sheet)
+        percentage = 100.0 * float(fires.mean())
+        p = at_least(int(fires.sum()), fires.size, _by_chance(rule))
+        parts = [any(abs(percentage - of) <= 1.0 for of in printed), p < 0.05 / 10]
         return f"{fired(sheet, rule)}; p = {p:.2g} against chance of {100 * _by_chance(rule):g} %", parts
 
-    def why(sheet: Sheet) -> str:
-        told = (
+    def why(sheet: DataSheet) -> str:
+        reason = (
             "Two parts: the printed rate is within a point of the counted one, and more than chance (5 %, ten columns)"
         )
         if rule is _TOGETHER:
-            a, b = (float(one.fires(sheet).mean()) for one in (_A_BOTH, _B_BOTH))
-            told += (
+            a, b = (float(part.fires(sheet).mean()) for part in (_A_BOTH, _B_BOTH))
+            reason += (
                 f"; the printed 65 is near the product of the two printed rates, 0.85 x 0.76 = {0.85 * 0.76:.3f} "
                 f"(counted: {a:.3f} x {b:.3f} = {a * b:.3f}), not a count of tests"
             )
-        return f"{told}. {_controls(evidence, rule)}."
+        return f"{reason}. {_controls(evidence, rule)}."
 
-    rates = " or ".join(f"{one} %" for one in printed)
+    rates = " or ".join(f"{of} %" for of in printed)
     return on_sheet(
         evidence,
         f"claim-5.4.{number}",
@@ -79,90 +77,82 @@ def _cell(evidence: Evidence, number: int, rule: Rule, where: str, printed: Sequ
     )
 
 
-def _before_table(sheet: Sheet) -> tuple[str, list[bool]]:
-    told, parts = [], []
-    for chamber, said in (("p_A", 1), ("p_B", -1)):
-        for name in ("d3", "d4", "d3d4"):
-            change = log_change(sheet, chamber, name)
-            goes = int(np.sum(change * said > 0))
-            told.append(f"{chamber} {name} {goes}")
-            parts.append(goes > change.size / 2)
-    return f"tests as the sentence says, of {_N}: {', '.join(told)}", parts
+def _before_table(sheet: DataSheet) -> tuple[str, list[bool]]:
+    texts, parts = [], []
+    for chamber, direction in (("p_A", 1), ("p_B", -1)):
+        for name in SENSITIVE:
+            change = sheet.log_change(chamber, name)
+            count = int(np.sum(change * direction > 0))
+            texts.append(f"{chamber} {name} {count}")
+            parts.append(count > change.size / 2)
+    return f"tests as the sentence says, of {_N}: {', '.join(texts)}", parts
 
 
-def _over_80(sheet: Sheet) -> tuple[str, list[bool]]:
-    return "; ".join(f"{rule.name} {fired(sheet, rule)}" for rule in CLAIMED), [
-        bool(rule.fires(sheet).mean() > 0.8) for rule in CLAIMED
-    ]
+def _over_80(sheet: DataSheet) -> tuple[str, list[bool]]:
+    texts = "; ".join(f"{rule.name} {fired(sheet, rule)}" for rule in CLAIMED)
+    return texts, [bool(rule.fires(sheet).mean() > 0.8) for rule in CLAIMED]
 
 
-def _levels(sheet: Sheet) -> tuple[str, list[bool]]:
-    told, parts = [], []
-    found = _past_noise(sheet, "p_A", "d3")
-    for level in NOMINAL_LPM:
-        rows = np.array([row.level == level for row in APPENDIX_C])
-        told.append(f"{level} {share(int(found[rows].sum()), int(rows.sum()))}")
-        parts.append(bool(found[rows].mean() >= 0.8))
-    return f"d3 of P_A falls beyond noise: {'; '.join(told)}", parts
+def _levels(sheet: DataSheet) -> tuple[str, list[bool]]:
+    past = _past_noise(sheet, "p_A", "d3")
+    of_level = {level: past[[row.level == level for row in APPENDIX_C]] for level in NOMINAL_LPM}
+    texts = "; ".join(f"{level} {share(tests)}" for level, tests in of_level.items())
+    return f"d3 of P_A falls beyond noise: {texts}", [bool(tests.mean() >= 0.8) for tests in of_level.values()]
 
 
-def _smallest(names: tuple[Rule, ...]) -> SheetTest:
-    def test(sheet: Sheet) -> tuple[str, list[bool]]:
+def _smallest(rules: tuple[Rule, ...]) -> SheetTest:
+    def test(sheet: DataSheet) -> tuple[str, list[bool]]:
         row = int(np.argmin(mean_leaks()))
-        told = []
-        for rule in names:
-            change = ", ".join(f"{percent(log_change(sheet, c, name)[row]):+.1f} %" for c, name in rule.details)
-            told.append(f"{rule.name}: {change}")
-        return f"the {mean_leaks()[row]:g} L/min test: {'; '.join(told)}", [bool(r.fires(sheet)[row]) for r in names]
+        texts = []
+        for rule in rules:
+            change = ", ".join(f"{percent(sheet.log_change(c, name)[row]):+.1f} %" for c, name in rule.details)
+            texts.append(f"{rule.name}: {change}")
+        return f"the {mean_leaks()[row]:g} L/min test: {'; '.join(texts)}", [bool(r.fires(sheet)[row]) for r in rules]
 
     return test
 
 
-def _abstract_85(sheet: Sheet) -> tuple[str, list[bool]]:
-    leak = mean_leaks()
+def _abstract_85(sheet: DataSheet) -> tuple[str, list[bool]]:
     fires = _A_BOTH.fires(sheet)
-    small = leak <= 0.0050
-    told, smallest = _smallest((_A_BOTH,))(sheet)
+    small = fires[mean_leaks() <= 0.0050]
+    text, smallest = _smallest((_A_BOTH,))(sheet)
     return (
-        f"{told}; up to 0.0050 L/min {share(int(fires[small].sum()), int(small.sum()))}; all leaks "
-        f"{share(int(fires.sum()), _N)}",
-        [*smallest, bool(fires[small].mean() >= 0.85)],
+        f"{text}; up to 0.0050 L/min {share(small)}; all leaks {share(fires)}",
+        [*smallest, bool(small.mean() >= 0.85)],
     )
 
 
-def _passes_both(sheet: Sheet) -> tuple[str, list[bool]]:
+def _passes_both(sheet: DataSheet) -> tuple[str, list[bool]]:
     fires, leak = _TOGETHER.fires(sheet), mean_leaks()
     least = float(leak[fires].min()) if fires.any() else math.nan
     return (
-        f"smallest test that passes d3d4 on both chambers: {least:.4f} L/min; both pass in "
-        f"{share(int(fires.sum()), _N)}",
+        f"smallest test that passes d3d4 on both chambers: {least:.4f} L/min; both pass in {share(fires)}",
         [abs(least - 0.0048) < 5e-5, bool(fires.mean() > 0.8)],
     )
 
 
-def _identified(sheet: Sheet) -> tuple[str, list[bool]]:
-    told, parts = [], []
+def _identified(sheet: DataSheet) -> tuple[str, list[bool]]:
+    texts, parts = [], []
     for chamber in CHAMBERS:
-        best = max(("d3", "d4", "d3d4"), key=lambda name: int(_past_noise(sheet, chamber, name).sum()))
-        found = _past_noise(sheet, chamber, best)
-        told.append(f"{chamber}: {best} beyond noise in {share(int(found.sum()), found.size)}")
-        parts.append(bool(found.mean() >= 0.8))
-    return "; ".join(told), parts
+        best = max(SENSITIVE, key=lambda name: int(_past_noise(sheet, chamber, name).sum()))
+        past = _past_noise(sheet, chamber, best)
+        texts.append(f"{chamber}: {best} beyond noise in {share(past)}")
+        parts.append(bool(past.mean() >= 0.8))
+    return "; ".join(texts), parts
 
 
-def _without_baseline(sheet: Sheet) -> str:
-    tests, conditions = (told_by_levels(sheet, held) for held in (np.arange(_N), condition_groups()))
+def _without_baseline(sheet: DataSheet) -> str:
+    tests, conditions = ("{:.2f} (AUC {:.3f})".format(*told_apart_by_levels(sheet, of)) for of in ("test", "condition"))
     return (
         "Identified: beyond what d1 (noise) does one time in twenty, in 80 % of the tests. Without any baseline, the "
-        f"levels of d1..d4 of both chambers tell leak from no leak with an accuracy of {tests.accuracy:.2f} (AUC "
-        f"{tests.auc:.3f}) with whole tests held out and {conditions.accuracy:.2f} (AUC {conditions.auc:.3f}) with "
-        "whole "
-        "conditions held out; the leak always came second, so drift is in these figures too."
+        f"levels of d1..d4 of both chambers tell leak from no leak with an accuracy of {tests} with whole tests held "
+        f"out and {conditions} with whole conditions held out; the leak always came second, so drift is in these "
+        "figures too."
     )
 
 
-def claims(evidence: Evidence) -> tuple[Claim, ...]:
-    """Claims of the abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6 on what was detected."""
+def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
+    """Judge the claims of the abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6 on what was detected."""
     cells = tuple(_cell(evidence, k, rule, where, printed) for k, (rule, where, printed) in enumerate(_CELLS, start=1))
     return (
         on_sheet(
@@ -189,8 +179,8 @@ def claims(evidence: Evidence) -> tuple[Claim, ...]:
             "section 5.6, sentence before Table 5.1",
             "On P_A the RMS without a leak is lower than with one, on P_B higher.",
             _before_table,
-            "The sentence is the wrong way round for the sheet and for Table 5.1; a part holds where most tests are "
-            "as it says.",
+            "The sentence is the wrong way round for the sheet and for Table 5.1; a part holds where most tests are as "
+            "it says.",
         ),
         on_sheet(
             evidence,
@@ -200,7 +190,7 @@ def claims(evidence: Evidence) -> tuple[Claim, ...]:
             _over_80,
             lambda sheet: (
                 f"A part for each rate of Table 5.1. {_controls(evidence, _A_D3)} (d3 of P_A). Set for 5 % false "
-                f"alarms by d1's scatter, d3 of P_A finds {share(int(_past_noise(sheet, 'p_A', 'd3').sum()), _N)}."
+                f"alarms by d1's scatter, d3 of P_A finds {share(_past_noise(sheet, 'p_A', 'd3'))}."
             ),
         ),
         on_sheet(
@@ -216,7 +206,7 @@ def claims(evidence: Evidence) -> tuple[Claim, ...]:
             "claim-5.6.3",
             "section 5.7",
             "The smallest mean leak detected is 0.0042 L/min.",
-            _smallest((_A_D3, _A_D4, _A_BOTH, _B_D3, _B_D4, _B_BOTH)),
+            _smallest(CLAIMED[:6]),
             "A part for each cell of Table 5.1 in that one test.",
         ),
         on_sheet(
@@ -226,7 +216,6 @@ def claims(evidence: Evidence) -> tuple[Claim, ...]:
             "The success rate is above 80 % with a smallest mean leak of 0.0048 L/min.",
             _passes_both,
             "Parts: 0.0048 L/min is the smallest leak that passes d3d4 on both chambers, and both pass in over 80 %. "
-            "Abstract "
-            "and section 5.7 say 0.0042.",
+            "Abstract and section 5.7 say 0.0042.",
         ),
     )

@@ -1,5 +1,4 @@
-"""What chapters 1, 5 and 6 say that the sheet is silent on, judged by the simulated rig, with a control where one is
-needed."""
+"""What chapters 1, 5 and 6 say that the sheet is silent on, judged by the simulated rig, with controls."""
 
 from __future__ import annotations
 
@@ -8,21 +7,24 @@ import itertools
 import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import column, data_rig, log_change
+from sealscope.thesis.chapters.appendix_c.simulation import column
 from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED
-from sealscope.thesis.claims.evidence import NO_SHEET, NOT_ON_SHEET, Evidence, by_simulation, fired, share
-from sealscope.thesis.claims.judging import verdict_of
-from sealscope.thesis.conditions import APPENDIX_C
-from sealscope.thesis.engine.products import Claim
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.claims.evidence import NO_SHEET, NOT_ON_SHEET, ClaimEvidence, by_simulation, fired, share
+from sealscope.thesis.engine.products import Claim, verdict_of
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
 
 #: How near an estimated onset must come [s].
 _NEAR = 10.0
 _LEVELS = ("d1", "d2", "d3", "d4")
 
 
-def _speed(evidence: Evidence) -> Claim:
-    moved = {name: 100.0 * (one.speed[1] / one.speed[0] - 1.0) for name, one in evidence.shown.items()}
+def _change(pair: tuple[float, float]) -> float:
+    """Return the change from without to with the leak [%]."""
+    return 100.0 * (pair[1] / pair[0] - 1.0)
+
+
+def _speed(evidence: ClaimEvidence) -> Claim:
+    moved = {name: _change(test.speed) for name, test in evidence.shown.items()}
     worst = max(moved, key=lambda name: abs(moved[name]))
     return by_simulation(
         "claim-5.7.1",
@@ -34,7 +36,7 @@ def _speed(evidence: Evidence) -> Claim:
     )
 
 
-def _drifting(evidence: Evidence) -> Claim:
+def _drifting(evidence: ClaimEvidence) -> Claim:
     leaking, control = evidence.shown["5.2a"].drift, evidence.control.drift
     fell, fell_anyway = (abs(pair[0]) - abs(pair[1]) for pair in (leaking, control))
     return by_simulation(
@@ -42,19 +44,17 @@ def _drifting(evidence: Evidence) -> Claim:
         "section 5.2 a, Fig. 5.1",
         "The piston drifts, and stops drifting because of the leak.",
         f"drift {1e3 * leaking[0]:.1f} um/s before and {1e3 * leaking[1]:.1f} after the leak opens; the same run "
-        "without a "
-        f"leak {1e3 * control[0]:.1f} and {1e3 * control[1]:.1f}",
+        f"without a leak {1e3 * control[0]:.1f} and {1e3 * control[1]:.1f}",
         [fell - fell_anyway > 0.1 * abs(fell_anyway)],
-        "Because of the leak: it falls by a tenth more than in the same time without one. Where both fall alike, it "
-        "is the "
-        "speed loop's integral term that settles, and the drift with it.",
+        "Because of the leak: it falls by a tenth more than in the same time without one. Where both fall alike, it is "
+        "the speed loop's integral term that settles, and the drift with it.",
     )
 
 
-def _performance(evidence: Evidence) -> Claim:
+def _performance(evidence: ClaimEvidence) -> Claim:
     tests = evidence.shown.values()
-    velocity = [100.0 * (one.velocity[1] / one.velocity[0] - 1.0) for one in tests]
-    pressure = [100.0 * (one.range_MPa[c][1] / one.range_MPa[c][0] - 1.0) for one in tests for c in CHAMBERS]
+    velocity = [_change(test.velocity) for test in tests]
+    pressure = [_change(test.range_MPa[c]) for test in tests for c in CHAMBERS]
     return by_simulation(
         "claim-6.1.2",
         "section 6.1",
@@ -66,76 +66,66 @@ def _performance(evidence: Evidence) -> Claim:
     )
 
 
-def _visible(evidence: Evidence) -> Claim:
+def _visible(evidence: ClaimEvidence) -> Claim:
     ranges = evidence.shown["5.3a"].range_MPa
-    told = [f"{c} {1e3 * ranges[c][0]:.1f} to {1e3 * ranges[c][1]:.1f} kPa" for c in CHAMBERS]
+    texts = [f"{c} {1e3 * ranges[c][0]:.1f} to {1e3 * ranges[c][1]:.1f} kPa" for c in CHAMBERS]
     return by_simulation(
         "claim-5.7.3",
         "section 5.3 a, Fig. 5.23",
         "The change of the pressures' wave after the leak opens is fairly visible.",
-        f"5 to 95 % range: {', '.join(told)}",
+        f"5 to 95 % range: {', '.join(texts)}",
         [abs(ranges[c][1] / ranges[c][0] - 1.0) > 0.05 for c in CHAMBERS],
         "A part for each chamber: the range moves by more than 5 %, about the least an eye sees in such a plot.",
     )
 
 
-def _onset(evidence: Evidence) -> Claim:
-    told, parts = [], []
+def _onset(evidence: ClaimEvidence) -> Claim:
+    texts, parts = [], []
     for chamber in CHAMBERS:
-        errors = [one.step_s[chamber] - one.onset_s for one in evidence.shown.values()]
-        near = sum(abs(error) <= _NEAR for error in errors)
-        told.append(
-            f"{chamber}: {share(near, len(errors))}, median error {np.median(np.abs(errors)):.0f} s, worst "
-            f"{max(np.abs(errors)):.0f} s"
-        )
-        parts.append(near == len(errors))
+        errors = [abs(test.step_s[chamber] - test.onset_s) for test in evidence.shown.values()]
+        near = [error <= _NEAR for error in errors]
+        texts.append(f"{chamber}: {share(near)}, median error {np.median(errors):.0f} s, worst {max(errors):.0f} s")
+        parts.append(all(near))
     return by_simulation(
         "claim-5.7.4",
         "sections 1.4 and 5.7",
         "The details tell when the leak began: they change at that moment and as long as it lasts.",
-        f"a single step fitted to the windowed RMS of d3 lies within {_NEAR:g} s of the onset in {'; '.join(told)}",
+        f"a single step fitted to the windowed RMS of d3 lies within {_NEAR:g} s of the onset in {'; '.join(texts)}",
         parts,
         "A part for each chamber: within 10 s in all ten tests. The sheet holds only means of the two halves.",
     )
 
 
-def _throttles(evidence: Evidence) -> Claim:
-    """The leak-free pressure range of each command with open and with the most closed throttles."""
-    table = evidence.table
-    span = {chamber: column(table, f"{chamber} range [MPa]") for chamber in CHAMBERS}
-    told, rises, grown = [], [], []
+def _throttles(evidence: ClaimEvidence) -> Claim:
+    """Judge by the leak-free pressure range of each command with open and with the most closed throttles."""
+    ranges = {chamber: column(evidence.table, f"{chamber} range [MPa]") for chamber in CHAMBERS}
+    texts, rises, grown = [], [], []
     for command in sorted({row.command for row in APPENDIX_C}):
-        rows = [k for k, row in enumerate(APPENDIX_C) if row.command == command]
-        closed = [APPENDIX_C[k].closed_pct for k in rows]
-        most = max(closed)
-        ends = [
-            {c: float(np.mean([span[c][k] for k, at in zip(rows, closed, strict=True) if at == end])) for c in CHAMBERS}
+        closings = [row.closed_pct if row.command == command else None for row in APPENDIX_C]
+        most = max(closed for closed in closings if closed is not None)
+        opened, throttled = (
+            {c: float(np.mean(ranges[c][[k for k, closed in enumerate(closings) if closed == end]])) for c in CHAMBERS}
             for end in (0.0, most)
-        ]
-        rise = [ends[1][c] - ends[0][c] for c in CHAMBERS]
-        told.append(f"{command} {1e3 * rise[0]:+.2f} and {1e3 * rise[1]:+.2f} kPa at {most:g} %")
-        rises += [one > 0.01 * ends[0][c] for one, c in zip(rise, CHAMBERS, strict=True)]
-        grown.append((_flow(command), most, float(np.mean(rise))))
-    same = [one for one in grown if one[1] == 75.0]
-    ordered = [one[2] for one in sorted(same)]
+        )
+        rise = [throttled[c] - opened[c] for c in CHAMBERS]
+        texts.append(f"{command} {1e3 * rise[0]:+.2f} and {1e3 * rise[1]:+.2f} kPa at {most:g} %")
+        rises += [of > 0.01 * opened[c] for of, c in zip(rise, CHAMBERS, strict=True)]
+        if most == 75.0:
+            grown.append((float(command.split(maxsplit=1)[0]), float(np.mean(rise))))
+    ordered = [rise for _, rise in sorted(grown)]
     return by_simulation(
         "claim-6.1.3",
         "section 6.1",
         "The orifices raise the pressure at both ends of the cylinder, the more the larger the command's amplitude.",
-        f"range of p_A and p_B without a leak, closed less open: {'; '.join(told)}",
+        f"range of p_A and p_B without a leak, closed less open: {'; '.join(texts)}",
         [*rises, ordered == sorted(ordered)],
         "Parts: each chamber's range rises by 1 % or more for each command, and at 75 % closed it rises more the "
-        "larger the amplitude. A "
-        "commanded pump pushes the same flow through; friction alone sets the difference of the two chambers.",
+        "larger the amplitude. A commanded pump pushes the same flow through; friction alone sets the difference of "
+        "the two chambers.",
     )
 
 
-def _flow(command: str) -> float:
-    """Amplitude [V] of a command such as `3 sin(4t)`."""
-    return float(command.split(maxsplit=1)[0])
-
-
-def _overlap(evidence: Evidence) -> Claim:
+def _overlap(evidence: ClaimEvidence) -> Claim:
     from sealscope.signals.filters import decomposition_filters
 
     shares = {}
@@ -148,18 +138,18 @@ def _overlap(evidence: Evidence) -> Claim:
         "section 5.1",
         "Daubechies' wavelet of order 8 keeps neighbouring frequency bands apart better than lower orders.",
         "share of the high-pass filter's energy below its band: "
-        + ", ".join(f"db{order} {100 * one:.1f} %" for order, one in shares.items()),
+        + ", ".join(f"db{order} {100 * of:.1f} %" for order, of in shares.items()),
         [lower < higher for higher, lower in itertools.pairwise(values)],
         "A part for each step up in order. Longer filters go on improving, so this does not single out order 8.",
     )
 
 
-def _fast(evidence: Evidence) -> Claim:
+def _fast(evidence: ClaimEvidence) -> Claim:
     from sealscope.parameters import load_rig
     from sealscope.signals.filters import decomposition_filters, reach
     from sealscope.signals.windows import WINDOW_SIZE
 
-    rate = load_rig(data_rig()).daq.sample_rate
+    rate = load_rig(BENCH_RIG).daq.sample_rate
     taps = decomposition_filters("db8")[0].size
     operations, wait = 4 * 2 * taps, int(reach("db8", 4)[-1][1])
     return by_simulation(
@@ -167,15 +157,14 @@ def _fast(evidence: Evidence) -> Claim:
         "abstract",
         "The method is fast and easy to implement.",
         f"{operations} multiply-adds a sample for four levels of db8, {operations * rate / 1e6:.2f} million a second "
-        "at "
-        f"{rate:g} Hz; d4 waits {wait} samples ({wait / rate:.2f} s), a window {WINDOW_SIZE / rate:.1f} s",
+        f"at {rate:g} Hz; d4 waits {wait} samples ({wait / rate:.2f} s), a window {WINDOW_SIZE / rate:.1f} s",
         [operations * rate < 1e7],
         "Fast: under ten million operations a second, which a small controller does. What a decision waits for is the "
         "window and the length of baseline its false-alarm rate needs.",
     )
 
 
-def _sign_means_leak(evidence: Evidence) -> Claim:
+def _sign_means_leak(evidence: ClaimEvidence) -> Claim:
     rule = CLAIMED[0]
     still, drift = (float(rule.fires(sheet).mean()) for sheet in (evidence.still, evidence.drift))
     return by_simulation(
@@ -185,43 +174,41 @@ def _sign_means_leak(evidence: Evidence) -> Claim:
         f"fires in {fired(evidence.leak, rule)} with leak, {fired(evidence.still, rule)} with nothing, "
         f"{fired(evidence.drift, rule)} with drift alone",
         [still < 0.05, drift < 0.05],
-        "Parts: it fires in under 5 % of tests without a leak, still or drifting. The bench had no leak-free test, "
-        "and the "
-        "leak always came second.",
+        "Parts: it fires in under 5 % of tests without a leak, still or drifting. The bench had no leak-free test, and "
+        "the leak always came second.",
     )
 
 
-def _similar(evidence: Evidence) -> Claim:
-    def ratio(measured: Sheet, chamber: str, name: str) -> float:
-        simulated = evidence.leak.rms[chamber][name][:, 0]
-        return float(np.exp(np.mean(np.log(simulated / measured.rms[chamber][name][:, 0]))))
-
-    measured = evidence.measured
-    told, parts, sheet = "compared with the sheet only", [], NO_SHEET
+def _similar(evidence: ClaimEvidence) -> Claim:
+    measured, leak = evidence.measured, evidence.leak
+    text, parts, sheet = "compared with the sheet only", [], NO_SHEET
     if measured is not None:
-        ratios = {(c, name): ratio(measured, c, name) for c in CHAMBERS for name in _LEVELS}
-        same = np.sign(log_change(evidence.leak, "p_A", "d3")) == np.sign(log_change(measured, "p_A", "d3"))
-        told = ", ".join(f"{c} {name} {one:.2f}" for (c, name), one in ratios.items())
-        told = (
-            f"leak-free RMS over the sheet's: {told}; d3 of P_A moves the same way in {int(same.sum())} of {same.size}"
+        ratios = {
+            (c, name): float(np.exp(np.mean(np.log(leak.rms[c][name][:, 0] / measured.rms[c][name][:, 0]))))
+            for c in CHAMBERS
+            for name in _LEVELS
+        }
+        same = np.sign(leak.log_change("p_A", "d3")) == np.sign(measured.log_change("p_A", "d3"))
+        text = (
+            f"leak-free RMS over the sheet's: {', '.join(f'{c} {name} {of:.2f}' for (c, name), of in ratios.items())}; "
+            f"d3 of P_A moves the same way in {int(same.sum())} of {same.size}"
         )
-        parts = [1 / 1.25 <= one <= 1.25 for one in ratios.values()] + [bool(same.sum() >= 39)]
+        parts = [1 / 1.25 <= of <= 1.25 for of in ratios.values()] + [bool(same.sum() >= 39)]
         sheet = "the reference"
     return Claim(
         "claim-6.1.4",
         "section 6.1",
         "Model and rig behave alike.",
         sheet,
-        told,
+        text,
         verdict_of(parts),
-        f"Rig {data_rig()}. Parts: each detail's leak-free RMS within 25 % in the geometric mean, and the way of d3 "
-        "on P_A in "
-        "39 of 41 tests. The thesis gives no recorded series to compare with.",
+        f"Rig {BENCH_RIG}. Parts: each detail's leak-free RMS within 25 % in the geometric mean, and the way of d3 on "
+        "P_A in 39 of 41 tests. The thesis gives no recorded series to compare with.",
     )
 
 
-def claims(evidence: Evidence) -> tuple[Claim, ...]:
-    """Claims of the abstract and of chapters 1, 5 and 6 that only a simulation, or nothing here, can judge."""
+def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
+    """Judge claims of the abstract and of chapters 1, 5 and 6 that only a simulation, or nothing here, can judge."""
     return (
         _fast(evidence),
         Claim(

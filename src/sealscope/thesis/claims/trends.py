@@ -5,95 +5,97 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import log_change
-from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED, UNCLAIMED, WAY
-from sealscope.thesis.claims.evidence import Evidence, corrected_p, correlated, fired, moved, on_sheet, percent
-from sealscope.thesis.claims.leak_size import (
+from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED, DIRECTION, UNCLAIMED
+from sealscope.thesis.claims.evidence import (
+    SENSITIVE,
+    ClaimEvidence,
+    corrected_p,
+    correlated,
+    fired,
+    moved,
+    on_sheet,
+    percent,
+)
+from sealscope.thesis.claims.regressions import (
     change_columns,
     condition_columns,
     left_out_r2,
     mean_leaks,
     partial_correlation,
 )
-from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.engine.products import Claim
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.sheet import APPENDIX_C, DataSheet
 
 _N = len(APPENDIX_C)
 
 
-def _trend(evidence: Evidence, id: str, where: str, claim: str, chamber: str, names: tuple[str, ...]) -> Claim:
+def _trend(evidence: ClaimEvidence, id: str, where: str, claim: str, chamber: str) -> Claim:
     leak, given = mean_leaks(), condition_columns()
+    direction = DIRECTION[chamber]
 
-    def test(sheet: Sheet) -> tuple[str, list[bool]]:
-        told, parts = [], []
-        for name in names:
-            change = log_change(sheet, chamber, name)
+    def test(sheet: DataSheet) -> tuple[str, list[bool]]:
+        texts, parts = [], []
+        for name in SENSITIVE:
+            change = sheet.log_change(chamber, name)
             raw, left = float(np.corrcoef(change, leak)[0, 1]), partial_correlation(change, leak, given)
-            told.append(f"{name}: {raw:+.2f}, at equal condition {left:+.2f}")
+            texts.append(f"{name}: {raw:+.2f}, at equal condition {left:+.2f}")
             parts += [
-                raw * WAY[chamber] > 0 and correlated(raw, _N),
-                left * WAY[chamber] > 0 and correlated(left, _N, given.shape[1]),
+                raw * direction > 0 and correlated(raw, _N),
+                left * direction > 0 and correlated(left, _N, given.shape[1]),
             ]
-        return f"correlation of the change with the mean leak: {'; '.join(told)}", parts
+        return f"correlation of the change with the mean leak: {'; '.join(texts)}", parts
 
-    def why(sheet: Sheet) -> str:
+    def why(sheet: DataSheet) -> str:
         return (
             "Parts: the correlation, and the one left once command and throttle are taken out, each beyond chance. "
-            "Command and "
-            f"throttle alone predict the mean leak with a left-out R2 of {left_out_r2(given, leak):.2f}, the six "
-            "changes "
-            f"with {left_out_r2(change_columns(sheet), leak):.2f}: the trend is mostly that of the condition."
+            f"Command and throttle alone predict the mean leak with a left-out R2 of {left_out_r2(given, leak):.2f}, "
+            f"the six changes with {left_out_r2(change_columns(sheet), leak):.2f}: the trend is mostly that of the "
+            "condition."
         )
 
     return on_sheet(evidence, id, where, claim, test, why)
 
 
-def _sensitive(sheet: Sheet) -> tuple[str, list[bool]]:
+def _sensitive(sheet: DataSheet) -> tuple[str, list[bool]]:
     p = corrected_p(sheet)
     claimed = [rule.details[0] for rule in CLAIMED[:6]]
     others = [rule.details[0] for rule in UNCLAIMED]
-    told = [
-        f"{chamber} {name} {percent(log_change(sheet, chamber, name)):+.1f} % (p = {p[chamber, name]:.2g})"
+    texts = [
+        f"{chamber} {name} {percent(sheet.log_change(chamber, name)):+.1f} % (p = {p[chamber, name]:.2g})"
         for chamber, name in (*claimed, *others)
     ]
-    parts = [moved(sheet, *one) for one in claimed] + [p[one] >= 0.05 for one in others]
-    return "; ".join(told), parts
+    parts = [moved(sheet, *column) for column in claimed] + [p[column] >= 0.05 for column in others]
+    return "; ".join(texts), parts
 
 
-def _amplified(sheet: Sheet) -> tuple[str, list[bool]]:
-    told, parts = [], []
+def _amplified(sheet: DataSheet) -> tuple[str, list[bool]]:
+    texts, parts = [], []
     for chamber in CHAMBERS:
-        sizes = {}
-        for name in ("d3", "d4", "d3d4"):
-            change = log_change(sheet, chamber, name) * WAY[chamber]
-            sizes[name] = float(change.mean() / change.std(ddof=1))
-        told.append(f"{chamber}: " + ", ".join(f"{name} {size:.2f}" for name, size in sizes.items()))
+        changes = {name: sheet.log_change(chamber, name) * DIRECTION[chamber] for name in SENSITIVE}
+        sizes = {name: float(change.mean() / change.std(ddof=1)) for name, change in changes.items()}
+        texts.append(f"{chamber}: " + ", ".join(f"{name} {size:.2f}" for name, size in sizes.items()))
         parts.append(sizes["d3d4"] > max(sizes["d3"], sizes["d4"]))
-    return f"mean over scatter of the log change, {'; '.join(told)}", parts
+    return f"mean over scatter of the log change, {'; '.join(texts)}", parts
 
 
-def _inverse(sheet: Sheet) -> tuple[str, list[bool]]:
-    told, parts = [], []
-    for name in ("d3", "d4", "d3d4"):
-        a, b = (log_change(sheet, chamber, name) for chamber in CHAMBERS)
+def _inverse(sheet: DataSheet) -> tuple[str, list[bool]]:
+    texts, parts = [], []
+    for name in SENSITIVE:
+        a, b = (sheet.log_change(chamber, name) for chamber in CHAMBERS)
         r = float(np.corrcoef(a, b)[0, 1])
-        told.append(f"{name}: correlation {r:+.2f}, opposite signs in {int(np.sum(a * b < 0))} of {a.size}")
+        texts.append(f"{name}: correlation {r:+.2f}, opposite signs in {int(np.sum(a * b < 0))} of {a.size}")
         parts.append(r < 0 and correlated(r, a.size))
-    return "; ".join(told), parts
+    return "; ".join(texts), parts
 
 
-def _upward(sheet: Sheet) -> tuple[str, list[bool]]:
+def _upward(sheet: DataSheet) -> tuple[str, list[bool]]:
     p = corrected_p(sheet)
-    names = ("d3", "d4", "d3d4")
-    told = [
-        f"{name} up in {int(np.sum(log_change(sheet, 'p_B', name) > 0))} (p = {p['p_B', name]:.2g})" for name in names
-    ]
-    return f"of {sheet.rms['p_B']['d3'].shape[0]}: {', '.join(told)}", [moved(sheet, "p_B", name) for name in names]
+    up = [f"{q} up in {int(np.sum(sheet.log_change('p_B', q) > 0))} (p = {p['p_B', q]:.2g})" for q in SENSITIVE]
+    return f"of {sheet.rms['p_B']['d3'].shape[0]}: {', '.join(up)}", [moved(sheet, "p_B", q) for q in SENSITIVE]
 
 
-def claims(evidence: Evidence) -> tuple[Claim, ...]:
-    """Claims 5.5.1 to 5.5.6."""
+def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
+    """Judge claims 5.5.1 to 5.5.6."""
     return (
         on_sheet(
             evidence,
@@ -112,8 +114,8 @@ def claims(evidence: Evidence) -> tuple[Claim, ...]:
             "sections 5.2 to 5.7",
             "The product d3d4 amplifies the change and makes the detection surer.",
             _amplified,
-            "Two parts, one for each chamber: d3d4's change is larger than d3's and d4's when each is "
-            "measured by its own scatter. In percent it is larger because it is a product.",
+            "Two parts, one for each chamber: d3d4's change is larger than d3's and d4's when each is measured by its "
+            "own scatter. In percent it is larger because it is a product.",
         ),
         _trend(
             evidence,
@@ -121,7 +123,6 @@ def claims(evidence: Evidence) -> tuple[Claim, ...]:
             "section 5.6, Figs. 5.90 to 5.92",
             "On P_A the change of d3, d4 and d3d4 grows downward with the mean leak.",
             "p_A",
-            ("d3", "d4", "d3d4"),
         ),
         _trend(
             evidence,
@@ -129,7 +130,6 @@ def claims(evidence: Evidence) -> tuple[Claim, ...]:
             "section 5.6, Figs. 5.93 to 5.95",
             "On P_B the change of d3, d4 and d3d4 grows upward with the mean leak.",
             "p_B",
-            ("d3", "d4", "d3d4"),
         ),
         on_sheet(
             evidence,
@@ -146,7 +146,6 @@ def claims(evidence: Evidence) -> tuple[Claim, ...]:
             "The details' RMS values of the two chambers are inversely related.",
             _inverse,
             "A part for each detail: the changes of the two chambers correlate negatively beyond chance over the "
-            "tests. "
-            "Opposite mean signs alone are no inverse relation.",
+            "tests. Opposite mean signs alone are no inverse relation.",
         ),
     )

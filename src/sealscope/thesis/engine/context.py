@@ -1,4 +1,4 @@
-"""What a maker of figures and tables may ask for: simulated runs, the measured sheet, and whether to be quick."""
+"""What a maker of figures and tables may ask for: simulated runs, the measured sheet, other items, a quick version."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Literal, Protocol
 
 from sealscope.recordings.recording import Array, Recording
 from sealscope.thesis.engine.products import Claim, Product
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.sheet import DataSheet
 
 
 @dataclass(frozen=True)
 class RunSpec:
-    """A simulated run, in words; equal specs are run once and kept on disk.
+    """A simulated run as text and numbers; equal specs are run once and kept on disk.
 
     `values`: parameters by name, as text with unit or SI number; `leaks` as `simulation.faults.parse_leak` reads
     them; `prove`: do the halving test too (its outcome is in `SimulatedRun.resolved`; an unresolved run is kept and
@@ -34,9 +34,12 @@ class RunSpec:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """What a run left: the recording, the true outputs at its samples (`simulation.simulate.TRUE_OUTPUTS`), the mean
-    leak it had, and whether halving the step moved nothing too far (None: not asked). `diverged` holds the one-line
-    reason of a run that failed; recording and outputs are then empty."""
+    """The result of a run.
+
+    The recording, the true outputs at its samples (`simulation.simulate.TRUE_OUTPUTS`), the mean leak, and whether
+    halving the step moved no channel too far (None: not tested), by how much each moved (`proof`). `diverged` holds the
+    one-line reason of a run that failed; recording and outputs are then empty.
+    """
 
     recording: Recording | None
     t: Array
@@ -51,12 +54,16 @@ class Context(Protocol):
     """Handed to every maker."""
 
     quick: bool
-    sheet: Sheet | None
+
+    @property
+    def sheet(self) -> DataSheet | None:
+        """The measured sheet, None where it was not given."""
+        ...
 
     def run(self, spec: RunSpec) -> SimulatedRun:
-        """The run of `spec`, simulated now or earlier."""
+        """Return the run of `spec`, simulated now or earlier."""
         ...
 
     def product(self, item: str) -> tuple[Product | Claim, ...]:
-        """What another item of the registry gives, made now or earlier."""
+        """Return the products of another item, made now or earlier."""
         ...

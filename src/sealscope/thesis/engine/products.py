@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,23 +10,25 @@ import numpy as np
 
 from sealscope.recordings.recording import Array
 
-#: How a curve is drawn: what it stands for. `reporting.plots` gives each a line, a grey and a colour, readable
-#: without the colour.
+#: What a curve stands for. `reporting.thesis.plot_style` gives each role a line, a grey and a colour, readable without
+#: the colour.
 Role = Literal[
-    "command", "A", "B", "line 1", "line 2", "literal", "converged", "no leak", "leak", "measured", "simulated",
-    "25 %", "50 %", "75 %", "open", "d1", "d2", "d3", "d4", "d3d4", "reference", "other",
+    "command", "A", "B", "literal", "converged", "no leak", "leak", "measured", "simulated",
+    "25 %", "50 %", "75 %", "reference", "other",
 ]  # fmt: skip
+#: A value of a table; None: no value.
+Cell = float | int | str | None
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class PlotCurve:
     """One series of points (x, y), in the panel's units."""
 
     x: Array
     y: Array
     label: str
     role: Role = "other"
-    kind: Literal["line", "points", "steps", "stems"] = "line"
+    kind: Literal["line", "points", "stems"] = "line"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +47,11 @@ class Panel:
 
     x_label: str
     y_label: str
-    curves: tuple[Curve, ...] = ()
+    curves: tuple[PlotCurve, ...] = ()
     title: str = ""
     marks: tuple[tuple[float, str], ...] = ()
     image: Image | None = None
     x_range: tuple[float, float] | None = None
-    y_range: tuple[float, float] | None = None
     log_x: bool = False
     log_y: bool = False
 
@@ -81,27 +83,29 @@ class Figure:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
-    """A table: `columns` with units in brackets, `rows` of text and numbers (None: no value)."""
+class ResultTable:
+    """A table: `columns` with units in brackets, `rows` of text and numbers."""
 
     id: str
     title: str
     columns: tuple[str, ...]
-    rows: tuple[tuple[float | int | str | None, ...], ...]
+    rows: tuple[tuple[Cell, ...], ...]
     claims: tuple[str, ...] = ()
     resolved: bool | None = None
     notes: str = ""
 
 
-Product = Figure | Table
+Product = Figure | ResultTable
 
 Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One testable sentence of the thesis, in our words: where it stands, what the sheet says, what the simulation
-    says, the verdict, and why."""
+    """One testable sentence of the thesis, in our words, and its verdict.
+
+    `where` it stands, what the data `sheet` says, what the `simulation` says, the verdict, and `why`.
+    """
 
     id: str
     where: str
@@ -112,8 +116,22 @@ class Claim:
     why: str
 
 
+def verdict_of(tests: Iterable[bool | None]) -> Verdict:
+    """Judge a claim by the tests of its parts.
+
+    `holds` where every test passed, `does not hold` where none did, `holds in part` between; tests that could not be
+    made (None) do not count, and without any other the claim `cannot be tested`.
+    """
+    made = [bool(test) for test in tests if test is not None]
+    if not made:
+        return "cannot be tested"
+    if all(made):
+        return "holds"
+    return "holds in part" if any(made) else "does not hold"
+
+
 def thinned(x: Array, y: Array, most: int = 4000) -> tuple[Array, Array]:
-    """The curve with at most about `most` points, least and greatest of each stretch kept, so that peaks survive."""
+    """Thin a curve to about `most` points: the least and the greatest of each stretch, so that peaks survive."""
     if x.size <= most:
         return x, y
     size = int(np.ceil(2 * x.size / most))

@@ -1,4 +1,4 @@
-"""Simulate what a RunSpec says."""
+"""Simulate the run that a RunSpec describes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 
 
 def experiment_of(spec: RunSpec) -> Experiment:
-    """The experiment that a spec describes; raises InputError for one that cannot be."""
+    """Make the experiment that a spec describes; raise InputError for one that cannot be."""
     return Experiment.of(
         rig=spec.rig,
         command=spec.command,
@@ -29,14 +29,14 @@ def experiment_of(spec: RunSpec) -> Experiment:
     )
 
 
-def simulated(spec: RunSpec, experiment: Experiment) -> SimulatedRun:
-    """The run of a spec, its leaks sized once for the run and for its halving test."""
+def simulated_run(spec: RunSpec, experiment: Experiment) -> SimulatedRun:
+    """Simulate the run of a spec; its leaks are sized once for the run and its halving test."""
     try:
         experiment = replace(experiment, leaks=sized_leaks(experiment))
         made = simulate_with_truth(experiment)
         proof = prove(experiment) if spec.prove else None
     except SimulationFailed as error:
         return SimulatedRun(None, np.empty(0), {}, 0.0, False if spec.prove else None, diverged=str(error))
-    moved = {} if proof is None else {one.name: one.difference for one in proof.differences}
+    moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
     return SimulatedRun(made.recording, made.truth.t, made.truth.outputs, made.truth.mean_leak_lpm, resolved, moved)

@@ -20,45 +20,39 @@ _DATA = (".toml", ".j2", ".css", ".js")
 
 @cache
 def sources_key(module: str, libraries: Sequence[str] = LIBRARIES) -> str:
-    """Hash over every file that `module` reaches (see `reached`) and over the versions of `libraries`."""
+    """Hash every file that `module` reaches (see `reached_files`) and the versions of the installed `libraries`."""
     digest = hashlib.sha256()
-    for path in reached(module):
+    for path in reached_files(module):
         digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     for library in libraries:
-        digest.update(f"{library} {_version(library)}".encode())
+        try:
+            version = metadata.version(library)
+        except metadata.PackageNotFoundError:
+            version = "none"
+        digest.update(f"{library} {version}".encode())
     return digest.hexdigest()
 
 
-def reached(module: str) -> tuple[Path, ...]:
-    """Files of this package that `module` imports, directly or through others, at its top or inside functions.
+def reached_files(module: str) -> tuple[Path, ...]:
+    """Find the files of this package that `module` imports, directly or through others, at its top or in functions.
 
     Names taken from a room itself (`from sealscope.recordings import read`) load lazily, so they count as the whole
     room with its data files. Imports for type checkers alone do not count.
     """
-    files: dict[Path, None] = {}
-    pending, seen = [module], set()
+    files: set[Path] = set()
+    pending = [module]
     while pending:
         name = pending.pop()
-        if name in seen:
-            continue
-        seen.add(name)
         path = _file(name)
-        if path is None:
+        if path is None or path in files:
             continue
-        files[path] = None
+        files.add(path)
         pending += _imported(path)
         if path.name == "__init__.py" and name != PACKAGE:
-            for part in sorted(path.parent.rglob("*")):
-                if part.suffix in _DATA:
-                    files[part] = None
-                elif part.suffix == ".py":
-                    pending.append(_name(part, name, path.parent))
+            files.update(part for part in path.parent.rglob("*") if part.suffix in _DATA)
+            parts = (part.relative_to(path.parent).with_suffix("").parts for part in path.parent.rglob("*.py"))
+            pending += [".".join((name, *inner)).removesuffix(".__init__") for inner in parts]
     return tuple(sorted(files))
-
-
-def _name(part: Path, room: str, folder: Path) -> str:
-    inner = part.relative_to(folder).with_suffix("").parts
-    return ".".join((room, *(word for word in inner if word != "__init__")))
 
 
 @cache
@@ -72,28 +66,19 @@ def _file(module: str) -> Path | None:
 
 @cache
 def _imported(path: Path) -> tuple[str, ...]:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return tuple(name for name in _names(tree) if name.split(".")[0] == PACKAGE)
+    names = _names(ast.parse(path.read_text(encoding="utf-8")))
+    return tuple(name for name in names if name.split(".")[0] == PACKAGE)
 
 
 def _names(node: ast.AST) -> Iterator[str]:
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING":
-            for other in child.orelse:
-                yield from _names(other)
-        elif isinstance(child, ast.Import):
+            continue
+        if isinstance(child, ast.Import):
             yield from (alias.name for alias in child.names)
-        elif isinstance(child, ast.ImportFrom) and child.module and not child.level:
+        elif isinstance(child, ast.ImportFrom) and child.module:
             for alias in child.names:
                 inner = f"{child.module}.{alias.name}"
-                within = child.module.split(".")[0] == PACKAGE
-                yield inner if within and _file(inner) is not None else child.module
+                yield inner if child.module.split(".")[0] == PACKAGE and _file(inner) is not None else child.module
         else:
             yield from _names(child)
-
-
-def _version(library: str) -> str:
-    try:
-        return metadata.version(library)
-    except metadata.PackageNotFoundError:
-        return "none"

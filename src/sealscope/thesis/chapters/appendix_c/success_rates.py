@@ -10,37 +10,38 @@ from numpy.typing import NDArray
 
 from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import QUANTITIES, log_change
-from sealscope.thesis.chapters.appendix_c.tables import simulated
+from sealscope.thesis.chapters.appendix_c.tables import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Table
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.engine.products import Cell, ResultTable
+from sealscope.thesis.sheet import QUANTITIES, DataSheet
 
-#: The way each chamber's RMS is said to go when a leak opens, section 5.6.
-WAY: Mapping[str, int] = {"p_A": -1, "p_B": 1}
+#: The direction in which each chamber's RMS is said to move when a leak opens, section 5.6.
+DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}
 #: False-alarm probability at which the rules with a threshold are set.
 FALSE_ALARMS = 0.05
 #: Normal quantiles that are passed with probability FALSE_ALARMS, to one side and to either.
 _ONE_SIDED, _EITHER_SIDE = 1.6448536269514722, 1.959963984540054
+_COUNTED = ("rate [%]", "95 % low [%]", "95 % high [%]")
 
-Cell = float | int | str | None
 Fires = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule of Table 5.1: it fires when every named detail goes its chamber's way. `printed` [%]: as the thesis has
-    it (with its variants), empty for one it does not claim."""
+    """A rule of Table 5.1: it fires when every named detail moves in its chamber's direction.
+
+    `printed` [%]: as the thesis has it (with its variants), empty for one it does not claim.
+    """
 
     name: str
     details: tuple[tuple[str, str], ...]
     printed: str = ""
 
-    def fires(self, sheet: Sheet) -> Fires:
-        """Which tests it fires in, (n,)."""
-        went = [log_change(sheet, chamber, detail) * WAY[chamber] > 0 for chamber, detail in self.details]
-        return np.asarray(np.all(went, axis=0))
+    def fires(self, sheet: DataSheet) -> Fires:
+        """Return which tests it fires in, (n,)."""
+        moved = [sheet.log_change(chamber, detail) * DIRECTION[chamber] > 0 for chamber, detail in self.details]
+        return np.asarray(np.all(moved, axis=0))
 
 
 #: The six cells of Table 5.1 and the cumulative one.
@@ -62,32 +63,34 @@ UNCLAIMED: tuple[Rule, ...] = (
 )
 
 
-def _rate(fired: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
-    """Count as "k/n", rate and interval [%]."""
-    if fired is None:
+def _counted(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
+    """Count as "k/n", share of the tests and its interval [%]."""
+    if fires is None:
         return None, None, None, None
-    k, n = int(fired.sum()), fired.size
+    k, n = int(fires.sum()), fires.size
     low, high = clopper_pearson(k, n)
     return f"{k}/{n}", 100.0 * k / n, 100.0 * low, 100.0 * high
 
 
-def rates(measured: Sheet | None, leak: Sheet, still: Sheet, drift: Sheet) -> list[tuple[Cell, ...]]:
-    """Rows of Table 5.1: each rule on the sheet, in simulation with leak, with none, and with drift but no leak; then
-    the rules that always and never fire."""
-    sources = (measured, leak, still, drift)
+def counts(measured: DataSheet | None, leak: DataSheet, still: DataSheet, drift: DataSheet) -> list[tuple[Cell, ...]]:
+    """Count each rule of Table 5.1 on the sheet, in simulation with leak, with none, and with drift but no leak.
 
-    def row(name: str, printed: str, fired: list[Fires | None]) -> tuple[Cell, ...]:
-        with_leak, with_drift = fired[1], fired[3]
+    The last rows are the rules that always and never fire.
+    """
+
+    def row(name: str, printed: str, fires: list[Fires | None]) -> tuple[Cell, ...]:
+        with_leak, with_drift = fires[1], fires[3]
         assert with_leak is not None and with_drift is not None
         gain = 100.0 * float(with_leak.mean() - with_drift.mean())
-        return (name, printed or None, *(cell for one in fired for cell in _rate(one)), gain)
+        return (name, printed or None, *(cell for of in fires for cell in _counted(of)), gain)
 
+    sheets = (measured, leak, still, drift)
     rows = [
-        row(rule.name, rule.printed, [None if one is None else rule.fires(one) for one in sources])
+        row(rule.name, rule.printed, [None if sheet is None else rule.fires(sheet) for sheet in sheets])
         for rule in (*CLAIMED, *UNCLAIMED)
     ]
     for name, value in (("always fires", True), ("never fires", False)):
-        sizes = [None if one is None else one.rms["p_A"]["d3"].shape[0] for one in sources]
+        sizes = [None if sheet is None else sheet.rms["p_A"]["d3"].shape[0] for sheet in sheets]
         rows.append(row(name, "", [None if n is None else np.full(n, value) for n in sizes]))
     return rows
 
@@ -96,25 +99,29 @@ RATES = (
     "rule",
     "printed [%]",
     *(
-        f"{of}{what}"
-        for of in ("sheet: ", "simulated leak: ", "simulated, no leak: ", "simulated, drift only: ")
-        for what in ("fires", "rate [%]", "95 % low [%]", "95 % high [%]")
+        f"{of}: {what}"
+        for of in ("sheet", "simulated leak", "simulated, no leak", "simulated, drift only")
+        for what in ("fires", *_COUNTED)
     ),
     "simulated leak less drift [points]",
 )
 
 
-def column_tests(sheet: Sheet) -> list[tuple[Cell, ...]]:
-    """Every column of a sheet: how many tests fell and rose, the sign test's p, and p corrected (Holm) for all ten
-    columns that were there to choose from."""
-    found = []
+def column_tests(sheet: DataSheet) -> list[tuple[Cell, ...]]:
+    """Test every column of a sheet.
+
+    How many tests fell and rose, the sign test's p, and p corrected (Holm) for all ten columns that were there to
+    choose from.
+    """
+    rows = []
     for chamber in CHAMBERS:
         for name in QUANTITIES:
-            change = log_change(sheet, chamber, name)
+            change = sheet.log_change(chamber, name)
             down, up = int(np.sum(change < 0)), int(np.sum(change > 0))
-            found.append((chamber, name, down, up, float(100 * np.expm1(change.mean())), sign_test(down, down + up)))
-    corrected = holm([row[-1] for row in found])
-    return [(*row, value, (value < 0.05 and "yes") or "no") for row, value in zip(found, corrected, strict=True)]
+            mean = float(100 * np.expm1(change.mean()))
+            rows.append((chamber, name, down, up, mean, sign_test(down, down + up)))
+    corrected = holm([row[-1] for row in rows])
+    return [(*row, p, "yes" if p < 0.05 else "no") for row, p in zip(rows, corrected, strict=True)]
 
 
 COLUMNS = (
@@ -130,76 +137,78 @@ COLUMNS = (
 )
 
 
-def d1_threshold(sheet: Sheet, chamber: str, either_side: bool = False) -> float:
-    """The log change that noise alone passes with probability `FALSE_ALARMS`, one way or to either side, from the
-    scatter of d1 about zero: ``1.645 rms(log change of d1)``, or 1.960 times it.
+def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
+    """Return the log change that noise alone passes with probability `FALSE_ALARMS`, to one side or to either.
 
-    d1 is noise: no leak moves it, so its changes between the halves are those of a leak-free rig. The other details
-    can only scatter more.
+    From the scatter of d1 about zero: ``1.645 rms(log change of d1)``, or 1.960 times it. d1 is noise: no leak moves
+    it, so its changes between the halves are those of a leak-free rig. The other details can only scatter more.
     """
-    change = log_change(sheet, chamber, "d1")
+    change = sheet.log_change(chamber, "d1")
     return float((_EITHER_SIDE if either_side else _ONE_SIDED) * np.sqrt(np.mean(change**2)))
 
 
-def drift_threshold(drift: Sheet, chamber: str, detail: str) -> float:
-    """The log change, in the chamber's way, that the drift-only tests pass with probability `FALSE_ALARMS`."""
-    return float(np.quantile(log_change(drift, chamber, detail) * WAY[chamber], 1.0 - FALSE_ALARMS))
+def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
+    """Return the log change, in the chamber's direction, that drift-only tests pass with probability `FALSE_ALARMS`."""
+    return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
 
-def thresholds(measured: Sheet | None, leak: Sheet, drift: Sheet) -> list[tuple[Cell, ...]]:
-    """Each single-detail rule with a threshold instead of the bare sign: how many leaks it still finds."""
+def thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[tuple[Cell, ...]]:
+    """Count how many leaks each single-detail rule still finds with a threshold instead of the bare sign."""
     rows: list[tuple[Cell, ...]] = []
     for rule in (*CLAIMED[:6], *UNCLAIMED):
         ((chamber, detail),) = rule.details
-        limit = drift_threshold(drift, chamber, detail)
-        found = _rate(log_change(leak, chamber, detail) * WAY[chamber] > limit)
-        real: tuple[Cell, ...] = (None, None, None, None, None)
-        if measured is not None:
-            bench = d1_threshold(measured, chamber)
-            change = log_change(measured, chamber, detail) * WAY[chamber]
-            real = (100.0 * float(np.expm1(WAY[chamber] * bench)), *_rate(change > bench))
-        rows.append((rule.name, *real, 100.0 * float(np.expm1(WAY[chamber] * limit)), *found))
+        direction = DIRECTION[chamber]
+        row: list[Cell] = [rule.name]
+        for sheet, limit in (
+            (measured, None if measured is None else d1_threshold(measured, chamber)),
+            (leak, drift_threshold(drift, chamber, detail)),
+        ):
+            if sheet is None or limit is None:
+                row += [None] * 5
+                continue
+            fires = sheet.log_change(chamber, detail) * direction > limit
+            row += [100.0 * float(np.expm1(direction * limit)), *_counted(fires)]
+        rows.append(tuple(row))
     return rows
 
 
 THRESHOLDS = (
     "rule",
     "sheet: threshold from d1's scatter [%]",
-    *(f"sheet: {what}" for what in ("finds", "rate [%]", "95 % low [%]", "95 % high [%]")),
+    *(f"sheet: {what}" for what in ("finds", *_COUNTED)),
     "simulated: threshold from drift only [%]",
-    *(f"simulated leak: {what}" for what in ("finds", "rate [%]", "95 % low [%]", "95 % high [%]")),
+    *(f"simulated leak: {what}" for what in ("finds", *_COUNTED)),
 )
 
 
-def table(context: Context, item: Item) -> tuple[Table, ...]:
-    """Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
-    made, leak = simulated(context, "appendix-c-leak")
-    _, still = simulated(context, "appendix-c-no-leak")
-    _, drift = simulated(context, "appendix-c-drift")
+def table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+    """Tabulate Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
+    made, leak = simulated_sheet(context, "appendix-c-leak")
+    _, still = simulated_sheet(context, "appendix-c-no-leak")
+    _, drift = simulated_sheet(context, "appendix-c-drift")
     measured = context.sheet
     none = "" if measured else " No measured sheet was given."
-    success = Table(
+    success = ResultTable(
         item.id,
         item.title,
         RATES,
-        tuple(rates(measured, leak, still, drift)),
+        tuple(counts(measured, leak, still, drift)),
         resolved=made.resolved,
-        notes=f"A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
+        notes="A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
         f"(Clopper-Pearson) and take the tests as independent, which repeats of one condition are not.{none} The bench "
         f"had no leak-free test, so its own false-alarm rate is unknown. {made.notes}",
     )
-    sources = [("sheet", measured), ("simulated leak", leak), ("simulated, no leak", still)]
-    sources.append(("simulated, drift only", drift))
-    columns = Table(
+    sheets = {"sheet": measured, "simulated leak": leak, "simulated, no leak": still, "simulated, drift only": drift}
+    columns = ResultTable(
         f"{item.id}-columns",
         "Sign tests of every column of Appendix C",
         COLUMNS,
-        tuple((name, *row) for name, one in sources if one is not None for row in column_tests(one)),
+        tuple((name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet)),
         resolved=made.resolved,
         notes="Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the "
         "leak always came second.",
     )
-    limits = Table(
+    limits = ResultTable(
         f"{item.id}-thresholds",
         f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms",
         THRESHOLDS,
@@ -217,7 +226,7 @@ ITEMS: tuple[Item, ...] = (
         5,
         "table",
         "Success rates of Table 5.1, counted anew, with intervals and false alarms",
-        f"{__name__}:table",
+        table,
         needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
     ),
 )

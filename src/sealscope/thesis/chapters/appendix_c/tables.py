@@ -7,26 +7,22 @@ import numpy as np
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.thesis.chapters.appendix_c.simulated_sheet import (
+from sealscope.thesis.chapters.appendix_c.simulation import (
     BULK_DRIFT,
     FRICTION_DRIFT,
     NOISE_DRIFT,
-    QUANTITIES,
-    data_rig,
-    log_change,
     sheet_of,
     table_of,
     with_drift,
     with_leak,
     without_leak,
 )
-from sealscope.thesis.conditions import APPENDIX_C
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Curve, Figure, Number, Panel, Table
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.engine.products import Cell, Figure, Number, Panel, PlotCurve, ResultTable, Role
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, DataSheet
 
-#: Figs. 5.90 to 5.95: chamber, quantity, and the way it is said to go when a leak opens.
+#: Figs. 5.90 to 5.95: chamber, quantity, and the direction it is said to move when a leak opens.
 DIFFERENCES: tuple[tuple[str, str, str, str], ...] = (
     ("fig-5.90", "p_A", "d3", "down"),
     ("fig-5.91", "p_A", "d4", "down"),
@@ -35,96 +31,6 @@ DIFFERENCES: tuple[tuple[str, str, str, str], ...] = (
     ("fig-5.94", "p_B", "d4", "up"),
     ("fig-5.95", "p_B", "d3d4", "up"),
 )
-_SHEETS = ("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift")
-
-
-def _unit(quantity: str) -> str:
-    return "psi^2" if quantity == "d3d4" else "psi"
-
-
-def _where(context: Context) -> str:
-    half = "40 s a half (quick)" if context.quick else "90 s a half"
-    return f"Rig {data_rig()}, {half}, the first 5 s left out; RMS in psi, the unit the sheet is taken to be in."
-
-
-def leak_table(context: Context, item: Item) -> tuple[Table, ...]:
-    """The 41 tests with their leak from half time on."""
-    proof = (
-        "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
-    )
-    notes = f"{_where(context)} Laminar leak of the test's own mean. {proof}"
-    return (table_of(list(with_leak(context.quick)), item.id, item.title, notes),)
-
-
-def no_leak_table(context: Context, item: Item) -> tuple[Table, ...]:
-    """The 41 tests with nothing happening at half time."""
-    notes = f'{_where(context)} Nothing leaks: "leak" heads the second half.'
-    return (table_of(list(without_leak(context.quick)), item.id, item.title, notes),)
-
-
-def drift_table(context: Context, item: Item) -> tuple[Table, ...]:
-    """The 41 tests without a leak on a rig that drifts between the halves."""
-    bounds = [f"{100 * low:g} to {100 * high:g} %" for low, high in (FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT)]
-    notes = (
-        f'{_where(context)} Nothing leaks: "leak" heads the second half, from a rig with friction moved {bounds[0]}, '
-        f"bulk modulus {bounds[1]}, noise {bounds[2]}, up or down at random. The sizes are assumed: the scatter "
-        "of d1 on the thesis's own sheet is 4 %, the others were not measured."
-    )
-    return (table_of(list(with_drift(context.quick)), item.id, item.title, notes),)
-
-
-def simulated(context: Context, item: str) -> tuple[Table, Sheet]:
-    """The table of `appendix-c-leak`, `-no-leak` or `-drift`, and the sheet in it."""
-    table = next(one for one in context.product(item) if isinstance(one, Table))
-    return table, sheet_of(table)
-
-
-def _diff(pairs: Array) -> Array:
-    return np.asarray(100.0 * (pairs[:, 1] - pairs[:, 0]) / pairs[:, 0])
-
-
-def chamber_table(sheet: Sheet, measured: Sheet | None, chamber: str, item: str) -> Table:
-    """The thesis's table of one chamber: RMS without and with leak and the difference [%], simulated and measured."""
-    heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
-    columns: list[list[float] | list[None]] = []
-    for name in QUANTITIES:
-        for of, source in (("simulated", sheet), ("measured", measured)):
-            heads += [f"{name} {when}, {of} [{_unit(name)}]" for when in ("no leak", "leak")]
-            heads.append(f"{name} diff, {of} [%]")
-            if source is None:
-                columns += [[None] * len(APPENDIX_C)] * 3
-            else:
-                pairs = source.rms[chamber][name]
-                columns += [pairs[:, 0].tolist(), pairs[:, 1].tolist(), _diff(pairs).tolist()]
-    rows = tuple(
-        (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(values[k] for values in columns))
-        for k, row in enumerate(APPENDIX_C)
-    )
-    return Table(item, f"Appendix C, RMS of the wavelet details of {chamber}", tuple(heads), rows)
-
-
-def agreement(sheet: Sheet, measured: Sheet | None) -> list[tuple[float | int | str | None, ...]]:
-    """How the simulated sheet compares with the measured one, a row for each chamber and detail."""
-    rows: list[tuple[float | int | str | None, ...]] = []
-    for chamber in CHAMBERS:
-        for name in QUANTITIES:
-            change = log_change(sheet, chamber, name)
-            told: list[float | int | None] = [float(100 * np.expm1(change.mean())), None, None, None, None, None]
-            if measured is not None:
-                real = log_change(measured, chamber, name)
-                ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
-                told = [
-                    told[0],
-                    float(100 * np.expm1(real.mean())),
-                    float(np.exp(ratio.mean())),
-                    float(np.exp(ratio.std(ddof=1))),
-                    int(np.sum(np.sign(change) == np.sign(real))),
-                    float(np.corrcoef(change, real)[0, 1]),
-                ]
-            rows.append((chamber, name, *told))
-    return rows
-
-
 AGREEMENT = (
     "chamber",
     "detail",
@@ -137,37 +43,121 @@ AGREEMENT = (
 )
 
 
-def appendix(context: Context, item: Item) -> tuple[Table, ...]:
-    """How simulation and sheet agree, and the thesis's two tables with both side by side."""
-    table, sheet = simulated(context, "appendix-c-leak")
-    notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
-    summary = Table(
-        item.id, item.title, AGREEMENT, tuple(agreement(sheet, context.sheet)), resolved=table.resolved, notes=notes
+def _where(context: Context) -> str:
+    half = "40 s a half (quick)" if context.quick else "90 s a half"
+    return f"Rig {BENCH_RIG}, {half}, the first 5 s left out; RMS in psi, the unit the sheet is taken to be in."
+
+
+def leak_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+    """Tabulate the 41 tests with their leak from half time on."""
+    proof = (
+        "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
     )
-    chambers = tuple(
+    notes = f"{_where(context)} Laminar leak of the test's own mean. {proof}"
+    return (table_of(list(with_leak(context.quick)), item.id, item.title, notes),)
+
+
+def no_leak_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+    """Tabulate the 41 tests with nothing happening at half time."""
+    notes = f'{_where(context)} Nothing leaks: "leak" heads the second half.'
+    return (table_of(list(without_leak(context.quick)), item.id, item.title, notes),)
+
+
+def drift_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+    """Tabulate the 41 tests without a leak on a rig that drifts between the halves."""
+    bounds = [f"{100 * low:g} to {100 * high:g} %" for low, high in (FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT)]
+    notes = (
+        f'{_where(context)} Nothing leaks: "leak" heads the second half, from a rig with friction moved {bounds[0]}, '
+        f"bulk modulus {bounds[1]}, noise {bounds[2]}, up or down at random. The sizes are assumed: the scatter "
+        "of d1 on the thesis's own sheet is 4 %, the others were not measured."
+    )
+    return (table_of(list(with_drift(context.quick)), item.id, item.title, notes),)
+
+
+def simulated_sheet(context: Context, item: str) -> tuple[ResultTable, DataSheet]:
+    """Return the table of `appendix-c-leak`, `-no-leak` or `-drift`, and the sheet in it."""
+    table = next(product for product in context.product(item) if isinstance(product, ResultTable))
+    return table, sheet_of(table)
+
+
+def _difference(pairs: Array) -> Array:
+    return np.asarray(100.0 * (pairs[:, 1] - pairs[:, 0]) / pairs[:, 0])
+
+
+def chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: str) -> ResultTable:
+    """Tabulate one chamber as the thesis does: RMS without and with leak and the difference [%], with both sources."""
+    heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
+    columns: list[list[float] | list[None]] = []
+    for name in QUANTITIES:
+        for label, source in (("simulated", sheet), ("measured", measured)):
+            heads += [f"{name} {when}, {label} [{UNITS[name]}]" for when in ("no leak", "leak")]
+            heads.append(f"{name} diff, {label} [%]")
+            if source is None:
+                columns += [[None] * len(APPENDIX_C)] * 3
+            else:
+                pairs = source.rms[chamber][name]
+                columns += [pairs[:, 0].tolist(), pairs[:, 1].tolist(), _difference(pairs).tolist()]
+    rows = tuple(
+        (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(values[k] for values in columns))
+        for k, row in enumerate(APPENDIX_C)
+    )
+    return ResultTable(item, f"Appendix C, RMS of the wavelet details of {chamber}", tuple(heads), rows)
+
+
+def agreement(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
+    """Compare the simulated sheet with the measured one, a row for each chamber and detail."""
+    rows: list[tuple[Cell, ...]] = []
+    for chamber in CHAMBERS:
+        for name in QUANTITIES:
+            change = sheet.log_change(chamber, name)
+            row: list[Cell] = [chamber, name, float(100 * np.expm1(change.mean()))]
+            if measured is None:
+                row += [None] * 5
+            else:
+                real = measured.log_change(chamber, name)
+                ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
+                row += [
+                    float(100 * np.expm1(real.mean())),
+                    float(np.exp(ratio.mean())),
+                    float(np.exp(ratio.std(ddof=1))),
+                    int(np.sum(np.sign(change) == np.sign(real))),
+                    float(np.corrcoef(change, real)[0, 1]),
+                ]
+            rows.append(tuple(row))
+    return rows
+
+
+def appendix(context: Context, item: Item) -> tuple[ResultTable, ...]:
+    """Tabulate how simulation and sheet agree, and the thesis's two tables with both side by side."""
+    table, sheet = simulated_sheet(context, "appendix-c-leak")
+    notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
+    rows = tuple(agreement(sheet, context.sheet))
+    summary = ResultTable(item.id, item.title, AGREEMENT, rows, resolved=table.resolved, notes=notes)
+    return summary, *(
         chamber_table(sheet, context.sheet, chamber, f"{item.id}-{short}")
         for chamber, short in zip(CHAMBERS, ("pa", "pb"), strict=True)
     )
-    return (summary, *chambers)
 
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Change of one detail's RMS against the mean leak: measured, simulated, and simulated with nothing leaking."""
+    """Draw the change of a detail's RMS against the mean leak: measured, simulated, simulated without a leak."""
     chamber, name, way = (str(item.input(key)) for key in ("chamber", "detail", "way"))
-    table, sheet = simulated(context, "appendix-c-leak")
-    _, still = simulated(context, "appendix-c-no-leak")
+    table, sheet = simulated_sheet(context, "appendix-c-leak")
     leak = np.array([row.mean_leak_lpm for row in APPENDIX_C])
-    sources = [(context.sheet, "measured (sheet)", "measured"), (sheet, "simulated", "simulated")]
-    sources.append((still, "simulated, nothing leaks", "no leak"))
+    sources: list[tuple[DataSheet | None, str, Role]] = [
+        (context.sheet, "measured (sheet)", "measured"),
+        (sheet, "simulated", "simulated"),
+        (simulated_sheet(context, "appendix-c-no-leak")[1], "simulated, nothing leaks", "no leak"),
+    ]
     numbers: list[Number] = []
     absolute, relative = [], []
     for source, label, role in sources:
         if source is None:
             continue
         pairs = source.rms[chamber][name]
-        absolute.append(Curve(leak, pairs[:, 1] - pairs[:, 0], label, role, "points"))  # type: ignore[arg-type]
-        relative.append(Curve(leak, _diff(pairs), label, role, "points"))  # type: ignore[arg-type]
-        change = log_change(source, chamber, name)
+        absolute.append(PlotCurve(leak, pairs[:, 1] - pairs[:, 0], label, role, "points"))
+        relative.append(PlotCurve(leak, _difference(pairs), label, role, "points"))
+        change = source.log_change(chamber, name)
         k = int(np.sum(change < 0 if way == "down" else change > 0))
         low, high = clopper_pearson(k, change.size)
         numbers += [
@@ -175,51 +165,26 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
             Number(f"{label}: rate, 95 % interval", f"{k / change.size:.3f} ({low:.3f} to {high:.3f})"),
             Number(f"{label}: correlation of the change with the leak", float(np.corrcoef(change, leak)[0, 1])),
         ]
-    zero = Curve(np.array([leak.min(), leak.max()]), np.zeros(2), "no change", "reference")
+    zero = PlotCurve(np.array([leak.min(), leak.max()]), np.zeros(2), "no change", "reference")
     panels = (
-        Panel("mean leak [L/min]", f"RMS with - without leak, {name} [{_unit(name)}]", (*absolute, zero)),
+        Panel("mean leak [L/min]", f"RMS with - without leak, {name} [{UNITS[name]}]", (*absolute, zero)),
         Panel("mean leak [L/min]", f"change of the RMS of {name} [%]", (*relative, zero)),
     )
     return (Figure(item.id, item.title, panels, tuple(numbers), resolved=table.resolved, notes=table.notes),)
 
 
 ITEMS: tuple[Item, ...] = (
-    Item(
-        "appendix-c-leak",
-        5,
-        "case",
-        "The 41 tests of Appendix C simulated with their leak",
-        f"{__name__}:leak_table",
-    ),
-    Item(
-        "appendix-c-no-leak",
-        5,
-        "case",
-        "The same 41 tests simulated with no leak",
-        f"{__name__}:no_leak_table",
-    ),
-    Item(
-        "appendix-c-drift",
-        5,
-        "case",
-        "The same 41 tests simulated with no leak on a rig that drifts",
-        f"{__name__}:drift_table",
-    ),
-    Item(
-        "appendix-c",
-        5,
-        "table",
-        "Appendix C, simulated beside measured",
-        f"{__name__}:appendix",
-        needs=("appendix-c-leak",),
-    ),
+    Item("appendix-c-leak", 5, "case", "The 41 tests of Appendix C simulated with their leak", leak_table),
+    Item("appendix-c-no-leak", 5, "case", "The same 41 tests simulated with no leak", no_leak_table),
+    Item("appendix-c-drift", 5, "case", "The same 41 tests simulated with no leak on a rig that drifts", drift_table),
+    Item("appendix-c", 5, "table", "Appendix C, simulated beside measured", appendix, needs=("appendix-c-leak",)),
     *(
         Item(
             figure,
             5,
             "figure",
             f"Change of the RMS of {name} of {chamber} against the mean leak",
-            f"{__name__}:difference_figure",
+            difference_figure,
             inputs=(("chamber", chamber), ("detail", name), ("way", way)),
             needs=("appendix-c-leak", "appendix-c-no-leak"),
         )

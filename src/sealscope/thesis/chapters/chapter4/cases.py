@@ -1,5 +1,7 @@
-"""The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and each case run as the thesis ran it and
-converged."""
+"""The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and the numbers that claims are judged by.
+
+A case is run with the thesis's own method and step ("literal") and converged; the equations are the same in both.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,15 @@ from typing import Literal
 
 import numpy as np
 
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 
+Solver = Literal["converged", "literal"]
+SOLVERS: tuple[Solver, ...] = ("converged", "literal")
+SOLVER_TEXT: dict[Solver, str] = {"converged": "converged", "literal": "RK4 1e-4 s"}
+#: The solvers in the legend of a figure, in the order of drawing.
+LABELS: dict[Solver, str] = {"literal": "RK4, 1e-4 s", "converged": "converged"}
 #: Step [s] of the thesis's own Runge-Kutta method (section 4.1.1).
 THESIS_STEP = 1e-4
 #: Duration [s] of a run, and the whole periods of both commands in it that numbers are taken from.
@@ -24,10 +32,16 @@ SAMPLE_RATE = 1.0 / (3.0 * THESIS_STEP)
 #: Pressure difference [Pa] below which a throttle is taken as laminar. Eqs. (4.9)-(4.12) have no such limit; 1 Pa is
 #: far below every drop, and above zero, so that the equations can be solved at all.
 DP_0 = 1.0
+COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)")
+CLOSINGS = (25.0, 50.0, 75.0)
+#: Command of section 4.3, and its period [s].
+COMMAND, PERIOD = "5 sin(2t)", math.pi
+#: Length [s] and sampling rate [Hz] of the runs that show drift of the piston.
+_DRIFT_DURATION, _DRIFT_RATE = 60.0, 100.0
 
 
 @dataclass(frozen=True)
-class Case:
+class ThesisCase:
     """A row of Table 4.2 or 4.3: `name` such as "4.3-f", `closed_pct` [%] of both throttles, None without them."""
 
     name: str
@@ -40,26 +54,17 @@ class Case:
         return f"{self.command}, " + ("no orifice" if self.closed_pct is None else f"{self.closed_pct:g} % closed")
 
 
-COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)")
-CLOSINGS = (25.0, 50.0, 75.0)
-CASES: dict[str, Case] = {
+_THROTTLED = [(closed, command) for closed in CLOSINGS for command in COMMANDS]
+CASES: dict[str, ThesisCase] = {
     case.name: case
     for case in (
-        *(Case(f"4.2-{letter}", command, None) for letter, command in zip("abc", COMMANDS, strict=True)),
+        *(ThesisCase(f"4.2-{letter}", command, None) for letter, command in zip("abc", COMMANDS, strict=True)),
         *(
-            Case(f"4.3-{letter}", command, closed)
-            for letter, (closed, command) in zip(
-                "abcdefghi", ((closed, command) for closed in CLOSINGS for command in COMMANDS), strict=True
-            )
+            ThesisCase(f"4.3-{letter}", command, closed)
+            for letter, (closed, command) in zip("abcdefghi", _THROTTLED, strict=True)
         ),
     )
 }
-
-
-Metering = Literal["meter-out", "literal"]
-Meaning = Literal["area", "diameter"]
-METERINGS: tuple[Metering, ...] = ("meter-out", "literal")
-MEANINGS: tuple[Meaning, ...] = ("area", "diameter")
 
 
 @dataclass(frozen=True)
@@ -71,8 +76,8 @@ class Reading:
     text); `V_line_cm3` V_1 = V_2, not given.
     """
 
-    metering: Metering = "meter-out"
-    closed_means: Meaning = "area"
+    metering: Literal["meter-out", "literal"] = "meter-out"
+    closed_means: Literal["area", "diameter"] = "area"
     d_line_mm: float = 7.0
     V_line_cm3: float = 44.0
 
@@ -84,11 +89,12 @@ class Reading:
         return text if self.V_line_cm3 == Reading.V_line_cm3 else f"{text}, V_1 = {self.V_line_cm3:g} cm3"
 
     def values(self, closed_pct: float | None) -> tuple[tuple[str, str | float], ...]:
-        """The rig's parameters by name for throttles closed by `closed_pct` [%] (0: open in the line; None: absent)."""
+        """Return the rig's parameters by name for throttles closed by `closed_pct` [%] (0: open; None: absent)."""
         sampling: tuple[tuple[str, str | float], ...] = (("daq.sample_rate", SAMPLE_RATE),)
         if closed_pct is None:
             return sampling
-        opened = replace(self, metering="meter-out", closed_means="area") if closed_pct == 0 else self  # all the same
+        # open throttles are the same under every reading
+        opened = replace(self, metering="meter-out", closed_means="area") if closed_pct == 0 else self
         return (
             *sampling,
             ("line.orifices", "present"),
@@ -108,16 +114,35 @@ OURS = Reading()
 AS_PRINTED = Reading(metering="literal", closed_means="diameter", d_line_mm=5.0)
 #: Both readings of "closed", both areas of eqs. (4.11), (4.12), both line diameters.
 READINGS: tuple[Reading, ...] = tuple(
-    Reading(metering, closed_means, d_line)
-    for metering in METERINGS
-    for closed_means in MEANINGS
+    replace(reading, d_line_mm=d_line)
+    for reading in (OURS, Reading(closed_means="diameter"), Reading("literal"), Reading("literal", "diameter"))
     for d_line in (7.0, 5.0)
 )
 
 
+def readings(quick: bool) -> tuple[Reading, ...]:
+    """Return the readings that are tried: all eight, or, where it must be quick, ours and the printed one."""
+    return (OURS, AS_PRINTED) if quick else READINGS
+
+
+def spec(command: str, closed_pct: float | None, reading: Reading = OURS, solver: Solver = "converged") -> RunSpec:
+    """Return the run of a command with throttles closed by `closed_pct` [%] (None: absent)."""
+    return _solved(RunSpec(command, DURATION, values=reading.values(closed_pct), prove=True), solver)
+
+
+def drift_spec(reading: Reading, closed_pct: float | None, solver: Solver, **changed: str | float) -> RunSpec:
+    """Return a long run of section 4.3's command for the drift of the piston; `changed` parameters by bare name."""
+    values = {**dict(reading.values(closed_pct)), "daq.sample_rate": _DRIFT_RATE, **changed}
+    return _solved(RunSpec(COMMAND, _DRIFT_DURATION, values=tuple(values.items()), prove=True), solver)
+
+
+def _solved(run: RunSpec, solver: Solver) -> RunSpec:
+    return replace(run, method="rk4", step=THESIS_STEP) if solver == "literal" else run
+
+
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """One case run twice: with the thesis's method and step, and converged. The equations are the same in both."""
+class SolverPair:
+    """One case run with both solvers."""
 
     literal: SimulatedRun
     converged: SimulatedRun
@@ -127,53 +152,103 @@ class Pair:
         """Whether both passed the halving test."""
         return bool(self.literal.resolved and self.converged.resolved)
 
-    def runs(self) -> tuple[tuple[Literal["literal", "converged"], str, SimulatedRun], ...]:
-        """Role, label and run of those that did not diverge."""
-        both: tuple[tuple[Literal["literal", "converged"], str, SimulatedRun], ...] = (
-            ("literal", "RK4, 1e-4 s", self.literal),
-            ("converged", "converged", self.converged),
-        )
-        return tuple(one for one in both if not one[2].diverged)
+    def of(self, solver: Solver) -> SimulatedRun:
+        """Return the run with that solver."""
+        return self.literal if solver == "literal" else self.converged
+
+    def runs(self) -> list[tuple[Solver, str, SimulatedRun]]:
+        """Return solver, label and run of those that did not diverge."""
+        return [(solver, label, self.of(solver)) for solver, label in LABELS.items() if not self.of(solver).diverged]
 
 
-def spec(command: str, closed_pct: float | None, reading: Reading = OURS) -> RunSpec:
-    """The converged run of a command with throttles closed by `closed_pct` [%] (None: absent)."""
-    return RunSpec(command=command, duration=DURATION, values=reading.values(closed_pct), prove=True)
-
-
-def literal(converged: RunSpec) -> RunSpec:
-    """The same run with the thesis's method and step."""
-    return replace(converged, method="rk4", step=THESIS_STEP)
-
-
-def pair(context: Context, case: Case, reading: Reading = OURS) -> Pair:
-    """A case as the thesis ran it, and converged."""
-    converged = spec(case.command, case.closed_pct, reading)
-    return Pair(context.run(literal(converged)), context.run(converged))
+def run_pair(context: Context, command: str, closed_pct: float | None, reading: Reading = OURS) -> SolverPair:
+    """Run a command as the thesis ran it, and converged."""
+    return SolverPair(
+        context.run(spec(command, closed_pct, reading, "literal")), context.run(spec(command, closed_pct, reading))
+    )
 
 
 def steady(run: SimulatedRun) -> np.ndarray:
-    """Which samples lie in the whole periods that numbers are taken from, (n,) truth values."""
+    """Return which samples lie in the whole periods that numbers are taken from, (n,) truth values."""
     return np.asarray((run.t >= STEADY[0]) & (run.t < STEADY[1]))
 
 
 def settled(run: SimulatedRun, name: str) -> Array:
-    """The output `name` over those whole periods."""
+    """Return the output `name` over those whole periods."""
     return np.asarray(run.outputs[name][steady(run)])
 
 
 def span(run: SimulatedRun, name: str) -> float:
-    """Range (greatest less least) of an output over the whole periods; nan where the run diverged."""
+    """Return the range (greatest less least) of an output over the whole periods; nan where the run diverged."""
     return math.nan if run.diverged else float(np.ptp(settled(run, name)))
 
 
-def mean_difference(run: SimulatedRun, one: str, other: str) -> float:
-    """Mean of one output less another over the whole periods; nan where the run diverged."""
-    return math.nan if run.diverged else float(np.mean(settled(run, one) - settled(run, other)))
+def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
+    """Return the mean of one output less another over the whole periods; nan where the run diverged."""
+    return math.nan if run.diverged else float(np.mean(settled(run, first) - settled(run, second)))
+
+
+@dataclass(frozen=True)
+class RunNumbers:
+    """Numbers of one command under one reading, closing [%] and solver.
+
+    Range, peak and least value [Pa] of each pressure, mean differences across both orifices [Pa], largest drop [Pa],
+    and how unlike the two flows are.
+    """
+
+    span: dict[str, float]
+    peak: dict[str, float]
+    least: dict[str, float]
+    p_1_less_p_A: float
+    p_2_less_p_B: float
+    largest_drop: float
+    flows_differ: float
+    resolved: bool | None
+
+
+def numbers_of(run: SimulatedRun) -> RunNumbers:
+    """Return the numbers of one run; nan throughout where it diverged."""
+    if run.diverged:
+        nothing = dict.fromkeys(PRESSURES, math.nan)
+        return RunNumbers(nothing, nothing, nothing, *(math.nan,) * 4, False)
+    Q_A, Q_B = settled(run, "Q_A"), settled(run, "Q_B")
+    drops = [np.abs(settled(run, pump) - settled(run, end)).max() for pump, end in (("p_1", "p_A"), ("p_2", "p_B"))]
+    return RunNumbers(
+        {name: span(run, name) for name in PRESSURES},
+        {name: float(settled(run, name).max()) for name in PRESSURES},
+        {name: float(settled(run, name).min()) for name in PRESSURES},
+        mean_difference(run, "p_1", "p_A"),
+        mean_difference(run, "p_2", "p_B"),
+        float(max(drops)),
+        float(np.sqrt(np.mean((Q_A - Q_B) ** 2) / np.mean(Q_A**2))),
+        run.resolved,
+    )
+
+
+def throttled(
+    context: Context, reading: Reading, closed_pct: float | None, solver: Solver, command: str = COMMAND
+) -> RunNumbers:
+    """Return the numbers of a command under a reading, with throttles closed by `closed_pct` [%] (None: absent)."""
+    return numbers_of(context.run(spec(command, closed_pct, reading, solver)))
+
+
+def over_closings(context: Context, reading: Reading, solver: Solver) -> dict[float, RunNumbers]:
+    """Return the numbers at 0, 25, 50 and 75 % closed under the command of section 4.3."""
+    return {closed: throttled(context, reading, closed, solver) for closed in (0.0, *CLOSINGS)}
+
+
+def piston_drift(run: SimulatedRun) -> float:
+    """Return how far [m] a period's mean position moves from the first to the last whole one; nan if it diverged."""
+    if run.diverged:
+        return math.nan
+    t, x = run.t, run.outputs["x"]
+    last = int((t[-1] + t[1] - t[0]) // PERIOD) - 1
+    means = [float(x[(t >= k * PERIOD) & (t < (k + 1) * PERIOD)].mean()) for k in (0, last)]
+    return means[1] - means[0]
 
 
 def visible_pressure() -> float:
-    """The least difference of pressures [Pa] that a transducer of the rig shows: its noise (standard deviation)."""
+    """Return the least pressure difference [Pa] that a transducer of the rig shows: its noise (standard deviation)."""
     from sealscope.parameters import load_rig
 
     sensors = load_rig("thesis").sensors

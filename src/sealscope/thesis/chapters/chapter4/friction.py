@@ -3,72 +3,73 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Curve, Figure, Number, Panel
+from sealscope.thesis.engine.products import Figure, Number, Panel, PlotCurve
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+_AXES = ("v [m/s]", "F_f [N]")
+
+
+def _rig() -> Rig:
+    from sealscope.parameters import load_rig
+
+    return load_rig("thesis")
 
 
 def stribeck(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
-    """Friction [N] of the thesis's rig at the velocities `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs.
-    (4.21), (4.22)."""
-    from sealscope.parameters import load_rig
+    """Return the rig's friction [N] at `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs. (4.21), (4.22)."""
     from sealscope.physics.friction import stribeck_friction
 
-    f = load_rig("thesis").friction
+    f = _rig().friction
     plain = getattr(stribeck_friction, "py_func", stribeck_friction)
-    return np.array([plain(float(one), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for one in v])
+    return np.array([plain(float(value), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for value in v])
 
 
 def jumps_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
-    """Friction [N] just below and just above v_th for both bracketings of eq. (4.22), "continuous" and "literal"."""
-    from sealscope.parameters import load_rig
-
-    v_th = load_rig("thesis").friction.v_th
+    """Return friction [N] at and just above v_th for both bracketings of eq. (4.22), "continuous" and "literal"."""
+    v_th = _rig().friction.v_th
     sides = np.array([v_th, math.nextafter(v_th, 1.0)])
-    return {
-        name: (float(below), float(above))
-        for name, (below, above) in (
-            ("continuous", stribeck(sides, F_C)),
-            ("literal", stribeck(sides, F_C, literal_bracket=True)),
-        )
-    }
+    jumps = {}
+    for name, literal_bracket in (("continuous", False), ("literal", True)):
+        below, above = stribeck(sides, F_C, literal_bracket=literal_bracket)
+        jumps[name] = float(below), float(above)
+    return jumps
 
 
 def falls_up_to(F_C: float) -> float:
-    """Velocity [m/s] up to which friction falls with velocity: where F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
-    from sealscope.parameters import load_rig
-
-    f = load_rig("thesis").friction
+    """Return the velocity [m/s] up to which friction falls with it: where F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
+    f = _rig().friction
     return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
 
 
 def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with Table 4.1's numbers."""
-    from sealscope.parameters import load_rig
-
-    f = load_rig("thesis").friction
+    """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with Table 4.1's numbers."""
+    f = _rig().friction
     v = np.linspace(-0.1, 0.1, 801)
-    break_away = f.F_pr * f.K_brk
+    peak = f.F_pr * f.K_brk
     step = np.array([-0.1, 0.0, 0.0, 0.1])
     coulomb = np.array([-f.F_pr, -f.F_pr, f.F_pr, f.F_pr])
     static_v = np.array([-0.1, 0.0, 0.0, 0.0, 0.0, 0.1])
-    static = np.array([-f.F_pr, -f.F_pr, -break_away, break_away, f.F_pr, f.F_pr])
+    static = np.array([-f.F_pr, -f.F_pr, -peak, peak, f.F_pr, f.F_pr])
     slip_v = np.array([-0.1, -f.v_th, f.v_th, 0.1])
-    slip = np.array([-f.F_pr, -break_away, break_away, f.F_pr])
-    axes = ("v [m/s]", "F_f [N]")
+    slip = np.array([-f.F_pr, -peak, peak, f.F_pr])
     panels = (
-        Panel(*axes, (Curve(step, coulomb, "F_C sign(v)", "reference"),), "(a) Coulomb"),
-        Panel(*axes, (Curve(static_v, static, "F_C K_brk at rest", "reference"),), "(b) Static"),
-        Panel(*axes, (Curve(slip_v, slip, "linear below v_th", "reference"),), "(c) Stick-slip"),
-        Panel(*axes, (Curve(v, stribeck(v, f.F_pr), "eqs. 4.21, 4.22", "reference"),), "(d) Stribeck"),
+        Panel(*_AXES, (PlotCurve(step, coulomb, "F_C sign(v)", "reference"),), "(a) Coulomb"),
+        Panel(*_AXES, (PlotCurve(static_v, static, "F_C K_brk at rest", "reference"),), "(b) Static"),
+        Panel(*_AXES, (PlotCurve(slip_v, slip, "linear below v_th", "reference"),), "(c) Stick-slip"),
+        Panel(*_AXES, (PlotCurve(v, stribeck(v, f.F_pr), "eqs. 4.21, 4.22", "reference"),), "(d) Stribeck"),
     )
     numbers = (
         Number("Coulomb force without pressure", f.F_pr, "N"),
-        Number("breakaway force", break_away, "N"),
+        Number("breakaway force", peak, "N"),
         Number("threshold velocity", f.v_th, "m/s"),
     )
     notes = "Sketches (a) to (c) hold the rig's own forces without pressure; the rig is simulated with (d)."
@@ -76,42 +77,32 @@ def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Fig. 4.3: friction against velocity, near rest under both bracketings, and its slope."""
-    from sealscope.parameters import load_rig
-
-    rig = load_rig("thesis")
+    """Draw Fig. 4.3: friction against velocity, near rest under both bracketings, and its slope."""
+    rig = _rig()
     f = rig.friction
     charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
     v = np.linspace(-0.2, 0.2, 1601)
     near = np.linspace(-2.0 * f.v_th, 2.0 * f.v_th, 1601)
     ahead = np.linspace(f.v_th, 0.2, 800)
     slope = np.gradient(stribeck(ahead, f.F_pr), ahead)
-    panels = (
-        Panel(
-            "v [m/s]",
-            "F_f [N]",
-            (
-                Curve(v, stribeck(v, f.F_pr), "no pressure", "reference"),
-                Curve(v, stribeck(v, charged), f"both chambers at {rig.fluid.p_charge / 1e6:g} MPa", "other"),
-            ),
-            "(a) Stribeck curve",
-        ),
-        Panel(
-            "v [m/s]",
-            "F_f [N]",
-            (
-                Curve(near, stribeck(near, f.F_pr), "bracket closed: continuous", "converged"),
-                Curve(near, stribeck(near, f.F_pr, literal_bracket=True), "bracket over all", "literal"),
-            ),
-            "(b) Both bracketings of eq. 4.22",
-        ),
-        Panel("v [m/s]", "slope of F_f [N s/m]", (Curve(ahead, slope, "slope above v_th", "reference"),), "(c) Slope"),
+    curves = (
+        PlotCurve(v, stribeck(v, f.F_pr), "no pressure", "reference"),
+        PlotCurve(v, stribeck(v, charged), f"both chambers at {rig.fluid.p_charge / 1e6:g} MPa", "other"),
     )
-    jumps = jumps_at_threshold(f.F_pr)
+    brackets = (
+        PlotCurve(near, stribeck(near, f.F_pr), "bracket closed: continuous", "converged"),
+        PlotCurve(near, stribeck(near, f.F_pr, literal_bracket=True), "bracket over all", "literal"),
+    )
+    slopes = (PlotCurve(ahead, slope, "slope above v_th", "reference"),)
+    panels = (
+        Panel(*_AXES, curves, "(a) Stribeck curve"),
+        Panel(*_AXES, brackets, "(b) Both bracketings of eq. 4.22"),
+        Panel("v [m/s]", "slope of F_f [N s/m]", slopes, "(c) Slope"),
+    )
     numbers = (
         *(
             Number(f"friction {side} v_th, {name}", value, "N")
-            for name, both in jumps.items()
+            for name, both in jumps_at_threshold(f.F_pr).items()
             for side, value in zip(("at", "above"), both, strict=True)
         ),
         Number("friction falls up to", falls_up_to(f.F_pr), "m/s"),

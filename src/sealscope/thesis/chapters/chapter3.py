@@ -5,47 +5,101 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.recordings.recording import Array
-from sealscope.thesis.chapters.chapter3.continuous_wavelet import continuous_transform, scales_for, wavelet_centre
 from sealscope.thesis.engine.context import Context, RunSpec
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Curve, Figure, Image, Number, Panel, Role, thinned
+from sealscope.thesis.engine.products import Figure, Image, Number, Panel, PlotCurve, Role, thinned
 
+#: Sampling rate [Hz] of the signals of this chapter; the thesis gives none.
 RATE = 1000.0
-"""Sampling rate [Hz] of the signals of this chapter; the thesis gives none."""
+#: Frequency [Hz] and amplitude of the two components of eq. (3.3).
 TONES = ((100.0, 1.0), (30.0, 0.5))
-"""Frequency [Hz] and amplitude of the two components of eq. (3.3)."""
+WAVELET = "db8"
 #: Sine command and leak of the pressure record of eq. (3.4): the largest mean leak at 3 sin(4t) among the tests.
 RECORD = RunSpec(command="3 sin(4t)", duration=20.0, leaks=("0.0163 L/min from 10 s",), prove=True)
 _ONSET, _SETTLED, _BLOCK = 10.0, 1.0, 0.05
+_OCTAVES = 24
 
-ITEMS: tuple[Item, ...] = (
-    Item("fig-3.2", 3, "figure", "Two tones and their spectrum", f"{__name__}:two_tones"),
-    Item(
-        "fig-3.3",
-        3,
-        "figure",
-        "The db8 wavelet and its scaling function",
-        f"{__name__}:db8",
-    ),
-    Item("fig-3.4", 3, "figure", "One signal in four views", f"{__name__}:four_views"),
-    Item(
-        "eq-3.4",
-        3,
-        "figure",
-        "Continuous wavelet transform of a pressure record",
-        f"{__name__}:pressure_scalogram",
-    ),
-    Item("chapter-3-claims", 3, "claims", "What chapter 3 claims", "sealscope.thesis.claims.chapter3:claims"),
-)
+
+def mother_wavelet() -> tuple[Array, Array, Array]:
+    """Return scaling function, mother wavelet and their time [samples] by the cascade of db8's filters."""
+    from sealscope.signals.filters import discrete_wavelet
+
+    phi, psi, t = discrete_wavelet(WAVELET).wavefun(level=10)
+    return phi, psi, t
+
+
+def wavelet_spectrum(omega: Array) -> np.ndarray:
+    """Return the Fourier transform of the mother wavelet at `omega` [rad per unit of its own time].
+
+    Psi(w) = G(w/2)/sqrt(2) prod_(j>=2) H(w/2^j)/sqrt(2), with H and G the synthesis filters' responses
+    sum_k taps_k exp(-j w k); unit l2 norm.
+    Source: Daubechies, Ten Lectures on Wavelets (1992), eqs. (5.1.17), (6.2.2).
+    """
+    from sealscope.signals.filters import discrete_wavelet
+
+    def response(taps: list[float], at: Array) -> np.ndarray:
+        return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * at), np.array(taps, dtype=np.float64)))
+
+    filters = discrete_wavelet(WAVELET)
+    product = response(filters.rec_hi, omega / 2.0) / np.sqrt(2.0)
+    for octave in range(2, _OCTAVES):
+        product = product * response(filters.rec_lo, omega / 2.0**octave) / np.sqrt(2.0)
+    return np.asarray(product)
+
+
+def wavelet_centre() -> tuple[float, float]:
+    """Return the centre of |psi|^2 in the wavelet's own time and the frequency [1 per unit] of its peak response."""
+    _, psi, t = mother_wavelet()
+    omega = np.linspace(0.1, 12.0, 12000)
+    peak = omega[np.abs(wavelet_spectrum(omega)).argmax()]
+    return float(np.sum(t * psi**2) / np.sum(psi**2)), float(peak / (2.0 * np.pi))
+
+
+def scales_for(frequencies: Array) -> Array:
+    """Return the scales a [s] whose wavelet responds most at `frequencies` [Hz]."""
+    return np.asarray(wavelet_centre()[1] / np.asarray(frequencies, dtype=np.float64))
+
+
+def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
+    """Return CWT(a, b) of samples `x` (n,) at `rate` [Hz] for each scale a [s], (scales, n) [unit of x times s^0.5].
+
+    CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6), with the sum over samples as the
+    integral. b is the middle of the wavelet (the centre of its energy). The record is mirrored at its ends.
+    """
+    reach = int(np.ceil(16.0 * float(np.max(scales)) * rate))
+    pad = min(x.size - 1, reach)
+    padded = np.pad(x - x.mean(), pad, mode="symmetric")
+    omega = 2.0 * np.pi * np.fft.rfftfreq(padded.size, 1.0 / rate)
+    spectrum = np.fft.rfft(padded)
+    centre, _ = wavelet_centre()
+    rows = np.empty((len(scales), x.size))
+    for k, a in enumerate(scales):
+        atom = np.sqrt(a) * wavelet_spectrum(a * omega) * np.exp(1j * a * omega * centre)
+        rows[k] = np.fft.irfft(spectrum * np.conj(atom), padded.size)[pad : pad + x.size]
+    return rows
+
+
+def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
+    """Return the gain at `frequencies` [Hz] of transforming by eq. (3.4) and back with the measure da db / |a|^weight.
+
+    gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da, over 12 decades of scales about the frequencies.
+    With weight 2 it is the same at every frequency (the wavelet's admissibility constant), and dividing by it gives
+    the signal back. Eq. (3.5) is printed with weight 0, whose gain falls as 1/w^2.
+    """
+    omega = 2.0 * np.pi * np.asarray(frequencies, dtype=np.float64)
+    middle = float(np.exp(np.mean(np.log(omega))))
+    a = np.geomspace(1e-3, 1e3, 12000) / middle
+    gains = [np.trapezoid(a ** (1.0 - weight) * np.abs(wavelet_spectrum(a * w)) ** 2 * a, np.log(a)) for w in omega]
+    return np.array(gains)
 
 
 def two_tone_signal(t: Array) -> Array:
-    """x(t) = cos(2 pi 100 t) + 0.5 sin(2 pi 30 t), eq. (3.3)."""
+    """Return x(t) = cos(2 pi 100 t) + 0.5 sin(2 pi 30 t), eq. (3.3)."""
     return np.asarray(np.cos(2.0 * np.pi * 100.0 * t) + 0.5 * np.sin(2.0 * np.pi * 30.0 * t))
 
 
 def amplitude_spectrum(x: Array, rate: float) -> tuple[Array, Array, Array]:
-    """Frequencies [Hz], amplitudes and phases [degree, of a cosine] of real samples `x` by the DFT of eq. (3.2)."""
+    """Return frequencies [Hz], amplitudes and phases [degree, of a cosine] of real samples by the DFT of eq. (3.2)."""
     spectrum = np.asarray(np.fft.rfft(x), dtype=np.complex128) * (2.0 / x.size)
     spectrum[0] /= 2.0
     if x.size % 2 == 0:
@@ -55,7 +109,7 @@ def amplitude_spectrum(x: Array, rate: float) -> tuple[Array, Array, Array]:
 
 
 def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> tuple[Array, Array, Array]:
-    """Times [s] of the windows' middles, frequencies [Hz] and amplitudes (frequencies, times) under a Hann window."""
+    """Return the windows' middles [s], frequencies [Hz] and amplitudes (frequencies, times) under a Hann window."""
     starts = np.arange(0, x.size - window + 1, step)
     shape = np.hanning(window + 1)[:-1]
     pieces = np.lib.stride_tricks.sliding_window_view(x, window)[starts] * shape
@@ -64,34 +118,29 @@ def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> tuple[
     return np.asarray((starts + window / 2.0) / rate, dtype=np.float64), frequency, np.asarray(values)
 
 
-def tones_in_turn(t: Array) -> Array:
-    """The two tones of eq. (3.3) one after the other, 100 Hz before 0.5 s and 30 Hz after, and one sample of height
-    8 at 0.75 s."""
-    x = np.where(t < 0.5, np.cos(2.0 * np.pi * 100.0 * t), 0.5 * np.sin(2.0 * np.pi * 30.0 * t))
-    x[np.abs(t - 0.75).argmin()] += 8.0
-    return np.asarray(x)
+def nearest(values: Array, wanted: float) -> int:
+    """Return the index of the value nearest to `wanted`."""
+    return int(np.abs(values - wanted).argmin())
 
 
 def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Fig. 3.2: the signal of eq. (3.3) and its amplitude spectrum."""
+    """Draw Fig. 3.2: the signal of eq. (3.3) and its amplitude spectrum."""
     t = np.arange(round(RATE)) / RATE
     x = two_tone_signal(t)
     frequency, amplitude, phase = amplitude_spectrum(x, RATE)
+    at = {tone: nearest(frequency, tone) for tone, _ in TONES}
     numbers = []
-    for tone, _ in TONES:
-        k = int(np.abs(frequency - tone).argmin())
+    for tone, k in at.items():
         numbers.append(Number(f"amplitude at {tone:g} Hz", float(amplitude[k])))
         numbers.append(Number(f"phase at {tone:g} Hz (cosine 0)", float(phase[k]), "deg"))
-    others = np.ones(frequency.size, dtype=bool)
-    others[[int(np.abs(frequency - tone).argmin()) for tone, _ in TONES]] = False
-    numbers.append(Number("largest amplitude elsewhere", float(amplitude[others].max())))
-    shown, lines = t < 0.2, amplitude > 1e-6
+    numbers.append(Number("largest amplitude elsewhere", float(np.delete(amplitude, list(at.values())).max())))
+    early, lines = t < 0.2, amplitude > 1e-6
     panels = (
-        Panel("t [s]", "x(t) [1]", (Curve(t[shown], x[shown], "x(t), eq. 3.3", "reference"),), "(a) Signal"),
+        Panel("t [s]", "x(t) [1]", (PlotCurve(t[early], x[early], "x(t), eq. 3.3", "reference"),), "(a) Signal"),
         Panel(
             "frequency [Hz]",
             "amplitude [1]",
-            (Curve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems"),),
+            (PlotCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems"),),
             "(b) Amplitude spectrum",
             x_range=(0.0, 150.0),
         ),
@@ -104,15 +153,13 @@ def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def db8(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Fig. 3.3: mother wavelet and scaling function of db8, by the cascade of their filters."""
-    from sealscope.signals.filters import discrete_wavelet
-
-    phi, psi, t = discrete_wavelet("db8").wavefun(level=10)
+    """Draw Fig. 3.3: mother wavelet and scaling function of db8, by the cascade of their filters."""
+    phi, psi, t = mother_wavelet()
     step = float(t[1] - t[0])
-    frequency = wavelet_centre("db8")[1]
+    frequency = wavelet_centre()[1]
     panels = (
-        Panel("t [samples]", "psi(t) [1]", (Curve(*thinned(t, psi), "psi(t)", "reference"),), "(a) Mother wavelet"),
-        Panel("t [samples]", "phi(t) [1]", (Curve(*thinned(t, phi), "phi(t)", "other"),), "(b) Scaling function"),
+        Panel("t [samples]", "psi(t) [1]", (PlotCurve(*thinned(t, psi), "psi(t)", "reference"),), "(a) Mother wavelet"),
+        Panel("t [samples]", "phi(t) [1]", (PlotCurve(*thinned(t, phi), "phi(t)", "other"),), "(b) Scaling function"),
     )
     numbers = (
         Number("integral of psi", float(psi.sum() * step)),
@@ -127,7 +174,7 @@ def db8(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def vanishing_moments(psi: Array, t: Array) -> int:
-    """How many of the moments integral of t^k psi(t) dt, k = 0, 1, ..., are zero against the integral of |t^k psi|."""
+    """Count the moments integral of t^k psi(t) dt, k = 0, 1, ..., that are zero against the integral of |t^k psi|."""
     moments = 0
     centred = t - t.mean()
     while moments < 20 and abs(np.sum(centred**moments * psi)) < 1e-6 * np.sum(np.abs(centred**moments * psi)):
@@ -136,20 +183,25 @@ def vanishing_moments(psi: Array, t: Array) -> int:
 
 
 def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Fig. 3.4: one signal in time, in frequency, under a short-time Fourier and under a wavelet transform."""
+    """Draw Fig. 3.4: one signal in time, in frequency, under a short-time Fourier and under a wavelet transform.
+
+    The signal is the two tones of eq. (3.3) one after the other, 100 Hz before 0.5 s and 30 Hz after, and one sample of
+    height 8 at 0.75 s.
+    """
     t = np.arange(round(RATE)) / RATE
-    x = tones_in_turn(t)
+    x = np.where(t < 0.5, np.cos(2.0 * np.pi * 100.0 * t), 0.5 * np.sin(2.0 * np.pi * 30.0 * t))
+    x[nearest(t, 0.75)] += 8.0
     frequency, amplitude, _ = amplitude_spectrum(x, RATE)
     window = 128
     times, bins, short = short_time_spectrum(x, RATE, window, 4)
     wanted = np.geomspace(10.0, 450.0, 64)
     wavelet = np.abs(continuous_transform(x, RATE, scales_for(wanted)))
     panels = (
-        Panel("t [s]", "x(t) [1]", (Curve(t, x, "x(t)", "reference"),), "(a) Time"),
+        Panel("t [s]", "x(t) [1]", (PlotCurve(t, x, "x(t)", "reference"),), "(a) Time"),
         Panel(
             "frequency [Hz]",
             "amplitude [1]",
-            (Curve(frequency, amplitude, "2 |X[n]| / N", "reference"),),
+            (PlotCurve(frequency, amplitude, "2 |X[n]| / N", "reference"),),
             "(b) Frequency",
         ),
         Panel(
@@ -167,11 +219,11 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
         ),
     )
     pulse = (t > 0.6) & (t < 0.9)
-    high = int(np.abs(wanted - 300.0).argmin())
+    high = nearest(wanted, 300.0)
     numbers = (
         Number("resolution in frequency of (b)", RATE / x.size, "Hz"),
         Number("resolution in frequency of (c)", RATE / window, "Hz"),
-        Number("width of the pulse at 300 Hz in (c)", _width(times, short[int(np.abs(bins - 300.0).argmin())]), "s"),
+        Number("width of the pulse at 300 Hz in (c)", _width(times, short[nearest(bins, 300.0)]), "s"),
         Number("width of the pulse at 300 Hz in (d)", _width(t[pulse], wavelet[high][pulse]), "s"),
     )
     notes = (
@@ -183,7 +235,7 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _width(t: Array, values: Array) -> float:
-    """Root mean square half-width [s] of the energy of `values` about its middle, near its largest value."""
+    """Return the root mean square half-width [s] of the energy of `values` about its middle, near its largest value."""
     near = np.abs(t - t[values.argmax()]) < 0.1
     weight = values[near] ** 2 / np.sum(values[near] ** 2)
     middle = np.sum(t[near] * weight)
@@ -191,7 +243,7 @@ def _width(t: Array, values: Array) -> float:
 
 
 def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Eqs. (3.4)-(3.6) on a simulated record of p_A: the ringing after each reversal, before and with a leak."""
+    """Draw eqs. (3.4)-(3.6) on a simulated record of p_A: the ringing after each reversal, before and with a leak."""
     run = context.run(RECORD)
     if run.recording is None:
         return (Figure(item.id, item.title, (), notes=f"the run failed: {run.diverged}", resolved=False),)
@@ -200,7 +252,9 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
     wanted = np.geomspace(12.0, 0.45 * rate, 64)
     recorded, clean = run.recording["p_A"] * 1e-6, run.outputs["p_A"] * 1e-6
     leak = ((_ONSET, "leak"),)
-    panels = [Panel("t [s]", "p_A [MPa]", (Curve(*thinned(t, recorded), "p_A, recorded", "A"),), "(a) Record", leak)]
+    panels = [
+        Panel("t [s]", "p_A [MPa]", (PlotCurve(*thinned(t, recorded), "p_A, recorded", "A"),), "(a) Record", leak)
+    ]
     for letter, p_A, name in (("b", recorded, "as recorded"), ("c", clean, "without the instruments' noise")):
         rows = continuous_transform(p_A, rate, scales_for(wanted))
         middles, power = _running_rms(t, rows, round(_BLOCK * rate))
@@ -209,7 +263,7 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
         panels.append(Panel("t [s]", "frequency [Hz]", title=title, marks=leak, image=image, log_y=True))
     parts: tuple[tuple[Role, np.ndarray], ...] = (("no leak", (t > _SETTLED) & (t < _ONSET)), ("leak", t >= _ONSET))
     strength = {role: np.sqrt(np.mean(rows[:, part] ** 2, axis=1)) * 1e3 for role, part in parts}
-    curves = tuple(Curve(wanted, strength[role], role, role) for role, _ in parts)
+    curves = tuple(PlotCurve(wanted, strength[role], role, role) for role, _ in parts)
     panels.append(Panel("frequency [Hz]", "rms of CWT [kPa s^0.5]", curves, "(d) rms of (c) over time", log_x=True))
     fast = wanted > 30.0
     ring = int(np.flatnonzero(fast)[strength["no leak"][fast].argmax()])
@@ -227,7 +281,15 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
-    """Middles [s] of blocks of `size` samples, and the rms of each row of `rows` in them, (rows, blocks)."""
+    """Return the middles [s] of blocks of `size` samples and the rms of each row of `rows` in them, (rows, blocks)."""
     whole = t.size // size * size
     power = np.sqrt(np.mean(rows[:, :whole].reshape(rows.shape[0], -1, size) ** 2, axis=2))
     return t[:whole].reshape(-1, size).mean(axis=1), power
+
+
+ITEMS: tuple[Item, ...] = (
+    Item("fig-3.2", 3, "figure", "Two tones and their spectrum", two_tones),
+    Item("fig-3.3", 3, "figure", "The db8 wavelet and its scaling function", db8),
+    Item("fig-3.4", 3, "figure", "One signal in four views", four_views),
+    Item("eq-3.4", 3, "figure", "Continuous wavelet transform of a pressure record", pressure_scalogram),
+)

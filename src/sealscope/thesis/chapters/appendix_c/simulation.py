@@ -1,7 +1,7 @@
-"""The 41 tests of Appendix C run on the simulated rig, reduced to the RMS of the details before and after, as on the
-thesis's own sheet; and the same tests with nothing leaking.
+"""The 41 tests of Appendix C run on the simulated rig, reduced to the RMS of the details before and after.
 
-Records are reduced at once and not kept: all of them would fill gigabytes.
+The same tests are run with their leak, with nothing leaking, and with nothing leaking on a rig that drifts. Records are
+reduced at once and not kept: all of them would fill gigabytes.
 """
 
 from __future__ import annotations
@@ -14,18 +14,23 @@ import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.thesis.conditions import APPENDIX_C, Condition, experiment_values
-from sealscope.thesis.engine.products import Table
-from sealscope.thesis.sheet import Sheet
+from sealscope.thesis.engine.products import Cell, ResultTable
+from sealscope.thesis.sheet import (
+    APPENDIX_C,
+    BENCH_RIG,
+    PSI,
+    QUANTITIES,
+    UNITS,
+    Condition,
+    DataSheet,
+    experiment_values,
+)
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import Trajectory
 
-QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
-#: Pascals in a pound per square inch, the unit the sheet is read in.
-PSI = 6894.757293168361
 #: Length of the part without and of the part with the leak [s]; a quick reproduction takes the shorter one.
 HALF, QUICK_HALF = 90.0, 40.0
 #: What is left out of each record's beginning [s]: the rig starts at rest, the thesis's was running.
@@ -38,15 +43,8 @@ _NO_LEAK_SEED, _DRIFT_SEED = 1000, 2000
 _DRAWS, _QUICK_DRAWS = 2, 1
 
 
-def data_rig() -> str:
-    """Name of the packaged rig that stands for the thesis's bench: the one fitted to Appendix C, where there is one."""
-    from sealscope.parameters import rig_names
-
-    return "thesis-calibrated" if "thesis-calibrated" in rig_names() else "thesis"
-
-
 @dataclass(frozen=True)
-class Drift:
+class RigDrift:
     """Factors on friction, bulk modulus and noise of a rig that has drifted."""
 
     friction: float
@@ -54,7 +52,7 @@ class Drift:
     noise: float
 
     def values(self, rig: Rig) -> dict[str, float]:
-        """The drifted parameters by name, SI."""
+        """Return the drifted parameters by name, SI."""
         friction, sensors = rig.friction, rig.sensors
         return {
             "friction.F_pr": friction.F_pr * self.friction,
@@ -67,60 +65,70 @@ class Drift:
         }
 
 
-def drift_of(number: int, draw: int = 0) -> Drift:
-    """The drift drawn for a test: each share uniform within its bounds, up or down with equal chance, independent."""
+def drift_of(number: int, draw: int = 0) -> RigDrift:
+    """Draw the drift of a test: each share uniform within its bounds, up or down with equal chance, independent."""
     random = np.random.default_rng([_DRIFT_SEED, draw, number])
     shares = [random.uniform(*bounds) for bounds in (FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT)]
     signs = random.choice([-1.0, 1.0], size=3)
-    return Drift(*(float(1.0 + sign * share) for sign, share in zip(signs, shares, strict=True)))
+    return RigDrift(*(float(1.0 + sign * share) for sign, share in zip(signs, shares, strict=True)))
 
 
 @dataclass(frozen=True)
-class Row:
+class SimulatedTest:
     """One simulated test: RMS without and with what happened at half time, and what the run was."""
 
     condition: Condition
-    rms: Mapping[str, Mapping[str, tuple[float, float]]]
+    rms: Mapping[str, Mapping[str, tuple[float, ...]]]
     mean_leak_lpm: float
     range_MPa: tuple[float, float]
     resolved: bool | None = None
     happened: str = ""
 
 
+def detail_series(recording: Recording, chamber: str) -> dict[str, Array]:
+    """Return d1..d4 [psi] and d3d4 [psi^2] of a chamber's pressure."""
+    from sealscope.signals.details import details
+
+    d = details(recording[chamber] / PSI)
+    return {**{f"d{level}": d[level] for level in range(1, 5)}, "d3d4": d.product()}
+
+
 def detail_rms(recording: Recording, parts: tuple[tuple[float, float], ...]) -> dict[str, dict[str, tuple[float, ...]]]:
-    """RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers' pressures within each part (from, to) [s].
+    """Return the RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers' pressures within each part (from, to) [s].
 
     A part is narrowed by the transform's reach on both sides, so that no coefficient saw anything outside of it.
     """
-    from sealscope.signals.details import details
     from sealscope.signals.filters import reach
 
     before, after = (int(samples) for samples in reach("db8", 4)[-1])
     rate = recording.rate
     slices = [slice(round(start * rate) + before, round(stop * rate) - after) for start, stop in parts]
-    found: dict[str, dict[str, tuple[float, ...]]] = {}
-    for chamber in CHAMBERS:
-        d = details(recording[chamber] / PSI)
-        series = {**{f"d{level}": d[level] for level in range(1, 5)}, "d3d4": d.product()}
-        found[chamber] = {
+    return {
+        chamber: {
             name: tuple(float(np.sqrt(np.mean(np.square(values[part])))) for part in slices)
-            for name, values in series.items()
+            for name, values in detail_series(recording, chamber).items()
         }
-    return found
+        for chamber in CHAMBERS
+    }
 
 
-def _range_MPa(t: Array, p_A: Array, p_B: Array, stop: float) -> tuple[float, float]:
-    """5 to 95 % range of both chambers' true pressures [MPa] from the settled start to `stop` [s]."""
+def pressure_range(values: Array) -> float:
+    """Return the 5 to 95 % range of a pressure."""
+    return float(np.ptp(np.percentile(values, [5.0, 95.0])))
+
+
+def _range_MPa(t: Array, outputs: Mapping[str, Array] | Trajectory, stop: float) -> tuple[float, float]:
+    """Range of both chambers' true pressures [MPa] from the settled start to `stop` [s]."""
     part = (t >= SETTLING) & (t < stop)
-    low_high = [np.percentile(pressure[part], [5.0, 95.0]) for pressure in (p_A, p_B)]
-    return float(np.ptp(low_high[0]) / 1e6), float(np.ptp(low_high[1]) / 1e6)
+    range_A, range_B = (pressure_range(outputs[chamber][part]) / 1e6 for chamber in CHAMBERS)
+    return range_A, range_B
 
 
 def _experiment(condition: Condition, duration: float, leak: str | None = None, **others: Any) -> Experiment:
     from sealscope.simulation.experiment import Experiment
 
     return Experiment.of(
-        rig=data_rig(),
+        rig=BENCH_RIG,
         command=condition.command,
         set=experiment_values(condition),
         leak=leak,
@@ -130,7 +138,7 @@ def _experiment(condition: Condition, duration: float, leak: str | None = None, 
 
 
 def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
-    """What the instruments make of a trajectory, with the noise of the experiment's seed."""
+    """Record a trajectory with the rig's instruments and the noise of the experiment's seed."""
     from sealscope.simulation.instruments import record
     from sealscope.simulation.simulate import oversampling
 
@@ -138,13 +146,11 @@ def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
     return record(experiment.rig, path, volts, oversampling(experiment), experiment.seed)
 
 
-def _before_and_after(rms: Mapping[str, Mapping[str, tuple[float, ...]]]) -> dict[str, dict[str, tuple[float, float]]]:
-    return {chamber: {name: (pair[0], pair[1]) for name, pair in of.items()} for chamber, of in rms.items()}
+def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
+    """Simulate the tests as they were: the leak opens at half time.
 
-
-def with_leak(quick: bool = False) -> Iterator[Row]:
-    """The tests as they were: the leak opens at half time. The first test of each condition is proved by halving the
-    step, except in a quick reproduction."""
+    The first test of each condition is proved by halving the step, except in a quick reproduction.
+    """
     from sealscope.simulation.faults.faults import From
     from sealscope.simulation.proof import prove
     from sealscope.simulation.simulate import simulate_with_truth, sized_leaks
@@ -152,9 +158,9 @@ def with_leak(quick: bool = False) -> Iterator[Row]:
     half = QUICK_HALF if quick else HALF
     proved: set[tuple[str, float]] = set()
     for condition in APPENDIX_C:
-        asked = f"{condition.mean_leak_lpm:g} L/min from {SETTLING:g} s"
-        found = sized_leaks(_experiment(condition, SETTLING + _SIZING, asked))
-        leaks = tuple(replace(leak, opening=From(half)) for leak in found)
+        leak = f"{condition.mean_leak_lpm:g} L/min from {SETTLING:g} s"
+        sized = sized_leaks(_experiment(condition, SETTLING + _SIZING, leak))
+        leaks = tuple(replace(leak, opening=From(half)) for leak in sized)
         experiment = replace(_experiment(condition, 2 * half, seed=condition.number), leaks=leaks)
         made = simulate_with_truth(experiment)
         resolved = None
@@ -162,18 +168,12 @@ def with_leak(quick: bool = False) -> Iterator[Row]:
             proved.add(condition.group)
             resolved = prove(replace(experiment, allow_unresolved=True)).resolved
         rms = detail_rms(made.recording, ((SETTLING, half), (half, 2 * half)))
-        yield Row(
-            condition,
-            _before_and_after(rms),
-            made.truth.mean_leak_lpm,
-            _range_MPa(made.truth.t, made.truth.outputs["p_A"], made.truth.outputs["p_B"], half),
-            resolved,
-            "leak opened",
-        )
+        ranges = _range_MPa(made.truth.t, made.truth.outputs, half)
+        yield SimulatedTest(condition, rms, made.truth.mean_leak_lpm, ranges, resolved, "leak opened")
 
 
-def without_leak(quick: bool = False) -> Iterator[Row]:
-    """The same tests with no leak: nothing happens at half time; the noise alone differs."""
+def without_leak(quick: bool = False) -> Iterator[SimulatedTest]:
+    """Simulate the same tests with no leak: nothing happens at half time; the noise alone differs."""
     from sealscope.simulation.simulate import trajectory
 
     half = QUICK_HALF if quick else HALF
@@ -184,14 +184,15 @@ def without_leak(quick: bool = False) -> Iterator[Row]:
             paths[condition.group] = trajectory(experiment, ())
         path = paths[condition.group]
         rms = detail_rms(_recorded(experiment, path), ((SETTLING, half), (half, 2 * half)))
-        yield Row(
-            condition, _before_and_after(rms), 0.0, _range_MPa(path.t, path["p_A"], path["p_B"], half), None, "nothing"
-        )
+        yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, half), None, "nothing")
 
 
-def with_drift(quick: bool = False) -> Iterator[Row]:
-    """The same tests with no leak on a rig that drifts: the second half comes from a rig with other friction, bulk
-    modulus and noise (`drift_of`), several draws of each test."""
+def with_drift(quick: bool = False) -> Iterator[SimulatedTest]:
+    """Simulate the same tests with no leak on a rig that drifts.
+
+    The second half comes from a rig with other friction, bulk modulus and noise (`drift_of`), several draws of each
+    test.
+    """
     from sealscope.simulation.simulate import trajectory
 
     half = QUICK_HALF if quick else HALF
@@ -210,64 +211,56 @@ def with_drift(quick: bool = False) -> Iterator[Row]:
             before = detail_rms(_recorded(first, path), part)
             after = detail_rms(_recorded(second, trajectory(second, ())), part)
             rms = {c: {name: (before[c][name][0], after[c][name][0]) for name in QUANTITIES} for c in CHAMBERS}
-            told = f"friction x {drift.friction:.3f}, K x {drift.bulk:.3f}, noise x {drift.noise:.3f}"
-            yield Row(condition, rms, 0.0, _range_MPa(path.t, path["p_A"], path["p_B"], SETTLING + half), None, told)
+            happened = f"friction x {drift.friction:.3f}, K x {drift.bulk:.3f}, noise x {drift.noise:.3f}"
+            yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, SETTLING + half), None, happened)
 
 
-def _rms_columns() -> list[tuple[str, str, int, str]]:
-    return [
-        (chamber, name, k, f"{chamber} {name} {when} [{'psi^2' if name == 'd3d4' else 'psi'}]")
-        for chamber in CHAMBERS
-        for name in QUANTITIES
-        for k, when in enumerate(("no leak", "leak"))
-    ]
+#: Chamber, quantity, half and head of the RMS columns.
+_RMS_COLUMNS = [
+    (chamber, name, k, f"{chamber} {name} {when} [{UNITS[name]}]")
+    for chamber in CHAMBERS
+    for name in QUANTITIES
+    for k, when in enumerate(("no leak", "leak"))
+]
+_COLUMNS = (
+    "test",
+    "input",
+    "closed [%]",
+    "at half time",
+    "mean leak [L/min]",
+    "p_A range [MPa]",
+    "p_B range [MPa]",
+    *(head for *_, head in _RMS_COLUMNS),
+)
 
 
-def table_of(rows: list[Row], item: str, title: str, notes: str = "") -> Table:
-    """The rows as a table; `sheet_of` reads it back. It is resolved when every run that was proved is."""
-    heads = (
-        "test",
-        "input",
-        "closed [%]",
-        "at half time",
-        "mean leak [L/min]",
-        "p_A range [MPa]",
-        "p_B range [MPa]",
-        *(head for *_, head in _rms_columns()),
-    )
-    body: tuple[tuple[float | int | str | None, ...], ...] = tuple(
+def table_of(tests: list[SimulatedTest], item: str, title: str, notes: str = "") -> ResultTable:
+    """Tabulate the tests; `sheet_of` reads the table back. It is resolved when every run that was proved is."""
+    rows: tuple[tuple[Cell, ...], ...] = tuple(
         (
-            row.condition.number,
-            row.condition.command,
-            row.condition.closed_pct,
-            row.happened,
-            row.mean_leak_lpm,
-            *row.range_MPa,
-            *(row.rms[chamber][name][k] for chamber, name, k, _ in _rms_columns()),
+            test.condition.number,
+            test.condition.command,
+            test.condition.closed_pct,
+            test.happened,
+            test.mean_leak_lpm,
+            *test.range_MPa,
+            *(test.rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS),
         )
-        for row in rows
+        for test in tests
     )
-    outcomes = [row.resolved for row in rows if row.resolved is not None]
-    return Table(item, title, heads, body, resolved=all(outcomes) if outcomes else None, notes=notes)
+    outcomes = [test.resolved for test in tests if test.resolved is not None]
+    return ResultTable(item, title, _COLUMNS, rows, resolved=all(outcomes) if outcomes else None, notes=notes)
 
 
-def column(table: Table, head: str) -> Array:
-    """The numbers of one column of a table, NaN where there is none."""
+def column(table: ResultTable, head: str) -> Array:
+    """Return the numbers of one column of a table, NaN where there is none."""
     place = table.columns.index(head)
     return np.array([np.nan if row[place] is None else float(row[place]) for row in table.rows])  # type: ignore[arg-type]
 
 
-def sheet_of(table: Table) -> Sheet:
-    """The RMS columns of a table made by `table_of` as a sheet, in the table's order of rows."""
-    rms: dict[str, dict[str, Array]] = {
-        chamber: {name: np.empty((len(table.rows), 2)) for name in QUANTITIES} for chamber in CHAMBERS
-    }
-    for chamber, name, k, head in _rms_columns():
-        rms[chamber][name][:, k] = column(table, head)
-    return Sheet(rms)
-
-
-def log_change(sheet: Sheet, chamber: str, quantity: str) -> Array:
-    """log(RMS with leak / RMS without) of each test, (n,)."""
-    pairs = sheet.rms[chamber][quantity]
-    return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))
+def sheet_of(table: ResultTable) -> DataSheet:
+    """Read the RMS columns of a table made by `table_of` as a sheet, in the table's order of rows."""
+    columns = {(chamber, name, k): column(table, head) for chamber, name, k, head in _RMS_COLUMNS}
+    return DataSheet(
+        {c: {q: np.column_stack([columns[c, q, 0], columns[c, q, 1]]) for q in QUANTITIES} for c in CHAMBERS}
+    )

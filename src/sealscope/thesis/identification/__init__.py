@@ -1,1 +1,0 @@
-"""Parameters of the rig fitted to the leak-free tests of Appendix C."""

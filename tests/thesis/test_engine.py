@@ -1,0 +1,323 @@
+"""The engine of the reproduction: the list of items, what is kept between calls, when it is out of date, and calls that
+are broken off, fail or lose a process."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sealscope.thesis
+from sealscope.errors import InputError
+from sealscope.thesis.engine import serialization, sources
+from sealscope.thesis.engine.build import Reproduction, reproduce
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun
+from sealscope.thesis.engine.folder import ResultsFolder
+from sealscope.thesis.engine.items import MODULES, Item, check, collect, select, with_needed
+from sealscope.thesis.engine.products import Claim, Figure, Image, Number, Panel, PlotCurve, ResultTable
+from sealscope.thesis.sheet import MISSING
+
+
+def nothing(context: object, item: Item) -> tuple[()]:
+    return ()
+
+
+def maker(name: str, module: str = "fakes.chapter") -> Any:
+    """A maker of the fake chapter, as it stands now."""
+    return getattr(importlib.import_module(module), name)
+
+
+def bare(name: str, *needs: str, chapter: int = 4) -> Item:
+    """An item that is listed and never made."""
+    return Item(name, chapter, "table", f"Item {name}", nothing, needs=needs)
+
+
+def item(name: str, make: str, *needs: str, needs_sheet: bool = False) -> Item:
+    return Item(name, 4, "table", f"Item {name}", maker(make), needs=needs, needs_sheet=needs_sheet)
+
+
+def worked(tmp_path: Path) -> list[str]:
+    """Which items were made, in order."""
+    log = tmp_path / "log"
+    return log.read_text().split() if log.exists() else []
+
+
+def states(outcome: Reproduction) -> dict[str, str]:
+    return {status.item.id: status.state for status in outcome.statuses}
+
+
+# registry
+
+
+def test_select_by_id_chapter_wildcard_and_all() -> None:
+    items = (bare("t-1"), bare("fig-5.1"), bare("fig-5.2", chapter=5), bare("chapter-5-claims"))
+    patterns = ("all", "chapter-5", "chapter-5-*", "fig-5.*", "t-1")
+    assert {pattern: [one.id for one in select(items, [pattern])] for pattern in patterns} == {
+        "all": ["t-1", "fig-5.1", "fig-5.2", "chapter-5-claims"],
+        "chapter-5": ["fig-5.2"],
+        "chapter-5-*": ["chapter-5-claims"],
+        "fig-5.*": ["fig-5.1", "fig-5.2"],
+        "t-1": ["t-1"],
+    }
+
+
+def test_an_unknown_id_names_the_closest() -> None:
+    with pytest.raises(InputError, match=r"got 'fig-5\.9'; closest: fig-5\.1"):
+        select((bare("fig-5.1"), bare("t-1")), ["fig-5.9"])
+
+
+@pytest.mark.parametrize(
+    ("items", "words"),
+    [
+        ((bare("t-1"), bare("t-1")), "t-1 twice"),
+        ((bare("t-1", "t-2"),), "t-2 (t-1)"),
+        ((bare("t-1", "t-2"), bare("t-2", "t-1")), "t-1 -> t-2 -> t-1"),
+        ((bare("T 1"),), "'T 1'"),
+    ],
+)
+def test_a_list_that_contradicts_itself_is_refused(items: tuple[Item, ...], words: str) -> None:
+    with pytest.raises(ValueError, match="must") as error:
+        check(items)
+    assert words in str(error.value)
+
+
+def test_what_is_needed_comes_first() -> None:
+    items = (bare("t-1", "t-3"), bare("t-2"), bare("t-3", "t-2"))
+    assert [one.id for one in with_needed(items, items[:1])] == ["t-2", "t-3", "t-1"]
+
+
+def test_every_module_that_lists_items_is_collected() -> None:
+    offering = set()
+    for module in pkgutil.walk_packages(sealscope.thesis.__path__, "sealscope.thesis."):
+        if hasattr(importlib.import_module(module.name), "ITEMS"):
+            offering.add(module.name.removeprefix("sealscope.thesis."))
+    assert offering == set(MODULES)
+    assert {3, 4, 5, 6} == {one.chapter for one in collect()}
+
+
+# kept results
+
+
+def test_a_second_call_makes_nothing(fakes: Path, tmp_path: Path) -> None:
+    items = (item("t-1", "table"), item("t-2", "doubled", "t-1"))
+    first = reproduce(["all"], "out", items=items, jobs=1)
+    second = reproduce(["all"], "out", items=items, jobs=1)
+    assert states(first) == {"t-1": "made", "t-2": "made"}
+    assert states(second) == {"t-1": "kept", "t-2": "kept"}
+    assert worked(tmp_path) == ["t-1", "t-2"]
+    (table,) = second.products(second.statuses[1])
+    assert isinstance(table, ResultTable)
+    assert table.rows == ((2,),)
+
+
+def test_an_edited_source_makes_its_items_and_those_that_need_them_anew(
+    fakes: Path, edit: Callable[[str, str], None]
+) -> None:
+    other = fakes.with_name("other.py")
+    other.write_text(fakes.read_text())
+
+    def items() -> tuple[Item, ...]:
+        other_item = Item("t-3", 5, "table", "", maker("table", "fakes.other"))
+        return item("t-1", "table"), item("t-2", "doubled", "t-1"), other_item
+
+    reproduce(["all"], "out", items=items(), jobs=1)
+    edit("FACTOR = 1", "FACTOR = 10")
+    again = reproduce(["all"], "out", items=items(), jobs=1)
+    assert states(again) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
+    (table,) = again.products(again.statuses[1])
+    assert isinstance(table, ResultTable)
+    assert table.rows == ((20,),)
+
+
+def test_changed_inputs_and_quick_make_anew(fakes: Path, tmp_path: Path) -> None:
+    one = item("t-1", "table")
+    reproduce(["all"], "out", items=(one,), jobs=1)
+    changed = Item(**{**one.__dict__, "inputs": (("rate", 500.0),)})
+    assert states(reproduce(["all"], "out", items=(changed,), jobs=1)) == {"t-1": "made"}
+    assert states(reproduce(["all"], "out", items=(changed,), jobs=1, quick=True)) == {"t-1": "made"}
+    assert states(reproduce(["all"], "out", items=(changed,), jobs=1, quick=True)) == {"t-1": "kept"}
+
+
+def test_a_damaged_kept_file_is_made_anew(fakes: Path, tmp_path: Path) -> None:
+    items = (item("t-1", "table"),)
+    reproduce(["all"], "out", items=items, jobs=1)
+    (tmp_path / "out" / "kept" / "drawn" / "t-1.json").unlink()
+    (tmp_path / "out" / "kept" / "items" / "t-1.npz").write_bytes(b"PK broken")
+    assert states(reproduce(["all"], "out", items=items, jobs=1)) == {"t-1": "made"}
+
+
+def test_only_the_asked_items_and_their_needs_are_made(fakes: Path, tmp_path: Path) -> None:
+    items = (item("t-1", "table"), item("t-2", "doubled", "t-1"), item("t-3", "table"))
+    assert states(reproduce(["t-2"], "out", items=items, jobs=1)) == {
+        "t-1": "made",
+        "t-2": "made",
+        "t-3": "not made",
+    }
+
+
+def test_a_maker_may_ask_only_for_what_it_named(fakes: Path, tmp_path: Path) -> None:
+    items = (item("t-1", "table"), item("t-2", "unknown_need"))
+    outcome = reproduce(["all"], "out", items=items, jobs=1)
+    assert outcome.statuses[1].reason == "t-2 must name t-1 among its needs to ask for its products"
+
+
+def test_a_folder_in_use_is_refused(fakes: Path, tmp_path: Path) -> None:
+    with ResultsFolder(tmp_path / "out").locked(), pytest.raises(InputError, match="one call at a time"):
+        reproduce(["all"], "out", items=(item("t-1", "table"),), jobs=1)
+
+
+def test_products_and_runs_survive_the_file(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 1.0, 5)
+    curve, image = PlotCurve(t, t**2, "x", "A"), Image(t, t, np.eye(5), "z")
+    panel = Panel("t [s]", "x", (curve,), "a", ((0.5, "here"),), image, (0.0, 1.0), log_y=True)
+    numbers = (Number("n", float("nan"), "Pa"), Number("m", "text"))
+    figure = Figure("fig-1", "One", (panel,), numbers, ("claim-1",), False, "note")
+    claim = Claim("claim-1", "section 1", "It is.", "so", "so", "holds", "why")
+    table = ResultTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.5), True)))
+    serialization.save(tmp_path / "one.npz", (figure, claim, table))
+    again = serialization.load(tmp_path / "one.npz")
+    assert again is not None
+    assert again[1] == claim
+    assert (again[2].id, again[2].rows) == ("t-1", ((1, 2.5), ("x", None), (0.5, True)))
+    panel = again[0].panels[0]
+    assert (panel.x_label, panel.marks, panel.x_range, panel.log_y) == ("t [s]", ((0.5, "here"),), (0.0, 1.0), True)
+    np.testing.assert_array_equal(panel.curves[0].y, t**2)
+    np.testing.assert_array_equal(panel.image.values, np.eye(5))
+    assert np.isnan(again[0].numbers[0].value)
+    assert again[0].resolved is False
+
+
+def test_what_cannot_be_kept_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="must hold texts, numbers and arrays, got object"):
+        serialization.save(tmp_path / "one.npz", (object(),))
+    with pytest.raises(TypeError, match="must hold numbers"):
+        serialization.save(tmp_path / "one.npz", (np.array([object()]),))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_sources_of_a_module_are_those_it_imports() -> None:
+    found = {path.name for path in sources.reached_files("sealscope.thesis.engine.runs")}
+    assert {"runs.py", "simulate.py", "experiment.py", "restrictors.py", "thesis.toml", "context.py"} <= found
+    assert not {"chapter5.py", "page.py", "verdict.py"} & found
+    assert {path.name for path in sources.reached_files("sealscope.thesis.engine.items")} == {"errors.py", "items.py"}
+
+
+def test_without_the_sheet_items_that_need_it_are_left_out(
+    fakes: Path, tmp_path: Path, write_sheet: Callable[..., Path]
+) -> None:
+    items = (item("t-1", "measured", needs_sheet=True), item("t-2", "perhaps_measured"), item("t-3", "table"))
+    without = reproduce(["all"], "out", items=items, jobs=1)
+    assert states(without) == {"t-1": "left out", "t-2": "made", "t-3": "made"}
+    assert without.statuses[0].reason == MISSING
+    sheet = write_sheet(tmp_path / "sheet")
+    given = reproduce(["all"], "out", items=items, jobs=1, sheet=sheet)
+    assert states(given) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
+    write_sheet(sheet, 1.0)
+    changed = reproduce(["all"], "out", items=items, jobs=1, sheet=sheet)
+    assert states(changed) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
+    (table,) = changed.products(changed.statuses[0])
+    assert isinstance(table, ResultTable)
+    assert table.rows == ((2.0,),)
+
+
+def test_equal_runs_are_simulated_once_and_kept_exactly(
+    fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sealscope.thesis.engine import runs
+
+    calls = []
+    real = runs.simulated_run
+    monkeypatch.setattr(runs, "simulated_run", lambda *given: calls.append(given) or real(*given))
+    first = reproduce(["fig-4.1"], "out", items=(item("fig-4.1", "simulated"), item("fig-4.2", "simulated")), jobs=1)
+    second = reproduce(["all"], "out", items=(item("fig-4.1", "simulated"), item("fig-4.2", "simulated")), jobs=1)
+    assert len(calls) == 1
+    (fresh,), (loaded,) = first.products(first.statuses[0]), second.products(second.statuses[1])
+    assert isinstance(fresh, Figure)
+    assert isinstance(loaded, Figure)
+    np.testing.assert_array_equal(fresh.panels[0].curves[0].y, loaded.panels[0].curves[0].y)
+    assert fresh.resolved is True
+
+
+def test_a_run_survives_the_file(tmp_path: Path) -> None:
+    from sealscope.thesis.engine.runs import experiment_of, simulated_run
+
+    spec = RunSpec("3 sin(4t)", 2.0)
+    run = simulated_run(spec, experiment_of(spec))
+    serialization.save(tmp_path / "run.npz", run)
+    again = serialization.load(tmp_path / "run.npz")
+    assert isinstance(again, SimulatedRun)
+    assert run.recording is not None
+    assert again.recording is not None
+    assert dict(again.recording.provenance) == dict(run.recording.provenance)
+    np.testing.assert_array_equal(again.recording["p_A"], run.recording["p_A"])
+    np.testing.assert_array_equal(again.outputs["p_A"], run.outputs["p_A"])
+
+
+# calls that do not end well
+
+
+def test_an_interrupt_leaves_what_was_finished(fakes: Path, tmp_path: Path) -> None:
+    items = (item("t-1", "table"), item("t-2", "interrupted"), item("t-3", "table"))
+    with pytest.raises(KeyboardInterrupt):
+        reproduce(["all"], "out", items=items, jobs=1)
+    assert worked(tmp_path) == ["t-1"]
+    (tmp_path / "log.go").touch()
+    assert states(reproduce(["all"], "out", items=items, jobs=1)) == {"t-1": "kept", "t-2": "made", "t-3": "made"}
+    assert worked(tmp_path) == ["t-1", "t-2", "t-3"]
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT] if hasattr(signal, "SIGKILL") else [])
+def test_a_killed_call_is_taken_up_where_it_stopped(fakes: Path, tmp_path: Path, how: int) -> None:
+    names = [f"t-{number}" for number in range(8)]
+    script = tmp_path / "call.py"
+    script.write_text(
+        "from fakes.chapter import slow\nfrom sealscope.thesis.engine.build import reproduce\n"
+        "from sealscope.thesis.engine.items import Item\n"
+        "if __name__ == '__main__':\n"
+        f"    items = tuple(Item(n, 4, 'table', 'Item ' + n, slow) for n in {names!r})\n"
+        "    reproduce(['all'], 'out', items=items, jobs=2)\n"
+    )
+    paths = os.pathsep.join([str(fakes.parent.parent), *sys.path])
+    call = subprocess.Popen(
+        [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": paths}, cwd=tmp_path, stderr=subprocess.DEVNULL
+    )
+    end = time.monotonic() + 60
+    while len(list((tmp_path / "out" / "kept" / "drawn").glob("*.json"))) < 3 and time.monotonic() < end:
+        assert call.poll() is None
+        time.sleep(0.02)
+    call.send_signal(how)
+    call.wait(20)
+    time.sleep(1.0)  # workers of a killed parent end with it
+    finished = {path.stem for path in (tmp_path / "out" / "kept" / "drawn").glob("*.json")}
+    assert 3 <= len(finished) < 8
+    again = reproduce(["all"], "out", items=tuple(item(name, "slow") for name in names), jobs=2)
+    assert {name for name, state in states(again).items() if state == "kept"} == finished
+    # "drawn": killed between the product and the note on its drawing
+    assert {name for name, state in states(again).items() if state in ("made", "drawn")} == set(names) - finished
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_failure_is_told_and_the_others_go_on(fakes: Path, tmp_path: Path, jobs: int) -> None:
+    items = (item("t-0", "broken"), item("t-1", "table"), item("t-2", "doubled", "t-0"), item("t-3", "doubled", "t-1"))
+    outcome = reproduce(["all"], "out", items=items, jobs=jobs)
+    assert states(outcome) == {"t-0": "failed", "t-1": "made", "t-2": "failed", "t-3": "made"}
+    assert outcome.statuses[0].reason == "RuntimeError: no such curve"
+    assert outcome.statuses[2].reason == "needs t-0, which failed"
+    assert "second line" in (tmp_path / "out" / "kept" / "failed" / "t-0.txt").read_text()
+
+
+def test_a_process_that_dies_takes_only_its_item(fakes: Path, tmp_path: Path) -> None:
+    items = (item("t-1", "dies"), *(item(f"t-{number}", "table") for number in range(2, 6)))
+    outcome = reproduce(["all"], "out", items=items, jobs=2)
+    assert states(outcome) == {"t-1": "failed", "t-2": "made", "t-3": "made", "t-4": "made", "t-5": "made"}
+    assert outcome.statuses[0].reason == "the process that made it died"
