@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.rms_change.against_baseline import predict, student_threshold
-from sealscope.diagnosis.rms_change.results import excess
+from sealscope.diagnosis.rms_change.blocks import excess
+from sealscope.diagnosis.rms_change.detector import predict, student_threshold
 from sealscope.recordings.recording import Recording
 
 pytestmark = pytest.mark.usefixtures("rms_change_alone")

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
-from sealscope.diagnosis.pressure_model.detector import PressureModel, threshold_of
+from sealscope.diagnosis.changepoint.tails import largest_normal, seed_of
+from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.model import GAIN, STATES, DrivenModel, G, assumed_numbers, nominal
 from sealscope.diagnosis.pressure_model.track import Track, steps_in, track
@@ -96,7 +96,7 @@ def test_the_threshold_holds_its_probability(linear: tuple[Track, np.ndarray, fl
     alarms = 0
     for _ in range(400):
         steps = steps_in(of_linear_model(like, theta, speed, random), theta, speed, scales=scales)
-        alarms += float(steps.z[2:-2].max()) > threshold_of(steps.correlation[2:-2, 2:-2], 0.05)
+        alarms += float(steps.z[2:-2].max()) > largest_normal(steps.correlation[2:-2, 2:-2], 0.05, seed_of(steps.z))
     assert alarms <= 33
     assert alarms >= (8 if len(scales) == 1 else 1)
 
@@ -113,14 +113,6 @@ def test_a_step_is_estimated_without_bias(linear: tuple[Track, np.ndarray, float
     assert found.mean() == pytest.approx(size, abs=4.0 * deviation / np.sqrt(200))
     assert found.std() == pytest.approx(float(deviation), rel=0.2)
     assert np.mean([abs(int(np.argmax(one.z)) - 8) <= 2 for one in drawn]) > 0.8
-
-
-@pytest.mark.parametrize("p", [0.2, 0.01, 1e-3])
-def test_threshold_of_known_maxima(p: float) -> None:
-    """Of independent z: (1 - p)^(1/m) of the normal; of z that are all the same: 1 - p."""
-    m = 12
-    assert threshold_of(np.eye(m), p) == pytest.approx(norm.ppf((1.0 - p) ** (1.0 / m)), abs=0.1)
-    assert threshold_of(np.ones((m, m)), p) == pytest.approx(norm.ppf(1.0 - p), abs=0.1)
 
 
 # ---- verdicts ------------------------------------------------------------------------------------------------------

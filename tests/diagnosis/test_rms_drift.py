@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.rms_change.blocks import QUANTITIES, Blocks
-from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.blocks import QUANTITIES, RmsBlocks, excess
+from sealscope.diagnosis.rms_change.detector import within
 from sealscope.diagnosis.rms_change.drift import (
     LEAST_SHARE,
     MACHINE_WANDER,
@@ -16,9 +16,7 @@ from sealscope.diagnosis.rms_change.drift import (
     drift_beyond_noise,
     drift_of,
     own_shares,
-    settled,
 )
-from sealscope.diagnosis.rms_change.results import excess
 
 BLOCK = 1.5
 #: Deviation of a block's log RMS of d1..d4 and d3d4 where it is white noise at 500 Hz.
@@ -33,8 +31,8 @@ def log_rms(noise: np.ndarray, machine: np.ndarray) -> np.ndarray:
     return np.column_stack([levels, levels[:, 2] + levels[:, 3]])
 
 
-def blocks_of(values: np.ndarray, cycle: float | None = 1.5) -> Blocks:
-    return Blocks(np.arange(len(values) + 1) * BLOCK, values, ("p_A", "p_B")[: values.shape[1] // 5], 1, cycle)
+def blocks_of(values: np.ndarray, cycle: float | None = 1.5) -> RmsBlocks:
+    return RmsBlocks(np.arange(len(values) + 1) * BLOCK, values, ("p_A", "p_B")[: values.shape[1] // 5], 1, cycle)
 
 
 def test_shares_and_the_way_of_the_noise_are_those_of_the_energies() -> None:
@@ -87,7 +85,7 @@ def test_energies_beyond_the_noise_move_with_the_machine_alone() -> None:
 def test_the_start_is_left_out(n: int, cycle: float | None, first: int) -> None:
     """10 s (7 blocks), or three cycles, or an eighth of the record, whichever says least."""
     blocks = blocks_of(np.zeros((n, len(QUANTITIES))), cycle)
-    found = settled(blocks)
+    found = blocks.settled()
     assert len(found.log_rms) == n - first
     assert found.edges[0] == first * BLOCK
     assert len(found.edges) == n - first + 1
@@ -100,7 +98,7 @@ def wandering(random: np.random.Generator, n: int, size: float) -> np.ndarray:
     return np.asarray(size * path / np.ptp(path))
 
 
-def drifting(random: np.random.Generator, n: int = 115, leak: float = 0.0) -> Blocks:
+def drifting(random: np.random.Generator, n: int = 115, leak: float = 0.0) -> RmsBlocks:
     """A record of both chambers: noise wanders by 4 %, the machine's part by 8 %; `leak`: how far that falls at
     once, half-way."""
     chambers = []
@@ -114,11 +112,11 @@ def drifting(random: np.random.Generator, n: int = 115, leak: float = 0.0) -> Bl
 
 def test_a_machine_that_drifts_and_does_not_leak_is_not_called_leaky() -> None:
     random = np.random.default_rng(5)
-    verdicts = [RmsChange()._judged(drifting(random), 0.1).verdict for _ in range(16)]
+    verdicts = [within(drifting(random), 0.1).verdict for _ in range(16)]
     assert verdicts.count("leak") <= 5  # of 16 at 10 %: more has a probability of 0.3 %
 
 
 def test_a_leak_is_found_beside_that_drift() -> None:
     random = np.random.default_rng(6)
-    verdicts = [RmsChange()._judged(drifting(random, leak=0.5), 0.1).verdict for _ in range(6)]
+    verdicts = [within(drifting(random, leak=0.5), 0.1).verdict for _ in range(6)]
     assert verdicts.count("leak") >= 5

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.shapes import least_blocks
+from sealscope.diagnosis.changepoint.tails import seed_of, upper_quantile
 from sealscope.recordings.recording import Array
 
 #: Directions whose scatter is less than this share of the largest are sums of others.
@@ -154,12 +155,12 @@ class StepScan:
             moved = moved + np.cumsum(random.standard_normal((count, self.n, walks.shape[1])), axis=1) @ walks.T
         return moved
 
-    def null(self, count: int, seed: int = 0, *, after: int | None = None) -> tuple[Array, Array, Array]:
+    def null(self, count: int, *, after: int | None = None) -> tuple[Array, Array, Array]:
         """Return T2 (count,), |single| (count, f) and trend T2 (count,) of `count` series without a step.
 
-        The largest over all steps, or those of a step after the block `after` alone.
+        The largest over all steps, or those of a step after the block `after` alone. The seed is that of the series.
         """
-        random = np.random.default_rng(seed)
+        random = np.random.default_rng(seed_of(self.x))
         t2_max, single_max, trend = np.empty(count), np.empty((count, self.f)), np.empty(count)
         steps = slice(None) if after is None else slice(after - 1, after)
         for first in range(0, count, _BATCH):
@@ -168,6 +169,15 @@ class StepScan:
             t2_max[here] = t2[:, steps].max(axis=1)
             single_max[here] = np.abs(single[:, steps]).max(axis=1)
         return t2_max, single_max, trend
+
+    def thresholds(self, probability: float, *, after: int | None = None) -> tuple[float, Array, float]:
+        """Return what T2, |single| (f,) and trend T2 exceed with `probability` without a step, as `null` has them.
+
+        From so many random orders that at least 20 exceed the threshold: a relative error of its tail under 25 %.
+        """
+        orders = max(999, int(np.ceil(20.0 / probability)) - 1)
+        t2, single, trend = (upper_quantile(null, probability) for null in self.null(orders, after=after))
+        return float(t2), single, float(trend)
 
 
 def _cosines(x: Array) -> Array:
@@ -220,8 +230,3 @@ def _orders(n: int, count: int, random: np.random.Generator) -> NDArray[np.int64
     places = (chosen[:, :, None] + np.arange(_RUN)).reshape(count, -1)
     places = places[places < n].reshape(count, n)  # the last run may be a short one
     return np.asarray((places - shifts) % n)
-
-
-def permutations_for(false_alarm_probability: float) -> int:
-    """Return the number of random orders: at least 20 exceed the threshold, a relative error of its tail under 25 %."""
-    return max(999, int(np.ceil(20.0 / false_alarm_probability)) - 1)

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import DayToDay, against_baseline, share_of_each
-from sealscope.diagnosis.changepoint.tails import near_best, upper_quantile
+from sealscope.diagnosis.changepoint.tails import largest_normal, near_best, seed_of
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import constant
-from sealscope.recordings.recording import Array, Recording, remembered
+from sealscope.recordings.recording import Recording, remembered
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ EXPLAINED = 0.9
 UNRULY = 1.2
 #: A change of a parameter from the first to the last third that no healthy machine shows within a record, as a share.
 _OTHER_CAUSE = {"friction": 0.18, "stiffness": 0.15}
-_SEED = 20
 #: From day to day the level of G moves by this much [m^3/(s Pa)], known as from five machines: fits differ with the
 #: machine's friction.
 DAY_TO_DAY = DayToDay(3e-13, 4.0)
@@ -128,14 +127,6 @@ def _mean_drop(recording: Recording, since: float = -np.inf) -> float:
     return float(np.mean(np.abs(recording["p_A"][late] - recording["p_B"][late])))
 
 
-def threshold_of(correlation: Array, probability: float) -> float:
-    """Return the value that the largest of standard normal z of this correlation exceeds with the probability."""
-    draws = int(np.clip(60.0 / probability, 6000, 200_000))
-    root = np.linalg.cholesky(correlation + 1e-9 * np.eye(len(correlation)))
-    random = np.random.default_rng(_SEED)
-    return float(upper_quantile((random.standard_normal((draws, len(root))) @ root.T).max(axis=1), probability))
-
-
 def _within(followed: Followed, recording: Recording, probability: float) -> Evidence:
     """Return the evidence on a rise of G within the record."""
     from sealscope.diagnosis.pressure_model.track import excess_of
@@ -143,7 +134,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     steps, begin = followed.steps, float(recording.t[0])
     inner = slice(LEAST - 1, followed.blocks - LEAST)
     z = steps.z[inner]
-    threshold = threshold_of(steps.correlation[inner, inner], probability)
+    threshold = largest_normal(steps.correlation[inner, inner], probability, seed_of(z))
     best = int(np.argmax(z))
     excess = excess_of(steps)
     cause = _other_cause(followed)

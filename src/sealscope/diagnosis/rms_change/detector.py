@@ -1,32 +1,44 @@
-"""The thesis's method as a detector with a false-alarm probability: has the RMS of the db8 details of the chamber
-pressures changed?
+"""The thesis's method as a detector with a false-alarm probability: a change of the RMS of the db8 details.
 
 The thesis compares the RMS of d1..d4 and of d3*d4 before and after (its ch. 5 and Appendix C) and calls a leak where
-it went down (p_A) or up (p_B). Here each of these changes is a method of its own with a threshold from the leak-free
+it went down (p_A) or up (p_B). Here each of these changes is a part of the evidence with a threshold from the leak-free
 scatter, and all chambers and levels d2..d4 together make the verdict. d1 is noise alone: where it changes too, the
 sensors' noise is taken out of the other levels first.
+
+Within a recording the change is a step at any instant. Against leak-free recordings it is a change of the level: from
+three on by the scatter between recordings, with one or two by the scatter of blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from sealscope.diagnosis.changepoint.scatter import HealthyDrift, Scan, StepScan, permutations_for
-from sealscope.diagnosis.changepoint.tails import near_best, upper_quantile
-from sealscope.diagnosis.rms_change.against_baseline import against
-from sealscope.diagnosis.rms_change.blocks import Blocks, cut
-from sealscope.diagnosis.rms_change.drift import drift_beyond_noise, drift_of, settled
-from sealscope.diagnosis.rms_change.results import JUDGED, describe_change, excess, largest_changes, method_result
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, operating_point
+from sealscope.diagnosis.changepoint.scatter import HealthyDrift, StepScan
+from sealscope.diagnosis.changepoint.tails import near_best
+from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, RmsBlocks, cut, excess, whole_log_rms
+from sealscope.diagnosis.rms_change.drift import drift_beyond_noise, drift_of
+from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import shortest
 
-#: Fewest blocks in which a change can be looked for: the covariance of six columns needs them.
-FEWEST_BLOCKS = 24
+#: Fewest blocks in which a change can be looked for (the covariance of six columns needs them), and fewest of each side
+#: where blocks of several recordings are compared.
+FEWEST_BLOCKS, FEWEST_BLOCKS_A_SIDE = 24, 12
+#: Fewest baseline recordings from which the scatter between recordings is estimated ...
+FEWEST_RECORDINGS = 3
+#: ... and from which the dependence of the details on the pressure level is estimated too.
+FEWEST_FOR_LEVEL = 6
+#: How far outside the baseline's range of levels a recording may lie, as a share of the range.
+LEVEL_MARGIN = 0.25
+#: Scatter of the log RMS between recordings below which they are copies of one another.
+_LEAST_SCATTER = 1e-9
+_WITHOUT_NOISE = "; the noise (d1) changed too, and was taken out of the other details"
 
 
 class RmsChange:
@@ -36,6 +48,7 @@ class RmsChange:
     reads = ("u", "p_A", "p_B")
 
     def usable(self, recording: Recording) -> str | None:
+        """Return None when the recording has a chamber pressure that moves, else the reason why not."""
         chambers = chambers_of(recording)
         if not chambers:
             return "needs the pressure of a chamber (p_A or p_B)"
@@ -47,11 +60,9 @@ class RmsChange:
         return None
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
+        """Return the evidence on a recording that is `usable`, within it or against the baseline."""
         if baseline:
             return against(recording, baseline, false_alarm_probability)
-        return self._within(recording, false_alarm_probability)
-
-    def _within(self, recording: Recording, probability: float) -> Evidence:
         blocks = cut(recording)
         n = len(blocks.log_rms)
         if n < FEWEST_BLOCKS:
@@ -62,69 +73,241 @@ class RmsChange:
             )
         if blocks.still is not None:
             return Evidence("cannot tell", f"the pressures cannot be trusted: {blocks.still}")
-        return self._judged(settled(blocks), probability)
+        return within(blocks.settled(), false_alarm_probability)
 
-    def _judged(self, blocks: Blocks, probability: float) -> Evidence:
-        x = blocks.log_rms
-        drift, d1 = drift_of(blocks), blocks.columns("d1")
-        scan = StepScan(x, blocks.columns(*JUDGED), drift)
-        found = scan.observed()
-        null, single_null, trend_null = scan.null(permutations_for(probability))
-        threshold, most_even = (float(upper_quantile(one, probability)) for one in (null, trend_null))
-        thresholds = upper_quantile(single_null, probability)
-        methods = self._methods(blocks, found.single, thresholds)
 
-        step = int(np.argmax(found.joint))
-        changes = x[step + 1 :].mean(axis=0) - x[: step + 1].mean(axis=0)
-        told = largest_changes(blocks.names, found.single[step], changes, thresholds)
-        noise = StepScan(x[:, d1], list(range(len(d1))), HealthyDrift(drift.walks[d1], np.zeros((len(d1), 0))))
-        noisy = noise.observed()
-        even = found
-        if float(noisy.joint.max()) > float(upper_quantile(noise.null(permutations_for(probability))[0], probability)):
-            found, threshold = self._without_noise(blocks, int(np.argmax(noisy.joint)) + 1, probability)
-            step = int(np.argmax(found.joint))
-            even = noisy if noisy.trend > noisy.joint.max() else found
-            told += ", beyond a change of the noise"
-            if even is found and found.joint[step] <= threshold:
-                reason = (
-                    "the noise (d1) changed, and the other details by no more than it: a sensor or its "
-                    "wiring changed, or the leak is hidden"
-                )
-                return Evidence("cannot tell", reason, float(found.joint[step]), threshold, parts=methods)
-        score = float(found.joint[step])
-        if not even.step_wins() and (score > threshold or even.trend > most_even or even is noisy):
-            what = "the noise (d1) changed" if even is noisy else told
-            reason = (
-                f"{what}, evenly over the recording (trend T2 {even.trend:.1f}, step {even.joint.max():.1f}): a drift "
-                "and a growing leak look alike"
-            )
-            return Evidence("cannot tell", reason, score, threshold, parts=methods)
-        if score <= threshold:
-            reason = (
-                f"no change of the details' RMS within the recording beyond its scatter and a sound machine's drift "
-                f"(T2 {score:.1f}, threshold {threshold:.1f}); "
-                "a leak that was there from the start would need a --baseline to be seen"
-            )
-            return Evidence("no leak", reason, score, threshold, parts=methods)
-        near = blocks.edges[near_best(found.joint) + 1]
-        onset, interval = float(blocks.edges[step + 1]), (float(near[0]), float(near[-1]))
-        reason = f"{told} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"
-        return Evidence("leak", reason, score, threshold, onset, interval, parts=methods)
+def within(blocks: RmsBlocks, probability: float) -> Evidence:
+    """Return the evidence of a step within the blocks of one recording."""
+    x = blocks.log_rms
+    drift, d1 = drift_of(blocks), blocks.columns("d1")
+    scan = StepScan(x, blocks.columns(*JUDGED), drift)
+    result = scan.observed()
+    threshold, thresholds, most_even = scan.thresholds(probability)
+    parts = []
+    for k, name in enumerate(blocks.names):
+        step = int(np.argmax(np.abs(result.single[:, k])))
+        change = float(x[step + 1 :, k].mean() - x[: step + 1, k].mean())
+        reason = f"{_change(name, change)} at {blocks.edges[step + 1]:.1f} s"
+        parts.append(_part(name, float(result.single[step, k]), thresholds[k], reason))
 
-    @staticmethod
-    def _without_noise(blocks: Blocks, split: int, probability: float) -> tuple[Scan, float]:
-        beyond = excess(blocks.log_rms, split)
+    step = int(np.argmax(result.joint))
+    changes = x[step + 1 :].mean(axis=0) - x[: step + 1].mean(axis=0)
+    changed = _largest_changes(blocks.names, result.single[step], changes, thresholds)
+    noise_scan = StepScan(x[:, d1], list(range(len(d1))), HealthyDrift(drift.walks[d1], np.zeros((len(d1), 0))))
+    noise = noise_scan.observed()
+    even = result
+    noisy = float(noise.joint.max()) > noise_scan.thresholds(probability)[0]
+    if noisy:
+        beyond = excess(x, int(np.argmax(noise.joint)) + 1)
         scan = StepScan(beyond, list(range(beyond.shape[1])), drift_beyond_noise(blocks))
-        null, _, _ = scan.null(permutations_for(probability), seed=1)
-        return scan.observed(), float(upper_quantile(null, probability))
+        result, threshold = scan.observed(), scan.thresholds(probability)[0]
+        step = int(np.argmax(result.joint))
+        even = noise if noise.trend > noise.joint.max() else result
+        changed += ", beyond a change of the noise"
+    score = float(result.joint[step])
+    onset, interval = None, None
+    verdict: Verdict = "cannot tell"
+    if noisy and even is result and score <= threshold:
+        reason = (
+            "the noise (d1) changed, and the other details by no more than it: a sensor or its wiring changed, or the "
+            "leak is hidden"
+        )
+    elif not even.step_wins() and (score > threshold or even.trend > most_even or even is noise):
+        what = "the noise (d1) changed" if even is noise else changed
+        reason = (
+            f"{what}, evenly over the recording (trend T2 {even.trend:.1f}, step {even.joint.max():.1f}): a drift "
+            "and a growing leak look alike"
+        )
+    elif score <= threshold:
+        verdict = "no leak"
+        reason = (
+            f"no change of the details' RMS within the recording beyond its scatter and a healthy machine's drift (T2 "
+            f"{score:.1f}, threshold {threshold:.1f}); a leak that was there from the start would need a --baseline to "
+            "be seen"
+        )
+    else:
+        verdict = "leak"
+        near = blocks.edges[near_best(result.joint) + 1]
+        onset, interval = float(blocks.edges[step + 1]), (float(near[0]), float(near[-1]))
+        reason = f"{changed} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"
+    return Evidence(verdict, reason, score, threshold, onset, interval, parts=tuple(parts))
 
-    @staticmethod
-    def _methods(blocks: Blocks, single: Array, thresholds: Array) -> tuple[Evidence, ...]:
-        results = []
-        for k, name in enumerate(blocks.names):
-            step = int(np.argmax(np.abs(single[:, k])))
-            score = abs(float(single[step, k]))
-            change = float(blocks.log_rms[step + 1 :, k].mean() - blocks.log_rms[: step + 1, k].mean())
-            reason = f"{describe_change(name, change)} at {blocks.edges[step + 1]:.1f} s"
-            results.append(method_result(name, score, float(thresholds[k]), reason))
-        return tuple(results)
+
+def against(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
+    """Return the evidence from the comparison with leak-free recordings of the same operating point."""
+    point = operating_point(recording)
+    levels = np.array([operating_point(other).level for other in baseline])
+    margin = float(np.log(LEVEL_RATIO))
+    if len(levels) < FEWEST_FOR_LEVEL:
+        outside = bool(np.all(np.abs(levels - point.level) > margin))
+    else:
+        margin = max(LEVEL_MARGIN * float(np.ptp(levels)), margin)
+        outside = not levels.min() - margin <= point.level <= levels.max() + margin
+    if outside:
+        return Evidence(
+            "cannot tell",
+            f"the pressure level, {np.exp(point.level):.4g} {point.units[0]} rms, lies outside that of the "
+            f"{len(baseline)} comparable baseline recordings, {np.exp(levels.min()):.4g} to {np.exp(levels.max()):.4g}",
+        )
+    if len(baseline) >= FEWEST_RECORDINGS:
+        return _by_recordings(recording, baseline, point.level, levels, probability)
+    return _by_blocks(recording, baseline, probability)
+
+
+@dataclass(frozen=True)
+class HealthyLevels:
+    """Log RMS expected of a healthy recording, from leak-free ones at the same operating point.
+
+    `mean` and standard `deviation` (f,), degrees of `freedom`, and the `fitted` values (n, f) of the leak-free ones.
+    """
+
+    mean: Array
+    deviation: Array
+    freedom: int
+    fitted: Array
+
+
+def predict(log_rms: Array, levels: Array, level: float) -> HealthyLevels:
+    """Return the normal prediction for one more recording from n leak-free ones.
+
+    `log_rms`: (n, f); `levels`: (n,) log pressure levels. From six recordings on, the log RMS is a line over the
+    level (least squares), else a constant; the deviation includes the estimate's own error (Montgomery, Peck &
+    Vining, Introduction to Linear Regression Analysis, sec. 2.5).
+    """
+    n = len(levels)
+    with_level = n >= FEWEST_FOR_LEVEL and np.ptp(levels) > 0
+    design = np.stack([np.ones(n), levels - levels.mean()], axis=1) if with_level else np.ones((n, 1))
+    at = np.array([1.0, level - float(levels.mean())]) if with_level else np.ones(1)
+    coefficients, *_ = np.linalg.lstsq(design, log_rms, rcond=None)
+    freedom = n - design.shape[1]
+    residual = log_rms - design @ coefficients
+    variance = np.sum(residual**2, axis=0) / freedom
+    leverage = float(at @ np.linalg.solve(design.T @ design, at))
+    return HealthyLevels(at @ coefficients, np.sqrt(variance * (1.0 + leverage)), freedom, design @ coefficients)
+
+
+def student_threshold(probability: float, freedom: int) -> float:
+    """Return |t| that Student's t with `freedom` degrees of freedom exceeds with `probability`, both tails together."""
+    from scipy.special import stdtrit
+
+    return float(-stdtrit(freedom, probability / 2.0))
+
+
+def _by_recordings(
+    recording: Recording, baseline: Sequence[Recording], level: float, levels: Array, probability: float
+) -> Evidence:
+    known, measured = np.stack([whole_log_rms(other) for other in baseline]), whole_log_rms(recording)
+    expected = predict(known, levels, level)
+    if not (np.all(np.isfinite(measured)) and np.all(expected.deviation > _LEAST_SCATTER)):
+        return Evidence(
+            "cannot tell",
+            f"the {len(baseline)} comparable baseline recordings do not scatter, or a pressure does not move: "
+            "nothing to judge a change by",
+        )
+    changes = measured - expected.mean
+    t = changes / expected.deviation
+    names = [f"{quantity} of {chamber}" for chamber in chambers_of(recording) for quantity in QUANTITIES]
+    judged = [k for k, name in enumerate(names) if name.split()[0] in JUDGED]
+    own = student_threshold(probability, expected.freedom)
+    threshold = student_threshold(probability / len(judged), expected.freedom)
+    parts = _parts_against(names, t, np.full(len(names), own), changes)
+    noisy = any(abs(t[k]) > own for k, name in enumerate(names) if name.startswith("d1 "))
+    if noisy:
+        t = t.copy()
+        t[judged] = _without_noise(known, measured, expected, judged)
+    score = float(np.max(np.abs(t[judged])))
+    changed = "no change of the details' RMS"
+    if score > threshold:
+        limits = np.full(len(judged), threshold)
+        changed = _largest_changes([names[k] for k in judged], t[judged], changes[judged], limits)
+    reason = (
+        f"{changed} against {len(baseline)} comparable leak-free recordings (largest |t| {score:.1f}, threshold "
+        f"{threshold:.1f}){_WITHOUT_NOISE if noisy else ''}"
+    )
+    return Evidence("leak" if score > threshold else "no leak", reason, score, threshold, parts=parts)
+
+
+def _without_noise(known: Array, measured: Array, expected: HealthyLevels, judged: list[int]) -> Array:
+    """Return t of the judged quantities' energy beyond that of their chamber's d1, so that white noise drops out.
+
+    Energies are relative to what was expected of the quantity. More noise means more scatter of the energy, too: in
+    proportion to it.
+    """
+    noise = [k - k % len(QUANTITIES) for k in judged]
+
+    def energy(log_rms: Array, level: Array) -> Array:
+        return np.asarray(np.exp(2 * (log_rms - level)))
+
+    fitted, mean = expected.fitted[:, judged], expected.mean[judged]
+    before = energy(known[:, judged], fitted) - energy(known[:, noise], fitted)
+    after = energy(measured[judged], mean) - energy(measured[noise], mean)
+    added = energy(measured[noise], mean) - energy(expected.mean[noise], mean)
+    own = (1.0 + np.maximum(added, 0.0)) ** 2
+    scatter = np.sqrt(np.sum((before - before.mean(axis=0)) ** 2, axis=0) / expected.freedom * (own + 1.0 / len(known)))
+    return np.asarray((after - before.mean(axis=0)) / scatter)
+
+
+def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
+    before = [cut(other) for other in baseline]
+    after = cut(recording)
+    x = np.concatenate([*(blocks.log_rms for blocks in before), after.log_rms])
+    split = len(x) - len(after.log_rms)
+    if min(split, len(after.log_rms)) < FEWEST_BLOCKS_A_SIDE:
+        return Evidence(
+            "cannot tell",
+            f"too little to compare: {split} blocks of baseline and {len(after.log_rms)} of the recording, "
+            f"{FEWEST_BLOCKS_A_SIDE} of each are needed "
+            f"(or {FEWEST_RECORDINGS} comparable baseline recordings, got {len(baseline)})",
+        )
+    still = next((blocks.still for blocks in (after, *before) if blocks.still is not None), None)
+    if still is not None:
+        return Evidence("cannot tell", f"the pressures cannot be trusted: {still}")
+    scan = StepScan(x, after.columns(*JUDGED), least=1)
+    result = scan.observed()
+    score, single = float(result.joint[split - 1]), result.single[split - 1]
+    threshold, thresholds, _ = scan.thresholds(probability, after=split)
+    changes = x[split:].mean(axis=0) - x[:split].mean(axis=0)
+    noisy = any(abs(single[k]) > thresholds[k] for k in after.columns("d1"))
+    if noisy:
+        beyond = excess(x, split)
+        scan = StepScan(beyond, list(range(beyond.shape[1])), least=1)
+        score = float(scan.observed().joint[split - 1])
+        threshold = scan.thresholds(probability, after=split)[0]
+    changed = "no change of the details' RMS"
+    if score > threshold:
+        changed = _largest_changes(after.names, single, changes, thresholds)
+    reason = (
+        f"{changed} against {len(baseline)} comparable leak-free recording{'s' if len(baseline) > 1 else ''} (T2 "
+        f"{score:.1f}, threshold {threshold:.1f}, from the scatter within recordings alone: give {FEWEST_RECORDINGS} "
+        f"or more to have the drift between recordings in it){_WITHOUT_NOISE if noisy else ''}"
+    )
+    parts = _parts_against(after.names, single, thresholds, changes)
+    return Evidence("leak" if score > threshold else "no leak", reason, score, threshold, parts=parts)
+
+
+def _parts_against(names: list[str], scores: Array, thresholds: Array, changes: Array) -> tuple[Evidence, ...]:
+    return tuple(
+        _part(name, float(scores[k]), thresholds[k], f"{100 * np.expm1(changes[k]):+.1f} % against the baseline")
+        for k, name in enumerate(names)
+    )
+
+
+def _part(name: str, score: float, threshold: float, reason: str) -> Evidence:
+    """Return one quantity's evidence; a change of d1 alone is a change of the noise, never a leak."""
+    verdict: Verdict = "no leak"
+    if abs(score) > threshold:
+        verdict = "cannot tell" if name.startswith("d1 ") else "leak"
+    return Evidence(verdict, reason, abs(score), float(threshold), detector=f"RMS of {name}")
+
+
+def _change(name: str, change: float) -> str:
+    """Return a change of log RMS as text."""
+    percent = 100.0 * np.expm1(change)
+    return f"RMS of {name} {'rose' if percent > 0 else 'fell'} by {abs(percent):.1f} %"
+
+
+def _largest_changes(names: list[str], single: Array, changes: Array, thresholds: Array) -> str:
+    """Return the significant changes as text, the clearest first, at most three."""
+    order = [k for k in np.argsort(-np.abs(single) / thresholds) if not names[k].startswith("d3d4")]
+    significant = [k for k in order if abs(single[k]) > thresholds[k]][:3] or order[:1]
+    return ", ".join(_change(names[k], float(changes[k])) for k in significant)

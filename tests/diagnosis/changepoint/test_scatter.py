@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis.changepoint.scatter import HealthyDrift, Scan, StepScan, permutations_for
+from sealscope.diagnosis.changepoint.scatter import HealthyDrift, Scan, StepScan
 from sealscope.diagnosis.changepoint.scatter import _orders as orders
 from sealscope.diagnosis.changepoint.shapes import least_blocks
-from sealscope.diagnosis.changepoint.tails import ONSET_CUT, near_best, upper_quantile
+from sealscope.diagnosis.changepoint.tails import ONSET_CUT, near_best, seed_of, upper_quantile
 
 
 def scan(x: np.ndarray, joint: list[int], drift: HealthyDrift | None = None) -> Scan:
@@ -182,10 +182,13 @@ def test_quantile_keeps_the_rate_exactly(p: float) -> None:
     assert exceeding == int(100 * p + 1e-9)
 
 
-def test_permutations_reach_beyond_the_quantile() -> None:
-    assert permutations_for(0.05) == 999
-    assert permutations_for(0.01) == 1999
-    assert permutations_for(1e-4) == 199999
+def test_enough_orders_exceed_the_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = []
+    made = StepScan(np.random.default_rng(0).standard_normal((24, 2)), [0, 1])
+    monkeypatch.setattr(made, "null", lambda count, after: counts.append(count) or (np.arange(9.0),) * 3)
+    for probability in (0.05, 0.01, 1e-4):
+        made.thresholds(probability)
+    assert counts == [999, 1999, 199999]
 
 
 @pytest.mark.parametrize("n", [24, 25])
@@ -198,16 +201,16 @@ def test_orders_keep_neighbours_together(n: int) -> None:
     assert len({tuple(order) for order in found}) == 50
 
 
-def test_random_orders_are_an_argument() -> None:
+def test_random_orders_come_from_the_series() -> None:
+    """The same series has the same orders, in any unit; another series has others."""
     x = np.random.default_rng(0).standard_normal((40, 3))
-    made = StepScan(x, [0, 2], HealthyDrift(0.1 * np.eye(3), np.zeros((3, 0))))
-    one, same, other = (made.null(300, seed) for seed in (5, 5, 6))
-    np.testing.assert_array_equal(one[0], same[0])
-    np.testing.assert_array_equal(one[1], same[1])
-    assert not np.array_equal(one[0], other[0])
-    assert one[0].shape == (300,)
-    assert one[1].shape == (300, 3)
-    assert one[2].shape == (300,)
+    drift = HealthyDrift(0.1 * np.eye(3), np.zeros((3, 0)))
+    null, same = (StepScan(x, [0, 2], drift).null(300) for _ in range(2))
+    for first, second, shape in zip(null, same, ((300,), (300, 3), (300,)), strict=True):
+        np.testing.assert_array_equal(first, second)
+        assert first.shape == shape
+    assert seed_of(x) == seed_of(3.0 * x - 7.0)
+    assert len({seed_of(np.random.default_rng(k).standard_normal((40, 3))) for k in range(50)}) == 50
 
 
 def test_nothing_alarms_as_seldom_as_stated() -> None:
