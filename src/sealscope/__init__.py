@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from sealscope.signals.windows import RmsStream
     from sealscope.simulation.batch.batch import simulate_batch
     from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.proof import prove
-    from sealscope.simulation.simulate import simulate, simulate_with_truth
+    from sealscope.simulation.simulate import prove, simulate, simulate_with_truth
 
 _HOMES = {
     "DetailStream": "signals.streams",

@@ -14,7 +14,7 @@ from sealscope.campaigns.prediction.predict import experiment_for
 from sealscope.campaigns.prediction.responses import bench_responses, fixed_levels, instrument_noise, noise_responses
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.bench.machines import Machine
+from sealscope.simulation.bench.machines import BenchMachine
 from sealscope.simulation.commands import Sine
 from sealscope.simulation.experiment import Experiment
 
@@ -26,11 +26,11 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A bench of machines that differ in viscous friction and would have noisy sensors; the seeds it was asked for."""
     asked: list[int] = []
 
-    def draw(profile: str, seed: int, *, rig: Rig, duration: float) -> Machine:
+    def draw(profile: str, seed: int, *, rig: Rig, duration: float) -> BenchMachine:
         asked.append(seed)
         share = np.random.default_rng(seed).uniform(0.9, 1.1)
         values = {"friction.F_v": 300.0 * share, "sensors.p_A.noise": 9e4}
-        return Machine(profile, seed, rig, duration, values, (), Sine(8.0, 1.0), 0.0)
+        return BenchMachine(profile, seed, rig, duration, values, (), Sine(8.0, 1.0), 0.0)
 
     monkeypatch.setattr("sealscope.simulation.bench.machines.draw", draw)
     monkeypatch.setattr(room, "in_parallel", lambda jobs, label, progress: [job() for job in jobs])

@@ -15,7 +15,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults.faults import From, Leak
+from sealscope.simulation.faults import From, Leak
 from sealscope.simulation.sensitivity import clean_channels
 from sealscope.units import LITRE_PER_MINUTE
 

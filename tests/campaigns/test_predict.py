@@ -23,7 +23,7 @@ from sealscope.cli import prediction
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.faults.faults import From, Leak
+from sealscope.simulation.faults import From, Leak
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 

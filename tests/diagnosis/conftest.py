@@ -12,7 +12,8 @@ from sealscope.diagnosis import registry
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
-from sealscope.simulation.simulate import oversampling, sized_leaks, trajectory
+from sealscope.simulation.integrate import oversampling, trajectory
+from sealscope.simulation.sizing import sized_leaks
 
 THROTTLED = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
 Records = Callable[..., Recording]

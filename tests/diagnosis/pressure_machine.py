@@ -11,12 +11,12 @@ import numpy as np
 from sealscope.diagnosis.pressure_model.model import G
 from sealscope.diagnosis.pressure_model.track import Track, wander
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.changes.drifts import Drift, Linear
+from sealscope.simulation.changes import Linear, ParameterDrift
 from sealscope.simulation.commands import Command, Recorded
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
-from sealscope.simulation.integrate import Trajectory
-from sealscope.simulation.simulate import oversampling, sized_leaks, trajectory
+from sealscope.simulation.integrate import Trajectory, oversampling, trajectory
+from sealscope.simulation.sizing import sized_leaks
 
 ONSET = 60.0
 LEAK = f"0.0042 L/min from {ONSET:g} s"
@@ -55,7 +55,7 @@ def _command(words: str, duration: float) -> Command | str:
 def _case(
     command: str, leak: str | None, fault: str | None, drift: tuple[str, float] | None, values: tuple, duration: float
 ) -> tuple[Experiment, Trajectory, np.ndarray]:
-    drifts = () if drift is None else (Drift(drift[0], Linear(drift[1], duration)),)
+    drifts = () if drift is None else (ParameterDrift(drift[0], Linear(drift[1], duration)),)
     experiment = Experiment.of(
         command=_command(command, duration),
         leak=leak,

@@ -35,11 +35,11 @@ SMALL = PROBE.format(
 WHOLE = """
 import numpy as np
 from sealscope.compiled import cache_directory
-from sealscope.parameters import load_rig
 from sealscope.physics.solvers.rk4 import advance_rk4
-from sealscope.simulation.integrate import integrate
-run = integrate(load_rig(), lambda t: (3 * np.sin(4 * t), 0 * t, 0 * t), 0.2, 500.0)
-print(float(run["p_A"][-1]), sum(advance_rk4.stats.cache_hits.values()), cache_directory())
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.integrate import trajectory
+path = trajectory(Experiment.of(duration=0.2), ())
+print(float(path["p_A"][-1]), sum(advance_rk4.stats.cache_hits.values()), cache_directory())
 """
 
 

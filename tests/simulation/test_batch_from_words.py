@@ -17,7 +17,7 @@ QUIET["sensors.common_noise"] = 0.0
 
 def test_a_batch_of_words_is_what_each_recording_is():
     words = [
-        {"command": "3 sin(4t)", "duration": 8.0, "set": QUIET, "step": 5e-4, "leak": leak}
+        {"command": "3 sin(4t)", "duration": 8.0, "set": QUIET, "step": 5e-4, "leak": leak, "allow_unresolved": True}
         for leak in (None, "G = 3e-12 from 4 s")
     ]
     batch = ss.simulate_batch([ss.Experiment.of(**one) for one in words], bounds=[1.0, 3.5, 7.5])

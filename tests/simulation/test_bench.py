@@ -13,8 +13,7 @@ from sealscope.parameters import load_rig
 from sealscope.physics.rig import rig_numbers
 from sealscope.simulation.bench.machines import centred_start, draw
 from sealscope.simulation.bench.profile import Profile, load_profile
-from sealscope.simulation.changes.drifts import RESOLUTION
-from sealscope.simulation.changes.rig import LONGEST_BLOCK, Schedule
+from sealscope.simulation.changes import LONGEST_BLOCK, RESOLUTION, Schedule
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth
 

@@ -11,9 +11,9 @@ import pytest
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.simulation.commands import Recorded, Sine
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults.faults import Leak, Tabulated
-from sealscope.simulation.proof import prove
-from sealscope.simulation.simulate import simulate, simulate_with_truth, trajectory
+from sealscope.simulation.faults import Leak, Tabulated
+from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.simulate import prove, simulate, simulate_with_truth
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 
@@ -202,3 +202,42 @@ def test_simulate_names_itself():
 def test_simulate_and_an_experiment_take_the_same_arguments():
     ours, theirs = (dict(inspect.signature(function).parameters) for function in (simulate, Experiment.of))
     assert ours == theirs
+
+
+COARSE = {"duration": 20.0, "step": 1.5e-3, "set": {"sample_rate": "400[Hz]"}}
+
+
+def test_a_stated_step_is_checked_like_a_chosen_one():
+    with pytest.raises(
+        SimulationFailed, match=r"under-resolved: halving the step of 0\.00125 s \(rk4\) moves .*; take a "
+    ):
+        simulate_with_truth(Experiment.of(**COARSE))
+    solver = simulate_with_truth(Experiment.of(**COARSE, allow_unresolved=True)).recording.provenance["solver"]
+    assert solver["allow_unresolved"]
+    assert solver["error_found_pa"] > 100.0
+    fine = simulate_with_truth(Experiment.of(duration=4.0, step=5e-4)).recording.provenance["solver"]
+    assert 0.0 < fine["error_found_pa"] < 100.0
+
+
+def test_the_check_of_a_stated_step_changes_no_byte():
+    experiment = Experiment.of(duration=6.0, step=5e-4, leak="G = 6e-13 from 3 s")
+    checked, unchecked = (trajectory(experiment, experiment.leaks, step=step) for step in (None, 5e-4))
+    assert np.isnan(unchecked.error)
+    np.testing.assert_array_equal(checked.rows, unchecked.rows)
+
+
+def test_a_proof_integrates_half_the_step_and_nothing_else_twice(monkeypatch):
+    counted: list[float | None] = []
+
+    def count(*args, step=None, **more):
+        counted.append(step)
+        return trajectory(*args, step=step, **more)
+
+    for module in ("simulate", "sizing"):
+        monkeypatch.setattr(f"sealscope.simulation.{module}.trajectory", count)
+    experiment = Experiment.of(duration=6.0, leak="0.01 L/min from 3 s")
+    simulate_with_truth(experiment)
+    without = len(counted)
+    run = simulate_with_truth(experiment, prove=True)
+    assert run.proof is not None
+    assert counted[without:] == [*counted[:without], run.proof.step / 2]

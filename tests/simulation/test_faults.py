@@ -11,11 +11,20 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.simulation.commands import Sine, Step
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults.duty import DutyChange
-from sealscope.simulation.faults.faults import From, Growing, Tabulated
-from sealscope.simulation.faults.parse import parse_fault
-from sealscope.simulation.faults.rig import AirInOil, ExternalLeakage, FrictionChange, PumpLeakage
-from sealscope.simulation.faults.sensors import SensorGain, SensorOffset, SensorStuck
+from sealscope.simulation.faults import (
+    AirInOil,
+    DutyChange,
+    ExternalLeakage,
+    FrictionChange,
+    From,
+    Growing,
+    PumpLeakage,
+    SensorGain,
+    SensorOffset,
+    SensorStuck,
+    Tabulated,
+    parse_fault,
+)
 from sealscope.simulation.simulate import simulate_with_truth, write_truth
 
 PSI = 6894.757293168361

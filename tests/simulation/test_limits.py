@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.simulation.integrate import choose_method
+from sealscope.physics.rig import rig_numbers
+from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
+from sealscope.simulation.experiment import choose_method
 
 FULL_CHARGE = {"p_charge": "40[MPa]"}  # so that the emptied chamber stays above vacuum
 
@@ -146,3 +148,46 @@ def test_inputs_that_jump_at_a_step_keep_the_order(check_rig, drive):
     errors = [np.abs(drive(rig, 0.4, u=late, rate=100.0, step=h)["p_A"] - truth["p_A"]).max() for h in (5e-4, 2.5e-4)]
     assert errors[0] < 100.0
     assert np.log2(errors[0] / errors[1]) > 3.7
+
+
+def test_the_throttles_answer_fastest_at_the_end_of_the_stroke(check_rig):
+    """A chamber at the end of its stroke holds 50 cm^3 instead of 240: the throttle between it and the line is as much
+    quicker, and a step that mid-stroke allows is refused."""
+    p = rig_numbers(check_rig(throttled=True, volumes="position"))
+    c, end = p.c_A_in, p.V - p.A_A * p.L / 2
+    fastest = p.K_oil * (1 / p.V_1 + 1 / end) * c / np.sqrt(p.dp_0)
+    assert fastest > 1.3 * p.K_oil * (1 / p.V_1 + 1 / p.V) * c / np.sqrt(p.dp_0)
+    assert stiffest_rate(p) == pytest.approx(fastest)
+    fixed = p._replace(position_dependent=False)
+    assert stiffest_rate(fixed) == pytest.approx(p.K_oil * (1 / p.V_1 + 1 / p.V) * c / np.sqrt(p.dp_0))
+
+
+def test_a_step_between_the_two_limits_is_refused(check_rig, drive):
+    rig = check_rig(throttled=True, volumes="position")
+    p = rig_numbers(rig)
+    mid = DECAY_LIMIT / (p.K_oil * (1 / p.V_1 + 1 / p.V) * p.c_A_in / np.sqrt(p.dp_0))
+    with pytest.raises(SimulationFailed, match="for rk4 with throttles"):
+        drive(rig, 0.2, method="rk4", step=0.98 * mid, x_0=-0.29)
+
+
+def test_the_unequal_sides_of_a_cylinder_are_taken_where_the_oil_is_stiffer(check_rig):
+    equal = rig_numbers(check_rig(volumes="position"))
+    unequal = equal._replace(A_B=1.2 * equal.A_B)
+    stiffer = (equal.V + equal.A_A * equal.L / 2, equal.V - 1.2 * equal.A_B * equal.L / 2)
+    column = equal.K_oil * (unequal.A_A**2 / stiffer[0] + unequal.A_B**2 / stiffer[1]) / equal.M_eq
+    assert longest_step(unequal) <= 1 / np.sqrt(column) * (1 + 1e-9)
+
+
+def test_the_pressure_in_the_friction_shortens_the_step(check_rig, drive):
+    """F_C = F_pr + F_cfr (p_A + p_B): 825 N at the charge pressure of 40 MPa, not the 25 N of the seals' preload."""
+    rig = check_rig(F_cfr=1e-5, **FULL_CHARGE)
+    p = rig_numbers(rig)
+    slope = (p.F_pr + p.F_cfr * 2 * p.p_charge) * p.K_brk / p.v_th + p.F_v
+    assert longest_step(p) == pytest.approx(DECAY_LIMIT / (slope / p.M_eq), rel=0.02)
+    assert longest_step(p._replace(coulomb_of_difference=True)) > 5 * longest_step(p)
+    with pytest.raises(SimulationFailed, match=r"step must be <= .* friction of this rig"):
+        drive(rig, 1.0, step=5e-4)
+    chosen = drive(rig, 4.0)
+    truth = drive(rig, 4.0, step=chosen.step / 8)
+    every = round((chosen.t[1] - chosen.t[0]) / (truth.t[1] - truth.t[0]))
+    assert np.sqrt(np.mean((chosen["p_A"] - truth["p_A"][::every]) ** 2)) < 100.0

@@ -7,8 +7,10 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults.faults import From, Growing, Leak, Tabulated, parse_leak
-from sealscope.simulation.simulate import simulate_with_truth, sized_leaks, trajectory
+from sealscope.simulation.faults import From, Growing, Leak, Tabulated, parse_leak
+from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.sizing import sized_leaks
 from sealscope.units import LITRE_PER_MINUTE
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}

@@ -17,6 +17,7 @@ from sealscope.errors import InputError, SealscopeError, UnreadableFile
 _WRONG_CALL, _INTERRUPTED = 2, 130
 
 app = typer.Typer(
+    rich_markup_mode="markdown",
     name="sealscope",
     help="Find internal leakage in electro-hydrostatic actuators: simulate the rig, read recordings, diagnose them.",
     no_args_is_help=True,

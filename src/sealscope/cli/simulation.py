@@ -79,7 +79,6 @@ def simulate(
     from sealscope.recordings import write
     from sealscope.recordings.files import check_target
     from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.proof import prove as prove_run
     from sealscope.simulation.simulate import simulate_with_truth, write_truth
 
     check_target(output)
@@ -101,25 +100,24 @@ def simulate(
         error=error,
         allow_unresolved=allow_unresolved,
     )
-    with progress() as told:
-        proof = prove_run(experiment, told) if prove else None
-        made = simulate_with_truth(experiment, told)
-    write(made.recording, output)
+    with progress() as report:
+        run = simulate_with_truth(experiment, report, prove=prove)
+    write(run.recording, output)
     if truth is not None:
-        write_truth(made.truth, truth)
-    if proof is not None:
-        typer.echo(proof.text())
-    solver = made.recording.provenance["solver"]
+        write_truth(run.truth, truth)
+    if run.proof is not None:
+        typer.echo(run.proof.text())
+    solver = run.recording.provenance["solver"]
     typer.echo(
-        f"{output}: {len(made.recording)} samples at {experiment.rate:g} Hz, {experiment.command} "
+        f"{output}: {len(run.recording)} samples at {experiment.rate:g} Hz, {experiment.command} "
         f"({solver['method']}, h = {solver['step_s']:.3g} s)"
     )
-    for one in made.truth.leaks:
-        typer.echo(f"leak: {one}")
-    for other in made.truth.faults:
-        typer.echo(f"fault: {other}")
-    if made.truth.leaks:
-        typer.echo(f"mean leak while open: {made.truth.mean_leak_lpm:.5g} L/min")
+    for leak_ in run.truth.leaks:
+        typer.echo(f"leak: {leak_}")
+    for fault_ in run.truth.faults:
+        typer.echo(f"fault: {fault_}")
+    if run.truth.leaks:
+        typer.echo(f"mean leak while open: {run.truth.mean_leak_lpm:.5g} L/min")
 
 
 def parameters(

@@ -98,6 +98,13 @@ class RigNumbers(NamedTuple):
     p_charge: float
 
 
+#: The fields of `RigNumbers` that are numbers, and those that are choices.
+NUMBERS = tuple(
+    name for name, kind in RigNumbers.__annotations__.items() if getattr(kind, "__forward_arg__", kind) == "float"
+)
+CHOICES = tuple(name for name in RigNumbers._fields if name not in NUMBERS)
+
+
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
     """Flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)] of the one-way throttles, eqs.
     (4.7)-(4.12).

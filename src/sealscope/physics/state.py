@@ -58,7 +58,7 @@ def pressures_moved(y: State, h: float, s: Pressures) -> State:
 
 @kernel
 def survey(rows: np.ndarray) -> tuple[bool, float, float]:
-    """Of rows of outputs (n, 17): whether all are finite, the largest |x| [m], and the lowest pressure [Pa]."""
+    """Of rows of outputs (n, 18): whether all are finite, the largest |x| [m], and the lowest pressure [Pa]."""
     reach, least, total = 0.0, math.inf, 0.0
     for k in range(rows.shape[0]):
         row = rows[k]

@@ -8,20 +8,16 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes.drifts import Drift
-from sealscope.simulation.changes.readings import Readings
-from sealscope.simulation.changes.rig import Effect
+from sealscope.simulation.changes import Effect, ParameterDrift, Readings
 from sealscope.simulation.commands import Command, Sine, check_command, parse_command
-from sealscope.simulation.faults.faults import Fault, Leak, parse_leak
-from sealscope.simulation.integrate import Method, choose_method
-from sealscope.simulation.resolution import PRESSURE_TOLERANCE
+from sealscope.simulation.faults import Fault, Leak, parse_fault, parse_leak
 from sealscope.units import parse_quantity
 
 if TYPE_CHECKING:
@@ -29,7 +25,25 @@ if TYPE_CHECKING:
 
 #: Most samples a recording may have (about 1.4 GB of channels), so that a slip of the unit cannot fill the memory.
 MOST_SAMPLES = 20_000_000
+#: Default for the rms error [Pa] that a pressure may have (a transducer's noise is 8600 Pa).
+PRESSURE_TOLERANCE = 100.0
+Method = Literal["auto", "rk4", "imex"]
 _Kind = TypeVar("_Kind", Leak, Fault)
+
+
+def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
+    """Return the stated method, or the one that suits the rig: implicit-explicit with throttles, explicit without."""
+    if method not in ("auto", "rk4", "imex"):
+        raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
+    throttled = rig.line.orifices == "present"
+    if method == "imex" and not throttled:
+        raise InputError("method imex needs throttles (line.orifices = present), got line.orifices = absent; use rk4")
+    euler = rig.motor.integrator == "euler"
+    if euler and (method == "imex" or (throttled and method == "auto")):
+        raise InputError("motor.integrator = euler (eq. 4.2 taken literally) needs method rk4, got imex")
+    if method == "auto":
+        return "imex" if throttled else "rk4"
+    return method
 
 
 @dataclass(frozen=True, repr=False)
@@ -53,7 +67,7 @@ class Experiment:
     step: float | None = None
     allow_unresolved: bool = False
     faults: tuple[Fault, ...] = ()
-    drifts: tuple[Drift, ...] = ()
+    drifts: tuple[ParameterDrift, ...] = ()
     error: float | None = None
 
     def __post_init__(self) -> None:
@@ -92,7 +106,7 @@ class Experiment:
         command: Command | str = "3 sin(4t)",
         leak: Leak | str | Iterable[Leak | str] | None = None,
         fault: Fault | str | Iterable[Fault | str] | None = None,
-        drifts: Iterable[Drift] = (),
+        drifts: Iterable[ParameterDrift] = (),
         set: Mapping[str, float | str] | None = None,
         duration: float | str = 180.0,
         rate: float | str | None = None,
@@ -115,7 +129,6 @@ class Experiment:
         <Experiment: rig thesis, 3 sin(4t), 180 s at 500 Hz, 0.0042 L/min laminar from 90 s, seed 1>
         """
         from sealscope.parameters import load_rig
-        from sealscope.simulation.faults.parse import parse_fault
 
         if not isinstance(set, Mapping | None):
             raise InputError(f"set must map names of parameters to values, got {set!r}")

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.simulation.changes.readings import Readings
+from sealscope.simulation.changes import Readings
 
 if TYPE_CHECKING:
     from sealscope.parameters import Daq, PressureTransducer, Rig
-    from sealscope.simulation.integrate import Trajectory
 
 #: Half length of the anti-alias filter, in samples of the recording.
 FILTER_REACH = 16
 _KAISER_BETA = 8.0
 _PASS = 0.9  # cut-off (-6 dB) as a share of the Nyquist frequency
+
+
+class Outputs(Protocol):
+    """Outputs of a run by name, such as a `Trajectory`."""
+
+    def __getitem__(self, name: str) -> Array:
+        """Return an output over time."""
+        ...
 
 
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
@@ -95,7 +102,7 @@ def _counted(values: Array, resolution: float) -> Array:
 
 
 def record(
-    rig: Rig, trajectory: Trajectory, u: Array, factor: int, seed: int, readings: Readings | None = None
+    rig: Rig, trajectory: Outputs, u: Array, factor: int, seed: int, readings: Readings | None = None
 ) -> Recording:
     """The Recording that the rig's instruments make of a trajectory.
 

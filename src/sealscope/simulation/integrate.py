@@ -1,5 +1,8 @@
-"""Integrate the rig over an experiment: choose method and step, feed the inputs block by block, refuse a result that
-cannot be trusted."""
+"""Integrate the rig over an experiment: its inputs at the nodes of the steps, the choice of the step, and its checks.
+
+A step is chosen by error or stated; either way short windows of the run are integrated again at half the step, and a
+run that moves further than it may is refused.
+"""
 
 from __future__ import annotations
 
@@ -7,39 +10,52 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
+from sealscope.compiled import kernel
 from sealscope.errors import InputError, SimulationFailed
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes.rig import Effect, Schedule
-from sealscope.simulation.resolution import PRESSURE_TOLERANCE
+from sealscope.simulation.changes import Effect, Schedule
+from sealscope.simulation.commands import Sine, check_command
+from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment, Method, choose_method
+from sealscope.simulation.faults import Leak
+from sealscope.simulation.instruments import FILTER_REACH
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.physics.rig import RigNumbers
 
-Method = Literal["auto", "rk4", "imex"]
-Inputs = Callable[[Array], tuple[Array, Array, Array]]
 Progress = Callable[[float], None]
 #: Step [s] that suits the thesis's rig: error in p_A under 10 Pa rms (docs/decisions/0004-solvers.md).
 DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
-
 #: Longest step [s] that is tried when the step is chosen by error (docs/decisions/0004-solvers.md), and how many times
 #: finer it may become.
 LONGEST_STEP = 1e-3
 FINEST = 20
 #: Lowest gauge pressure [Pa] the model is valid for: there is no cavitation in it, and oil holds no tension.
 VACUUM = -101325.0
+#: The share by which a detail's RMS in a recording (truth and noise together) may be off.
+DETAIL_TOLERANCE = 1e-3
+#: What moves in windows, times this, stands for the whole run; a difference to half the step is at least 14/15 of the
+#: error of a method of order four.
+SAFETY = 1.2
+#: Lengths [s] of the first window and of the later ones, and where these begin as shares of the run.
+FIRST_WINDOW, LATER_WINDOW = 2.0, 1.0
+LATER = (0.5, 0.9)
+LEVELS = 4
 _BLOCK_STEPS = 4096
+_OVERSAMPLING = 4
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What the integration gives: (n,) times [s] and (n, 17) outputs in the order of
-    `sealscope.physics.rig.OUTPUTS`; `error`: the estimated rms error [Pa] of the pressures, NaN where the step was
-    given."""
+    """Result of an integration: (n,) times [s] and (n, 18) outputs in the order of `sealscope.physics.state.OUTPUTS`.
+
+    `error`: the estimated rms error [Pa] of the pressures, NaN where it was not checked.
+    """
 
     t: Array
     rows: Array
@@ -53,32 +69,142 @@ class Trajectory:
         return self.rows[:, OUTPUTS.index(name)]
 
 
-def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
-    """The stated method, or the one that suits the rig: implicit-explicit with throttles, explicit without."""
-    if method not in ("auto", "rk4", "imex"):
-        raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
-    throttled = rig.line.orifices == "present"
-    if method == "imex" and not throttled:
-        raise InputError("method imex needs throttles (line.orifices = present), got line.orifices = absent; use rk4")
-    euler = rig.motor.integrator == "euler"
-    if euler and (method == "imex" or (throttled and method == "auto")):
-        raise InputError("motor.integrator = euler (eq. 4.2 taken literally) needs method rk4, got imex")
-    if method == "auto":
-        return "imex" if throttled else "rk4"
-    return method
+class Inputs(Protocol):
+    """What drives a run: the command [V] and the leakage coefficients G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)]."""
+
+    def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
+        """Return command, G and C at times start[:, None] + offsets [s], for evenly spaced starts."""
+        ...
+
+    def largest(self, t: Array) -> tuple[float, float]:
+        """Return the largest G and C at times t [s]."""
+        ...
+
+
+@kernel
+def sines_of_sums(
+    sine: np.ndarray, cosine: np.ndarray, sine_off: np.ndarray, cosine_off: np.ndarray, amplitude: float, offset: float
+) -> np.ndarray:
+    """Return offset + amplitude sin(a + b), (n, m), for all a (n,) and b (m,), from the sines and cosines of both."""
+    out = np.empty((sine.size, sine_off.size))
+    for k in range(sine.size):
+        s, c = amplitude * sine[k], amplitude * cosine[k]
+        for m in range(sine_off.size):
+            out[k, m] = offset + (s * cosine_off[m] + c * sine_off[m])
+    return out
+
+
+class NodeSines:
+    """A sine at the nodes of steps, block after block.
+
+    The sines of a block's steps are taken once, and turned by the angle at which a block begins. Within some 1e-13 of
+    the sine of each time, as that is by the rounding of its angle.
+    """
+
+    def __init__(self, omega: float, phase: float) -> None:
+        self._omega, self._phase = omega, phase
+        self._steps = np.empty(0)
+        self._sine = self._cosine = np.empty(0)
+
+    def at(self, start: Array, offsets: Array, amplitude: float, offset: float) -> Array:
+        """Return offset + amplitude sin(omega t + phase), (n, m), at evenly spaced t = start[:, None] + offsets [s]."""
+        n = start.size
+        length = float(start[-1] - start[0])
+        if not (n <= self._steps.size and abs(self._steps[n - 1] - length) <= 1e-9 * (1e-3 + length)):
+            self._steps = start - start[0]
+            self._sine, self._cosine = np.sin(self._omega * self._steps), np.cos(self._omega * self._steps)
+        angle, turn = self._omega * float(start[0]) + self._phase, self._omega * offsets
+        s, c = np.sin(angle), np.cos(angle)
+        sine = s * self._cosine[:n] + c * self._sine[:n]
+        cosine = c * self._cosine[:n] - s * self._sine[:n]
+        return np.asarray(sines_of_sums(sine, cosine, np.sin(turn), np.cos(turn), amplitude, offset))
+
+
+class RunInputs:
+    """Command and leakage of an experiment; `leaks` have their coefficients."""
+
+    def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
+        self._leaks, self._command = leaks, experiment.commanded
+        self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
+        self._zero = np.zeros((0, 0))
+        command = self._command
+        within = isinstance(command, Sine) and abs(command.amplitude) + abs(command.offset) <= self._limit
+        self._sines = NodeSines(command.omega, command.phase) if within else None  # type: ignore[attr-defined]
+
+    def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
+        """Return command [V], G and C at times start[:, None] + offsets [s], for evenly spaced starts."""
+        command = self._command
+        if self._sines is None:
+            t = start[:, None] + offsets
+            return self._within_limit(command.volts(t), t), *self._leakage(t)
+        u = self._sines.at(start, offsets, command.amplitude, command.offset)  # type: ignore[attr-defined]
+        if self._leaks:
+            return u, *self._leakage(start[:, None] + offsets)
+        return u, self._none(u.shape), self._none(u.shape)
+
+    def largest(self, t: Array) -> tuple[float, float]:
+        """Return the largest G and C at times t [s]."""
+        G, C = self._leakage(t) if self._leaks else (np.zeros(1), np.zeros(1))
+        return float(G.max(initial=0.0)), float(C.max(initial=0.0))
+
+    def _leakage(self, t: Array) -> tuple[Array, Array]:
+        G, C = self._none(t.shape), self._none(t.shape)
+        for leak in self._leaks:
+            more = (leak.coefficient or 0.0) * leak.opening.share(t)
+            G, C = (G + more, C) if leak.law == "laminar" else (G, C + more)
+        return G, C
+
+    def _none(self, shape: tuple[int, ...]) -> Array:
+        if self._zero.shape != shape:
+            self._zero = np.zeros(shape)
+            self._zero.flags.writeable = False
+        return self._zero
+
+    def _within_limit(self, u: Array, t: Array) -> Array:
+        if np.abs(u).max(initial=0.0) <= self._limit:
+            return u
+        # between samples, or beyond the end, where the filter still looks
+        check_command(self._command, t[t <= self._duration], self._limit)
+        return np.clip(u, -self._limit, self._limit)
+
+
+def oversampling(experiment: Experiment) -> int:
+    """Return the outputs per sample: enough for the anti-alias filter, no more than the solver has steps."""
+    longest = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
+    return oversampling_of(experiment.rate, longest)
+
+
+def oversampling_of(rate: float, step: float) -> int:
+    """Return the outputs per sample at `rate` [Hz] where the solver has a step about every `step` [s]."""
+    return max(1, min(_OVERSAMPLING, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9))))
 
 
 def steps_per_output(rate: float, step: float) -> int:
-    """Steps between outputs at `rate` [Hz]: as few as keep the step within `step` [s]."""
+    """Return the steps between outputs at `rate` [Hz]: as few as keep the step within `step` [s]."""
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))
 
 
-class _TooCoarseError(Exception):
-    """Halving the step moved a window of the run `times` further than it may."""
+def trajectory(
+    experiment: Experiment, leaks: tuple[Leak, ...], *, step: float | None = None, progress: Progress | None = None
+) -> Trajectory:
+    """Integrate an experiment and report states and flows as often as its instruments need them.
 
-    def __init__(self, times: float) -> None:
-        super().__init__(times)
-        self.times = times
+    `leaks` take the place of the experiment's and have coefficients; `step` [s], if given, that of its own step, and is
+    not checked: the caller compares runs.
+    """
+    return integrate(
+        experiment.rig,
+        RunInputs(experiment, leaks),
+        (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate,
+        experiment.rate * oversampling(experiment),
+        x_0=experiment.x_0,
+        method=experiment.method,
+        step=step or experiment.step,
+        error=experiment.error_allowed if step is None else None,
+        allow_unresolved=experiment.allow_unresolved,
+        progress=progress,
+        effects=experiment.effects(),
+    )
 
 
 def integrate(
@@ -90,107 +216,95 @@ def integrate(
     x_0: float = 0.0,
     method: Method = "auto",
     step: float | None = None,
-    error: float = PRESSURE_TOLERANCE,
+    error: float | None = PRESSURE_TOLERANCE,
     allow_unresolved: bool = False,
     progress: Progress | None = None,
     effects: Sequence[Effect] = (),
 ) -> Trajectory:
     """Integrate from rest over `duration` [s] and report the outputs at `rate` [Hz].
 
-    `inputs(t)` gives command [V] and the leakage coefficients G and C at times `t` of any shape; where it has them,
-    `inputs.at_nodes(start, offsets)` gives the same at start[:, None] + offsets and `inputs.largest(t)` the largest G
-    and C at times t. A step that is given is taken (the largest that divides the output interval and is not above it).
-    Else it is chosen by error: the largest from `LONGEST_STEP` down, refined until in short windows spread over the run
-    its half moves no pressure by more than `error` [Pa rms] and no detail's RMS by more than 0.1 % (`resolution`), down
-    to `FINEST` of it; `Trajectory.error` tells what was found. Inputs may jump at a step's boundary: the step's first
-    and last node are looked up just inside it. `effects` are numbers of the rig that change within the run, held over
-    short blocks (`Schedule`). `progress` is called with the time reached [s].
+    A `step` [s] that is given is taken (the largest that divides the output interval and is not above it); else the
+    largest is chosen, from `LONGEST_STEP` down to `FINEST` of it, that passes the check: in short windows spread over
+    the run (`windows`) half the step moves no pressure by more than `error` [Pa rms] and no detail's RMS by more than
+    0.1 % (`Judge`). The finest step is taken whatever the check says; `Trajectory.error` is what it found. `error` None
+    leaves the check of a given step out. Inputs may jump at a step's boundary: the step's
+    first and last node are looked up just inside it. `effects` are numbers of the rig that change within the run, held
+    over short blocks (`Schedule`). `progress` is called with the time reached [s].
 
     Raises InputError for a step or an error that is not positive; SimulationFailed when the step cannot resolve the
-    rig, the leak or a stop that was hit, when a state is not finite, or when a pressure falls below vacuum;
-    `allow_unresolved` lets all but a state that is not finite pass.
+    rig, the leak or a stop that was hit, when a given step does not pass the check, when a state is not finite, or when
+    a pressure falls below vacuum; `allow_unresolved` lets all but a state that is not finite pass.
     """
-    from sealscope.physics.rig import rig_numbers
+    from sealscope.physics.rig import initial_state, rig_numbers
     from sealscope.physics.solvers.limits import longest_step
+    from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
-    chosen = choose_method(rig, method)
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
-    if not (math.isfinite(error) and error > 0):
+    if error is not None and not (math.isfinite(error) and error > 0):
         raise InputError(f"error must be > 0 Pa, got {error}")
     n_out = round(duration * rate)
     schedule = Schedule(effects, rig_numbers(rig), n_out, rate)
-    run = _Run(rig, inputs, schedule, n_out, rate, chosen, x_0, allow_unresolved, progress)
-    if step is not None:
-        return run.at(steps_per_output(rate, step), None)
-    worst = run.largest_leak()
-    longest = LONGEST_STEP
-    step = max(min(longest, *(longest_step(p, *worst) for p in schedule.numbers)), longest / FINEST)
-    every, finest = steps_per_output(rate, step), steps_per_output(rate, longest / FINEST)
+    euler = rig.motor.integrator == "euler"
+    run = _Run(inputs, schedule, rate, choose_method(rig, method), euler, allow_unresolved, progress)
+    checks = [] if error is None else windows(n_out, rate)
+    bounds, finest = {0, n_out}, steps_per_output(rate, LONGEST_STEP / FINEST)
+    if step is None:  # checked window by window, and given up at the first that fails
+        bounds |= {bound for window in checks for bound in window}
+        worst = inputs.largest(np.arange(n_out) / rate)
+        step_0 = min(LONGEST_STEP, *(longest_step(p, *worst) for p in schedule.numbers))
+        every = steps_per_output(rate, max(step_0, LONGEST_STEP / FINEST))
+    else:
+        every = steps_per_output(rate, step)
+    pressures = slice(P_A, P_2 + 1)
     while True:
-        try:
-            return run.at(every, error, last=every >= finest)
-        except _TooCoarseError as found:
-            # of order four, or near it; a step far too long tells little
-            longer = min(2.0, (1.1 * found.times) ** 0.25) if math.isfinite(found.times) else 2.0
-            every = min(max(every + 1, math.ceil(every * longer)), finest)
+        run.refuse_unresolved(every)
+        judge = Judge(rig, rate, error or PRESSURE_TOLERANCE)
+        times = 0.0
+        rows, y = np.empty((n_out, len(OUTPUTS))), initial_state(rig, x_0)
+        for start, stop in itertools.pairwise(sorted(bounds)):
+            run.advance(y, start, stop, every, rows)
+            for first, end in checks:
+                if start <= first and end <= stop:
+                    before, fine = rows[first, : len(STATES)].copy(), np.empty((end - first, len(OUTPUTS)))
+                    run.advance(before, first, end, 2 * every, fine, first)
+                    times = max(times, judge.beyond(rows[first:end, pressures], fine[:, pressures]))
+            if times > 1.0 and every < finest and step is None:
+                break
+        h = 1.0 / (rate * every)
+        if times <= 1.0 or every >= finest or (step is not None and allow_unresolved):
+            return Trajectory(np.arange(n_out) / rate, rows, run.method, h, judge.moved if checks else math.nan)
+        if step is not None:
+            raise SimulationFailed(
+                f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves {judge.worst()}; take "
+                "a smaller step, or state an error instead of a step"
+            )
+        # of order four, or near it; a step far too long tells little
+        longer = min(2.0, (1.1 * times) ** 0.25) if math.isfinite(times) else 2.0
+        every = min(max(every + 1, math.ceil(every * longer)), finest)
 
 
 @dataclass
 class _Run:
     """One run of a rig, to be integrated at one step or another."""
 
-    rig: Rig
     inputs: Inputs
     schedule: Schedule
-    n_out: int
     rate: float
     method: Literal["rk4", "imex"]
-    x_0: float
+    euler: bool
     allow_unresolved: bool
     progress: Progress | None
     reached: float = 0.0
 
-    def largest_leak(self) -> tuple[float, float]:
-        t = np.arange(self.n_out) / self.rate
-        if hasattr(self.inputs, "largest"):
-            G, C = self.inputs.largest(t)
-            return float(G), float(C)
-        _, G, C = self.inputs(t)
-        return float(G.max(initial=0.0)), float(C.max(initial=0.0))
-
-    def at(self, every: int, error: float | None, *, last: bool = False) -> Trajectory:
-        """The run with `every` steps an output; with an error [Pa], checked in windows against half the step, and
-        given up (`_TooCoarseError`) where it is beyond it, unless this is the last resort."""
-        from sealscope.physics.rig import initial_state
-        from sealscope.physics.state import OUTPUTS, P_2, P_A
-        from sealscope.simulation.resolution import Judge, windows
-
-        n_out = self.n_out
-        h = 1.0 / (self.rate * every)
+    def refuse_unresolved(self, every: int) -> None:
+        """Raise SimulationFailed where `every` steps an output cannot resolve the rig."""
         if not self.allow_unresolved:
             for p in self.schedule.numbers:
-                refuse_unresolved(p, h, self.method)
-        rows = np.empty((n_out, len(OUTPUTS)))
-        y = initial_state(self.rig, self.x_0)
-        checks = windows(n_out, self.rate) if error is not None else []
-        bounds = sorted({0, n_out, *(bound for check in checks for bound in check)})
-        judge = None if error is None else Judge(self.rig, self.rate, error)
-        pressures = slice(P_A, P_2 + 1)
-        for start, stop in itertools.pairwise(bounds):
-            before = y.copy()
-            self._advance(y, start, stop, every, rows)
-            if judge is not None and (start, stop) in checks:
-                fine = np.empty((stop - start, len(OUTPUTS)))
-                self._advance(before, start, stop, 2 * every, fine, start)
-                times = judge.beyond(rows[start:stop, pressures], fine[:, pressures])
-                if not (times <= 1.0 or last):
-                    raise _TooCoarseError(times)
-        found = math.nan if judge is None else judge.found
-        return Trajectory(np.arange(n_out) / self.rate, rows, self.method, h, found)
+                refuse_unresolved(p, 1.0 / (self.rate * every), self.method)
 
-    def _advance(self, y: Array, start: int, stop: int, every: int, rows: Array, origin: int = 0) -> None:
-        """Outputs start <= k < stop into rows k - origin, with `every` steps an output, from `y` on, which moves."""
+    def advance(self, y: Array, start: int, stop: int, every: int, rows: Array, origin: int = 0) -> None:
+        """Advance the state `y` in place from output `start` to `stop`, `every` steps each; write rows k - origin."""
         from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
         from sealscope.physics.solvers.limits import longest_step, longest_step_on_stop
         from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
@@ -199,15 +313,11 @@ class _Run:
         h = 1.0 / (self.rate * every)
         nodes = np.array(IMEX_NODES if self.method == "imex" else RK4_NODES)
         nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
-        euler = self.rig.motor.integrator == "euler"
         block = max(1, _BLOCK_STEPS // every)
         for first in range(start, stop, block):
             last = min(first + block, stop)
             steps = np.arange(first * every, last * every, dtype=np.float64)
-            if hasattr(self.inputs, "at_nodes"):
-                u, G, C = self.inputs.at_nodes(steps * h, nodes * h)
-            else:
-                u, G, C = self.inputs((steps[:, None] + nodes) * h)
+            u, G, C = self.inputs.at_nodes(steps * h, nodes * h)
             worst = float(G.max()), float(C.max())
             for k, end, p in self.schedule.within(first, last):
                 if not self.allow_unresolved and max(worst) > 0.0:
@@ -217,13 +327,13 @@ class _Run:
                 if self.method == "imex":
                     advance_imex(y, h, u[part], G[part], C[part], p, every, out)
                 else:
-                    advance_rk4(y, h, u[part], G[part], C[part], p, euler, every, out)
+                    advance_rk4(y, h, u[part], G[part], C[part], p, self.euler, every, out)
             done = rows[first - origin : last - origin]
             finite, reach, least = survey(done)
             if not (self.allow_unresolved or reach <= 0.5 * p.L):
                 refuse_long(h, longest_step_on_stop(p), "the hard stop (cylinder.k_stop, d_stop)")
             if not finite or (not self.allow_unresolved and least < VACUUM):
-                _check(done, first, self.rate, self.allow_unresolved)
+                _refuse_rows(done, first, self.rate, self.allow_unresolved)
             if self.progress is not None and last / self.rate > self.reached:
                 self.reached = last / self.rate
                 self.progress(self.reached)
@@ -248,7 +358,7 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
         )
 
 
-def _check(rows: Array, first: int, rate: float, allow_unresolved: bool) -> None:
+def _refuse_rows(rows: Array, first: int, rate: float, allow_unresolved: bool) -> None:
     from sealscope.physics.state import OUTPUTS, P_2, P_A
 
     bad = ~np.isfinite(rows)
@@ -267,3 +377,72 @@ def _check(rows: Array, first: int, rate: float, allow_unresolved: bool) -> None
             "raise fluid.p_charge, take a smaller command, start further from the cap, or replace what leaks out "
             "(makeup.check_valves = present)"
         )
+
+
+def windows(n_out: int, rate: float) -> list[tuple[int, int]]:
+    """Return the outputs (start, stop) of the windows in which a run of `n_out` outputs at `rate` [Hz] is checked."""
+    first = min(n_out, round(FIRST_WINDOW * rate))
+    found = [(0, first)]
+    length = round(LATER_WINDOW * rate)
+    for share in LATER:
+        start = round(share * n_out)
+        if length and start >= found[-1][1] and start + length <= n_out:
+            found.append((start, start + length))
+    return found
+
+
+class Judge:
+    """Compares windows of a run at one step with those at half of it.
+
+    `moved` [Pa rms]: how far a pressure moved at most; `changed`: how far a detail's RMS did, as a share of it.
+    """
+
+    def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:
+        """`rate` [Hz] of the outputs; `tolerance` [Pa] of a pressure."""
+        self._tolerance = tolerance
+        self._every = max(1, round(rate / rig.daq.sample_rate))
+        sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
+        self._noise = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
+        self._squares, self._samples = np.zeros((LEVELS, 4)), 0
+        self.moved = self.changed = 0.0
+
+    def beyond(self, coarse: Array, fine: Array) -> float:
+        """Return how many times further than it may anything has moved, with one window more.
+
+        `coarse`, `fine`: (n, 4) p_A, p_B, p_1, p_2 [Pa]. Each window's pressures are judged by themselves, the RMS of
+        db8's d_1 .. d_4 in both chambers over all windows so far, at the recording's rate and with its noise.
+        """
+        pressure = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
+        self.moved = max(self.moved, pressure)
+        if not pressure <= self._tolerance:
+            return pressure / self._tolerance
+        self._add(coarse, fine)
+        if self._samples == 0:
+            return pressure / self._tolerance
+        recorded = np.sqrt(self._squares / self._samples + self._noise)
+        a, b = recorded[:, ::2], recorded[:, 1::2]
+        change = float(np.max(np.abs(a - b) / np.where(b > 0, b, 1.0)))
+        self.changed = max(self.changed, change)
+        return max(pressure / self._tolerance, change / DETAIL_TOLERANCE)
+
+    def worst(self) -> str:
+        """Return what moved furthest beyond its tolerance, by how much, and how much it may."""
+        if self.moved / self._tolerance >= self.changed / DETAIL_TOLERANCE:
+            return f"a pressure by {self.moved:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
+        return f"the RMS of a detail by {100 * self.changed:.3g} %, which must be <= {100 * DETAIL_TOLERANCE:.3g} %"
+
+    def _add(self, coarse: Array, fine: Array) -> None:
+        """Sum the squares of a window's details where they see nothing but the window."""
+        import pywt
+
+        from sealscope.signals.filters import reach
+
+        before, after = reach("db8", LEVELS)[-1]
+        runs = np.array([run[:: self._every, column] for column in range(2) for run in (coarse, fine)])
+        n = runs.shape[1] // 2**LEVELS * 2**LEVELS
+        if n <= before + after:
+            return
+        _, *details = pywt.swt(runs[:, :n], "db8", level=LEVELS, trim_approx=True, norm=False, axis=-1)
+        inside = np.array(details)[..., before : n - after]
+        self._squares += np.sum(np.square(inside), axis=-1)
+        self._samples += inside.shape[-1]

@@ -1,5 +1,4 @@
-"""Simulate an experiment: size its leaks, integrate the rig, record it as the instruments would, keep the truth
-apart."""
+"""Simulate an experiment: size its leaks, integrate, record as the instruments would, and keep the truth apart."""
 
 from __future__ import annotations
 
@@ -13,33 +12,36 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.errors import InputError
+from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.atomic import atomic_write
+from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array, Recording
-from sealscope.simulation.changes.drifts import Drift
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults.faults import Fault, Leak
-from sealscope.simulation.inputs import RunInputs
-from sealscope.simulation.instruments import FILTER_REACH, record
-from sealscope.simulation.integrate import DEFAULT_STEP, Method, Trajectory, choose_method, integrate
-from sealscope.simulation.sizing import leak_flow, mean_while_open, sized
+from sealscope.simulation.changes import ParameterDrift
+from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment, Method
+from sealscope.simulation.faults import Fault, Leak
+from sealscope.simulation.instruments import decimate, record
+from sealscope.simulation.integrate import DETAIL_TOLERANCE, Trajectory, oversampling, trajectory
+from sealscope.simulation.sizing import leak_flow, mean_while_open, sized_leaks
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.simulation.commands import Command
 
-#: Told what is being done and how far it is, 0..1.
+#: Called with what is being done and how far it is, 0..1.
 Progress = Callable[[str, float], None]
 #: What the truth of a run holds at each sample.
 TRUE_OUTPUTS = ("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak", "q_ext", "q_up")
-_OVERSAMPLING = 4
+#: States that a proof compares, and the unit of each.
+_STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What a real rig would not tell: the leaks, faults and drifts that were put in, and every state without noise at
-    the recording's samples. `onset_s` and the mean are those of the leaks across the piston."""
+    """What a real rig would not tell: leaks, faults and drifts, and every state without noise at the samples.
+
+    `onset_s` and the mean are those of the leaks across the piston.
+    """
 
     leaks: tuple[Leak, ...]
     onset_s: float | None
@@ -47,75 +49,65 @@ class Truth:
     t: Array
     outputs: dict[str, Array]
     faults: tuple[Fault, ...] = ()
-    drifts: tuple[Drift, ...] = ()
+    drifts: tuple[ParameterDrift, ...] = ()
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far one quantity moved: `difference` and `tolerance` (None: reported only) in `unit`."""
+
+    name: str
+    difference: float
+    unit: str
+    tolerance: float | None
+
+    @property
+    def resolved(self) -> bool:
+        """Whether it moved no further than it may."""
+        return self.tolerance is None or self.difference <= self.tolerance
+
+
+@dataclass(frozen=True)
+class Proof:
+    """The halving test of one experiment: the two steps [s] and every difference."""
+
+    method: str
+    step: float
+    halved: float
+    differences: tuple[Difference, ...]
+
+    @property
+    def resolved(self) -> bool:
+        """Whether every difference is within its tolerance."""
+        return all(one.resolved for one in self.differences)
+
+    def text(self) -> str:
+        """The proof as lines of text: what moved, by how much, and how much it may."""
+        lines = [f"halving the step ({self.method}, {self.step:.3g} s to {self.halved:.3g} s) moves"]
+        for one in self.differences:
+            limit = "" if one.tolerance is None else f" (at most {one.tolerance:.3g})"
+            lines.append(
+                f"  {one.name:<18} {one.difference:10.3g} {one.unit}{limit}{'' if one.resolved else '  NOT RESOLVED'}"
+            )
+        return "\n".join(lines)
+
+    def worst(self) -> Difference:
+        """The difference furthest beyond, or nearest to, its tolerance."""
+        judged = [one for one in self.differences if one.tolerance]
+        return max(judged, key=lambda one: one.difference / (one.tolerance or math.inf))
 
 
 @dataclass(frozen=True)
 class Run:
-    """A simulated experiment: the recording, and, apart from it, the truth."""
+    """A simulated experiment: the recording, apart from it the truth, and the proof where one was asked for."""
 
     recording: Recording
     truth: Truth
-
-
-def oversampling(experiment: Experiment) -> int:
-    """Outputs per sample: enough for the anti-alias filter, no more than the solver has steps."""
-    longest = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
-    return oversampling_of(experiment.rate, longest)
-
-
-def oversampling_of(rate: float, step: float) -> int:
-    """Outputs per sample of a recording at `rate` [Hz] where the solver has a step about every `step` [s]."""
-    return max(1, min(_OVERSAMPLING, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9))))
-
-
-def trajectory(
-    experiment: Experiment,
-    leaks: tuple[Leak, ...],
-    *,
-    step: float | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> Trajectory:
-    """The states and flows over the experiment, sampled for the instruments; `leaks` have their coefficients."""
-    factor = oversampling(experiment)
-    return integrate(
-        experiment.rig,
-        RunInputs(experiment, leaks),
-        (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate,
-        experiment.rate * factor,
-        x_0=experiment.x_0,
-        method=experiment.method,
-        step=step or experiment.step,
-        error=experiment.error_allowed,
-        allow_unresolved=experiment.allow_unresolved,
-        progress=progress,
-        effects=experiment.effects(),
-    )
-
-
-def sized_leaks(experiment: Experiment, progress: Progress | None = None) -> tuple[Leak, ...]:
-    """The experiment's leaks with the coefficients that give their means at the rig's own operating point."""
-    if not any(leak.mean for leak in experiment.leaks):
-        return tuple(
-            leak if leak.mean is None else Leak(leak.law, 0.0, None, leak.opening) for leak in experiment.leaks
-        )
-    runs = 0
-
-    def one_run(leaks: tuple[Leak, ...]) -> Trajectory:
-        nonlocal runs
-        if progress is not None:
-            progress("sizing the leak", 1.0 - 0.5**runs)
-        runs += 1
-        return trajectory(experiment, leaks)
-
-    found = sized(experiment.leaks, one_run, experiment.rig.line.dp_0)
-    if progress is not None:
-        progress("sizing the leak", 1.0)
-    return found
+    proof: Proof | None = None
 
 
 @checked_call
-def simulate_with_truth(experiment: Experiment, progress: Progress | None = None) -> Run:
+def simulate_with_truth(experiment: Experiment, progress: Progress | None = None, *, prove: bool = False) -> Run:
     """Simulate an experiment and keep its truth beside the recording.
 
     Parameters
@@ -124,18 +116,22 @@ def simulate_with_truth(experiment: Experiment, progress: Progress | None = None
         What is simulated, as `Experiment.of` makes it.
     progress : callable, optional
         Called with what is being done (str) and how far it is (0 to 1).
+    prove : bool, optional
+        Integrate again at half the step, and compare (`Proof`).
 
     Returns
     -------
     Run
-        `recording`, and `truth`: leaks with their coefficients, onset, mean leak and every state without noise.
+        `recording`; `truth`: leaks with their coefficients, onset, mean leak and every state without noise; `proof`,
+        None unless `prove`.
 
     Raises
     ------
     InputError
         The experiment is impossible, such as a leak larger than the pump's flow.
     SimulationFailed
-        The run diverged, fell below vacuum, or is not resolved by its step.
+        The run diverged, fell below vacuum, or is not resolved by its step; with `prove`, also where halving the step
+        moves more than it may, unless the experiment allows it.
 
     Examples
     --------
@@ -146,53 +142,117 @@ def simulate_with_truth(experiment: Experiment, progress: Progress | None = None
     """
     if not isinstance(experiment, Experiment):
         raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
+
+    def report(what: str) -> Callable[[float], None]:
+        def tell(reached: float) -> None:
+            if progress is not None:
+                progress(what, min(1.0, reached / experiment.duration))
+
+        return tell
+
     leaks = sized_leaks(experiment, progress)
-    n = round(experiment.duration * experiment.rate)
-    factor = oversampling(experiment)
-
-    def told(reached: float) -> None:
-        if progress is not None:
-            progress("simulating", min(1.0, reached / experiment.duration))
-
-    path = trajectory(experiment, leaks, progress=told)
+    path = trajectory(experiment, leaks, progress=report("simulating"))
+    proof = None
+    if prove:
+        fine = trajectory(experiment, leaks, step=path.step / 2, progress=report("proving: half the step"))
+        proof = Proof(path.method, path.step, fine.step, compare(experiment, path, fine))
+        if not (proof.resolved or experiment.allow_unresolved):
+            worst = proof.worst()
+            raise SimulationFailed(
+                f"the run is under-resolved: halving the step of {path.step:.3g} s ({path.method}) moves {worst.name} "
+                f"by {worst.difference:.4g} {worst.unit}, which must be <= {worst.tolerance:.4g} {worst.unit}; take a "
+                "smaller step"
+            )
+    n, factor = round(experiment.duration * experiment.rate), oversampling(experiment)
     times = experiment.sample_times()
     volts = experiment.commanded.volts(times)
-    made = record(experiment.rig, path, volts, factor, experiment.seed, experiment.readings())
+    recorded = record(experiment.rig, path, volts, factor, experiment.seed, experiment.readings())
+    solver = {"method": path.method, "step_s": path.step, "allow_unresolved": experiment.allow_unresolved}
+    if experiment.step is None:
+        solver["error_pa"] = experiment.error_allowed
     provenance: dict[str, Any] = {
         "origin": "simulation",
         "experiment": experiment.describe(),
         "experiment_key": experiment.key(),
-        "solver": _solver(path, experiment),
+        "solver": solver | {"error_found_pa": path.error},
     }
     history = (f"simulated with {path.method}, h = {path.step:.4g} s; sampled at {experiment.rate:g} Hz",)
-    recording = replace(made, provenance=provenance, history=history)
-    instants = slice(0, n * factor, factor)
-    outputs = {name: path[name][instants] for name in TRUE_OUTPUTS}
-    mean = _mean_leak(leaks, path, experiment)
+    recording = replace(recorded, provenance=provenance, history=history)
+    outputs = {name: path[name][: n * factor : factor] for name in TRUE_OUTPUTS}
+    dp, dp_0 = path["p_A"] - path["p_B"], experiment.rig.line.dp_0
+    mean = sum(mean_while_open(leak, path.t, leak_flow(leak, path.t, dp, dp_0)) for leak in leaks) / LITRE_PER_MINUTE
     truth = Truth(leaks, experiment.onset(), mean, times, outputs, experiment.faults, experiment.drifts)
-    return Run(recording, truth)
+    return Run(recording, truth, proof)
 
 
-def _solver(path: Trajectory, experiment: Experiment) -> dict[str, Any]:
-    """How the run was integrated, for its provenance; where the step was chosen by error, `error_pa` is what was asked
-    for and `error_found_pa` what was found in the windows that were checked."""
-    told: dict[str, Any] = {"method": path.method, "step_s": path.step, "allow_unresolved": experiment.allow_unresolved}
-    if experiment.step is None:
-        told |= {"error_pa": experiment.error_allowed, "error_found_pa": path.error}
-    return told
+def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
+    """Return the differences between two trajectories: rms of each channel, and change of each detail's RMS."""
+    from sealscope.signals.details import details
+    from sealscope.signals.windows import rms
+
+    n, factor = round(experiment.duration * experiment.rate), oversampling(experiment)
+    units = _STATES | dict.fromkeys(PRESSURES, "Pa")
+    differences = [
+        Difference(
+            name,
+            rms(coarse[name][: n * factor] - fine[name][: n * factor]),
+            unit,
+            PRESSURE_TOLERANCE if unit == "Pa" else None,
+        )
+        for name, unit in units.items()
+    ]
+    for name in CHAMBERS:
+        ours, theirs = (details(decimate(run[name], factor, n)) for run in (coarse, fine))
+        sensor = getattr(experiment.rig.sensors, name)
+        noise = math.hypot(sensor.noise, experiment.rig.sensors.common_noise)
+        for level in range(1, ours.levels + 1):
+            a, b = rms(ours[level][ours.inside(level)]), rms(theirs[level][theirs.inside(level)])
+            recorded = math.hypot(b, noise)
+            change = abs(math.hypot(a, noise) - recorded)
+            differences.append(Difference(f"RMS of d{level} of {name}", change, "Pa", DETAIL_TOLERANCE * recorded))
+    return tuple(differences)
 
 
-def _mean_leak(leaks: tuple[Leak, ...], path: Trajectory, experiment: Experiment) -> float:
-    """Mean of the leaks' flows while open [L/min], as the run really had it."""
-    dp = path["p_A"] - path["p_B"]
-    flows = [mean_while_open(leak, path.t, leak_flow(leak, path.t, dp, experiment.rig.line.dp_0)) for leak in leaks]
-    return sum(flows) / LITRE_PER_MINUTE
+@checked_call
+def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
+    """Integrate an experiment at its step and at half of it, and compare.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What is simulated.
+    progress : callable, optional
+        Called with what is being done (str) and how far it is (0 to 1).
+
+    Returns
+    -------
+    Proof
+        How far each channel and each detail's RMS moved, and how far it may.
+
+    Raises
+    ------
+    SimulationFailed
+        The run is under-resolved, which the message explains with the worst difference, unless the experiment allows
+        it.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> ss.prove(ss.Experiment.of(duration="6 s")).resolved
+    True
+    """
+    proof = simulate_with_truth(experiment, progress, prove=True).proof
+    assert proof is not None
+    return proof
 
 
 def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
-    """Write what was put in as JSON: leaks with their coefficients, onset [s], mean leak while open [L/min], other
-    faults with their onsets [s], and what drifted from the start to the end, in per cent (or in the SI unit)."""
-    told: dict[str, Any] = {
+    """Write what was put in as JSON.
+
+    Leaks with their coefficients, onset [s], mean leak while open [L/min], other faults with their onsets [s], and what
+    drifted from the start to the end, in per cent (or in the SI unit).
+    """
+    tree: dict[str, Any] = {
         "onset_s": truth.onset_s,
         "mean_leak_lpm": truth.mean_leak_lpm,
         "leaks": [
@@ -200,17 +260,21 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
         ],
     }
     if truth.faults:
-        told["faults"] = [
-            {"kind": one.kind, "words": str(one), "onset_s": onset if math.isfinite(onset := one.onset()) else None}
-            for one in truth.faults
+        tree["faults"] = [
+            {
+                "kind": fault.kind,
+                "words": str(fault),
+                "onset_s": onset if math.isfinite(onset := fault.onset()) else None,
+            }
+            for fault in truth.faults
         ]
     if truth.drifts:
-        told["drifts"] = [_told_drift(drift, truth.t) for drift in truth.drifts]
+        tree["drifts"] = [_drift_of(drift, truth.t) for drift in truth.drifts]
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
 
 
-def _told_drift(drift: Drift, t: Array) -> dict[str, Any]:
+def _drift_of(drift: ParameterDrift, t: Array) -> dict[str, Any]:
     change = drift.shape.at(t)
     span, end = float(np.ptp(change)), float(change[-1] - change[0])
     if drift.absolute:
@@ -225,7 +289,7 @@ def simulate(
     command: Command | str = "3 sin(4t)",
     leak: Leak | str | Iterable[Leak | str] | None = None,
     fault: Fault | str | Iterable[Fault | str] | None = None,
-    drifts: Iterable[Drift] = (),
+    drifts: Iterable[ParameterDrift] = (),
     set: Mapping[str, float | str] | None = None,
     duration: float | str = 180.0,
     rate: float | str | None = None,
@@ -255,7 +319,7 @@ def simulate(
         Other faults: ``"pump leak x3 from 90 s"``, ``"rod seal A 0.01 L/min"``, ``"friction +20 %"``, ``"air 1 %"``,
         ``"sensor p_A offset 2 psi"``, ``"sensor p_A gain -1 %"``, ``"sensor p_A stuck from 90 s to 100 s"``, ``"duty
         amplitude x1.5"``.
-    drifts : iterable of Drift, optional
+    drifts : iterable of ParameterDrift, optional
         Parameters of the rig and of its instruments that change slowly within the run.
     set : mapping of str to float or str, optional
         Overrides of the rig's parameters: ``{"V_1": "50[cm^3]"}``.

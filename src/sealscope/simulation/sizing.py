@@ -10,8 +10,9 @@ import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
-from sealscope.simulation.faults.faults import Leak
-from sealscope.simulation.integrate import Trajectory
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.faults import Leak
+from sealscope.simulation.integrate import trajectory
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Relative distance from the mean asked for at which the search ends.
@@ -19,11 +20,9 @@ TOLERANCE = 1e-3
 MOST_RUNS = 20
 _LEAST_SLOPE = 0.1
 
-Integrate = Callable[[tuple[Leak, ...]], Trajectory]
-
 
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
-    """|Q_L| [m^3/s] of one leak with a known coefficient under the chambers' pressure difference `dp` [Pa]."""
+    """Return |Q_L| [m^3/s] of a leak with a known coefficient under the chambers' pressure difference `dp` [Pa]."""
     from sealscope.physics.leakage import leakage_series
 
     size = (leak.coefficient or 0.0) * leak.opening.share(t)
@@ -33,41 +32,30 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
-    """Mean flow [m^3/s] while the leak is open, per unit of opening: sum |Q_L| over the sum of the opening."""
+    """Return the mean flow [m^3/s] while open, per unit of opening: the sum of |Q_L| over the sum of the opening."""
     opening = leak.opening.share(t)
     total = float(opening.sum())
     return float(flow.sum()) / total if total > 0 else 0.0
 
 
-def _refuse_impossible(leaks: tuple[Leak, ...], pump_flow: float) -> None:
-    for leak in leaks:
-        if leak.mean is not None and leak.mean >= pump_flow:
-            raise InputError(
-                f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for "
-                f"this command, "
-                f"got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
-            )
-
-
-def _slope(before: tuple[float, float], now: tuple[float, float]) -> float:
-    """d log flow / d log coefficient between two runs, within what a leak can do; 1 where they do not tell."""
-    (c_0, q_0), (c_1, q_1) = before, now
-    if min(c_0, q_0, c_1, q_1) <= 0.0 or abs(c_1 / c_0 - 1.0) < 1e-6:
-        return 1.0
-    return min(max(math.log(q_1 / q_0) / math.log(c_1 / c_0), _LEAST_SLOPE), 1.0)
-
-
 def scaled_size(asked: float, before: tuple[float, float], now: tuple[float, float]) -> float:
-    """The coefficient to try next for a mean flow `asked` [m^3/s], from (coefficient, mean flow) of the run before and
-    of this run; with a coefficient of 0, the flow is that of a coefficient of 1."""
-    size, flow = now
-    if size == 0.0:
-        return asked / flow
-    return float(size * (asked / flow) ** (1.0 / _slope(before, now)))
+    """Return the coefficient to try next for a mean flow `asked` [m^3/s].
+
+    `before`, `now`: coefficient and mean flow of the run before and of this run; with a coefficient of 0, the flow is
+    that of a coefficient of 1. The slope d log flow / d log coefficient between the two is kept within what a leak can
+    do, and is 1 where they do not tell.
+    """
+    (c_0, q_0), (c_1, q_1) = before, now
+    if c_1 == 0.0:
+        return asked / q_1
+    slope = 1.0
+    if min(c_0, q_0, c_1, q_1) > 0.0 and abs(c_1 / c_0 - 1.0) >= 1e-6:
+        slope = min(max(math.log(q_1 / q_0) / math.log(c_1 / c_0), _LEAST_SLOPE), 1.0)
+    return float(c_1 * (asked / q_1) ** (1.0 / slope))
 
 
-def refuse_unsettled(leaks: Sequence[Leak]) -> SimulationFailed:
-    """The error of a search that does not end."""
+def unsettled(leaks: Sequence[Leak]) -> SimulationFailed:
+    """Return the error of a search that does not end."""
     return SimulationFailed(
         f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: "
         f"{', '.join(str(leak) for leak in leaks)} is more than this "
@@ -75,8 +63,8 @@ def refuse_unsettled(leaks: Sequence[Leak]) -> SimulationFailed:
     )
 
 
-def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[Leak, ...]:
-    """The leaks with a coefficient each, found so that each one's mean is what was asked for.
+def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] | None = None) -> tuple[Leak, ...]:
+    """Return the experiment's leaks with a coefficient each, so that each one's mean is what was asked for.
 
     A small leak's flow is proportional to its coefficient (friction sets the pressure difference), a large one's grows
     less. So each coefficient is scaled by (asked/got)^(1/s), s the slope d log flow / d log coefficient of that leak
@@ -85,12 +73,16 @@ def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[L
     Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed
     where the search does not settle.
     """
+    leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
     current = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
+    if not any(leak.mean for leak in leaks):
+        return current
     before: list[tuple[float, float]] = [(0.0, 0.0)] * len(leaks)  # coefficient and mean flow of the run before
     for attempt in range(MOST_RUNS):
-        run = integrate(current)
-        if attempt == 0:
-            _refuse_impossible(leaks, float(np.mean(np.abs(run["Q_1"]))))
+        if progress is not None:
+            progress("sizing the leak", 1.0 - 0.5**attempt)
+        run = trajectory(experiment, current)
+        pump_flow = float(np.mean(np.abs(run["Q_1"])))
         dp = run["p_A"] - run["p_B"]
         worst = 0.0
         following = []
@@ -98,6 +90,11 @@ def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[L
             if asked.mean is None or asked.mean == 0.0:
                 following.append(now)
                 continue
+            if attempt == 0 and asked.mean >= pump_flow:
+                raise InputError(
+                    f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for "
+                    f"this command, got {asked.mean / LITRE_PER_MINUTE:.4g} L/min ({asked})"
+                )
             size = now.coefficient or 0.0
             unit = mean_while_open(now, run.t, leak_flow(replace(now, coefficient=1.0), run.t, dp, dp_0))
             if not unit > 0:
@@ -108,6 +105,8 @@ def sized(leaks: tuple[Leak, ...], integrate: Integrate, dp_0: float) -> tuple[L
             before[k] = (size, got)
             following.append(replace(now, coefficient=scaled))
         if worst <= TOLERANCE:
+            if progress is not None:
+                progress("sizing the leak", 1.0)
             return current
         current = tuple(following)
-    raise refuse_unsettled(leaks)
+    raise unsettled(leaks)

@@ -13,7 +13,7 @@ from sealscope.campaigns.plans.model import SimulatedPlan
 if TYPE_CHECKING:
     from sealscope.simulation.bench.profile import Profile
     from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.faults.faults import Leak
+    from sealscope.simulation.faults import Leak
 
 #: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
 SIZING_SECONDS = 13.0
@@ -21,7 +21,7 @@ SIZING_SECONDS = 13.0
 
 def leak_of(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
     """Return the case's leak, open from the plan's onset on; its size still a mean flow."""
-    from sealscope.simulation.faults.faults import From, Leak
+    from sealscope.simulation.faults import From, Leak
     from sealscope.units import LITRE_PER_MINUTE
 
     if not case.leak_lpm:
@@ -36,13 +36,13 @@ def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = N
     The machine is the one that the case's seed draws from the bench (or the plan's rig), with the case's levels on
     top. `profile`: the plan's bench, where it has been loaded.
     """
-    from sealscope.simulation.bench.machines import Machine, draw
+    from sealscope.simulation.bench.machines import BenchMachine, draw
     from sealscope.simulation.commands import Sine, parse_command
 
     if plan.profile:
         machine = draw(profile or plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s)
     else:
-        machine = Machine("none", case.machine_seed, plan.rig, plan.duration_s, {}, (), Sine(3.0, 4.0), 0.0)
+        machine = BenchMachine("none", case.machine_seed, plan.rig, plan.duration_s, {}, (), Sine(3.0, 4.0), 0.0)
     values = dict(machine.overrides)
     for name, level in case.levels.items():
         if name == "command":
@@ -72,7 +72,7 @@ def _by_full_name(values: Mapping[str, str | float]) -> dict[str, str | float]:
 
 def sizing_run(experiment: Experiment) -> Experiment:
     """Return the short run on which an experiment's leaks are sized, open from its start."""
-    from sealscope.simulation.faults.faults import From
+    from sealscope.simulation.faults import From
 
     return replace(
         experiment,
@@ -87,7 +87,7 @@ def sized_once(experiment: Experiment) -> tuple[Leak, ...]:
     Sizing on the whole record would cost it two or three times over; the mean that the record really had is in its
     row.
     """
-    from sealscope.simulation.simulate import sized_leaks
+    from sealscope.simulation.sizing import sized_leaks
 
     if not experiment.leaks:
         return ()

@@ -32,7 +32,7 @@ from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.signals.filters import IntArray
 from sealscope.simulation.commands import Sine
-from sealscope.simulation.simulate import oversampling, trajectory
+from sealscope.simulation.integrate import oversampling, trajectory
 
 if TYPE_CHECKING:
     from sealscope.simulation.bench.profile import Profile
@@ -214,7 +214,8 @@ class StepChooser:
         """
         from sealscope.physics.rig import rig_numbers
         from sealscope.physics.solvers.limits import longest_step
-        from sealscope.simulation.integrate import FINEST, LONGEST_STEP, choose_method
+        from sealscope.simulation.experiment import choose_method
+        from sealscope.simulation.integrate import FINEST, LONGEST_STEP
 
         method = choose_method(experiment.rig, experiment.method)
         step = self._cell(case.levels).get(method) or chosen_step(experiment)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
-    from sealscope.simulation.faults.faults import Fault
+    from sealscope.simulation.faults import Fault
 
 
 def closing_values(level: str | float) -> dict[str, str | float]:
@@ -23,7 +23,7 @@ def closing_values(level: str | float) -> dict[str, str | float]:
 
 def fault_of(text: str, onset_s: float) -> Fault:
     """Parse a fault other than a piston leak; it sets in at the plan's onset unless the text says when."""
-    from sealscope.simulation.faults.parse import parse_fault
+    from sealscope.simulation.faults import parse_fault
 
     timed = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if timed else f"{text} from {onset_s:g} s")

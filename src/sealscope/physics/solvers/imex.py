@@ -136,7 +136,7 @@ def advance_imex(
 ) -> None:
     """Advance `y` (11,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
-    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 17).
+    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 18).
     """
     z = state_of(y)
     for step in range(u.shape[0]):

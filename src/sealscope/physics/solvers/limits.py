@@ -12,15 +12,12 @@ OSCILLATION_LIMIT = 1.0
 DECAY_LIMIT = 2.785
 
 
-def stiffest_rate(p: RigNumbers) -> float:
-    """Fastest decay rate [1/s] of the throttled rig: a line volume against its chamber through the laminar slope at
-    dp = 0.
-
-    lambda = K_oil (1/V_1 + 1/V) c / sqrt(dp_0); an explicit method is stable only for h lambda below its own limit
-    (2.785 for RK4).
-    """
-    c = max(p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out)
-    return p.K_oil * (1.0 / min(p.V_1, p.V_2) + 1.0 / p.V) * c / math.sqrt(p.dp_0)
+def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
+    """Volumes (V_A, V_B) [m^3] with the piston at either end of its stroke, where one of them is smallest."""
+    if not p.position_dependent:
+        return ((p.V, p.V),)
+    half = 0.5 * p.L
+    return (p.V - p.A_A * half, p.V + p.A_B * half), (p.V + p.A_A * half, p.V - p.A_B * half)
 
 
 def _longest_for_pair(damping: float, stiffness: float) -> float:
@@ -32,32 +29,43 @@ def _longest_for_pair(damping: float, stiffness: float) -> float:
     return DECAY_LIMIT / decay if decay > 0.0 else math.inf
 
 
+def stiffest_rate(p: RigNumbers) -> float:
+    """Return the fastest decay rate [1/s] of the throttled rig.
+
+    It is that of a line volume against its chamber through the throttle's laminar slope at dp = 0, lambda = K_oil
+    (1/V_1 + 1/V) c / sqrt(dp_0), with the chamber at the end of the stroke where it is smallest. An explicit method is
+    stable only for h lambda below its own limit (2.785 for RK4).
+    """
+    c = max(p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out)
+    smallest = min(volume for volumes in _end_volumes(p) for volume in volumes)
+    return float(p.K_oil * (1.0 / min(p.V_1, p.V_2) + 1.0 / smallest) * c / math.sqrt(p.dp_0))
+
+
 def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
-    """Longest step [s] at which an explicit method resolves all but the throttles, for leaks up to `G` and `C`.
+    """Return the longest step [s] at which an explicit method resolves all but the throttles, for leaks up to `G`, `C`.
 
     The shortest of: speed loop (winding and shaft), piston between its oil columns (running, and within the linear part
-    of the friction), pump and motor between the volumes at the pump's ports, leakage between the chambers, leakage
-    outwards and make-up. An oscillation needs h |lambda| <= 1, a decay h lambda <= 2.785 (stability of RK4, which the
-    explicit part of ARK4(3)6L[2]SA exceeds). Position-dependent volumes are taken at the end of the stroke, where the
-    oil is stiffest; air only makes it softer.
+    of the friction, F_C/v_th with F_C = F_pr + F_cfr (p_A + p_B) at the charge pressure), pump and motor between the
+    volumes at the pump's ports, leakage between the chambers, leakage outwards and make-up. An oscillation needs h
+    |lambda| <= 1, a decay h lambda <= 2.785 (stability of RK4, which the explicit part of ARK4(3)6L[2]SA exceeds).
+    Position-dependent volumes are taken at the end of the stroke where the oil is stiffer; air only makes it softer.
     """
-    V_A, V_B = p.V, p.V
-    if p.position_dependent:
-        V_A, V_B = p.V - 0.5 * p.A_A * p.L, p.V + 0.5 * p.A_B * p.L
-    chambers = p.K_oil * (1.0 / V_A + 1.0 / V_B)
+    ends = _end_volumes(p)
+    chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
     ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if p.throttled else chambers
     loop = _longest_for_pair(p.R_c / p.L_c + p.B_M / p.J_M, (p.R_c * p.B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M))
-    column = p.K_oil * (p.A_A**2 / V_A + p.A_B**2 / V_B) / p.M_eq
-    standing = p.F_pr * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
+    column = p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) / p.M_eq
+    F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
+    standing = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
     standing += 0.0 if p.literal_bracket else p.F_v
     running = _longest_for_pair(p.F_v / p.M_eq, column)
     stuck = _longest_for_pair(standing / p.M_eq, column)
     pump = _longest_for_pair(ports * p.G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
     leak = _longest_for_pair(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
     outward = _longest_for_pair(chambers * max(p.G_ext_A, p.G_ext_B) + ports * p.G_check * p.made_up, 0.0)
-    return min(loop, running, stuck, pump, leak, outward)
+    return float(min(loop, running, stuck, pump, leak, outward))
 
 
 def longest_step_on_stop(p: RigNumbers) -> float:
-    """Longest step [s] that resolves the piston against a cap: M_eq on k_stop and d_stop."""
+    """Return the longest step [s] that resolves the piston against a cap: M_eq on k_stop and d_stop."""
     return _longest_for_pair(p.d_stop / p.M_eq, p.k_stop / p.M_eq)

@@ -50,7 +50,7 @@ def advance_rk4(
     """Advance `y` (11,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
     `u`, `G`, `C`: (n, 3) command [V] and leakage coefficients at t, t + h/2 and t + h of each step; `rows`: (n //
-    every, 17). `euler_integral` takes eq. (4.2) literally: I is held within the step and grows by h (omega_d - omega)
+    every, 18). `euler_integral` takes eq. (4.2) literally: I is held within the step and grows by h (omega_d - omega)
     once after it.
     """
     n = u.shape[0]

@@ -21,9 +21,8 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.layout import LaneSet, sets_of, with_sizes
 from sealscope.simulation.batch.run import SetRun
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import FINEST, LONGEST_STEP
-from sealscope.simulation.resolution import FIRST_WINDOW, PRESSURE_TOLERANCE
+from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment
+from sealscope.simulation.integrate import FINEST, FIRST_WINDOW, LONGEST_STEP
 from sealscope.simulation.sizing import scaled_size
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
@@ -254,9 +253,7 @@ def _run(
 def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
     """The finest of the steps [s] that `integrate` chooses for some members of the set over its first seconds, and that
     all members' numbers and leaks allow."""
-    from sealscope.simulation.inputs import RunInputs
-    from sealscope.simulation.integrate import integrate
-    from sealscope.simulation.simulate import oversampling
+    from sealscope.simulation.integrate import RunInputs, integrate, oversampling
 
     steps = [allowed_step(part, sizes)]
     picked = np.unique(np.linspace(0, len(part.members) - 1, _SCOUTS).round().astype(int))
@@ -299,7 +296,7 @@ def _sized(
     runner: type[SetRun],
 ) -> Array:
     """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members at once."""
-    from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, refuse_unsettled
+    from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, unsettled
 
     wanted = asked > 0
     before = np.zeros((2, len(sizes)))
@@ -319,4 +316,4 @@ def _sized(
             following[k] = scaled_size(asked[k], (before[0, k], before[1, k]), (sizes[k], got[k]))
         before = np.where(known, np.stack([sizes, got]), 0.0)
         sizes = following
-    raise refuse_unsettled([member.leak for member in part.members])
+    raise unsettled([member.leak for member in part.members])

@@ -13,13 +13,13 @@ from sealscope.simulation.batch.layout import Member
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
-    from sealscope.simulation.changes.readings import Readings
+    from sealscope.simulation.changes import Readings
 
 
 def instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
     """(runs, 2, INSTRUMENT_ROWS) of p_A and p_B for samples first .. last, even between these."""
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE, INSTRUMENT_ROWS
-    from sealscope.simulation.changes.readings import Readings
+    from sealscope.simulation.changes import Readings
 
     rows = np.zeros((len(members), len(CHAMBERS), INSTRUMENT_ROWS))
     ends = np.array([first, last]) / members[0].experiment.rate

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -12,10 +11,10 @@ import numpy as np
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes.rig import LONGEST_BLOCK, SHORTEST_BLOCK, Effect, values_of
+from sealscope.simulation.changes import LONGEST_BLOCK, SHORTEST_BLOCK, Effect, jumps_of, moved_per_block, values_of
 from sealscope.simulation.commands import Command, Sine
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults.faults import From, Growing, Leak
+from sealscope.simulation.faults import From, Growing, Leak
 
 if TYPE_CHECKING:
     from sealscope.physics.rig import RigNumbers
@@ -92,7 +91,7 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
     rate."""
     from sealscope.physics.rig import rig_numbers
     from sealscope.physics.vector.runs import CHOICES
-    from sealscope.simulation.integrate import choose_method
+    from sealscope.simulation.experiment import choose_method
 
     if not experiments:
         raise InputError("a batch must have experiments, got none")
@@ -178,17 +177,10 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     if not effects:
         return Cells(np.array([0, n_out]), base, (), np.empty((len(members), 0, 1)))
     coarse = np.arange(0, n_out + 1, max(1, round(LONGEST_BLOCK * rate)))
-    inside = 1e-6 / rate
-    parts = 1.0
-    for effect in effects:
-        change = np.abs(effect.change(coarse[1:] / rate - inside) - effect.change(coarse[:-1] / rate + inside))
-        if change.size:
-            parts = max(parts, float(np.ceil(change / effect.resolution - 1e-9).max()))
+    parts = max(float(moved_per_block(effect, coarse, rate).max(initial=1.0)) for effect in effects)
     length = max(LONGEST_BLOCK / parts, SHORTEST_BLOCK)
-    jumps = np.array([jump for effect in effects for jump in effect.jumps if math.isfinite(jump)])
-    at = np.ceil(jumps * rate * (1.0 - 1e-12)).astype(np.int64)
     grid = np.arange(0, n_out, max(1, round(length * rate)))
-    bounds = np.unique(np.r_[grid, n_out, at[(at > 0) & (at < n_out)]])
+    bounds = np.unique(np.r_[grid, n_out, jumps_of(effects, n_out, rate)])
     middles = 0.5 * (bounds[:-1] + bounds[1:]) / rate
     fields = tuple(sorted({LANE_FIELDS.index(effect.field) for effect in effects}))
     values = np.repeat(base[:, list(fields), None], middles.size, axis=2)

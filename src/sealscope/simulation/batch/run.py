@@ -17,8 +17,9 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.instruments import instrument_rows
 from sealscope.simulation.batch.layout import LaneSet, cells_of, in_lanes, leak_rows, out_of_lanes
+from sealscope.simulation.experiment import choose_method
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
-from sealscope.simulation.integrate import VACUUM, choose_method, refuse_long, refuse_unresolved, steps_per_output
+from sealscope.simulation.integrate import VACUUM, refuse_long, refuse_unresolved, steps_per_output
 
 if TYPE_CHECKING:
     from sealscope.physics.rig import RigNumbers
@@ -49,7 +50,7 @@ class SetRun:
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.physics.solvers.rk4 import RK4_NODES
         from sealscope.physics.vector.runs import ACCOUNTS, LEAST, TOLD
-        from sealscope.simulation.simulate import oversampling_of
+        from sealscope.simulation.integrate import oversampling_of
 
         members, common = part.members, part.experiment
         self.asked_step, self.sizes = step, sizes
@@ -219,7 +220,7 @@ class SetRun:
     def _shapes(self) -> Callable[[int, int], Array]:
         """The command's shape at the nodes of the steps between two outputs, for one thread's use."""
         from sealscope.simulation.commands import Sine
-        from sealscope.simulation.inputs import NodeSines
+        from sealscope.simulation.integrate import NodeSines
 
         def times(start: int, stop: int) -> Array:
             return np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h

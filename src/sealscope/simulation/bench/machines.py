@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.simulation.bench.profile import DriftRange, Nuisance, Profile, load_profile
-from sealscope.simulation.changes.drifts import Drift, Wander
+from sealscope.simulation.changes import ParameterDrift, Wander
 from sealscope.simulation.commands import Command, parse_command
 from sealscope.simulation.experiment import Experiment
 
@@ -24,7 +24,7 @@ WANDER_TERMS = 6
 
 
 @dataclass(frozen=True)
-class Machine:
+class BenchMachine:
     """One machine on one day: a rig as designed, what differs from it, what drifts, and what the machine is asked for.
 
     `overrides`: values of parameters by dotted name, in SI, throttles among them (`closed`; open ones leave
@@ -36,7 +36,7 @@ class Machine:
     rig: Rig
     duration: float
     overrides: Mapping[str, float | str]
-    drifts: tuple[Drift, ...]
+    drifts: tuple[ParameterDrift, ...]
     command: Command
     closed: float
 
@@ -93,23 +93,23 @@ def _drift(random: np.random.Generator, wanted: DriftRange, oil: Wander) -> Wand
     return both.scaled(float(random.uniform(*wanted.size)))
 
 
-def _drawn(one: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[Drift]]:
+def _drawn(one: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
     """Values (or factors) and drifts of one nuisance."""
     values: dict[str, float] = {}
-    drifts: list[Drift] = []
+    drifts: list[ParameterDrift] = []
     for group in [(name,) for name in one.parameters] if one.each else [one.parameters]:
         random = _random(seed, f"{one.name}/{group[0]}" if one.each else one.name)
         value = float(random.uniform(one.low, one.high)) if one.high > one.low else one.low
         values |= dict.fromkeys(group, value)
         if one.drift is not None:
             shape = _drift(random, one.drift, oil)
-            drifts += [Drift(name, shape, one.drift.absolute) for name in group]
+            drifts += [ParameterDrift(name, shape, one.drift.absolute) for name in group]
     return values, drifts
 
 
 def draw(
     profile: Profile | str = "bench", seed: int = 0, *, rig: Rig | str = "thesis", duration: float = 180.0
-) -> Machine:
+) -> BenchMachine:
     """A healthy machine of a rig's kind, drawn from a profile (or its name, or its file); one seed, one machine.
 
     `duration` [s] is the record over which the drifts have their sizes. Raises InputError for a seed below 0, and where
@@ -125,7 +125,7 @@ def draw(
         raise InputError(f"duration must be > 0 s and finite, got {duration}")
     oil = _path(_random(seed, "temperature of the oil"), ("linear", "wander"), duration, warms=True)
     overrides: dict[str, float | str] = {}
-    drifts: list[Drift] = []
+    drifts: list[ParameterDrift] = []
     for one in found.nuisances:
         values, drifting = _drawn(one, seed, oil)
         overrides |= {name: float(base[name]) * value for name, value in values.items()} if one.scales else values
@@ -139,4 +139,4 @@ def draw(
     amplitude = float(random.uniform(*found.duty.amplitude))
     if amplitude != 1.0:
         command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, attr-defined]
-    return Machine(found.name, seed, base, duration, overrides, tuple(drifts), command, closed)
+    return BenchMachine(found.name, seed, base, duration, overrides, tuple(drifts), command, closed)

@@ -10,7 +10,7 @@ from typing import Any
 
 from sealscope.errors import InputError
 from sealscope.parameters.toml_file import read_toml
-from sealscope.simulation.changes.drifts import Drift, Linear, drifts_absolutely
+from sealscope.simulation.changes import Linear, ParameterDrift, drifts_absolutely
 from sealscope.simulation.commands import parse_command
 
 _PACKAGED = Path(__file__).parent / "profiles"
@@ -44,7 +44,7 @@ class Nuisance:
 
 
 @dataclass(frozen=True)
-class Duty:
+class BenchDuty:
     """What the machines are asked for: one of `commands`, times a factor within `amplitude`, both throttles `closed`
     by one of these shares."""
 
@@ -60,7 +60,7 @@ class Profile:
 
     name: str
     title: str
-    duty: Duty
+    duty: BenchDuty
     nuisances: tuple[Nuisance, ...]
     place: str
 
@@ -178,7 +178,7 @@ def _drift(table: Any, name: str, parameters: tuple[str, ...], place: str) -> Dr
     try:
         absolute = drifts_absolutely(parameters[0])
         for one in parameters:
-            Drift(one, Linear(0.0, 1.0), absolute)
+            ParameterDrift(one, Linear(0.0, 1.0), absolute)
     except InputError as error:
         raise InputError(f"{error} ({name}, {place})") from None
     si_unit = unit_of(_declared()[parameters[0]]) if absolute else "1"
@@ -196,7 +196,7 @@ def _drift(table: Any, name: str, parameters: tuple[str, ...], place: str) -> Dr
     return DriftRange((low, high), absolute, tuple(shapes), float(oil))
 
 
-def _duty(table: Any, place: str) -> Duty:
+def _duty(table: Any, place: str) -> BenchDuty:
     if table is None:
         raise InputError(f"a profile must have [duty], got none ({place})")
     _known(table, ("commands", "closed", "amplitude", "why"), "[duty]", place)
@@ -215,7 +215,7 @@ def _duty(table: Any, place: str) -> Duty:
     if not isinstance(closed, list) or not closed or not all(_percent(one) for one in closed):
         raise InputError(f"closed of [duty] must be a list of per cent, 0 to 99, got {closed!r} ({place})")
     shares = tuple(one / 100.0 for one in closed)
-    return Duty(tuple(commands), shares, amplitude, _text(table, "why", "[duty]", place))
+    return BenchDuty(tuple(commands), shares, amplitude, _text(table, "why", "[duty]", place))
 
 
 def _percent(value: Any) -> bool:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from sealscope.errors import SimulationFailed
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.proof import prove
-from sealscope.simulation.simulate import simulate_with_truth, sized_leaks
+from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 
 
@@ -30,13 +27,12 @@ def experiment_of(spec: RunSpec) -> Experiment:
 
 
 def simulated_run(spec: RunSpec, experiment: Experiment) -> SimulatedRun:
-    """Simulate the run of a spec; its leaks are sized once for the run and its halving test."""
+    """Simulate the run of a spec, with its halving test where the spec asks for it."""
     try:
-        experiment = replace(experiment, leaks=sized_leaks(experiment))
-        made = simulate_with_truth(experiment)
-        proof = prove(experiment) if spec.prove else None
+        made = simulate_with_truth(experiment, prove=spec.prove)
     except SimulationFailed as error:
         return SimulatedRun(None, np.empty(0), {}, 0.0, False if spec.prove else None, diverged=str(error))
+    proof = made.proof
     moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
     return SimulatedRun(made.recording, made.truth.t, made.truth.outputs, made.truth.mean_leak_lpm, resolved, moved)

@@ -140,7 +140,7 @@ def _experiment(condition: Condition, duration: float, leak: str | None = None, 
 def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
     """Record a trajectory with the rig's instruments and the noise of the experiment's seed."""
     from sealscope.simulation.instruments import record
-    from sealscope.simulation.simulate import oversampling
+    from sealscope.simulation.integrate import oversampling
 
     volts = experiment.command.volts(experiment.sample_times())
     return record(experiment.rig, path, volts, oversampling(experiment), experiment.seed)
@@ -151,9 +151,10 @@ def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
 
     The first test of each condition is proved by halving the step, except in a quick reproduction.
     """
-    from sealscope.simulation.faults.faults import From
-    from sealscope.simulation.proof import prove
-    from sealscope.simulation.simulate import simulate_with_truth, sized_leaks
+    from sealscope.simulation.faults import From
+    from sealscope.simulation.simulate import prove
+    from sealscope.simulation.simulate import simulate_with_truth
+    from sealscope.simulation.sizing import sized_leaks
 
     half = QUICK_HALF if quick else HALF
     proved: set[tuple[str, float]] = set()
@@ -174,7 +175,7 @@ def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
 
 def without_leak(quick: bool = False) -> Iterator[SimulatedTest]:
     """Simulate the same tests with no leak: nothing happens at half time; the noise alone differs."""
-    from sealscope.simulation.simulate import trajectory
+    from sealscope.simulation.integrate import trajectory
 
     half = QUICK_HALF if quick else HALF
     paths: dict[tuple[str, float], Trajectory] = {}
@@ -193,7 +194,7 @@ def with_drift(quick: bool = False) -> Iterator[SimulatedTest]:
     The second half comes from a rig with other friction, bulk modulus and noise (`drift_of`), several draws of each
     test.
     """
-    from sealscope.simulation.simulate import trajectory
+    from sealscope.simulation.integrate import trajectory
 
     half = QUICK_HALF if quick else HALF
     paths: dict[tuple[str, float], Trajectory] = {}

@@ -1,0 +1,333 @@
+"""What changes within a run: numbers of the machine over time, held in short blocks, and readings of its instruments.
+
+Drifts (here) and faults (`faults`) say which: an `Effect` is a number of the compiled laws that changes, an
+`Adjustment` a parameter of an instrument, a `Hold` a reading that repeats itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+
+if TYPE_CHECKING:
+    from sealscope.physics.rig import RigNumbers
+
+#: Longest time [s] over which a changing number is held, and the shortest (unless something jumps within it).
+LONGEST_BLOCK, SHORTEST_BLOCK = 0.5, 0.05
+#: Most that a drifting parameter changes from one block of the solver to the next, relative.
+RESOLUTION = 5e-4
+#: Parameters that drift together under one name.
+GROUPS = {"friction": ("friction.F_pr", "friction.F_cfr", "friction.F_v")}
+_THROTTLES = ("c_A_in", "c_A_out", "c_B_in", "c_B_out")
+#: Parameters that the compiled laws know only within the throttles' coefficients, which go with this power of them.
+_POWERS = {"line.C_d": 1.0, "line.d_line": 2.0, "fluid.rho": -0.5}
+#: What is not a state of the machine that could drift: geometry, choices, the start.
+_FIXED = {"cylinder.L", "fluid.p_charge", "makeup.V_gas"}
+_OF_INSTRUMENTS = {"noise", "hum", "offset", "gain_error", "scale_error", "common_noise"}
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One number of the rig that changes: value = (own value + sum of `added`) x product of the others.
+
+    `change(t)` at times t [s]: what is added, or the factor; `resolution`: most that it may change from one block to
+    the next; `jumps`: times [s] at which it may jump or bend.
+    """
+
+    field: str
+    change: Callable[[Array], Array]
+    resolution: float
+    added: bool = False
+    jumps: tuple[float, ...] = ()
+
+
+def values_of(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
+    """Return the numbers of `base` that change, by name, at times t [s]."""
+    values: dict[str, Array] = {}
+    for effect in sorted(effects, key=lambda effect: not effect.added):  # sums before products
+        own = values.get(effect.field)
+        if own is None:
+            own = np.full(t.size, float(getattr(base, effect.field)))
+        change = effect.change(t)
+        values[effect.field] = own + change if effect.added else own * change
+    return values
+
+
+def moved_per_block(effect: Effect, bounds: np.ndarray, rate: float) -> Array:
+    """Return how many resolutions an effect moves in each block between `bounds` (outputs at `rate` [Hz]), rounded up.
+
+    Times are taken from inside the block, so that a jump at its bound is no slope.
+    """
+    inside = 1e-6 / rate
+    moved = np.abs(effect.change(bounds[1:] / rate - inside) - effect.change(bounds[:-1] / rate + inside))
+    return np.asarray(np.ceil(moved / effect.resolution - 1e-9))
+
+
+def jumps_of(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
+    """Return the outputs (at `rate` [Hz], within 0 .. `n_out`) at which the effects may jump or bend."""
+    jumps = np.array([jump for effect in effects for jump in effect.jumps if math.isfinite(jump)], dtype=np.float64)
+    outputs = np.ceil(jumps * rate * (1.0 - 1e-12)).astype(np.int64)
+    return outputs[(outputs > 0) & (outputs < n_out)]
+
+
+class Schedule:
+    """The rig's numbers over a run, constant within blocks: `bounds` (n + 1,) output indices, one number set a block.
+
+    A block is at most 0.5 s long, and so short (down to 0.05 s) that no effect moves by more than its resolution; a
+    jump falls on a block's boundary, within one output interval. Within a block a number has its value at the middle.
+    Neighbours with the same numbers are one block.
+    """
+
+    def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
+        cell = max(1, round(LONGEST_BLOCK * rate))
+        self.bounds = np.array([0, n_out], dtype=np.int64)
+        self.numbers = [base]
+        if not effects:
+            return
+        self.bounds = np.unique(np.r_[np.arange(0, n_out, cell), n_out, jumps_of(effects, n_out, rate)])
+        self.bounds = self._refined(effects, rate)
+        middles: Array = np.asarray(0.5 * (self.bounds[:-1] + self.bounds[1:]) / rate, dtype=np.float64)
+        values = values_of(effects, base, middles)
+        table = np.array(list(values.values()))
+        new = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]
+        self.bounds = np.r_[self.bounds[:-1][new], n_out]
+        # a run has one kind of numbers throughout: what the compiler leaves out is left out from its beginning
+        kinds: dict[str, Any] = {}
+        if any(name.startswith("G_ext") and np.any(found > 0) for name, found in values.items()):
+            kinds["open_circuit"] = (True,)
+        if "air" in values and np.any(values["air"] > 0):
+            kinds["aerated"] = (True,)
+        whole = base._replace(**kinds)
+        rows = table[:, new].T.tolist()
+        self.numbers = [whole._replace(**dict(zip(values, row, strict=True))) for row in rows]
+
+    def _refined(self, effects: Sequence[Effect], rate: float) -> np.ndarray:
+        """Return the bounds with each block cut so that no effect moves further than its resolution in one."""
+        starts, stops = self.bounds[:-1], self.bounds[1:]
+        parts = np.ones(starts.size)
+        for effect in effects:
+            parts = np.maximum(parts, moved_per_block(effect, self.bounds, rate))
+        least = max(1, round(SHORTEST_BLOCK * rate))
+        parts = np.minimum(parts, np.maximum(1, (stops - starts) // least)).astype(np.int64)
+        cuts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(starts, stops, parts, strict=True) if n > 1]
+        return np.unique(np.r_[self.bounds, np.rint(np.concatenate([*cuts, self.bounds[:0]])).astype(np.int64)])
+
+    def within(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
+        """Yield the parts (start, stop, numbers) of the outputs first <= k < last."""
+        k = int(np.searchsorted(self.bounds, first, side="right")) - 1
+        while first < last:
+            stop = min(int(self.bounds[k + 1]), last)
+            yield first, stop, self.numbers[k]
+            first, k = stop, k + 1
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """One parameter of an instrument over time: `change(t)` is added to it, or multiplies it as 1 + change."""
+
+    parameter: str
+    change: Callable[[Array], Array]
+    added: bool
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A channel that repeats its reading of `start` until `stop` [s]."""
+
+    channel: str
+    start: float
+    stop: float
+
+
+@dataclass(frozen=True)
+class Readings:
+    """All that changes at the instruments of a run; nothing by default."""
+
+    adjustments: tuple[Adjustment, ...] = ()
+    holds: tuple[Hold, ...] = ()
+
+    def value(self, parameter: str, own: float, t: Array) -> Array | float:
+        """Return the parameter at times t [s], its own value where nothing changes it."""
+        value: Array | float = own
+        for adjustment in sorted(self.adjustments, key=lambda adjustment: not adjustment.added):
+            if adjustment.parameter == parameter:
+                change = adjustment.change(t)
+                value = value + change if adjustment.added else value * (1.0 + change)
+        return value
+
+    def held(self, channel: str, read: Array, t: Array) -> Array:
+        """Return the readings (n,) with every hold of this channel in them."""
+        for hold in self.holds:
+            still = np.flatnonzero((t >= hold.start) & (t < hold.stop))
+            if hold.channel == channel and still.size:
+                read = read.copy()
+                read[still] = read[still[0]]
+        return read
+
+
+class Shape(Protocol):
+    """How a parameter drifts: its change since the start, as a share of its value (or in its unit)."""
+
+    def at(self, t: Array) -> Array:
+        """Return the change at times t [s] (any shape); 0 at t = 0."""
+        ...
+
+
+@dataclass(frozen=True)
+class Linear:
+    """An even change of `size` over `duration` [s], going on as long as the run does."""
+
+    size: float
+    duration: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.size) and self.duration > 0):
+            raise InputError(f"a linear drift must be finite and last > 0 s, got {self.size} over {self.duration} s")
+
+    def at(self, t: Array) -> Array:
+        """Return the change at times t [s]."""
+        return self.size / self.duration * np.maximum(t, 0.0)
+
+
+@dataclass(frozen=True)
+class Wander:
+    """A smooth random walk over `duration` T [s]: slope t / T + sum of w_k sin((k - 1/2) pi t / T), k = 1, 2, ...
+
+    With w_k normal of deviation 1/(k - 1/2) this is the Karhunen-Loeve expansion of the Wiener process, cut off where
+    it becomes quick (Loeve, Probability Theory, 1955, section 34.5; six terms: nothing quicker than T/2.75).
+    """
+
+    weights: tuple[float, ...]
+    duration: float
+    slope: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (all(map(math.isfinite, (*self.weights, self.slope))) and self.duration > 0):
+            raise InputError(f"a wander must have finite weights and last > 0 s, got {self}")
+
+    def at(self, t: Array) -> Array:
+        """Return the change at times t [s]."""
+        phase = np.pi / self.duration * np.maximum(t, 0.0)
+        change = np.asarray(self.slope / np.pi * phase)
+        if self.weights:  # sin(a + phi) = 2 cos(phi) sin(a) - sin(a - phi)
+            term, turn = np.sin(0.5 * phase), 2.0 * np.cos(phase)
+            before = -term
+            for weight in self.weights:
+                change = change + weight * term
+                before, term = term, turn * term - before
+        return change
+
+    def scaled(self, size: float) -> Wander:
+        """Return the same path with the distance `size` between its highest and lowest point within the duration."""
+        path = self.at(np.linspace(0.0, self.duration, 1001))
+        span = float(np.ptp(path))
+        return self.times(size / span) if span > 0 else self
+
+    def times(self, factor: float) -> Wander:
+        """Return the same path, `factor` times as large."""
+        return Wander(tuple(weight * factor for weight in self.weights), self.duration, self.slope * factor)
+
+    def plus(self, other: Wander) -> Wander:
+        """Return the sum of two paths of one duration."""
+        pairs = zip_longest(self.weights, other.weights, fillvalue=0.0)
+        return Wander(tuple(a + b for a, b in pairs), self.duration, self.slope + other.slope)
+
+
+@dataclass(frozen=True, eq=False)
+class TabulatedDrift:
+    """A change linear between the points of a table; constant before the first and after the last."""
+
+    t: Array
+    change: Array
+
+    def __post_init__(self) -> None:
+        if self.t.size != self.change.size or self.t.size < 1 or np.any(np.diff(self.t) < 0):
+            raise InputError("a drift table must have one change for each time, and its times must rise")
+        if not (np.all(np.isfinite(self.t)) and np.all(np.isfinite(self.change))):
+            raise InputError("times and changes of a drift table must be finite, got NaN or infinity")
+
+    def at(self, t: Array) -> Array:
+        """Return the change at times t [s]."""
+        return np.interp(t, self.t, self.change)
+
+
+def drifts_absolutely(parameter: str) -> bool:
+    """Whether a parameter drifts in its own unit: an error, which is zero on a perfect instrument."""
+    return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error")
+
+
+@dataclass(frozen=True)
+class ParameterDrift:
+    """A parameter that drifts: value(t) = value (1 + shape(t)), or value + shape(t) in its SI unit if `absolute`.
+
+    `parameter`: bare or dotted name of a number of motor, pump, lines, cylinder, friction, oil or make-up, of a
+    sensor's noise, hum, offset, gain or scale, or `friction` for the whole level of friction. Offsets, gain and scale
+    errors drift in absolute terms, all others in relative ones. Raises InputError for any other parameter.
+    """
+
+    parameter: str
+    shape: Shape
+    absolute: bool = False
+
+    def __post_init__(self) -> None:
+        if self.parameter not in GROUPS:
+            from sealscope.parameters import declared_names
+            from sealscope.parameters.names import resolve
+
+            object.__setattr__(self, "parameter", resolve(self.parameter, declared_names()))
+        if not (self._of_instruments() or fields_of(self.parameter)):
+            raise InputError(f"{self.parameter} cannot drift within a run")
+        if self.absolute != drifts_absolutely(self.parameter):
+            wanted = "relative" if self.absolute else "absolute"
+            raise InputError(f"a drift of {self.parameter} must be {wanted}")
+
+    def __str__(self) -> str:
+        return f"{self.parameter} drifts, {type(self.shape).__name__.lower()}"
+
+    def _of_instruments(self) -> bool:
+        return self.parameter.startswith("sensors.") and self.parameter.rpartition(".")[2] in _OF_INSTRUMENTS
+
+    def check(self, t: Array) -> None:
+        """Raise InputError where a relative drift takes its parameter to zero or below at the times t [s]."""
+        if not self.absolute and (least := float(np.min(self.shape.at(t), initial=0.0))) <= -1.0:
+            raise InputError(f"a relative drift must stay above -100 %, got {100 * least:.4g} % ({self.parameter})")
+
+    def effects(self) -> tuple[Effect, ...]:
+        """Return what it changes in the machine."""
+        if self._of_instruments():
+            return ()
+        table = isinstance(self.shape, TabulatedDrift) and self.shape.t.size < 1000
+        jumps = tuple(map(float, self.shape.t)) if table else ()  # type: ignore[attr-defined]
+
+        def effect(field: str, power: float) -> Effect:
+            return Effect(field, lambda t: (1.0 + self.shape.at(t)) ** power, RESOLUTION, jumps=jumps)
+
+        return tuple(effect(field, power) for field, power in fields_of(self.parameter))
+
+    def adjustments(self) -> tuple[Adjustment, ...]:
+        """Return what it changes at the instruments."""
+        return (Adjustment(self.parameter, self.shape.at, self.absolute),) if self._of_instruments() else ()
+
+
+@cache
+def fields_of(parameter: str) -> tuple[tuple[str, float], ...]:
+    """Return the numbers of the compiled laws that go with a parameter, each with its power; () where there is none."""
+    from sealscope.physics.rig import NUMBERS
+
+    if parameter in GROUPS:
+        return tuple(field for name in GROUPS[parameter] for field in fields_of(name))
+    if parameter in _POWERS:
+        return tuple((field, _POWERS[parameter]) for field in _THROTTLES)
+    group, _, symbol = parameter.rpartition(".")
+    if group.startswith(("sensors", "daq")) or parameter in _FIXED:
+        return ()
+    return ((symbol, 1.0),) if symbol in NUMBERS else ()

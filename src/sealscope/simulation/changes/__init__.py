@@ -1,1 +1,0 @@
-"""What changes slowly within a run: the rig, its instruments."""

@@ -1,0 +1,581 @@
+"""Faults over time, as data and as text: leaks across the piston, and faults of machine, sensors and duty.
+
+An opening says how far a fault is open at each instant. A text such as ``0.0042 L/min from 90 s`` or ``pump leak x3
+growing from 1 min to 2 min`` is read by `parse_leak` and `parse_fault`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import CHANNEL_UNITS, Array
+from sealscope.simulation.changes import GROUPS, Adjustment, Effect, Hold
+from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, number_text, seconds
+from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Most of a fault that comes or goes from one block of the solver to the next.
+SHARE_RESOLUTION = 5e-3
+#: Channels whose sensors can be faulty, and the parameter of each sensor that holds its relative error of gain.
+GAINS = {
+    **dict.fromkeys(("p_1", "p_2", "p_A", "p_B"), "gain_error"),
+    "x": "scale_error",
+    "q_leak": "gain_error",
+}
+
+
+class Opening(Protocol):
+    """How far a fault is open: 0 is closed, 1 is fully open."""
+
+    def share(self, t: Array) -> Array:
+        """Return the opening in 0..1 at times t [s] (any shape)."""
+        ...
+
+    def onset(self) -> float:
+        """Return the first time [s] at which it is open."""
+        ...
+
+    def __str__(self) -> str: ...
+
+
+@dataclass(frozen=True)
+class From:
+    """Closed before `at` [s], fully open from then on."""
+
+    at: float = 0.0
+
+    def share(self, t: Array) -> Array:
+        """Return the opening at times t [s]."""
+        return np.where(t >= self.at, 1.0, 0.0)
+
+    def onset(self) -> float:
+        """Return `at` [s]."""
+        return self.at
+
+    def __str__(self) -> str:
+        return f"from {self.at:g} s"
+
+
+@dataclass(frozen=True)
+class Growing:
+    """Opens evenly from `start` to `stop` [s] and stays open."""
+
+    start: float
+    stop: float
+
+    def __post_init__(self) -> None:
+        if not self.stop > self.start:
+            raise InputError(
+                f"a growing leak must stop growing after it starts, got {self.start:g} s to {self.stop:g} s"
+            )
+
+    def share(self, t: Array) -> Array:
+        """Return the opening at times t [s]."""
+        return np.clip((t - self.start) / (self.stop - self.start), 0.0, 1.0)
+
+    def onset(self) -> float:
+        """Return `start` [s]."""
+        return self.start
+
+    def __str__(self) -> str:
+        return f"growing from {self.start:g} s to {self.stop:g} s"
+
+
+@dataclass(frozen=True, eq=False)
+class Tabulated:
+    """Opening linear between the points of a table; constant before the first and after the last."""
+
+    t: Array
+    opening: Array
+
+    def __post_init__(self) -> None:
+        if self.t.size != self.opening.size or self.t.size < 1 or np.any(np.diff(self.t) < 0):
+            raise InputError("a leak table must have one opening for each time, and its times must rise")
+        if not (np.all(self.opening >= 0) and np.all(self.opening <= 1)):
+            raise InputError(
+                f"openings of a leak table must be in 0..1, got {self.opening.min():g}..{self.opening.max():g}"
+            )
+
+    def share(self, t: Array) -> Array:
+        """Return the opening at times t [s]."""
+        return np.interp(t, self.t, self.opening)
+
+    def onset(self) -> float:
+        """Return the time [s] of the last point before the first that is open; infinity where none is."""
+        opened = np.flatnonzero(self.opening > 0)
+        if opened.size == 0:
+            return math.inf
+        return float(self.t[max(int(opened[0]) - 1, 0)] if opened[0] > 0 else 0.0)
+
+    def __str__(self) -> str:
+        return f"table of {self.t.size} points over {self.t[0]:g}..{self.t[-1]:g} s"
+
+
+def bends(opening: Opening) -> tuple[float, ...]:
+    """Return the times [s] at which an opening jumps or bends, as far as its form tells."""
+    if isinstance(opening, Growing):
+        return opening.start, opening.stop
+    if isinstance(opening, Tabulated) and opening.t.size < 1000:
+        return tuple(map(float, opening.t))
+    return (opening.onset(),)
+
+
+@dataclass(frozen=True)
+class Leak:
+    """Leakage across the piston.
+
+    `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt|dp| with C [m^3/(s
+    Pa^0.5)] (needle valve). The size at full opening is either `coefficient` (G or C), or `mean` [m^3/s]: the mean of
+    |Q_L| that the rig shall show at full opening; the coefficient is then found on the rig at its own operating point.
+    """
+
+    law: Literal["laminar", "orifice"] = "laminar"
+    coefficient: float | None = None
+    mean: float | None = None
+    opening: Opening = field(default_factory=From)
+
+    def __post_init__(self) -> None:
+        if self.law not in ("laminar", "orifice"):
+            raise InputError(f"leak law must be laminar or orifice, got {self.law!r}")
+        given = [value for value in (self.coefficient, self.mean) if value is not None]
+        if len(given) != 1:
+            raise InputError("a leak needs either a coefficient or a mean flow, and not both")
+        if not (math.isfinite(given[0]) and given[0] >= 0):
+            raise InputError(f"a leak must be >= 0 and finite, got {given[0]}")
+
+    def __str__(self) -> str:
+        if self.mean is not None:
+            return f"{self.mean / LITRE_PER_MINUTE:g} L/min {self.law} {self.opening}"
+        return f"{'G' if self.law == 'laminar' else 'C'} = {self.coefficient:g} {self.opening}"
+
+
+class Fault:
+    """A fault other than a leak across the piston: what it changes in the machine, at the instruments, or in the duty.
+
+    Its `opening` says when: 0 is a healthy machine, 1 the whole fault; its text is what `parse_fault` reads.
+    """
+
+    #: One word for all faults of a kind, for tables and confusion matrices.
+    kind: ClassVar[str]
+    opening: Opening
+
+    def onset(self) -> float:
+        """Return the first time [s] at which it is there."""
+        return self.opening.onset()
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return what it changes in the machine; InputError where it cannot be on this rig."""
+        return ()
+
+    def adjustments(self) -> tuple[Adjustment, ...]:
+        """Return what it changes at the instruments."""
+        return ()
+
+    def holds(self) -> tuple[Hold, ...]:
+        """Return the readings that it makes repeat themselves."""
+        return ()
+
+    def commanded(self, command: Command) -> Command:
+        """Return the command that the rig gets instead of `command`."""
+        return command
+
+    def _times(self, name: str, factor: float) -> Effect:
+        """A number that is multiplied by `factor` when the fault is whole."""
+        step = SHARE_RESOLUTION * max(abs(factor - 1.0), 1e-3)
+        return Effect(name, lambda t: 1.0 + (factor - 1.0) * self.opening.share(t), step, jumps=bends(self.opening))
+
+    def _plus(self, name: str, size: float) -> Effect:
+        """A number to which `size` is added when the fault is whole."""
+        step = SHARE_RESOLUTION * size or math.inf
+        return Effect(name, lambda t: size * self.opening.share(t), step, added=True, jumps=bends(self.opening))
+
+
+def _check_factor(factor: float, what: str) -> None:
+    if not (math.isfinite(factor) and factor >= 0):
+        raise InputError(f"{what} must change by a factor >= 0, got {factor:g}")
+
+
+def _check_size(size: float, what: str, unit: str) -> None:
+    if not (math.isfinite(size) and size >= 0):
+        raise InputError(f"{what} must be >= 0 {unit} and finite, got {size:g}")
+
+
+@dataclass(frozen=True)
+class PumpLeakage(Fault):
+    """A worn pump: its internal leakage `pump.G_pump` grows `factor` times, or by `added` [m^3/(s Pa)]."""
+
+    factor: float | None = None
+    added: float | None = None
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "pump leakage"
+
+    def __post_init__(self) -> None:
+        if (self.factor is None) == (self.added is None):
+            raise InputError("a pump leak needs either a factor or a conductance, and not both")
+        if self.factor is not None:
+            _check_factor(self.factor, "a pump leak")
+        if self.added is not None:
+            _check_size(self.added, "a pump leak", "m^3/(s Pa)")
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return the change of `G_pump`; a factor needs a pump that leaks."""
+        if self.added is not None:
+            return (self._plus("G_pump", self.added),)
+        if rig.pump.G_pump == 0:
+            raise InputError(f"a pump leak by a factor needs pump.G_pump > 0, got 0 ({self})")
+        return (self._times("G_pump", self.factor or 0.0),)
+
+    def __str__(self) -> str:
+        if self.factor is not None:
+            return f"pump leak x{number_text(self.factor)} {self.opening}"
+        return f"pump leak G = {number_text(self.added or 0.0)} {self.opening}"
+
+
+@dataclass(frozen=True)
+class ExternalLeakage(Fault):
+    """A worn rod seal of side A or B: oil leaves the chamber, Q = G p (laminar).
+
+    Its size is `coefficient` G [m^3/(s Pa)], or `flow` [m^3/s], the flow at the charge pressure. A closed circuit holds
+    8e-13 m^3 of oil for each pascal: give the rig a make-up (`makeup.check_valves = "present"`), or it runs empty.
+    """
+
+    side: Literal["A", "B"]
+    coefficient: float | None = None
+    flow: float | None = None
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "external leakage"
+
+    def __post_init__(self) -> None:
+        if self.side not in ("A", "B"):
+            raise InputError(f"a rod seal must be A or B, got {self.side!r}")
+        if (self.coefficient is None) == (self.flow is None):
+            raise InputError("a rod seal's leak needs either a coefficient or a flow, and not both")
+        _check_size(self.coefficient or self.flow or 0.0, "a rod seal's leak", "m^3/s or m^3/(s Pa)")
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return the change of the side's `G_ext`; a flow needs a charge pressure."""
+        G = self.coefficient
+        if self.flow is not None:
+            if rig.fluid.p_charge == 0:
+                raise InputError(f"a rod seal's flow is that at fluid.p_charge, which must be > 0 Pa, got 0 ({self})")
+            G = self.flow / rig.fluid.p_charge
+        return (self._plus(f"G_ext_{self.side}", G or 0.0),)
+
+    def __str__(self) -> str:
+        if self.flow is not None:
+            return f"rod seal {self.side} {self.flow / LITRE_PER_MINUTE:g} L/min {self.opening}"
+        return f"rod seal {self.side} G = {number_text(self.coefficient or 0.0)} {self.opening}"
+
+
+@dataclass(frozen=True)
+class FrictionChange(Fault):
+    """Friction of piston and rod, as a whole, becomes `factor` times what it was (dry or swollen seals, side load)."""
+
+    factor: float
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "friction"
+
+    def __post_init__(self) -> None:
+        _check_factor(self.factor, "friction")
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return the change of all forces of friction."""
+        return tuple(self._times(name.rpartition(".")[2], self.factor) for name in GROUPS["friction"])
+
+    def __str__(self) -> str:
+        return f"friction x{number_text(self.factor)} {self.opening}"
+
+
+@dataclass(frozen=True)
+class AirInOil(Fault):
+    """Air drawn into the oil: `share` more of free air, by volume of oil at atmospheric pressure (`fluid.air`)."""
+
+    share: float
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "air"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 0.5:
+            raise InputError(f"air in the oil must be 0 % to 50 % of its volume, got {100 * self.share:g} %")
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return the change of `air`."""
+        return (self._plus("air", self.share),)
+
+    def __str__(self) -> str:
+        return f"air {number_text(self.share)} {self.opening}"
+
+
+def _check_sensor(channel: str, value: float, what: str) -> None:
+    if channel not in GAINS:
+        raise InputError(f"a faulty sensor must be one of {', '.join(GAINS)}, got {channel!r}")
+    if not math.isfinite(value):
+        raise InputError(f"{what} of a faulty sensor must be finite, got {value} ({channel})")
+
+
+@dataclass(frozen=True)
+class SensorOffset(Fault):
+    """The sensor of a channel reads `offset` too much, in the channel's SI unit."""
+
+    channel: str
+    offset: float
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "sensor offset"
+
+    def __post_init__(self) -> None:
+        _check_sensor(self.channel, self.offset, "offset")
+
+    def adjustments(self) -> tuple[Adjustment, ...]:
+        """Return the offset over time."""
+        return (
+            Adjustment(f"sensors.{self.channel}.offset", lambda t: self.offset * self.opening.share(t), added=True),
+        )
+
+    def __str__(self) -> str:
+        offset = f"{number_text(self.offset)} {CHANNEL_UNITS[self.channel]}"
+        return f"sensor {self.channel} offset {offset} {self.opening}"
+
+
+@dataclass(frozen=True)
+class SensorGain(Fault):
+    """The sensor of a channel reads `error` too much, relative: 0.01 is one per cent."""
+
+    channel: str
+    error: float
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "sensor gain"
+
+    def __post_init__(self) -> None:
+        _check_sensor(self.channel, self.error, "gain error")
+        if not self.error > -1:
+            raise InputError(f"the gain error of a sensor must be > -100 %, got {100 * self.error:g} %")
+
+    def adjustments(self) -> tuple[Adjustment, ...]:
+        """Return the error of the gain over time."""
+        parameter = f"sensors.{self.channel}.{GAINS[self.channel]}"
+        return (Adjustment(parameter, lambda t: self.error * self.opening.share(t), added=True),)
+
+    def __str__(self) -> str:
+        return f"sensor {self.channel} gain {number_text(self.error)} {self.opening}"
+
+
+@dataclass(frozen=True)
+class SensorStuck(Fault):
+    """The sensor of a channel repeats its reading of `at` until `until` [s]."""
+
+    channel: str
+    at: float = 0.0
+    until: float = math.inf
+    kind: ClassVar[str] = "sensor stuck"
+
+    def __post_init__(self) -> None:
+        _check_sensor(self.channel, self.at, "time")
+        if not self.until > self.at:
+            raise InputError(f"a sensor must be stuck until later than {self.at:g} s, got {self.until:g} s")
+
+    @property
+    def opening(self) -> Opening:  # type: ignore[override]
+        """From when on the reading repeats itself."""
+        return From(self.at)
+
+    def holds(self) -> tuple[Hold, ...]:
+        """Return the one reading that repeats itself."""
+        return (Hold(self.channel, self.at, self.until),)
+
+    def __str__(self) -> str:
+        until = f" to {number_text(self.until)} s" if math.isfinite(self.until) else ""
+        return f"sensor {self.channel} stuck from {number_text(self.at)} s{until}"
+
+
+@dataclass(frozen=True)
+class DutyChange(Fault):
+    """The command becomes `amplitude` times as large and runs `speed` times as fast, without a jump in its phase.
+
+    It is no fault of the machine, but looks like one.
+    """
+
+    amplitude: float = 1.0
+    speed: float = 1.0
+    opening: From | Growing = field(default_factory=From)
+    kind: ClassVar[str] = "duty"
+
+    def __post_init__(self) -> None:
+        _check_factor(self.amplitude, "a duty's amplitude")
+        _check_factor(self.speed, "a duty's frequency")
+        if not isinstance(self.opening, From | Growing):
+            raise InputError("a duty must change at one time or grow from one to another, got a table")
+
+    def clock(self, t: Array) -> Array:
+        """Return the time on the command's own clock: t + (speed - 1) x integral of the opening."""
+        growing = isinstance(self.opening, Growing)
+        start, stop = (self.opening.start, self.opening.stop) if growing else (self.opening.at, self.opening.at)  # type: ignore[union-attr]
+        since = np.maximum(t - start, 0.0)
+        if stop > start:
+            grown = np.minimum(since, stop - start)
+            since = grown**2 / (2.0 * (stop - start)) + np.maximum(t - stop, 0.0)
+        return np.asarray(t + (self.speed - 1.0) * since)
+
+    def commanded(self, command: Command) -> Command:
+        """Return the changed command."""
+        return ChangedDuty(command, self)
+
+    def __str__(self) -> str:
+        parts = []
+        if self.amplitude != 1.0 or self.speed == 1.0:
+            parts.append(f"amplitude x{number_text(self.amplitude)}")
+        if self.speed != 1.0:
+            parts.append(f"frequency x{number_text(self.speed)}")
+        return f"duty {' '.join(parts)} {self.opening}"
+
+
+@dataclass(frozen=True)
+class ChangedDuty:
+    """The command `before`, changed as `change` says."""
+
+    before: Command
+    change: DutyChange
+
+    def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
+        size = 1.0 + (self.change.amplitude - 1.0) * self.change.opening.share(t)
+        return np.asarray(size * self.before.volts(self.change.clock(t)))
+
+    def __str__(self) -> str:
+        return f"{self.before}, {self.change}"
+
+
+#: When, in texts of leaks and faults: `from 90 s`, `growing from 1 min to 120 s`.
+_WHEN = rf"(?:\s+(?:from\s+(?P<at>{TIME})|growing\s+from\s+(?P<start>{TIME})\s+to\s+(?P<stop>{TIME})))?"
+_MEAN = rf"(?P<mean>{UNSIGNED}\s*(?:\[[^\]]+\]|[a-zA-Z^0-9]+/[a-zA-Z]+))"
+_LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(?P<law>laminar|orifice))?{_WHEN}"
+_FACTOR = rf"(?:x\s*(?P<times>{NUMBER})|(?P<percent>[-+]\s*{UNSIGNED})\s*%)"
+_SHARE = rf"(?P<share>{NUMBER})\s*(?P<sign>%?)"
+_SIZE = rf"(?P<size>{NUMBER}\s*(?:\[[^\]]+\]|[a-zA-Z0-9^/_]+))"
+_SENSOR = r"sensor\s+(?P<channel>\w+)"
+_Part = dict[str, str | None]
+
+
+def _opening(part: _Part) -> From | Growing:
+    """The opening that the groups of `_WHEN` say; open from the start where they say nothing."""
+    if part["start"] is not None and part["stop"] is not None:
+        return Growing(seconds(part["start"]), seconds(part["stop"]))
+    return From(seconds(part["at"]))
+
+
+def parse_leak(text: str) -> Leak | None:
+    """Read a leak from text; None for ``none``.
+
+    The forms are ``0.0042 L/min from 90 s``, ``0.01[L/min] orifice growing from 1 min to 2 min``, ``G = 6.1e-13 from 90
+    s``, ``C = 2e-10``, and ``table LEAK.csv`` (columns `t [s]` and `q_leak [L/min]`: the mean flow asked for at each
+    time). Raises InputError that shows the forms when the text is none of them.
+    """
+    stripped = text.strip()
+    if stripped.lower() in ("none", "0", "no leak"):
+        return None
+    if stripped.lower().startswith("table "):
+        from sealscope.recordings import read
+
+        table = read(stripped[6:].strip())
+        flow = table["q_leak"]
+        peak = float(np.max(flow, initial=0.0))
+        if not (np.all(np.isfinite(flow)) and peak > 0 and flow.min() >= 0):
+            raise InputError(f"q_leak of a leak table must be finite, >= 0 and somewhere > 0 ({stripped[6:].strip()})")
+        return Leak("laminar", mean=peak, opening=Tabulated(table.t, flow / peak))
+    match = re.fullmatch(_LEAK, stripped)
+    if not match:
+        raise InputError(
+            "leak must be like '0.0042 L/min from 90 s', '0.01 L/min orifice growing from 60 s to 120 s', "
+            f"'G = 6.1e-13 from 90 s', 'C = 2e-10', 'table LEAK.csv' or 'none', got {text!r}"
+        )
+    part = match.groupdict()
+    if part["letter"]:
+        law: Literal["laminar", "orifice"] = "laminar" if part["letter"] == "G" else "orifice"
+        if part["law"] not in (None, law):
+            raise InputError(f"{part['letter']} is the coefficient of the {law} law, got law {part['law']} ({text!r})")
+        return Leak(law, coefficient=float(part["coefficient"]), opening=_opening(part))
+    mean = parse_quantity(part["mean"], "m^3/s", name="a leak")
+    return Leak(part["law"] or "laminar", mean=mean, opening=_opening(part))  # type: ignore[arg-type]
+
+
+def _number(text: str | None) -> float:
+    return float((text or "0").replace(" ", ""))
+
+
+def _factor(part: _Part) -> float:
+    return _number(part["times"]) if part["times"] is not None else 1.0 + _number(part["percent"]) / 100.0
+
+
+def _share(part: _Part) -> float:
+    return _number(part["share"]) / (100.0 if part["sign"] else 1.0)
+
+
+def _rod_seal(part: _Part) -> Fault:
+    side: Literal["A", "B"] = "A" if (part["side"] or "").upper() == "A" else "B"
+    if part["G"] is not None:
+        return ExternalLeakage(side, coefficient=_number(part["G"]), opening=_opening(part))
+    flow = parse_quantity(part["size"] or "", "m^3/s", name="a rod seal's leak")
+    return ExternalLeakage(side, flow=flow, opening=_opening(part))
+
+
+def _offset(part: _Part) -> Fault:
+    channel = part["channel"] or ""
+    offset = parse_quantity(part["size"] or "", CHANNEL_UNITS.get(channel, "Pa"), name="a sensor's offset")
+    return SensorOffset(channel, offset, _opening(part))
+
+
+def _stuck(part: _Part) -> Fault:
+    until = math.inf if part["until"] is None else seconds(part["until"])
+    return SensorStuck(part["channel"] or "", seconds(part["since"]), until)
+
+
+_FORMS: tuple[tuple[str, Callable[[_Part], Fault]], ...] = (
+    (rf"pump\s+leak(?:age)?\s+{_FACTOR}{_WHEN}", lambda p: PumpLeakage(_factor(p), None, _opening(p))),
+    (
+        rf"pump\s+leak(?:age)?\s+G\s*=\s*(?P<G>{NUMBER}){_WHEN}",
+        lambda p: PumpLeakage(None, _number(p["G"]), _opening(p)),
+    ),
+    (
+        rf"(?:rod\s+seal|external\s+leak(?:age)?)\s+(?P<side>[ABab])\s+(?:G\s*=\s*(?P<G>{NUMBER})|{_SIZE}){_WHEN}",
+        _rod_seal,
+    ),
+    (rf"friction\s+{_FACTOR}{_WHEN}", lambda p: FrictionChange(_factor(p), _opening(p))),
+    (rf"air\s+{_SHARE}{_WHEN}", lambda p: AirInOil(_share(p), _opening(p))),
+    (rf"{_SENSOR}\s+offset\s+{_SIZE}{_WHEN}", _offset),
+    (rf"{_SENSOR}\s+gain\s+{_SHARE}{_WHEN}", lambda p: SensorGain(p["channel"] or "", _share(p), _opening(p))),
+    (rf"{_SENSOR}\s+stuck(?:\s+from\s+(?P<since>{TIME})(?:\s+to\s+(?P<until>{TIME}))?)?", _stuck),
+    (
+        rf"duty(?=\s+[af])(?:\s+amplitude\s+x\s*(?P<amplitude>{NUMBER}))?"
+        rf"(?:\s+frequency\s+x\s*(?P<speed>{NUMBER}))?{_WHEN}",
+        lambda p: DutyChange(_number(p["amplitude"] or "1"), _number(p["speed"] or "1"), _opening(p)),
+    ),
+)
+
+
+def parse_fault(text: str) -> Fault | None:
+    """Read a fault from text; None for ``none``.
+
+    The forms are ``pump leak x3 from 90 s``, ``pump leak G = 5e-13``, ``rod seal A 0.01 L/min from 90 s`` (flow at the
+    charge pressure), ``friction +20 % growing from 60 s to 120 s``, ``air 1 % from 90 s``, ``sensor p_A offset 2 psi
+    from 90 s``, ``sensor p_A gain -1 %``, ``sensor p_A stuck from 90 s to 100 s``, and ``duty amplitude x1.5 frequency
+    x0.8 from 90 s``. Raises InputError that shows the forms when the text is none of them.
+    """
+    stripped = text.strip()
+    if stripped.lower() in ("none", "no fault"):
+        return None
+    for pattern, make in _FORMS:
+        if match := re.fullmatch(pattern, stripped):
+            return make(match.groupdict())
+    raise InputError(
+        "fault must be like 'pump leak x3 from 90 s', 'rod seal A 0.01 L/min from 90 s', 'friction +20 % growing from "
+        "60 s to 120 s', 'air 1 % from 90 s', 'sensor p_A offset 2 psi from 90 s', 'sensor p_A gain 1 %', 'sensor p_A "
+        f"stuck from 90 s', 'duty amplitude x1.5 from 90 s' or 'none', got {text!r}"
+    )

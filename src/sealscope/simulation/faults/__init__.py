@@ -1,1 +1,0 @@
-"""Faults over time, as data and in words."""

@@ -1,0 +1,46 @@
+"""`--help` of every command says what the sources say: units in brackets are text, not markup."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import typer
+
+from sealscope.cli.app import app
+
+
+def commands(command: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    command = typer.main.get_command(app) if command is None else command
+    if hasattr(command, "commands"):
+        for name, inner in command.commands.items():
+            yield from commands(inner, (*path, name))
+    else:
+        yield path, command
+
+
+COMMANDS = list(commands())
+
+
+def plain(text: str) -> str:
+    """A text without what a table draws around it, or how it breaks lines."""
+    return re.sub(r"[\s`│╭╮╰╯─]+", "", text)
+
+
+@pytest.mark.parametrize(("path", "command"), COMMANDS, ids=[" ".join(path) for path, _ in COMMANDS])
+def test_every_option_s_text_is_shown_whole(path, command, call, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("TERMINAL_WIDTH", "200")
+    done = call(*path, "--help")
+    assert done.status == 0
+    shown = plain(done.out)
+    for parameter in command.params:
+        if text := getattr(parameter, "help", None):
+            assert plain(text) in shown, (parameter.name, text)
+
+
+def test_units_are_among_what_is_shown(call):
+    out = call("simulate", "--help").out
+    assert all(unit in out for unit in ("[s]", "[Hz]", "[m]", "'20[Pa]'"))
