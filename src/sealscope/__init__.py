@@ -36,7 +36,7 @@ _HOMES = {
     "diagnose": "diagnosis.diagnose",
     "inspect": "recordings",
     "load_rig": "parameters",
-    "prove": "simulation.proof",
+    "prove": "simulation.simulate",
     "read": "recordings",
     "simulate": "simulation.simulate",
     "simulate_batch": "simulation.batch.batch",

@@ -61,9 +61,8 @@ def mean_squares(
     from sealscope.signals.details import details
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.instruments import decimate
+    from sealscope.simulation.integrate import oversampling, trajectory
     from sealscope.simulation.sizing import sized_leaks
-    from sealscope.simulation.integrate import oversampling
-    from sealscope.simulation.integrate import trajectory
 
     padded = USED + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
     experiment = Experiment.of(

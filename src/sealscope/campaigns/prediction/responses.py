@@ -39,11 +39,9 @@ from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import From, Leak
 from sealscope.simulation.instruments import decimate, record
-from sealscope.simulation.integrate import Trajectory
+from sealscope.simulation.integrate import Trajectory, oversampling, trajectory
 from sealscope.simulation.sensitivity import clean_channels
 from sealscope.simulation.simulate import simulate_with_truth
-from sealscope.simulation.integrate import oversampling
-from sealscope.simulation.integrate import trajectory
 from sealscope.units import LITRE_PER_MINUTE
 
 ProgressCallback = Callable[[str, float], None]
