@@ -23,7 +23,7 @@ from sealscope.reporting.thesis.plot_style import STYLES, caption, typeset
 from sealscope.reporting.thesis.plots import MOST_SVG_BYTES, UNRESOLVED, draw, grid_of, visible
 from sealscope.thesis.engine.build import ItemStatus
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Claim, Figure, Image, Number, Panel, PlotCurve, ResultTable, Role
+from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, Role, ThesisTable
 
 pytest.importorskip("matplotlib", reason="figures need the extra 'report'")
 
@@ -36,7 +36,7 @@ def make(context: object, item: Item) -> tuple[()]:
 
 def figure(name: str = "fig-4.22", resolved: bool | None = True, curves: int = 2) -> Figure:
     roles: tuple[Role, ...] = ("A", "B", "no leak", "leak")
-    made = tuple(PlotCurve(T, np.sin(T + k), f"curve {k}", roles[k % 4]) for k in range(curves))
+    made = tuple(FigureCurve(T, np.sin(T + k), f"curve {k}", roles[k % 4]) for k in range(curves))
     panel = Panel("t [s]", "p_A [MPa]", made, marks=((5.0, "leak opens"),))
     numbers = (Number("range of p_A", 0.125, "MPa"),)
     title = "Pressures in the chambers, p_A and p_B"
@@ -96,7 +96,11 @@ def test_long_records_stay_small_and_keep_their_peaks() -> None:
         y = rng.standard_normal(t.size)
         y[40_000 + k] = 60.0
         panels.append(
-            Panel("t [s]", f"d{k + 1} [psi]", (PlotCurve(t, y, "no leak", "no leak"), PlotCurve(t, -y, "leak", "leak")))
+            Panel(
+                "t [s]",
+                f"d{k + 1} [psi]",
+                (FigureCurve(t, y, "no leak", "no leak"), FigureCurve(t, -y, "leak", "leak")),
+            )
         )
     svg, png = draw(Figure("fig-5.5", "Details", tuple(panels)))
     assert len(svg) <= MOST_SVG_BYTES
@@ -108,7 +112,7 @@ def test_long_records_stay_small_and_keep_their_peaks() -> None:
 
 def test_a_zoomed_panel_keeps_every_sample_in_its_range() -> None:
     t = np.arange(90_000) / 500
-    x, _ = visible(PlotCurve(t, np.sin(t), "x"), (80.0, 82.0))
+    x, _ = visible(FigureCurve(t, np.sin(t), "x"), (80.0, 82.0))
     assert x.size == pytest.approx(1001, abs=3)
     assert x[0] <= 80.0
     assert x[-1] >= 82.0
@@ -118,8 +122,8 @@ def test_images_log_axes_points_and_stems_are_drawn() -> None:
     values = np.outer(np.arange(5), np.arange(6)).astype(float)
     panels = (
         Panel("t [s]", "f [Hz]", image=Image(np.arange(6.0), 1 + np.arange(5.0), values, "amplitude [1]"), log_y=True),
-        Panel("n", "a", (PlotCurve(np.arange(5.0), np.ones(5), "stems", kind="stems"),)),
-        Panel("n", "a", (PlotCurve(np.arange(5.0), np.arange(5.0), "points", "measured", "points"),), title="(d)"),
+        Panel("n", "a", (FigureCurve(np.arange(5.0), np.ones(5), "stems", kind="stems"),)),
+        Panel("n", "a", (FigureCurve(np.arange(5.0), np.arange(5.0), "points", "measured", "points"),), title="(d)"),
     )
     svg, _ = draw(Figure("fig-3.4", "Three", panels))
     assert "amplitude [1]" in texts(svg)
@@ -172,7 +176,7 @@ def test_symbols_are_set_as_symbols() -> None:
 @pytest.mark.parametrize(("panels", "grid"), [(1, (1, 1)), (5, (5, 1)), (6, (3, 2)), (8, (4, 2)), (13, (5, 3))])
 def test_panels_are_laid_out(panels: int, grid: tuple[int, int]) -> None:
     assert grid_of(panels) == grid
-    curves = (PlotCurve(T, T, "x"),)
+    curves = (FigureCurve(T, T, "x"),)
     draw(Figure("fig-1.1", "Many", tuple(Panel("t [s]", f"y_{k}", curves) for k in range(panels))))
 
 
@@ -181,7 +185,7 @@ def test_panels_are_laid_out(panels: int, grid: tuple[int, int]) -> None:
 
 def test_publish_writes_figures_tables_and_claims(tmp_path: Path) -> None:
     claims = [Claim(f"claim-{k}", "section 1", "It is.", "so", "so", "holds", "why") for k in range(2)]
-    table = ResultTable("table-4.2-a", "T", ("quantity", "p_A [MPa]"), (("range", 0.125), ("none", None)))
+    table = ThesisTable("table-4.2-a", "T", ("quantity", "p_A [MPa]"), (("range", 0.125), ("none", None)))
     item = Item("table-4.2-a", 4, "case", "T", make)
     files = publish(item, (figure(), table, *claims), tmp_path)
     assert files == (
@@ -240,8 +244,8 @@ def page(tmp_path: Path) -> str:
         Claim(f"claim-4.{k}", "section 4", f"Claim <{k}> of p_A", "sheet", "simulation", verdict, "why")
         for k, verdict in enumerate(VERDICTS)
     )
-    long = ResultTable("table-4.2-a", "Cases", ("name", "p_A [MPa]"), tuple((f"row {k}", k * 1e-7) for k in range(60)))
-    made: list[tuple[ItemStatus, tuple[Figure | ResultTable | Claim, ...]]] = []
+    long = ThesisTable("table-4.2-a", "Cases", ("name", "p_A [MPa]"), tuple((f"row {k}", k * 1e-7) for k in range(60)))
+    made: list[tuple[ItemStatus, tuple[Figure | ThesisTable | Claim, ...]]] = []
     for item, products in (
         (Item("fig-4.22", 4, "figure", "F", make), (figure(resolved=False),)),
         (Item("table-4.2-a", 4, "case", "T", make), (long,)),

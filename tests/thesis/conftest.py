@@ -17,7 +17,7 @@ CHAPTER = """
 import os, time
 from pathlib import Path
 from sealscope.thesis.engine.context import RunSpec
-from sealscope.thesis.engine.products import Claim, PlotCurve, Figure, Panel, ResultTable
+from sealscope.thesis.engine.products import Claim, FigureCurve, Figure, Panel, ThesisTable
 
 FACTOR = 1
 
@@ -29,19 +29,19 @@ def _note(item):
 
 def table(context, item):
     _note(item)
-    return (ResultTable(item.id, item.title, ("a", "b [Pa]"), ((1 * FACTOR, 2.5), ("x", None))),)
+    return (ThesisTable(item.id, item.title, ("a", "b [Pa]"), ((1 * FACTOR, 2.5), ("x", None))),)
 
 
 def doubled(context, item):
     _note(item)
     found = context.product("t-1")
-    return (ResultTable(item.id, item.title, ("a",), ((2 * found[0].rows[0][0],),)),)
+    return (ThesisTable(item.id, item.title, ("a",), ((2 * found[0].rows[0][0],),)),)
 
 
 def slow(context, item):
     time.sleep(0.4)
     _note(item)
-    return (ResultTable(item.id, item.title, ("a",), ((1,),)),)
+    return (ThesisTable(item.id, item.title, ("a",), ((1,),)),)
 
 
 def broken(context, item):
@@ -53,7 +53,7 @@ def interrupted(context, item):
     if not Path(os.environ["FAKE_LOG"] + ".go").exists():
         raise KeyboardInterrupt
     _note(item)
-    return (ResultTable(item.id, item.title, ("a",), ((1,),)),)
+    return (ThesisTable(item.id, item.title, ("a",), ((1,),)),)
 
 
 def dies(context, item):
@@ -66,18 +66,18 @@ def unknown_need(context, item):
 
 def measured(context, item):
     _note(item)
-    return (ResultTable(item.id, item.title, ("d3",), ((float(context.sheet.rms["p_A"]["d3"][0, 0]),),)),)
+    return (ThesisTable(item.id, item.title, ("d3",), ((float(context.sheet.rms["p_A"]["d3"][0, 0]),),)),)
 
 
 def perhaps_measured(context, item):
     _note(item)
-    return (ResultTable(item.id, item.title, ("there",), ((context.sheet is not None,),)),)
+    return (ThesisTable(item.id, item.title, ("there",), ((context.sheet is not None,),)),)
 
 
 def simulated(context, item):
     _note(item)
     run = context.run(RunSpec("3 sin(4t)", 2.0, prove=True))
-    curve = PlotCurve(run.t, run.outputs["p_A"] / 1e6, "p_A", "A")
+    curve = FigureCurve(run.t, run.outputs["p_A"] / 1e6, "p_A", "A")
     return (Figure(item.id, item.title, (Panel("t [s]", "p_A [MPa]", (curve,)),), resolved=run.resolved),)
 """
 

@@ -9,8 +9,8 @@ from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.appendix_c import simulation
 from sealscope.thesis.chapters.appendix_c import tables as appendix_c
-from sealscope.thesis.chapters.appendix_c.simulation import RigDrift, drift_of, sheet_of
-from sealscope.thesis.engine.products import Product, ResultTable
+from sealscope.thesis.chapters.appendix_c.simulation import RigDrift, draw_rig_drift, sheet_of
+from sealscope.thesis.engine.products import Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
 
 TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
@@ -32,7 +32,7 @@ class Made:
 
 
 @pytest.fixture(scope="module")
-def tables() -> dict[str, tuple[ResultTable, ...]]:
+def tables() -> dict[str, tuple[ThesisTable, ...]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, "APPENDIX_C", TWO)
         patch.setattr(simulation, "QUICK_HALF", 20.0)
@@ -46,7 +46,7 @@ def tables() -> dict[str, tuple[ResultTable, ...]]:
         return {name: make(context, items[name]) for name, make in makers.items()}  # type: ignore[arg-type]
 
 
-def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[ResultTable, ...]]) -> None:
+def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
     (table,) = tables["appendix-c-leak"]
     sheet = sheet_of(table)
     row = dict(zip(table.columns, table.rows[2], strict=True))
@@ -56,7 +56,7 @@ def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[Result
     assert sheet.rms["p_A"]["d3d4"][2, 1] == row["p_A d3d4 leak [psi^2]"]
 
 
-def test_the_same_condition_gives_the_same_truth_and_other_noise(tables: dict[str, tuple[ResultTable, ...]]) -> None:
+def test_the_same_condition_gives_the_same_truth_and_other_noise(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
     sheet = sheet_of(tables["appendix-c-no-leak"][0])
     first, second = (sheet.rms["p_A"]["d1"][k] for k in (0, 1))
     assert np.all(first != second)
@@ -66,7 +66,7 @@ def test_the_same_condition_gives_the_same_truth_and_other_noise(tables: dict[st
 
 
 def test_nothing_moves_without_a_leak_beyond_the_noise_of_the_estimate(
-    tables: dict[str, tuple[ResultTable, ...]],
+    tables: dict[str, tuple[ThesisTable, ...]],
 ) -> None:
     sheet = sheet_of(tables["appendix-c-no-leak"][0])
     for chamber in CHAMBERS:
@@ -74,22 +74,22 @@ def test_nothing_moves_without_a_leak_beyond_the_noise_of_the_estimate(
         assert np.abs(sheet.log_change(chamber, "d3")).max() < 0.25
 
 
-def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[ResultTable, ...]]) -> None:
+def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
     sheet = sheet_of(tables["appendix-c-drift"][0])
-    drawn = [np.log(drift_of(condition.number).noise) for condition in TWO]
+    drawn = [np.log(draw_rig_drift(condition.number).noise) for condition in TWO]
     moved = np.mean([sheet.log_change(chamber, "d1") for chamber in CHAMBERS], axis=0)
     np.testing.assert_allclose(moved, drawn, atol=0.03)  # deviation under 1 % where both chambers are averaged
     assert all("friction x" in str(row[3]) for row in tables["appendix-c-drift"][0].rows)
 
 
 def test_drifts_keep_within_their_bounds_and_go_both_ways() -> None:
-    drifts = [drift_of(number, draw) for number in range(1, 42) for draw in range(3)]
+    drifts = [draw_rig_drift(number, draw) for number in range(1, 42) for draw in range(3)]
     friction = np.array([drift.friction for drift in drifts]) - 1.0
     assert np.all((np.abs(friction) >= 0.04) & (np.abs(friction) <= 0.08))
     assert np.allclose(np.abs(np.array([drift.bulk for drift in drifts]) - 1.0), 0.03)
     assert np.allclose(np.abs(np.array([drift.noise for drift in drifts]) - 1.0), 0.04)
     assert 0.35 < np.mean(friction > 0) < 0.65
-    assert drift_of(7, 1) == drift_of(7, 1) != drift_of(7, 2)
+    assert draw_rig_drift(7, 1) == draw_rig_drift(7, 1) != draw_rig_drift(7, 2)
 
 
 def test_a_drifted_rig_differs_in_friction_bulk_modulus_and_noise_alone() -> None:
@@ -119,7 +119,7 @@ def made_sheet(seed: int, shift: float) -> DataSheet:
     return DataSheet(rms)
 
 
-def full_table(sheet: DataSheet, item: str) -> ResultTable:
+def full_table(sheet: DataSheet, item: str) -> ThesisTable:
     rows = [
         simulation.SimulatedTest(
             condition,

@@ -24,9 +24,9 @@ from sealscope.thesis.chapters.chapter4.cases import (
     numbers_of,
     piston_drift,
     run_pair,
-    settled,
     span,
     spec,
+    steady_output,
     visible_pressure,
 )
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold
@@ -34,7 +34,7 @@ from sealscope.thesis.claims import chapter4 as chapter4_claims
 from sealscope.thesis.claims.chapter4 import ringing, sine_fit
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item, check
-from sealscope.thesis.engine.products import Claim, Figure, ResultTable
+from sealscope.thesis.engine.products import Claim, Figure, ThesisTable
 from sealscope.thesis.engine.runs import experiment_of, simulated_run
 
 
@@ -52,7 +52,7 @@ class Kept:
             self.runs[spec] = simulated_run(spec, experiment_of(spec))
         return self.runs[spec]
 
-    def product(self, item: str) -> tuple[Figure | ResultTable | Claim, ...]:
+    def product(self, item: str) -> tuple[Figure | ThesisTable | Claim, ...]:
         raise AssertionError(f"no item of chapter 4 needs another, asked for {item}")
 
 
@@ -64,7 +64,7 @@ def kept() -> Kept:
 ALL = {item.id: item for item in (*chapter4.ITEMS, *chapter4_claims.ITEMS)}
 
 
-def make(context: Kept, item: Item) -> tuple[Figure | ResultTable | Claim, ...]:
+def make(context: Kept, item: Item) -> tuple[Figure | ThesisTable | Claim, ...]:
     return item.make(context, item)
 
 
@@ -103,7 +103,7 @@ def test_every_simulated_figure_and_case_has_an_item() -> None:
 
 def test_measured_only_figures_are_listed(kept: Kept) -> None:
     (table,) = make(kept, ALL["chapter-4-measured"])
-    assert isinstance(table, ResultTable)
+    assert isinstance(table, ThesisTable)
     assert [row[0] for row in table.rows] == [f"Fig. 4.{n}" for n in (15, 16, 37, 38, 39, 40)]
     assert {str(row[2]) for row in table.rows} <= ALL.keys()
 
@@ -137,7 +137,7 @@ def test_the_literal_run_has_the_thesis_s_own_method_and_step(kept: Kept, name: 
 def test_without_orifices_the_step_is_fine(kept: Kept) -> None:
     both = of_case(kept, "4.2-c")
     assert both.resolved
-    gap = settled(both.literal, "p_A") - settled(both.converged, "p_A")
+    gap = steady_output(both.literal, "p_A") - steady_output(both.converged, "p_A")
     assert np.sqrt(np.mean(gap**2)) < 10.0
     (figure,) = make(kept, ALL["fig-4.9"])
     assert figure.resolved is True
@@ -157,7 +157,7 @@ def test_with_orifices_it_is_not_and_the_figure_says_so(kept: Kept) -> None:
 def test_the_converged_drop_is_the_orifice_s(kept: Kept) -> None:
     run = of_case(kept, "4.3-i").converged
     c = throttle_coefficients(experiment_of(spec("7 sin(4t)", 75.0)).rig)
-    drop, flow = settled(run, "p_1") - settled(run, "p_A"), settled(run, "Q_A")
+    drop, flow = steady_output(run, "p_1") - steady_output(run, "p_A"), steady_output(run, "Q_A")
     assert drop.min() == pytest.approx(-((flow.min() / c[1]) ** 2), rel=1e-3)
     assert drop.max() == pytest.approx((flow.max() / c[0]) ** 2, rel=1e-3)
 
@@ -204,9 +204,9 @@ def test_case_table_holds_both_runs(kept: Kept) -> None:
     assert list(rows) == [
         "omega [rad/s]", "x [mm]", "p_1 [MPa]", "p_2 [MPa]", "p_A [MPa]", "p_B [MPa]", "Q_A [L/min]", "Q_B [L/min]",
     ]  # fmt: skip
-    assert rows["p_1 [MPa]"][1] == pytest.approx(settled(both.literal, "p_1").min() * 1e-6)
-    assert rows["x [mm]"][5] == pytest.approx(settled(both.converged, "x").max() * 1e3)
-    assert rows["Q_B [L/min]"][6] == pytest.approx(settled(both.converged, "Q_B").std() * 6e4)
+    assert rows["p_1 [MPa]"][1] == pytest.approx(steady_output(both.literal, "p_1").min() * 1e-6)
+    assert rows["x [mm]"][5] == pytest.approx(steady_output(both.converged, "x").max() * 1e3)
+    assert rows["Q_B [L/min]"][6] == pytest.approx(steady_output(both.converged, "Q_B").std() * 6e4)
 
 
 def test_a_figure_follows_the_reading_of_its_item(kept: Kept) -> None:
@@ -282,7 +282,7 @@ def test_every_claim_is_there_once_and_says_something(kept: Kept, claims: dict[s
     assert named <= claims.keys()
 
 
-def make_quietly(kept: Kept, item: Item) -> tuple[Figure | ResultTable, ...]:
+def make_quietly(kept: Kept, item: Item) -> tuple[Figure | ThesisTable, ...]:
     """What an item of few runs gives; the rest is left to the reproduction itself."""
     few = ("fig-4.2", "fig-4.3", "fig-4.4", "fig-4.5", "fig-4.10", "fig-4.11", "fig-4.12", "fig-4.13", "fig-4.33")
     return make(kept, item) if item.id in few else ()  # type: ignore[return-value]
@@ -303,7 +303,7 @@ def test_verdicts_on_the_thesis_s_rig(claims: dict[str, Claim]) -> None:
 
 
 def test_the_table_of_readings_marks_what_the_step_made(kept: Kept) -> None:
-    table = next(one for one in make(kept, ALL["chapter-4-claims"]) if isinstance(one, ResultTable))
+    table = next(one for one in make(kept, ALL["chapter-4-claims"]) if isinstance(one, ThesisTable))
     tested = {(row[2], row[-1]) for row in table.rows}
     assert tested == {("converged", "passed"), ("RK4 1e-4 s", "not passed")}
     assert len(table.rows) == 2 * 2 * 4

@@ -23,8 +23,8 @@ from sealscope.thesis.engine import serialization, sources
 from sealscope.thesis.engine.build import Reproduction, reproduce
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.folder import ResultsFolder
-from sealscope.thesis.engine.items import MODULES, Item, check, collect, select, with_needed
-from sealscope.thesis.engine.products import Claim, Figure, Image, Number, Panel, PlotCurve, ResultTable
+from sealscope.thesis.engine.items import MODULES, Item, check, collect, select_items, with_needed
+from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 from sealscope.thesis.sheet import MISSING
 
 
@@ -62,7 +62,7 @@ def states(outcome: Reproduction) -> dict[str, str]:
 def test_select_by_id_chapter_wildcard_and_all() -> None:
     items = (bare("t-1"), bare("fig-5.1"), bare("fig-5.2", chapter=5), bare("chapter-5-claims"))
     patterns = ("all", "chapter-5", "chapter-5-*", "fig-5.*", "t-1")
-    assert {pattern: [one.id for one in select(items, [pattern])] for pattern in patterns} == {
+    assert {pattern: [one.id for one in select_items(items, [pattern])] for pattern in patterns} == {
         "all": ["t-1", "fig-5.1", "fig-5.2", "chapter-5-claims"],
         "chapter-5": ["fig-5.2"],
         "chapter-5-*": ["chapter-5-claims"],
@@ -73,7 +73,7 @@ def test_select_by_id_chapter_wildcard_and_all() -> None:
 
 def test_an_unknown_id_names_the_closest() -> None:
     with pytest.raises(InputError, match=r"got 'fig-5\.9'; closest: fig-5\.1"):
-        select((bare("fig-5.1"), bare("t-1")), ["fig-5.9"])
+        select_items((bare("fig-5.1"), bare("t-1")), ["fig-5.9"])
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_second_call_makes_nothing(fakes: Path, tmp_path: Path) -> None:
     assert states(second) == {"t-1": "kept", "t-2": "kept"}
     assert worked(tmp_path) == ["t-1", "t-2"]
     (table,) = second.products(second.statuses[1])
-    assert isinstance(table, ResultTable)
+    assert isinstance(table, ThesisTable)
     assert table.rows == ((2,),)
 
 
@@ -135,7 +135,7 @@ def test_an_edited_source_makes_its_items_and_those_that_need_them_anew(
     again = reproduce(["all"], "out", items=items(), jobs=1)
     assert states(again) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
     (table,) = again.products(again.statuses[1])
-    assert isinstance(table, ResultTable)
+    assert isinstance(table, ThesisTable)
     assert table.rows == ((20,),)
 
 
@@ -178,12 +178,12 @@ def test_a_folder_in_use_is_refused(fakes: Path, tmp_path: Path) -> None:
 
 def test_products_and_runs_survive_the_file(tmp_path: Path) -> None:
     t = np.linspace(0.0, 1.0, 5)
-    curve, image = PlotCurve(t, t**2, "x", "A"), Image(t, t, np.eye(5), "z")
+    curve, image = FigureCurve(t, t**2, "x", "A"), Image(t, t, np.eye(5), "z")
     panel = Panel("t [s]", "x", (curve,), "a", ((0.5, "here"),), image, (0.0, 1.0), log_y=True)
     numbers = (Number("n", float("nan"), "Pa"), Number("m", "text"))
     figure = Figure("fig-1", "One", (panel,), numbers, ("claim-1",), False, "note")
     claim = Claim("claim-1", "section 1", "It is.", "so", "so", "holds", "why")
-    table = ResultTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.5), True)))
+    table = ThesisTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.5), True)))
     serialization.save(tmp_path / "one.npz", (figure, claim, table))
     again = serialization.load(tmp_path / "one.npz")
     assert again is not None
@@ -226,7 +226,7 @@ def test_without_the_sheet_items_that_need_it_are_left_out(
     changed = reproduce(["all"], "out", items=items, jobs=1, sheet=sheet)
     assert states(changed) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
     (table,) = changed.products(changed.statuses[0])
-    assert isinstance(table, ResultTable)
+    assert isinstance(table, ThesisTable)
     assert table.rows == ((2.0,),)
 
 

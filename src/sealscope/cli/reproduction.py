@@ -87,11 +87,11 @@ def _summarise(made: Reproduction, page: Path) -> None:
 
 
 def _list(patterns: Sequence[str], sheet: Path | None) -> None:
-    from sealscope.thesis.engine.items import collect, select
+    from sealscope.thesis.engine.items import collect, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet
 
     given = find_sheet(sheet) is not None
-    items = select(collect(), patterns)
+    items = select_items(collect(), patterns)
     width = max(len(item.id) for item in items)
     for item in items:
         note = f"  ({MISSING})" if item.needs_sheet and not given else ""

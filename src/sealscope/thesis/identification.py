@@ -19,7 +19,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Cell, ResultTable
+from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
@@ -45,7 +45,7 @@ def _identified_rig() -> Rig:
     return load_rig(BENCH_RIG)
 
 
-def mean_squares(
+def noise_free_squares(
     rig: Rig,
     condition: Condition,
     *,
@@ -86,7 +86,7 @@ def mean_squares(
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Return log RMS of d1..d4 and d3d4 with white noise of deviation `sigma` [psi], (..., 5), from `mean_squares`."""
+    """Return log RMS of d1..d4, d3d4 with white noise of deviation `sigma` [psi], (..., 5), from noise-free squares."""
     s = np.square(sigma)
     product = squares[..., 4] + s * squares[..., 2] + s * squares[..., 3] + s * s
     return np.asarray(0.5 * np.log(np.concatenate([squares[..., :4] + s, product[..., None]], axis=-1)))
@@ -101,7 +101,7 @@ def noise_of(rig: Rig, chamber: str) -> float:
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
     """Return log(simulated/measured) of the leak-free RMS of every test, (tests, 2, 5), at the rig's rate and noise."""
-    of_group = {group: mean_squares(rig, Condition(0, *group, 0.0, "extra-small")) for group in groups()}
+    of_group = {group: noise_free_squares(rig, Condition(0, *group, 0.0, "extra-small")) for group in groups()}
     squares = np.array([of_group[condition.group] for condition in APPENDIX_C])
     simulated = [log_rms(squares[:, k], noise_of(rig, chamber)) for k, chamber in enumerate(CHAMBERS)]
     measured = [[sheet.rms[chamber][name][:, 0] for name in QUANTITIES] for chamber in CHAMBERS]
@@ -166,9 +166,9 @@ def predicted_sheet(
     for row, condition in enumerate(conditions):
         closed = {"line.closed_B": min(0.99, condition.closed_pct / 100.0 + h.more_closed_B)}
         if condition.group not in leak_free:
-            leak_free[condition.group] = mean_squares(before, condition, x_0=h.x_0, values=closed)
+            leak_free[condition.group] = noise_free_squares(before, condition, x_0=h.x_0, values=closed)
         leak = f"{condition.mean_leak_lpm} L/min {h.law}"
-        leaking = mean_squares(after, condition, leak=leak, x_0=h.x_0_then, values=closed)
+        leaking = noise_free_squares(after, condition, leak=leak, x_0=h.x_0_then, values=closed)
         for half, squares in enumerate((leak_free[condition.group], leaking)):
             for k, chamber in enumerate(CHAMBERS):
                 read = squares[k] * np.array([h.gain_B**2] * 4 + [h.gain_B**4]) if k else squares[k]
@@ -180,7 +180,7 @@ def _multiplied(rig: Rig, factors: Mapping[str, float]) -> Rig:
     return rig.with_overrides({name: float(rig[name]) * by for name, by in factors.items()}) if factors else rig
 
 
-def parameters_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate every parameter in which the identified rig differs from the thesis's."""
     from sealscope.parameters import load_rig
 
@@ -192,15 +192,15 @@ def parameters_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
     )
     sigma = ", ".join(f"{noise_of(fitted, chamber):.2f} psi in {chamber}" for chamber in CHAMBERS)
     heads = ("parameter", "meaning", "rig thesis", f"rig {BENCH_RIG}", "source and interval")
-    return (ResultTable(item.id, item.title, heads, rows, notes=f"Noise of a sample, all sources together: {sigma}."),)
+    return (ThesisTable(item.id, item.title, heads, rows, notes=f"Noise of a sample, all sources together: {sigma}."),)
 
 
-def fit_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate simulated over measured leak-free RMS: geometric means over all tests, and by operating condition."""
     assert context.sheet is not None
     log = log_residuals(_identified_rig(), context.sheet)
     columns = [(c, q, log[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
-    summary = ResultTable(
+    summary = ThesisTable(
         item.id,
         item.title,
         ("chamber", "detail", _RATIO, "within 25 %", "scatter between tests [factor]"),
@@ -221,10 +221,10 @@ def fit_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
     for command, closed in groups():
         of = np.array([condition.group == (command, closed) for condition in APPENDIX_C])
         rows.append((command, closed, int(of.sum()), *np.exp(log[of].mean(axis=0)).ravel().tolist()))
-    return summary, ResultTable(f"{item.id}-conditions", f"{item.title}, by operating condition", heads, tuple(rows))
+    return summary, ThesisTable(f"{item.id}-conditions", f"{item.title}, by operating condition", heads, tuple(rows))
 
 
-def hypotheses_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate what each hypothesis makes of the leak-free level and of the change with the leak, beside the sheet."""
     assert context.sheet is not None
     sheet = context.sheet
@@ -252,7 +252,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
             )
         )
     notes = "Nothing here was fitted to the leak columns. Changes are geometric means over the 41 tests."
-    return (ResultTable(item.id, item.title, tuple(heads), tuple(rows), notes=notes),)
+    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=notes),)
 
 
 ITEMS: tuple[Item, ...] = (

@@ -12,7 +12,7 @@ from pathlib import Path
 from sealscope.recordings.atomic import atomic_write
 from sealscope.reporting.thesis.plots import draw, visible
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Claim, Figure, Product, ResultTable
+from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
 
 _NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
 
@@ -45,7 +45,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
             put(f"figures/{product.id}.svg", svg)
             put(f"figures/{product.id}.png", png)
             put_rows(f"tables/{product.id}.csv", figure_rows(product))
-        elif isinstance(product, ResultTable):
+        elif isinstance(product, ThesisTable):
             put_rows(f"tables/{product.id}.csv", table_rows(product))
     claims = [product for product in products if isinstance(product, Claim)]
     if claims:
@@ -54,7 +54,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
     return tuple(files)
 
 
-def table_rows(table: ResultTable) -> Iterable[Sequence[object]]:
+def table_rows(table: ThesisTable) -> Iterable[Sequence[object]]:
     """Yield a table's head and rows; numbers in full, an empty cell for no value."""
     yield table.columns
     yield from table.rows

@@ -13,7 +13,7 @@ from sealscope.reporting import template
 from sealscope.reporting.thesis.plot_style import caption
 from sealscope.reporting.thesis.plots import UNRESOLVED
 from sealscope.thesis.engine.build import ItemStatus
-from sealscope.thesis.engine.products import Claim, Figure, Product, ResultTable, Verdict
+from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable, Verdict
 
 THESIS = "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems"
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
@@ -33,7 +33,7 @@ class PageProduct:
 
     id: str
     heading: str
-    product: Figure | ResultTable
+    product: Figure | ThesisTable
     picture: str
     links: tuple[tuple[str, str], ...]
     claims: tuple[Claim, ...]
@@ -65,7 +65,7 @@ def render_thesis_page(
 ) -> str:
     """Return the page as text; it refers to nothing outside it but the files beside it."""
     statuses: list[ItemStatus] = []
-    shown: list[tuple[ItemStatus, Figure | ResultTable, str]] = []
+    shown: list[tuple[ItemStatus, Figure | ThesisTable, str]] = []
     claims: dict[str, Claim] = {}
     for status, made in products:
         statuses.append(status)
@@ -116,7 +116,7 @@ _TONES = {"holds": "ok", "holds in part": "open", "does not hold": "leak", "cann
 
 
 def _page_product(
-    status: ItemStatus, product: Figure | ResultTable, picture: str, claims: dict[str, Claim]
+    status: ItemStatus, product: Figure | ThesisTable, picture: str, claims: dict[str, Claim]
 ) -> PageProduct:
     about = tuple(claims[name] for name in product.claims if name in claims)
     stem = f"/{product.id}."

@@ -66,13 +66,13 @@ SETTINGS = {
 def caption(figure_id: str, title: str) -> str:
     """Return the thesis's number and the title, such as "Fig. 4.22. Pressures in the chambers"."""
     kind, _, number = figure_id.partition("-")
-    words = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)
+    prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)
     title = title.rstrip(".")
-    if words is None or not number[:1].isdigit():
+    if prefix is None or not number[:1].isdigit():
         return title
     number, _, part = number.partition("-")
     letter = f" {part})" if len(part) == 1 else f" ({part})" if part else ""
-    return f"{words} {number}{letter}. {title}"
+    return f"{prefix} {number}{letter}. {title}"
 
 
 def typeset(label: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.errors import MissingExtra
 from sealscope.reporting.thesis.plot_style import SAME_ROLE, SETTINGS, STYLES, caption, typeset
-from sealscope.thesis.engine.products import Figure, Panel, PlotCurve, Role, thinned
+from sealscope.thesis.engine.products import Figure, FigureCurve, Panel, Role, thinned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -111,9 +111,9 @@ def _canvas(figure: Figure) -> Canvas:
     rows, columns = grid_of(max(1, len(figure.panels)))
     each = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}.get(rows, 1.35 if columns == 1 else 1.7)
     shared = _shared_legend(figure.panels)
-    words = textwrap.wrap(caption(figure.id, figure.title), 122)
+    lines = textwrap.wrap(caption(figure.id, figure.title), 122)
     mark = 0.34 if figure.resolved is False else 0.0
-    foot, head = 0.16 * len(words) + 0.14, 0.03 + mark + (0.24 if shared else 0.0)
+    foot, head = 0.16 * len(lines) + 0.14, 0.03 + mark + (0.24 if shared else 0.0)
     height = rows * each + foot + head
     canvas = Canvas(figsize=(_WIDTH, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(canvas)
@@ -135,7 +135,7 @@ def _canvas(figure: Figure) -> Canvas:
         at = (0.5, 1 - (0.03 + mark) / height)
         _plain(canvas.legend(handles, labels, loc="upper center", bbox_to_anchor=at, ncols=len(labels)))
     canvas.text(
-        0.012, 0.06 / height, "\n".join(map(typeset, words)), va="bottom", ha="left", fontsize=8.2, linespacing=1.25
+        0.012, 0.06 / height, "\n".join(map(typeset, lines)), va="bottom", ha="left", fontsize=8.2, linespacing=1.25
     )
     if figure.resolved is False:
         box = {"boxstyle": "square,pad=0.35", "facecolor": "#fff3c4", "edgecolor": "#8f1d14", "linewidth": 1.6}
@@ -195,7 +195,7 @@ def _plain_numbers(axis: Axis) -> None:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def visible(curve: PlotCurve, x_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
+def visible(curve: FigureCurve, x_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
     """Return the points of a curve as drawn: in the range with a neighbour on each side, a long line thinned."""
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _POINTS and np.all(np.diff(x) >= 0):
@@ -204,7 +204,7 @@ def visible(curve: PlotCurve, x_range: tuple[float, float] | None) -> tuple[np.n
     return thinned(x, y, _POINTS) if curve.kind == "line" else (x, y)
 
 
-def _curve(ax: Axes, curve: PlotCurve, again: int, x_range: tuple[float, float] | None, alone: bool) -> None:
+def _curve(ax: Axes, curve: FigureCurve, again: int, x_range: tuple[float, float] | None, alone: bool) -> None:
     style = STYLES["other" if alone and curve.role == "reference" else curve.role]
     x, y = visible(curve, x_range)
     dense = x.size > _DENSE

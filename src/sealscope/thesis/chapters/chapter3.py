@@ -7,7 +7,7 @@ import numpy as np
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context, RunSpec
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Figure, Image, Number, Panel, PlotCurve, Role, thinned
+from sealscope.thesis.engine.products import Figure, FigureCurve, Image, Number, Panel, Role, thinned
 
 #: Sampling rate [Hz] of the signals of this chapter; the thesis gives none.
 RATE = 1000.0
@@ -136,11 +136,11 @@ def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
     numbers.append(Number("largest amplitude elsewhere", float(np.delete(amplitude, list(at.values())).max())))
     early, lines = t < 0.2, amplitude > 1e-6
     panels = (
-        Panel("t [s]", "x(t) [1]", (PlotCurve(t[early], x[early], "x(t), eq. 3.3", "reference"),), "(a) Signal"),
+        Panel("t [s]", "x(t) [1]", (FigureCurve(t[early], x[early], "x(t), eq. 3.3", "reference"),), "(a) Signal"),
         Panel(
             "frequency [Hz]",
             "amplitude [1]",
-            (PlotCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems"),),
+            (FigureCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems"),),
             "(b) Amplitude spectrum",
             x_range=(0.0, 150.0),
         ),
@@ -158,8 +158,10 @@ def db8(context: Context, item: Item) -> tuple[Figure, ...]:
     step = float(t[1] - t[0])
     frequency = wavelet_centre()[1]
     panels = (
-        Panel("t [samples]", "psi(t) [1]", (PlotCurve(*thinned(t, psi), "psi(t)", "reference"),), "(a) Mother wavelet"),
-        Panel("t [samples]", "phi(t) [1]", (PlotCurve(*thinned(t, phi), "phi(t)", "other"),), "(b) Scaling function"),
+        Panel(
+            "t [samples]", "psi(t) [1]", (FigureCurve(*thinned(t, psi), "psi(t)", "reference"),), "(a) Mother wavelet"
+        ),
+        Panel("t [samples]", "phi(t) [1]", (FigureCurve(*thinned(t, phi), "phi(t)", "other"),), "(b) Scaling function"),
     )
     numbers = (
         Number("integral of psi", float(psi.sum() * step)),
@@ -197,11 +199,11 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
     wanted = np.geomspace(10.0, 450.0, 64)
     wavelet = np.abs(continuous_transform(x, RATE, scales_for(wanted)))
     panels = (
-        Panel("t [s]", "x(t) [1]", (PlotCurve(t, x, "x(t)", "reference"),), "(a) Time"),
+        Panel("t [s]", "x(t) [1]", (FigureCurve(t, x, "x(t)", "reference"),), "(a) Time"),
         Panel(
             "frequency [Hz]",
             "amplitude [1]",
-            (PlotCurve(frequency, amplitude, "2 |X[n]| / N", "reference"),),
+            (FigureCurve(frequency, amplitude, "2 |X[n]| / N", "reference"),),
             "(b) Frequency",
         ),
         Panel(
@@ -253,7 +255,7 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
     recorded, clean = run.recording["p_A"] * 1e-6, run.outputs["p_A"] * 1e-6
     leak = ((_ONSET, "leak"),)
     panels = [
-        Panel("t [s]", "p_A [MPa]", (PlotCurve(*thinned(t, recorded), "p_A, recorded", "A"),), "(a) Record", leak)
+        Panel("t [s]", "p_A [MPa]", (FigureCurve(*thinned(t, recorded), "p_A, recorded", "A"),), "(a) Record", leak)
     ]
     for letter, p_A, name in (("b", recorded, "as recorded"), ("c", clean, "without the instruments' noise")):
         rows = continuous_transform(p_A, rate, scales_for(wanted))
@@ -263,7 +265,7 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
         panels.append(Panel("t [s]", "frequency [Hz]", title=title, marks=leak, image=image, log_y=True))
     parts: tuple[tuple[Role, np.ndarray], ...] = (("no leak", (t > _SETTLED) & (t < _ONSET)), ("leak", t >= _ONSET))
     strength = {role: np.sqrt(np.mean(rows[:, part] ** 2, axis=1)) * 1e3 for role, part in parts}
-    curves = tuple(PlotCurve(wanted, strength[role], role, role) for role, _ in parts)
+    curves = tuple(FigureCurve(wanted, strength[role], role, role) for role, _ in parts)
     panels.append(Panel("frequency [Hz]", "rms of CWT [kPa s^0.5]", curves, "(d) rms of (c) over time", log_x=True))
     fast = wanted > 30.0
     ring = int(np.flatnonzero(fast)[strength["no leak"][fast].argmax()])

@@ -16,7 +16,7 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.thesis.chapters.appendix_c.simulation import SETTLING, detail_rms, detail_series, pressure_range
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Figure, Number, Panel, PlotCurve, thinned
+from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, thinned
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, Level, experiment_values
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -154,16 +154,16 @@ class FigureView:
             f"closed, mean leak {self.run.mean_leak_lpm:.4f} L/min from {self.test.half:g} s{chosen}."
         )
 
-    def _panel(self, label: str, *curves: PlotCurve) -> Panel:
+    def _panel(self, label: str, *curves: FigureCurve) -> Panel:
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)
 
-    def _curve(self, y: Array, label: str, role: str, span: Span | None = None, t: Array | None = None) -> PlotCurve:
+    def _curve(self, y: Array, label: str, role: str, span: Span | None = None, t: Array | None = None) -> FigureCurve:
         t = self.recording.t if t is None else t
         start, stop = span or self.span
         part = (t >= start) & (t <= stop)
-        return PlotCurve(*thinned(t[part], y[part]), label, role)  # type: ignore[arg-type]
+        return FigureCurve(*thinned(t[part], y[part]), label, role)  # type: ignore[arg-type]
 
-    def _split(self, y: Array, t: Array | None = None) -> list[PlotCurve]:
+    def _split(self, y: Array, t: Array | None = None) -> list[FigureCurve]:
         """Split a series into two curves, without and with the leak."""
         (start, stop), half = self.span, self.test.half
         parts = (((start, min(stop, half)), "no leak"), ((max(start, half), stop), "leak"))
@@ -224,13 +224,13 @@ class FigureView:
         parts = np.array([SETTLING, half, half, 2 * half])
         panels = []
         for name, values in curves.items():
-            before, after = changes(self.recording, self.test)[chamber][name]
-            levels = PlotCurve(parts, np.array([before, before, after, after]), "RMS of each part", "reference")
+            before, after = half_rms(self.recording, self.test)[chamber][name]
+            levels = FigureCurve(parts, np.array([before, before, after, after]), "RMS of each part", "reference")
             panels.append(self._panel(f"RMS of {name} [{UNITS[name]}]", *self._split(values, t), levels))
         return tuple(panels), self._changes(chamber, _WINDOWED)
 
     def _changes(self, chamber: str, names: tuple[str, ...]) -> tuple[Number, ...]:
-        rms = changes(self.recording, self.test)[chamber]
+        rms = half_rms(self.recording, self.test)[chamber]
         numbers = []
         for name in names:
             before, after = rms[name]
@@ -249,7 +249,7 @@ def mean_slope(t: Array, y: Array, omega: float) -> float:
     return float(np.linalg.lstsq(basis, y, rcond=None)[0][1])
 
 
-def changes(recording: Recording, test: ShownTest) -> dict[str, dict[str, tuple[float, ...]]]:
+def half_rms(recording: Recording, test: ShownTest) -> dict[str, dict[str, tuple[float, ...]]]:
     """Return the RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers without and with the leak, as in Appendix C."""
     return detail_rms(recording, ((SETTLING, test.half), (test.half, 2 * test.half)))
 
@@ -327,7 +327,7 @@ def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownM
         steps[chamber] = best_step(centres[settled], curves["d3"][settled])
     return ShownMeasures(
         test=test,
-        rms=changes(recording, test),
+        rms=half_rms(recording, test),
         speed=pair(run.outputs["omega"], rms),
         drift=(mean_slope(t[parts[0]], x[parts[0]], omega) * 1e3, mean_slope(t[parts[1]], x[parts[1]], omega) * 1e3),
         velocity=pair(run.outputs["v"] * 1e3, rms),

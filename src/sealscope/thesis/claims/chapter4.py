@@ -32,17 +32,17 @@ from sealscope.thesis.chapters.chapter4.cases import (
     over_closings,
     piston_drift,
     readings,
-    settled,
     span,
     spec,
     steady,
+    steady_output,
     throttled,
     visible_pressure,
 )
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Cell, Claim, ResultTable, verdict_of
+from sealscope.thesis.engine.products import Cell, Claim, ThesisTable, verdict_of
 
 SHEET = "the sheet holds no pressures, flows or positions of chapter 4"
 #: Share of the drift without orifices that a change of drift must reach to count.
@@ -98,7 +98,7 @@ def _speed(context: Context) -> Claim:
         run = context.run(spec(case.command, None))
         command = parse_command(case.command)
         assert isinstance(command, Sine)
-        amplitude, rest = sine_fit(run.t[steady(run)], settled(run, "omega"), command.omega)
+        amplitude, rest = sine_fit(run.t[steady(run)], steady_output(run, "omega"), command.omega)
         share = amplitude / (command.amplitude * per_volt)
         texts.append(f"{case.command}: {rest * 100:.2f} % beside the sine, {share * 100:.0f} % of the commanded speed")
         tests.append(rest < 0.05)
@@ -210,7 +210,7 @@ def _level(context: Context) -> Claim:
 
     charge = load_rig("thesis").fluid.p_charge
     run = context.run(spec(CASES["4.3-a"].command, CASES["4.3-a"].closed_pct))
-    peaks = [float(settled(run, name).max()) for name in PRESSURES]
+    peaks = [float(steady_output(run, name).max()) for name in PRESSURES]
     return _claim(
         7,
         "section 4.2.2 a), Figs. 4.10, 4.11",
@@ -553,7 +553,7 @@ def _drift_over_openings(context: Context) -> tuple[Claim, ...]:
     )
 
 
-def claims(context: Context, item: Item) -> tuple[ResultTable | Claim, ...]:
+def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
     """Make the table of all readings, closings and solvers, and judge the claims of chapter 4."""
     judged = (
         _step(context),
@@ -585,7 +585,7 @@ def claims(context: Context, item: Item) -> tuple[ResultTable | Claim, ...]:
         "halving test show the step, not the rig."
     )
     ids = tuple(claim.id for claim in ordered)
-    return (ResultTable(item.id, item.title, _COLUMNS, tuple(rows), ids, None, notes), *ordered)
+    return (ThesisTable(item.id, item.title, _COLUMNS, tuple(rows), ids, None, notes), *ordered)
 
 
 _COLUMNS = (

@@ -10,7 +10,7 @@ from sealscope.thesis.claims import rates, rig, tests, trends
 from sealscope.thesis.claims.evidence import gather
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Claim, ResultTable, Verdict
+from sealscope.thesis.engine.products import Claim, ThesisTable, Verdict
 
 
 def detection(context: Context, item: Item) -> tuple[Claim, ...]:
@@ -32,7 +32,7 @@ def _place(claim: Claim) -> tuple[int, ...]:
     return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
 
 
-def table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate every claim of every chapter, and how many have each verdict."""
     claims = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
     claims.sort(key=_place)
@@ -43,8 +43,8 @@ def table(context: Context, item: Item) -> tuple[ResultTable, ...]:
     notes = f"Claims in our own words. A claim holds where every part of it does.{missing}"
     counts = tuple((verdict, verdicts.get(verdict, 0)) for verdict in get_args(Verdict))
     return (
-        ResultTable(item.id, item.title, heads, rows, claims=tuple(claim.id for claim in claims), notes=notes),
-        ResultTable(f"{item.id}-verdicts", "How many claims have each verdict", ("verdict", "claims"), counts),
+        ThesisTable(item.id, item.title, heads, rows, claims=tuple(claim.id for claim in claims), notes=notes),
+        ThesisTable(f"{item.id}-verdicts", "How many claims have each verdict", ("verdict", "claims"), counts),
     )
 
 

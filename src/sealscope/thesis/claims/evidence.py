@@ -13,7 +13,7 @@ from sealscope.thesis.chapters.appendix_c.success_rates import DIRECTION, Rule, 
 from sealscope.thesis.chapters.appendix_c.tables import simulated_sheet
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures, measure_test
 from sealscope.thesis.engine.context import Context
-from sealscope.thesis.engine.products import Claim, ResultTable, verdict_of
+from sealscope.thesis.engine.products import Claim, ThesisTable, verdict_of
 from sealscope.thesis.sheet import DataSheet
 
 NO_SHEET = "the thesis's data sheet was not given"
@@ -36,7 +36,7 @@ class ClaimEvidence:
     leak: DataSheet
     still: DataSheet
     drift: DataSheet
-    table: ResultTable
+    table: ThesisTable
     shown: dict[str, ShownMeasures]
     control: ShownMeasures
 
@@ -68,17 +68,17 @@ def by_simulation(id: str, where: str, claim: str, simulation: str, parts: Seque
 
 def fired(sheet: DataSheet, rule: Rule) -> str:
     """Return `k/n = share %` of the tests that a rule fires in, with its exact 95 % interval."""
-    return share(rule.fires(sheet))
+    return counted_share(rule.fires(sheet))
 
 
-def share(tests: Sequence[bool] | np.ndarray) -> str:
+def counted_share(tests: Sequence[bool] | np.ndarray) -> str:
     """Return `k/n = share % (low to high)` of the tests that are true, with the exact 95 % interval."""
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-def percent(change: Array | float) -> float:
+def in_percent(change: Array | float) -> float:
     """Return a log change, or the mean of several, in percent."""
     return float(100.0 * np.expm1(np.mean(change)))
 
@@ -88,7 +88,7 @@ def corrected_p(sheet: DataSheet) -> dict[tuple[str, str], float]:
     return {(str(row[0]), str(row[1])): float(row[-2]) for row in column_tests(sheet)}  # type: ignore[arg-type]
 
 
-def moved(sheet: DataSheet, chamber: str, name: str) -> bool:
+def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
     """Return whether a column moves in the chamber's direction beyond chance (5 %, corrected for ten columns)."""
     change = sheet.log_change(chamber, name) * DIRECTION[chamber]
     return bool(np.sum(change > 0) > np.sum(change < 0) and corrected_p(sheet)[chamber, name] < 0.05)

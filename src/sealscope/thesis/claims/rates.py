@@ -11,7 +11,15 @@ from sealscope.evaluation.binomial import at_least
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED, DIRECTION, Rule, d1_threshold
 from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM
-from sealscope.thesis.claims.evidence import SENSITIVE, ClaimEvidence, SheetTest, fired, on_sheet, percent, share
+from sealscope.thesis.claims.evidence import (
+    SENSITIVE,
+    ClaimEvidence,
+    SheetTest,
+    counted_share,
+    fired,
+    in_percent,
+    on_sheet,
+)
 from sealscope.thesis.claims.regressions import mean_leaks, told_apart_by_levels
 from sealscope.thesis.engine.products import Claim
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet
@@ -96,7 +104,7 @@ def _over_80(sheet: DataSheet) -> tuple[str, list[bool]]:
 def _levels(sheet: DataSheet) -> tuple[str, list[bool]]:
     past = _past_noise(sheet, "p_A", "d3")
     of_level = {level: past[[row.level == level for row in APPENDIX_C]] for level in NOMINAL_LPM}
-    texts = "; ".join(f"{level} {share(tests)}" for level, tests in of_level.items())
+    texts = "; ".join(f"{level} {counted_share(tests)}" for level, tests in of_level.items())
     return f"d3 of P_A falls beyond noise: {texts}", [bool(tests.mean() >= 0.8) for tests in of_level.values()]
 
 
@@ -105,7 +113,7 @@ def _smallest(rules: tuple[Rule, ...]) -> SheetTest:
         row = int(np.argmin(mean_leaks()))
         texts = []
         for rule in rules:
-            change = ", ".join(f"{percent(sheet.log_change(c, name)[row]):+.1f} %" for c, name in rule.details)
+            change = ", ".join(f"{in_percent(sheet.log_change(c, name)[row]):+.1f} %" for c, name in rule.details)
             texts.append(f"{rule.name}: {change}")
         return f"the {mean_leaks()[row]:g} L/min test: {'; '.join(texts)}", [bool(r.fires(sheet)[row]) for r in rules]
 
@@ -117,7 +125,7 @@ def _abstract_85(sheet: DataSheet) -> tuple[str, list[bool]]:
     small = fires[mean_leaks() <= 0.0050]
     text, smallest = _smallest((_A_BOTH,))(sheet)
     return (
-        f"{text}; up to 0.0050 L/min {share(small)}; all leaks {share(fires)}",
+        f"{text}; up to 0.0050 L/min {counted_share(small)}; all leaks {counted_share(fires)}",
         [*smallest, bool(small.mean() >= 0.85)],
     )
 
@@ -126,7 +134,7 @@ def _passes_both(sheet: DataSheet) -> tuple[str, list[bool]]:
     fires, leak = _TOGETHER.fires(sheet), mean_leaks()
     least = float(leak[fires].min()) if fires.any() else math.nan
     return (
-        f"smallest test that passes d3d4 on both chambers: {least:.4f} L/min; both pass in {share(fires)}",
+        f"smallest test that passes d3d4 on both chambers: {least:.4f} L/min; both pass in {counted_share(fires)}",
         [abs(least - 0.0048) < 5e-5, bool(fires.mean() > 0.8)],
     )
 
@@ -136,7 +144,7 @@ def _identified(sheet: DataSheet) -> tuple[str, list[bool]]:
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_past_noise(sheet, chamber, name).sum()))
         past = _past_noise(sheet, chamber, best)
-        texts.append(f"{chamber}: {best} beyond noise in {share(past)}")
+        texts.append(f"{chamber}: {best} beyond noise in {counted_share(past)}")
         parts.append(bool(past.mean() >= 0.8))
     return "; ".join(texts), parts
 
@@ -190,7 +198,7 @@ def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
             _over_80,
             lambda sheet: (
                 f"A part for each rate of Table 5.1. {_controls(evidence, _A_D3)} (d3 of P_A). Set for 5 % false "
-                f"alarms by d1's scatter, d3 of P_A finds {share(_past_noise(sheet, 'p_A', 'd3'))}."
+                f"alarms by d1's scatter, d3 of P_A finds {counted_share(_past_noise(sheet, 'p_A', 'd3'))}."
             ),
         ),
         on_sheet(

@@ -9,7 +9,7 @@ import numpy as np
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.appendix_c.simulation import column
 from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED
-from sealscope.thesis.claims.evidence import NO_SHEET, NOT_ON_SHEET, ClaimEvidence, by_simulation, fired, share
+from sealscope.thesis.claims.evidence import NO_SHEET, NOT_ON_SHEET, ClaimEvidence, by_simulation, counted_share, fired
 from sealscope.thesis.engine.products import Claim, verdict_of
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
 
@@ -84,7 +84,9 @@ def _onset(evidence: ClaimEvidence) -> Claim:
     for chamber in CHAMBERS:
         errors = [abs(test.step_s[chamber] - test.onset_s) for test in evidence.shown.values()]
         near = [error <= _NEAR for error in errors]
-        texts.append(f"{chamber}: {share(near)}, median error {np.median(errors):.0f} s, worst {max(errors):.0f} s")
+        texts.append(
+            f"{chamber}: {counted_share(near)}, median error {np.median(errors):.0f} s, worst {max(errors):.0f} s"
+        )
         parts.append(all(near))
     return by_simulation(
         "claim-5.7.4",

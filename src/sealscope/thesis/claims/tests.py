@@ -11,7 +11,7 @@ import numpy as np
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.appendix_c.success_rates import DIRECTION, d1_threshold, drift_threshold
 from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM, TESTS, ShownTest
-from sealscope.thesis.claims.evidence import NO_SHEET, SENSITIVE, ClaimEvidence, on_sheet, percent
+from sealscope.thesis.claims.evidence import NO_SHEET, SENSITIVE, ClaimEvidence, in_percent, on_sheet
 from sealscope.thesis.engine.products import Claim, verdict_of
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet
 
@@ -90,8 +90,8 @@ def _on_rows(
     row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
     every = {name: sheet.log_change(chamber, name) for name in names}
     parts = [_beyond(float(changes[row]), limit, statement) for changes in every.values()]
-    changed = ", ".join(f"{name} {percent(float(changes[row])):+.1f} %" for name, changes in every.items())
-    reach = f"{percent(-limit):+.1f} %" + ("" if statement == "fall" else f" or {percent(limit):+.1f} %")
+    changed = ", ".join(f"{name} {in_percent(float(changes[row])):+.1f} %" for name, changes in every.items())
+    reach = f"{in_percent(-limit):+.1f} %" + ("" if statement == "fall" else f" or {in_percent(limit):+.1f} %")
     text = f"row {row + 1}: {changed}; noise reaches {reach}"
     others = [candidate.number - 1 for candidate in test.candidates]
     if len(others) > 1:
@@ -111,7 +111,8 @@ def curves(evidence: ClaimEvidence) -> tuple[Claim, ...]:
         rms = evidence.shown[section].rms[chamber]
         simulated = ", ".join(f"{name} {100 * (rms[name][1] / rms[name][0] - 1):+.1f} %" for name in names)
         limits = ", ".join(
-            f"{percent(DIRECTION[chamber] * drift_threshold(evidence.drift, chamber, name)):+.1f} %" for name in names
+            f"{in_percent(DIRECTION[chamber] * drift_threshold(evidence.drift, chamber, name)):+.1f} %"
+            for name in names
         )
         parts: list[bool] = []
         text = NO_SHEET

@@ -12,9 +12,9 @@ from sealscope.thesis.claims.evidence import (
     corrected_p,
     correlated,
     fired,
-    moved,
+    in_percent,
+    moves_beyond_chance,
     on_sheet,
-    percent,
 )
 from sealscope.thesis.claims.regressions import (
     change_columns,
@@ -61,10 +61,10 @@ def _sensitive(sheet: DataSheet) -> tuple[str, list[bool]]:
     claimed = [rule.details[0] for rule in CLAIMED[:6]]
     others = [rule.details[0] for rule in UNCLAIMED]
     texts = [
-        f"{chamber} {name} {percent(sheet.log_change(chamber, name)):+.1f} % (p = {p[chamber, name]:.2g})"
+        f"{chamber} {name} {in_percent(sheet.log_change(chamber, name)):+.1f} % (p = {p[chamber, name]:.2g})"
         for chamber, name in (*claimed, *others)
     ]
-    parts = [moved(sheet, *column) for column in claimed] + [p[column] >= 0.05 for column in others]
+    parts = [moves_beyond_chance(sheet, *column) for column in claimed] + [p[column] >= 0.05 for column in others]
     return "; ".join(texts), parts
 
 
@@ -91,7 +91,9 @@ def _inverse(sheet: DataSheet) -> tuple[str, list[bool]]:
 def _upward(sheet: DataSheet) -> tuple[str, list[bool]]:
     p = corrected_p(sheet)
     up = [f"{q} up in {int(np.sum(sheet.log_change('p_B', q) > 0))} (p = {p['p_B', q]:.2g})" for q in SENSITIVE]
-    return f"of {sheet.rms['p_B']['d3'].shape[0]}: {', '.join(up)}", [moved(sheet, "p_B", q) for q in SENSITIVE]
+    return f"of {sheet.rms['p_B']['d3'].shape[0]}: {', '.join(up)}", [
+        moves_beyond_chance(sheet, "p_B", q) for q in SENSITIVE
+    ]
 
 
 def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:

@@ -18,8 +18,8 @@ from sealscope.campaigns.execution.workers import Workers
 from sealscope.errors import InputError, SealscopeError
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.folder import ResultsFolder
-from sealscope.thesis.engine.items import Item, check, collect, select, with_needed
-from sealscope.thesis.engine.products import Claim, Figure, Product, ResultTable, thinned
+from sealscope.thesis.engine.items import Item, check, collect, select_items, with_needed
+from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable, thinned
 from sealscope.thesis.engine.sources import sources_key
 from sealscope.thesis.sheet import MISSING, DataSheet, find_sheet, read_sheet
 
@@ -91,7 +91,7 @@ def reproduce(
     publish: Publish | None = None,
     progress: Progress | None = None,
 ) -> Reproduction:
-    """Make the chosen items (see `items.select`) and what they need, and draw them with `publish`.
+    """Make the chosen items (see `items.select_items`) and what they need, and draw them with `publish`.
 
     `jobs` processes (default: one a core; 1: in this process); `sheet`: folder of the data sheet (see
     `sheet.find_sheet`). What was made by an earlier call from the same sources stays. A failed item does not stop the
@@ -103,7 +103,7 @@ def reproduce(
         raise InputError(f"jobs must be >= 1, got {jobs}")
     every = tuple(items) if items is not None else collect()
     check(every)
-    chosen = with_needed(every, select(every, patterns))
+    chosen = with_needed(every, select_items(every, patterns))
     job = Job(Path(folder), every, quick, find_sheet(sheet), publish)
     builder = Builder(job)
     with builder.folder.locked():
@@ -292,8 +292,8 @@ class BuildContext:
 
 def _thinned(product: Product | Claim) -> Product | Claim:
     """Thin the long lines of a figure to what an eye can see."""
-    if not isinstance(product, (Figure, ResultTable, Claim)):
-        raise TypeError(f"a maker must give Figure, ResultTable or Claim, got {type(product).__name__}")
+    if not isinstance(product, (Figure, ThesisTable, Claim)):
+        raise TypeError(f"a maker must give Figure, ThesisTable or Claim, got {type(product).__name__}")
     if not isinstance(product, Figure):
         return product
     panels = []

@@ -87,7 +87,7 @@ def check(items: Iterable[Item]) -> None:
         raise ValueError(f"items must not need each other in a circle, got {' -> '.join(error.args[1])}") from None
 
 
-def select(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:
+def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:
     """Select items by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`), in the order of the list.
 
     Raises InputError, with the closest ids, where a pattern matches nothing.

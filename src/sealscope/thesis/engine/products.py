@@ -21,7 +21,7 @@ Cell = float | int | str | None
 
 
 @dataclass(frozen=True, eq=False)
-class PlotCurve:
+class FigureCurve:
     """One series of points (x, y), in the panel's units."""
 
     x: Array
@@ -47,7 +47,7 @@ class Panel:
 
     x_label: str
     y_label: str
-    curves: tuple[PlotCurve, ...] = ()
+    curves: tuple[FigureCurve, ...] = ()
     title: str = ""
     marks: tuple[tuple[float, str], ...] = ()
     image: Image | None = None
@@ -83,7 +83,7 @@ class Figure:
 
 
 @dataclass(frozen=True, eq=False)
-class ResultTable:
+class ThesisTable:
     """A table: `columns` with units in brackets, `rows` of text and numbers."""
 
     id: str
@@ -95,7 +95,7 @@ class ResultTable:
     notes: str = ""
 
 
-Product = Figure | ResultTable
+Product = Figure | ThesisTable
 
 Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
 

@@ -14,11 +14,11 @@ import numpy as np
 from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.recording import Recording
 from sealscope.thesis.engine.context import SimulatedRun
-from sealscope.thesis.engine.products import Claim, Figure, Image, Number, Panel, PlotCurve, ResultTable
+from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 
 _TYPES = {
     kind.__name__: kind
-    for kind in (Claim, Figure, Image, Number, Panel, PlotCurve, ResultTable, SimulatedRun, Recording)
+    for kind in (Claim, Figure, Image, Number, Panel, FigureCurve, ThesisTable, SimulatedRun, Recording)
 }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.thesis.engine.products import Cell, ResultTable
+from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
@@ -65,7 +65,7 @@ class RigDrift:
         }
 
 
-def drift_of(number: int, draw: int = 0) -> RigDrift:
+def draw_rig_drift(number: int, draw: int = 0) -> RigDrift:
     """Draw the drift of a test: each share uniform within its bounds, up or down with equal chance, independent."""
     random = np.random.default_rng([_DRIFT_SEED, draw, number])
     shares = [random.uniform(*bounds) for bounds in (FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT)]
@@ -190,8 +190,8 @@ def without_leak(quick: bool = False) -> Iterator[SimulatedTest]:
 def with_drift(quick: bool = False) -> Iterator[SimulatedTest]:
     """Simulate the same tests with no leak on a rig that drifts.
 
-    The second half comes from a rig with other friction, bulk modulus and noise (`drift_of`), several draws of each
-    test.
+    The second half comes from a rig with other friction, bulk modulus and noise (`draw_rig_drift`), several draws of
+    each test.
     """
     from sealscope.simulation.integrate import trajectory
 
@@ -204,7 +204,7 @@ def with_drift(quick: bool = False) -> Iterator[SimulatedTest]:
             if condition.group not in paths:
                 paths[condition.group] = trajectory(first, ())
             path = paths[condition.group]
-            drift = drift_of(condition.number, draw)
+            drift = draw_rig_drift(condition.number, draw)
             rig = first.rig.with_overrides(drift.values(first.rig), source="drifted")
             second = replace(first, rig=rig, seed=seed + 50_000)
             part = ((SETTLING, SETTLING + half),)
@@ -234,7 +234,7 @@ _COLUMNS = (
 )
 
 
-def table_of(tests: list[SimulatedTest], item: str, title: str, notes: str = "") -> ResultTable:
+def table_of(tests: list[SimulatedTest], item: str, title: str, notes: str = "") -> ThesisTable:
     """Tabulate the tests; `sheet_of` reads the table back. It is resolved when every run that was proved is."""
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (
@@ -249,16 +249,16 @@ def table_of(tests: list[SimulatedTest], item: str, title: str, notes: str = "")
         for test in tests
     )
     outcomes = [test.resolved for test in tests if test.resolved is not None]
-    return ResultTable(item, title, _COLUMNS, rows, resolved=all(outcomes) if outcomes else None, notes=notes)
+    return ThesisTable(item, title, _COLUMNS, rows, resolved=all(outcomes) if outcomes else None, notes=notes)
 
 
-def column(table: ResultTable, head: str) -> Array:
+def column(table: ThesisTable, head: str) -> Array:
     """Return the numbers of one column of a table, NaN where there is none."""
     place = table.columns.index(head)
     return np.array([np.nan if row[place] is None else float(row[place]) for row in table.rows])  # type: ignore[arg-type]
 
 
-def sheet_of(table: ResultTable) -> DataSheet:
+def sheet_of(table: ThesisTable) -> DataSheet:
     """Read the RMS columns of a table made by `table_of` as a sheet, in the table's order of rows."""
     columns = {(chamber, name, k): column(table, head) for chamber, name, k, head in _RMS_COLUMNS}
     return DataSheet(

@@ -13,7 +13,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.appendix_c.tables import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Cell, ResultTable
+from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import QUANTITIES, DataSheet
 
 #: The direction in which each chamber's RMS is said to move when a leak opens, section 5.6.
@@ -181,14 +181,14 @@ THRESHOLDS = (
 )
 
 
-def table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
     made, leak = simulated_sheet(context, "appendix-c-leak")
     _, still = simulated_sheet(context, "appendix-c-no-leak")
     _, drift = simulated_sheet(context, "appendix-c-drift")
     measured = context.sheet
     none = "" if measured else " No measured sheet was given."
-    success = ResultTable(
+    success = ThesisTable(
         item.id,
         item.title,
         RATES,
@@ -199,7 +199,7 @@ def table(context: Context, item: Item) -> tuple[ResultTable, ...]:
         f"had no leak-free test, so its own false-alarm rate is unknown. {made.notes}",
     )
     sheets = {"sheet": measured, "simulated leak": leak, "simulated, no leak": still, "simulated, drift only": drift}
-    columns = ResultTable(
+    columns = ThesisTable(
         f"{item.id}-columns",
         "Sign tests of every column of Appendix C",
         COLUMNS,
@@ -208,7 +208,7 @@ def table(context: Context, item: Item) -> tuple[ResultTable, ...]:
         notes="Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the "
         "leak always came second.",
     )
-    limits = ResultTable(
+    limits = ThesisTable(
         f"{item.id}-thresholds",
         f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms",
         THRESHOLDS,

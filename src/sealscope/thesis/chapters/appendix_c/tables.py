@@ -19,7 +19,7 @@ from sealscope.thesis.chapters.appendix_c.simulation import (
 )
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Cell, Figure, Number, Panel, PlotCurve, ResultTable, Role
+from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, DataSheet
 
 #: Figs. 5.90 to 5.95: chamber, quantity, and the direction it is said to move when a leak opens.
@@ -48,7 +48,7 @@ def _where(context: Context) -> str:
     return f"Rig {BENCH_RIG}, {half}, the first 5 s left out; RMS in psi, the unit the sheet is taken to be in."
 
 
-def leak_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the 41 tests with their leak from half time on."""
     proof = (
         "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
@@ -57,13 +57,13 @@ def leak_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
     return (table_of(list(with_leak(context.quick)), item.id, item.title, notes),)
 
 
-def no_leak_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def no_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the 41 tests with nothing happening at half time."""
     notes = f'{_where(context)} Nothing leaks: "leak" heads the second half.'
     return (table_of(list(without_leak(context.quick)), item.id, item.title, notes),)
 
 
-def drift_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def drift_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the 41 tests without a leak on a rig that drifts between the halves."""
     bounds = [f"{100 * low:g} to {100 * high:g} %" for low, high in (FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT)]
     notes = (
@@ -74,9 +74,9 @@ def drift_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
     return (table_of(list(with_drift(context.quick)), item.id, item.title, notes),)
 
 
-def simulated_sheet(context: Context, item: str) -> tuple[ResultTable, DataSheet]:
+def simulated_sheet(context: Context, item: str) -> tuple[ThesisTable, DataSheet]:
     """Return the table of `appendix-c-leak`, `-no-leak` or `-drift`, and the sheet in it."""
-    table = next(product for product in context.product(item) if isinstance(product, ResultTable))
+    table = next(product for product in context.product(item) if isinstance(product, ThesisTable))
     return table, sheet_of(table)
 
 
@@ -84,7 +84,7 @@ def _difference(pairs: Array) -> Array:
     return np.asarray(100.0 * (pairs[:, 1] - pairs[:, 0]) / pairs[:, 0])
 
 
-def chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: str) -> ResultTable:
+def chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: str) -> ThesisTable:
     """Tabulate one chamber as the thesis does: RMS without and with leak and the difference [%], with both sources."""
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
@@ -101,7 +101,7 @@ def chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, it
         (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(values[k] for values in columns))
         for k, row in enumerate(APPENDIX_C)
     )
-    return ResultTable(item, f"Appendix C, RMS of the wavelet details of {chamber}", tuple(heads), rows)
+    return ThesisTable(item, f"Appendix C, RMS of the wavelet details of {chamber}", tuple(heads), rows)
 
 
 def agreement(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
@@ -127,12 +127,12 @@ def agreement(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, 
     return rows
 
 
-def appendix(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def appendix(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate how simulation and sheet agree, and the thesis's two tables with both side by side."""
     table, sheet = simulated_sheet(context, "appendix-c-leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
     rows = tuple(agreement(sheet, context.sheet))
-    summary = ResultTable(item.id, item.title, AGREEMENT, rows, resolved=table.resolved, notes=notes)
+    summary = ThesisTable(item.id, item.title, AGREEMENT, rows, resolved=table.resolved, notes=notes)
     return summary, *(
         chamber_table(sheet, context.sheet, chamber, f"{item.id}-{short}")
         for chamber, short in zip(CHAMBERS, ("pa", "pb"), strict=True)
@@ -155,8 +155,8 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
         if source is None:
             continue
         pairs = source.rms[chamber][name]
-        absolute.append(PlotCurve(leak, pairs[:, 1] - pairs[:, 0], label, role, "points"))
-        relative.append(PlotCurve(leak, _difference(pairs), label, role, "points"))
+        absolute.append(FigureCurve(leak, pairs[:, 1] - pairs[:, 0], label, role, "points"))
+        relative.append(FigureCurve(leak, _difference(pairs), label, role, "points"))
         change = source.log_change(chamber, name)
         k = int(np.sum(change < 0 if way == "down" else change > 0))
         low, high = clopper_pearson(k, change.size)
@@ -165,7 +165,7 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
             Number(f"{label}: rate, 95 % interval", f"{k / change.size:.3f} ({low:.3f} to {high:.3f})"),
             Number(f"{label}: correlation of the change with the leak", float(np.corrcoef(change, leak)[0, 1])),
         ]
-    zero = PlotCurve(np.array([leak.min(), leak.max()]), np.zeros(2), "no change", "reference")
+    zero = FigureCurve(np.array([leak.min(), leak.max()]), np.zeros(2), "no change", "reference")
     panels = (
         Panel("mean leak [L/min]", f"RMS with - without leak, {name} [{UNITS[name]}]", (*absolute, zero)),
         Panel("mean leak [L/min]", f"change of the RMS of {name} [%]", (*relative, zero)),

@@ -173,19 +173,19 @@ def steady(run: SimulatedRun) -> np.ndarray:
     return np.asarray((run.t >= STEADY[0]) & (run.t < STEADY[1]))
 
 
-def settled(run: SimulatedRun, name: str) -> Array:
+def steady_output(run: SimulatedRun, name: str) -> Array:
     """Return the output `name` over those whole periods."""
     return np.asarray(run.outputs[name][steady(run)])
 
 
 def span(run: SimulatedRun, name: str) -> float:
     """Return the range (greatest less least) of an output over the whole periods; nan where the run diverged."""
-    return math.nan if run.diverged else float(np.ptp(settled(run, name)))
+    return math.nan if run.diverged else float(np.ptp(steady_output(run, name)))
 
 
 def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
     """Return the mean of one output less another over the whole periods; nan where the run diverged."""
-    return math.nan if run.diverged else float(np.mean(settled(run, first) - settled(run, second)))
+    return math.nan if run.diverged else float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
 
 @dataclass(frozen=True)
@@ -211,12 +211,15 @@ def numbers_of(run: SimulatedRun) -> RunNumbers:
     if run.diverged:
         nothing = dict.fromkeys(PRESSURES, math.nan)
         return RunNumbers(nothing, nothing, nothing, *(math.nan,) * 4, False)
-    Q_A, Q_B = settled(run, "Q_A"), settled(run, "Q_B")
-    drops = [np.abs(settled(run, pump) - settled(run, end)).max() for pump, end in (("p_1", "p_A"), ("p_2", "p_B"))]
+    Q_A, Q_B = steady_output(run, "Q_A"), steady_output(run, "Q_B")
+    drops = [
+        np.abs(steady_output(run, pump) - steady_output(run, end)).max()
+        for pump, end in (("p_1", "p_A"), ("p_2", "p_B"))
+    ]
     return RunNumbers(
         {name: span(run, name) for name in PRESSURES},
-        {name: float(settled(run, name).max()) for name in PRESSURES},
-        {name: float(settled(run, name).min()) for name in PRESSURES},
+        {name: float(steady_output(run, name).max()) for name in PRESSURES},
+        {name: float(steady_output(run, name).min()) for name in PRESSURES},
         mean_difference(run, "p_1", "p_A"),
         mean_difference(run, "p_2", "p_B"),
         float(max(drops)),

@@ -21,13 +21,13 @@ from sealscope.thesis.chapters.chapter4.cases import (
     SolverPair,
     mean_difference,
     run_pair,
-    settled,
     span,
+    steady_output,
 )
 from sealscope.thesis.chapters.chapter4.friction import friction_models, stribeck_curve
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Input, Item
-from sealscope.thesis.engine.products import Cell, Figure, Number, Panel, PlotCurve, ResultTable, Role, thinned
+from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable, thinned
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Unit and factor from SI of what the figures show.
@@ -91,17 +91,17 @@ def _label(name: str) -> str:
     return f"{name} [{OUTPUTS[name][0]}]"
 
 
-def _line(run: SimulatedRun, name: str, label: str, role: Role) -> PlotCurve:
-    return PlotCurve(*thinned(run.t, run.outputs[name] * OUTPUTS[name][1]), label, role)
+def _line(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
+    return FigureCurve(*thinned(run.t, run.outputs[name] * OUTPUTS[name][1]), label, role)
 
 
-def _marks(run: SimulatedRun, name: str, label: str, role: Role) -> PlotCurve:
+def _marks(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
     """Draw an output that lies on another curve as a few marks."""
     few = slice(None, None, max(1, run.t.size // _MARKS))
-    return PlotCurve(run.t[few], run.outputs[name][few] * OUTPUTS[name][1], f"{label} (the same)", role, "points")
+    return FigureCurve(run.t[few], run.outputs[name][few] * OUTPUTS[name][1], f"{label} (the same)", role, "points")
 
 
-def _both_solvers(pair: SolverPair, name: str) -> tuple[PlotCurve, ...]:
+def _both_solvers(pair: SolverPair, name: str) -> tuple[FigureCurve, ...]:
     if len(pair.runs()) == 2 and _difference(pair, name) < _ALIKE * span(pair.converged, name) * OUTPUTS[name][1]:
         same = _marks(pair.literal, name, LABELS["literal"], "literal")
         return _line(pair.converged, name, LABELS["converged"], "converged"), same
@@ -112,11 +112,11 @@ def _difference(pair: SolverPair, name: str) -> float:
     """Rms of the difference between the two runs over the steady periods, in the figure's unit; nan if one diverged."""
     if len(pair.runs()) < 2:
         return float("nan")
-    gap = settled(pair.literal, name) - settled(pair.converged, name)
+    gap = steady_output(pair.literal, name) - steady_output(pair.converged, name)
     return float(np.sqrt(np.mean(gap**2)) * OUTPUTS[name][1])
 
 
-def case_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate a case: least, greatest and rms about the mean of every quantity, with RK4 at 1e-4 s and converged."""
     pair, notes = _case_of(context, item)
     rows: list[tuple[Cell, ...]] = []
@@ -128,7 +128,7 @@ def case_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
             if run.diverged:
                 row += [None, None, None]
                 continue
-            values = settled(run, name) * OUTPUTS[name][1]
+            values = steady_output(run, name) * OUTPUTS[name][1]
             row += [float(values.min()), float(values.max()), float(values.std())]
         rows.append((*row, _difference(pair, name)))
     columns = (
@@ -136,7 +136,7 @@ def case_table(context: Context, item: Item) -> tuple[ResultTable, ...]:
         *(f"{what}, {how}" for how in ("RK4 1e-4 s", "converged") for what in ("least", "greatest", "rms about mean")),
         "rms of the difference",
     )
-    return (ResultTable(item.id, item.title, columns, tuple(rows), (), pair.resolved, f"Numbers {WINDOW}. {notes}"),)
+    return (ThesisTable(item.id, item.title, columns, tuple(rows), (), pair.resolved, f"Numbers {WINDOW}. {notes}"),)
 
 
 def over_time(context: Context, item: Item) -> tuple[Figure, ...]:
@@ -149,7 +149,7 @@ def over_time(context: Context, item: Item) -> tuple[Figure, ...]:
     for letter, name in zip(_LETTERS, _quantities(item), strict=False):
         if name == "u":
             t = pair.converged.t
-            curves = (PlotCurve(*thinned(t, parse_command(command).volts(t)), command, "command"),)
+            curves = (FigureCurve(*thinned(t, parse_command(command).volts(t)), command, "command"),)
             panels.append(Panel("t [s]", _label(name), curves, f"({letter})"))
             continue
         panels.append(Panel("t [s]", _label(name), _both_solvers(pair, name), f"({letter})"))
@@ -174,8 +174,8 @@ def across_orifice(context: Context, item: Item) -> tuple[Figure, ...]:
     for letter, (role, label, run) in zip("ab", reversed(pair.runs()), strict=False):
         panels.append(Panel("t [s]", "pressure [MPa]", _both_ends(run, pump, chamber), f"({letter}) {label}"))
         gap = (run.outputs[pump] - run.outputs[chamber]) * 1e-6
-        gaps.append(PlotCurve(*thinned(run.t, gap), label, role))
-        peak_gap = float(settled(run, pump).max() - settled(run, chamber).max()) * 1e-6
+        gaps.append(FigureCurve(*thinned(run.t, gap), label, role))
+        peak_gap = float(steady_output(run, pump).max() - steady_output(run, chamber).max()) * 1e-6
         numbers += [
             Number(f"mean of {pump} - {chamber}, {label}", mean_difference(run, pump, chamber) * 1e-6, "MPa"),
             Number(f"peak of {pump} less peak of {chamber}, {label}", peak_gap, "MPa"),
@@ -185,10 +185,10 @@ def across_orifice(context: Context, item: Item) -> tuple[Figure, ...]:
     return (Figure(item.id, item.title, tuple(panels), tuple(numbers), claims, pair.resolved, notes),)
 
 
-def _both_ends(run: SimulatedRun, pump: str, chamber: str) -> tuple[PlotCurve, ...]:
+def _both_ends(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureCurve, ...]:
     """Both pressures over time; the pump's as marks where it lies on the chamber's."""
     at_chamber = _line(run, chamber, chamber, "A" if chamber == "p_A" else "B")
-    apart = float(np.sqrt(np.mean((settled(run, pump) - settled(run, chamber)) ** 2)))
+    apart = float(np.sqrt(np.mean((steady_output(run, pump) - steady_output(run, chamber)) ** 2)))
     if apart >= _ALIKE * span(run, chamber):
         return _line(run, pump, pump, "reference"), at_chamber
     return at_chamber, _marks(run, pump, pump, "reference")
@@ -199,12 +199,12 @@ def _swept(
     pairs: Mapping[float, SolverPair],
     measure: Callable[[SimulatedRun], float],
     solvers: Sequence[Solver],
-) -> tuple[tuple[PlotCurve, ...], list[Number]]:
+) -> tuple[tuple[FigureCurve, ...], list[Number]]:
     """Draw a measure [Pa] over what was varied, in MPa, with its numbers; `name` has a place for what was varied."""
     curves, numbers = [], []
     for solver in solvers:
         values = np.array([measure(pair.of(solver)) * 1e-6 for pair in pairs.values()])
-        curves.append(PlotCurve(np.array(list(pairs)), values, LABELS[solver], solver))
+        curves.append(FigureCurve(np.array(list(pairs)), values, LABELS[solver], solver))
         numbers += [
             Number(f"{name.format(at)}, {LABELS[solver]}", float(value), "MPa")
             for at, value in zip(pairs, values, strict=True)
@@ -258,7 +258,7 @@ def volume_sweep(context: Context, item: Item) -> tuple[Figure, ...]:
     return (Figure(item.id, item.title, tuple(panels), tuple(numbers), ("claim-4.1",), resolved, notes),)
 
 
-def measured_only(context: Context, item: Item) -> tuple[ResultTable, ...]:
+def measured_only(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the figures of chapter 4 that show measured curves alone, and the simulated ones in their place."""
     rows = tuple(
         (number, content, f"fig-{beside}", "cannot be reproduced: no numbers are given")
@@ -274,7 +274,7 @@ def measured_only(context: Context, item: Item) -> tuple[ResultTable, ...]:
     notes = (
         "The measured curves beside the simulated ones in Figs. 4.4-4.11 and 4.17-4.32 are missing for the same reason."
     )
-    return (ResultTable(item.id, item.title, ("figure", "what it shows", "simulated", "why"), rows, (), None, notes),)
+    return (ThesisTable(item.id, item.title, ("figure", "what it shows", "simulated", "why"), rows, (), None, notes),)
 
 
 Inputs = tuple[tuple[str, Input], ...]

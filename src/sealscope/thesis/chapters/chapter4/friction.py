@@ -10,7 +10,7 @@ import numpy as np
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Figure, Number, Panel, PlotCurve
+from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -62,10 +62,10 @@ def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
     slip_v = np.array([-0.1, -f.v_th, f.v_th, 0.1])
     slip = np.array([-f.F_pr, -peak, peak, f.F_pr])
     panels = (
-        Panel(*_AXES, (PlotCurve(step, coulomb, "F_C sign(v)", "reference"),), "(a) Coulomb"),
-        Panel(*_AXES, (PlotCurve(static_v, static, "F_C K_brk at rest", "reference"),), "(b) Static"),
-        Panel(*_AXES, (PlotCurve(slip_v, slip, "linear below v_th", "reference"),), "(c) Stick-slip"),
-        Panel(*_AXES, (PlotCurve(v, stribeck(v, f.F_pr), "eqs. 4.21, 4.22", "reference"),), "(d) Stribeck"),
+        Panel(*_AXES, (FigureCurve(step, coulomb, "F_C sign(v)", "reference"),), "(a) Coulomb"),
+        Panel(*_AXES, (FigureCurve(static_v, static, "F_C K_brk at rest", "reference"),), "(b) Static"),
+        Panel(*_AXES, (FigureCurve(slip_v, slip, "linear below v_th", "reference"),), "(c) Stick-slip"),
+        Panel(*_AXES, (FigureCurve(v, stribeck(v, f.F_pr), "eqs. 4.21, 4.22", "reference"),), "(d) Stribeck"),
     )
     numbers = (
         Number("Coulomb force without pressure", f.F_pr, "N"),
@@ -86,14 +86,14 @@ def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
     ahead = np.linspace(f.v_th, 0.2, 800)
     slope = np.gradient(stribeck(ahead, f.F_pr), ahead)
     curves = (
-        PlotCurve(v, stribeck(v, f.F_pr), "no pressure", "reference"),
-        PlotCurve(v, stribeck(v, charged), f"both chambers at {rig.fluid.p_charge / 1e6:g} MPa", "other"),
+        FigureCurve(v, stribeck(v, f.F_pr), "no pressure", "reference"),
+        FigureCurve(v, stribeck(v, charged), f"both chambers at {rig.fluid.p_charge / 1e6:g} MPa", "other"),
     )
     brackets = (
-        PlotCurve(near, stribeck(near, f.F_pr), "bracket closed: continuous", "converged"),
-        PlotCurve(near, stribeck(near, f.F_pr, literal_bracket=True), "bracket over all", "literal"),
+        FigureCurve(near, stribeck(near, f.F_pr), "bracket closed: continuous", "converged"),
+        FigureCurve(near, stribeck(near, f.F_pr, literal_bracket=True), "bracket over all", "literal"),
     )
-    slopes = (PlotCurve(ahead, slope, "slope above v_th", "reference"),)
+    slopes = (FigureCurve(ahead, slope, "slope above v_th", "reference"),)
     panels = (
         Panel(*_AXES, curves, "(a) Stribeck curve"),
         Panel(*_AXES, brackets, "(b) Both bracketings of eq. 4.22"),
