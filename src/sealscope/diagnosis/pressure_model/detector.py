@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.level import DayToDay, against_baseline, share_of_each
+from sealscope.diagnosis.baseline.level import DayToDay, against_baseline, incomparable, share_of_each
 from sealscope.diagnosis.changepoint.tails import largest_normal, near_best, seed_of
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse
 from sealscope.recordings.chambers import CHAMBERS
@@ -35,9 +35,11 @@ EXPLAINED = 0.9
 UNRULY = 1.2
 #: A change of a parameter from the first to the last third that no healthy machine shows within a record, as a share.
 _OTHER_CAUSE = {"friction": 0.18, "stiffness": 0.15}
-#: From day to day the level of G moves by this much [m^3/(s Pa)], known as from five machines: fits differ with the
+#: From day to day the level of G moves by this much [m^3/(s Pa)], known as from five recordings: fits differ with the
 #: machine's friction.
-DAY_TO_DAY = DayToDay(3e-13, 4.0)
+DAY_TO_DAY = DayToDay(2e-13, 4.0)
+#: Two deviations of the prior on the lead [s]: a fit beyond has a ring too many or too few, and another level of G.
+_LARGEST_LEAD = 1e-3
 #: Commands are alike within this ratio of their rms.
 _ALIKE = 1.1
 
@@ -79,6 +81,8 @@ class PressureModel:
         within = _within(followed, recording, probability)
         if not baseline or within.score is None:
             return within
+        if not is_followed(followed):
+            return incomparable(within, "the fit has a ring too many or too few in each reversal")
         known = [remembered(other, (self.name, self.rig), self.follow) for other in baseline]
         return against_baseline(
             within,
@@ -115,10 +119,12 @@ def _comparable(followed: Followed, other: Followed) -> bool:
 
 
 def is_followed(followed: Followed) -> bool:
-    """Return whether the parameters of a record wander no more than those of a healthy machine."""
+    """Return whether the level of a record can be compared: its parameters are those of a machine, and wander so."""
+    from sealscope.diagnosis.pressure_model.model import LEAD
     from sealscope.diagnosis.pressure_model.track import excess_of
 
-    return excess_of(followed.steps) <= UNRULY
+    lead = float(np.mean(followed.path[:, LEAD]))
+    return excess_of(followed.steps) <= UNRULY and abs(lead) <= _LARGEST_LEAD
 
 
 def _mean_drop(recording: Recording, since: float = -np.inf) -> float:
