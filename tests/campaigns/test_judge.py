@@ -64,7 +64,7 @@ def test_the_table_counts_by_hand():
     assert first.false_alarm.count == sum(free)
     assert first.detection.count == sum(small)
     assert (first.detection.low, first.detection.high) == pytest.approx(clopper_pearson(sum(small), 200))
-    assert first.per_hour.hours == pytest.approx(20.0)
+    assert first.per_hour.value == pytest.approx(sum(free) / 20.0)
     assert table[CHANGED, 2.0].detection.value == 1.0
     assert table["always fire", 1.0].detection.value == table["always fire", 1.0].false_alarm.value == 1.0
     assert table["never fire", 1.0].detection.value == table["never fire", 1.0].false_alarm.value == 0.0

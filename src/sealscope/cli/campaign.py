@@ -240,10 +240,10 @@ def _sheet_samples(folder: Path | None) -> MeasuredSamples:
     from sealscope.thesis.claims.regressions import samples_of
     from sealscope.thesis.sheet import MISSING, find_sheet, read_sheet
 
-    found = find_sheet(folder)
-    if found is None:
+    path = find_sheet(folder)
+    if path is None:
         raise InputError(MISSING)
-    return samples_of(read_sheet(found)[0])
+    return samples_of(read_sheet(path)[0])
 
 
 def calibrate(

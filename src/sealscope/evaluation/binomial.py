@@ -11,15 +11,20 @@ from sealscope.evaluation.checks import share
 
 
 @dataclass(frozen=True)
-class Proportion:
-    """`count` of `n`: the `value` with its interval (`low`, `high`) at `confidence`; nan within 0..1 where n is 0."""
+class IntervalEstimate:
+    """A `value` from `n` observations with its confidence interval (`low`, `high`); infinite ends bound nothing."""
 
-    count: int
     n: int
     value: float
     low: float
     high: float
-    confidence: float
+
+
+@dataclass(frozen=True)
+class Proportion(IntervalEstimate):
+    """`count` of `n`: the proportion with its interval; the value is nan, within 0..1, where n is 0."""
+
+    count: int
 
 
 def _checked(k: int, n: int) -> None:
@@ -47,10 +52,11 @@ def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
 def proportion(k: int, n: int, confidence: float = 0.95) -> Proportion:
     """Return the proportion `k` of `n` with its Clopper-Pearson interval; nothing is known where n is 0."""
     k, n = int(k), int(n)
+    share(confidence, "confidence")
     if n == 0 and k == 0:
-        return Proportion(0, 0, math.nan, 0.0, 1.0, share(confidence, "confidence"))
+        return Proportion(0, math.nan, 0.0, 1.0, 0)
     low, high = clopper_pearson(k, n, confidence)
-    return Proportion(k, n, k / n, low, high, confidence)
+    return Proportion(n, k / n, low, high, k)
 
 
 def lower_bound(k: int, n: int, confidence: float = 0.95) -> float:

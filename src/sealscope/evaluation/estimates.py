@@ -9,34 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sealscope.errors import InputError
-from sealscope.evaluation.binomial import Proportion, proportion
+from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.checks import Array, numbers, share
-
-
-@dataclass(frozen=True)
-class Quantile:
-    """The `order` quantile of `n` values and its interval (`low`, `high`) at `confidence`.
-
-    Infinite where the sample is too small to bound it, or where that many values are infinite.
-    """
-
-    order: float
-    n: int
-    value: float
-    low: float
-    high: float
-    confidence: float
-
-
-@dataclass(frozen=True)
-class Mean:
-    """The mean of `n` values and its interval (`low`, `high`) at `confidence`; no interval from one value."""
-
-    n: int
-    value: float
-    low: float
-    high: float
-    confidence: float
 
 
 @dataclass(frozen=True)
@@ -47,8 +21,8 @@ class EstimateError:
     the truth; `without`: records without an estimate.
     """
 
-    bias: Mean
-    rmse: Mean
+    bias: IntervalEstimate
+    rmse: IntervalEstimate
     coverage: Proportion
     without: int
 
@@ -63,9 +37,9 @@ class OnsetErrors:
 
     n: int
     without: int
-    median: Quantile
-    median_size: Quantile
-    ninety_size: Quantile
+    median: IntervalEstimate
+    median_size: IntervalEstimate
+    ninety_size: IntervalEstimate
     coverage: Proportion
 
 
@@ -85,11 +59,12 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
     return int(np.count_nonzero(1.0 - reach <= tail)), int(np.count_nonzero(reach > tail)) + 1
 
 
-def quantile_of(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> Quantile:
+def quantile_of(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> IntervalEstimate:
     """Return the `order` quantile of a sample, ``x_(ceil(n order))``, and its order-statistic interval.
 
-    The interval holds for any distribution. `values` (n,) may hold inf for what was not reached; nan is refused.
-    Raises InputError for an empty sample. Source: as `order_ranks`.
+    The interval holds for any distribution; it is infinite where the sample is too small to bound the quantile.
+    `values` (n,) may hold inf for what was not reached; nan is refused. Raises InputError for an empty sample. Source:
+    as `order_ranks`.
     """
     array = np.sort(np.asarray(values, dtype=np.float64).ravel())
     if array.size == 0 or np.isnan(array).any():
@@ -98,23 +73,23 @@ def quantile_of(values: npt.ArrayLike, order: float, confidence: float = 0.95) -
     r, s = order_ranks(n, order, confidence)
     padded = np.concatenate([[-math.inf], array, [math.inf]])
     middle = min(n, max(1, math.ceil(n * order * (1.0 - 1e-12))))
-    return Quantile(order, n, float(padded[middle]), float(padded[r]), float(padded[s]), confidence)
+    return IntervalEstimate(n, float(padded[middle]), float(padded[r]), float(padded[s]))
 
 
-def mean_of(values: npt.ArrayLike, confidence: float = 0.95) -> Mean:
+def mean_of(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate:
     """Return the mean and its Student interval ``mean -+ t s/sqrt(n)``; infinite from one value, nan from none."""
     from scipy.special import stdtrit
 
     share(confidence, "confidence")
     array = np.asarray(values, dtype=np.float64).ravel()
     if array.size == 0:
-        return Mean(0, math.nan, math.nan, math.nan, confidence)
+        return IntervalEstimate(0, math.nan, math.nan, math.nan)
     array = numbers(array, "values")
     n, value = array.size, float(array.mean())
     if n == 1:
-        return Mean(1, value, -math.inf, math.inf, confidence)
+        return IntervalEstimate(1, value, -math.inf, math.inf)
     half = float(stdtrit(n - 1, 0.5 + confidence / 2.0) * array.std(ddof=1) / math.sqrt(n))
-    return Mean(n, value, value - half, value + half, confidence)
+    return IntervalEstimate(n, value, value - half, value + half)
 
 
 def _coverage(low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float) -> Proportion:
@@ -152,7 +127,7 @@ def estimate_error(
     roots = [math.sqrt(max(x, 0.0)) if not math.isnan(x) else math.nan for x in (square.value, square.low, square.high)]
     return EstimateError(
         bias=mean_of(error, confidence),
-        rmse=Mean(square.n, roots[0], roots[1], roots[2], confidence),
+        rmse=IntervalEstimate(square.n, *roots),
         coverage=_coverage(low, high, true, confidence),
         without=int(true.size - known.sum()),
     )

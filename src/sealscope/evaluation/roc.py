@@ -18,7 +18,7 @@ class Roc:
     """The curve by falling threshold, from (0, 0) to (1, 1), and its band.
 
     `threshold`, `false_alarm`, `detection` (k,): alarm where score >= threshold; (`low`, `high`) (k,): simultaneous
-    band of the detection at that false-alarm probability, at `confidence`.
+    band of the detection at that false-alarm probability.
     """
 
     threshold: Array
@@ -26,14 +26,13 @@ class Roc:
     detection: Array
     low: Array
     high: Array
-    confidence: float
 
 
 @dataclass(frozen=True)
 class Area:
     """Area under the curve `value` = P(leaky score > leak-free score) + half of the ties.
 
-    `standard_error` is 0 where the sample shows none; (`low`, `high`): interval at `confidence` by `method`.
+    `standard_error` is 0 where the sample shows none; (`low`, `high`): interval by `method`.
     """
 
     value: float
@@ -41,7 +40,6 @@ class Area:
     low: float
     high: float
     method: Literal["delong", "newcombe"]
-    confidence: float
 
 
 def _scores(leak_free: npt.ArrayLike, leaky: npt.ArrayLike) -> tuple[Array, Array]:
@@ -78,7 +76,7 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
     first = np.searchsorted(false_alarm, false_alarm - d, side="left")
     last = np.searchsorted(false_alarm, false_alarm + d, side="right") - 1
     low, high = np.maximum(detection[first] - e, 0.0), np.minimum(detection[last] + e, 1.0)
-    return Roc(thresholds, false_alarm, detection, low, high, confidence)
+    return Roc(thresholds, false_alarm, detection, low, high)
 
 
 def _placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
@@ -136,5 +134,5 @@ def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95
     value = float(placements[1].mean())
     error = math.sqrt(sum(_variance(side[None]) for side in placements))
     if error < 1e-12:
-        return Area(value, error, *_newcombe(value, a.size, b.size, z), "newcombe", confidence)
-    return Area(value, error, max(0.0, value - z * error), min(1.0, value + z * error), "delong", confidence)
+        return Area(value, error, *_newcombe(value, a.size, b.size, z), "newcombe")
+    return Area(value, error, max(0.0, value - z * error), min(1.0, value + z * error), "delong")

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 
 from sealscope.errors import InputError
-from sealscope.evaluation.binomial import Proportion, proportion
+from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.checks import share
 from sealscope.evaluation.confusion import CANNOT_TELL
 
@@ -31,18 +31,6 @@ class JudgedRecord:
 
 
 @dataclass(frozen=True)
-class EventsPerHour:
-    """`count` events in `hours`: events per hour with the exact interval (`low`, `high`) at `confidence`."""
-
-    count: int
-    hours: float
-    per_hour: float
-    low: float
-    high: float
-    confidence: float
-
-
-@dataclass(frozen=True)
 class SummaryRow:
     """One detector at one size of leak.
 
@@ -57,7 +45,7 @@ class SummaryRow:
     detection: Proportion
     cannot_tell: Proportion
     false_alarm: Proportion | None
-    per_hour: EventsPerHour | None
+    per_hour: IntervalEstimate | None
     informedness: float
 
 
@@ -76,12 +64,12 @@ def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float
     return 0.0 if count == 0 else float(gammaincinv(count, tail)), float(gammainccinv(count + 1, tail))
 
 
-def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> EventsPerHour:
+def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> IntervalEstimate:
     """Return events per operating hour with their exact interval; InputError unless `hours` > 0."""
     if not (math.isfinite(hours) and hours > 0.0):
         raise InputError(f"operating hours must be > 0, got {hours}")
     low, high = poisson_interval(count, confidence)
-    return EventsPerHour(int(count), float(hours), count / hours, low / hours, high / hours, confidence)
+    return IntervalEstimate(int(count), count / hours, low / hours, high / hours)
 
 
 def _checked(records: Iterable[JudgedRecord]) -> list[JudgedRecord]:
@@ -118,7 +106,9 @@ def _references(records: list[JudgedRecord]) -> list[JudgedRecord]:
     ]
 
 
-def _false_alarms(leak_free: list[JudgedRecord], confidence: float) -> tuple[Proportion | None, EventsPerHour | None]:
+def _false_alarms(
+    leak_free: list[JudgedRecord], confidence: float
+) -> tuple[Proportion | None, IntervalEstimate | None]:
     if not leak_free:
         return None, None
     count = sum(record.verdict == "leak" for record in leak_free)

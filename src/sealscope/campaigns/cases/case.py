@@ -103,8 +103,8 @@ def sources() -> Iterator[Path]:
 
 def code_key() -> str:
     """Return a hash of the sources that a row depends on: rows of other sources must not stand in the same table."""
-    found = hashlib.sha256()
+    key = hashlib.sha256()
     for path in sources():
-        found.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
-        found.update(path.read_bytes())
-    return found.hexdigest()[:16]
+        key.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
+        key.update(path.read_bytes())
+    return key.hexdigest()[:16]

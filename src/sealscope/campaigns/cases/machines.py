@@ -92,4 +92,4 @@ def sized_once(experiment: Experiment) -> tuple[Leak, ...]:
     if not experiment.leaks:
         return ()
     sized = sized_leaks(sizing_run(experiment))
-    return tuple(replace(leak, opening=asked.opening) for leak, asked in zip(sized, experiment.leaks, strict=True))
+    return tuple(replace(leak, opening=wanted.opening) for leak, wanted in zip(sized, experiment.leaks, strict=True))

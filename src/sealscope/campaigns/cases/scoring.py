@@ -28,8 +28,8 @@ def stated(look: Look, names: Sequence[str], views: Views) -> tuple[Scores, dict
             score = _share(statement) if detector.of == DIAGNOSE else rank_of(statement)
             scores[detector.name] = (score, statement.onset_s)
         else:
-            found = scorer(split_view(detector.name)[0]).score(seen)
-            scores[detector.name] = (finite(found.value), finite(found.onset_s))
+            scored = scorer(split_view(detector.name)[0]).score(seen)
+            scores[detector.name] = (finite(scored.value), finite(scored.onset_s))
     return scores, statements
 
 

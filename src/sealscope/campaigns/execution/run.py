@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from sealscope.campaigns.cases.case import CampaignCase, cases_of
+from sealscope.campaigns.cases.recordings import ProgressCallback
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
@@ -18,8 +19,6 @@ from sealscope.campaigns.execution.workers import Workers
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
 
-#: Called with how many records have their row, how many there are, and how many of those failed.
-ProgressCallback = Callable[[int, int, int], None]
 #: Carries out one case of a plan; the last argument is the folder to write its recording into, None for none.
 Task = Callable[[SimulatedPlan, CampaignCase, "Path | None"], CaseRow]
 RECORDINGS = "recordings"
@@ -73,12 +72,12 @@ def run(
             keep.mkdir(exist_ok=True)
         jobs = jobs or _cores()
         if batch:
-            made = batches.in_batches(plan, waiting, jobs, device)
+            new_rows = batches.in_batches(plan, waiting, jobs, device)
         else:
-            made = _rows(partial(_carry_out, task, plan, keep), waiting, jobs, cluster)
-        with store.Appender(place) as appender, closing(made):
-            for row in made:
-                appender.append(row)
+            new_rows = _rows(partial(_carry_out, task, plan, keep), waiting, jobs, cluster)
+        with store.appending(place) as append, closing(new_rows):
+            for row in new_rows:
+                append(row)
                 done += 1
                 failures += row.error is not None
                 if progress is not None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 from sealscope.campaigns.cases.case import cases_of, code_key, digest, world
@@ -180,36 +179,22 @@ def begin(folder: Path, source: Mapping[str, Any]) -> None:
         temporary.write_text(json.dumps(source, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-class Appender:
-    """The one writer of a campaign's rows: each line is on disk before the next is begun."""
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / ROWS
-        self._file: IO[bytes] | None = None
-
-    def __enter__(self) -> Appender:
-        file = self._path.open("ab+")
-        size = file.seek(0, os.SEEK_END)
-        keep = size
+@contextmanager
+def appending(folder: Path) -> Iterator[Callable[[CaseRow], None]]:
+    """Give a function that appends a row to the folder; each line is on disk before the next is begun."""
+    with (folder / ROWS).open("ab+") as file:
+        size = keep = file.seek(0, os.SEEK_END)
         while keep and _byte(file, keep - 1) != b"\n":  # a line that was being written when the power went
             keep -= 1
         if keep < size:
             file.truncate(keep)
-        self._file = file
-        return self
 
-    def append(self, row: CaseRow) -> None:
-        """Write one row and have it on disk."""
-        assert self._file is not None
-        self._file.write(json.dumps(row.as_dict(), allow_nan=False, sort_keys=True).encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        def append(row: CaseRow) -> None:
+            file.write(json.dumps(row.as_dict(), allow_nan=False, sort_keys=True).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._file is not None:
-            self._file.close()
+        yield append
 
 
 def _byte(file: IO[bytes], at: int) -> bytes:

@@ -110,7 +110,7 @@ def fold_log_odds(x: Array, leaks: npt.NDArray[np.bool_], folds: npt.NDArray[np.
     """
     from scipy.special import expit
 
-    found = np.empty(folds.shape)
+    odds = np.empty(folds.shape)
     single = np.ones(len(folds), dtype=bool)
     weight = folds.astype(np.float64)
     count = weight.sum(axis=1)
@@ -132,10 +132,10 @@ def fold_log_odds(x: Array, leaks: npt.NDArray[np.bool_], folds: npt.NDArray[np.
                 single &= ~(np.abs(np.sum(slope * step, axis=1)) <= _SMALL)
                 if not single.any() or not np.all(np.isfinite(beta)):
                     break
-        found = np.einsum("knf,kf->kn", design, beta)
+        odds = np.einsum("knf,kf->kn", design, beta)
     for k in np.flatnonzero(single):
-        found[k] = fit_logistic(x[folds[k]], leaks[folds[k]], ridge).log_odds(x)
-    return found
+        odds[k] = fit_logistic(x[folds[k]], leaks[folds[k]], ridge).log_odds(x)
+    return odds
 
 
 def group_numbers(samples: MeasuredSamples, leave_out: str) -> npt.NDArray[np.intp]:
@@ -160,15 +160,15 @@ def held_out_scores(
         raise InputError(f"tests to leave out in turn must be at least 2, got {of.max() + 1}")
     folds = of[None, :] != np.arange(of.max() + 1)[:, None]
     if isinstance(detector, LogisticClassifier):
-        found = fold_log_odds(samples.matrix(detector.features), leaks, folds, detector.ridge)
+        odds = fold_log_odds(samples.matrix(detector.features), leaks, folds, detector.ridge)
     else:
         candidates = detector.candidates()
         best = _choices(samples, detector, of, leaks, folds)
-        found = np.empty(folds.shape)
+        odds = np.empty(folds.shape)
         for number in dict.fromkeys(best):
             mine, candidate = best == number, candidates[number]
-            found[mine] = fold_log_odds(samples.matrix(candidate.features), leaks, folds[mine], candidate.ridge)
-    return np.asarray(found[of, np.arange(of.size)])
+            odds[mine] = fold_log_odds(samples.matrix(candidate.features), leaks, folds[mine], candidate.ridge)
+    return np.asarray(odds[of, np.arange(of.size)])
 
 
 def chosen_candidates(samples: MeasuredSamples, detector: ChosenClassifier, leave_out: str) -> list[LogisticClassifier]:

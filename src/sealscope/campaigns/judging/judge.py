@@ -20,12 +20,11 @@ from sealscope.diagnosis.calibration.scorers import scorer
 from sealscope.diagnosis.calibration.thresholds import Calibration, Place, calibrate
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
-from sealscope.evaluation.binomial import Proportion, proportion
+from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.confusion import CANNOT_TELL, Confusion, confusion_matrix
 from sealscope.evaluation.estimates import (
     EstimateError,
     OnsetErrors,
-    Quantile,
     estimate_error,
     onset_errors,
     quantile_of,
@@ -102,8 +101,8 @@ class FlowAccuracy:
     detector: str
     leak_lpm: float
     errors: EstimateError
-    median: Quantile
-    median_size: Quantile
+    median: IntervalEstimate
+    median_size: IntervalEstimate
 
 
 @dataclass(frozen=True)
@@ -371,12 +370,12 @@ def _flows(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float)
     flows = []
     for name in _stating(rows, detectors):
         for size in sorted({row.leak_lpm for row in rows}):
-            own = [(row, made) for row in rows if row.leak_lpm == size and (made := _statement(row, name)) is not None]
+            own = [(row, ev) for row in rows if row.leak_lpm == size and (ev := _statement(row, name)) is not None]
             truth = [row.leak_lpm if row.flow_lpm is None else row.flow_lpm for row, _ in own]
-            given = [math.nan if made.leak_lpm is None else made.leak_lpm for _, made in own]
+            given = [math.nan if ev.leak_lpm is None else ev.leak_lpm for _, ev in own]
             if not np.isfinite(given).any():
                 continue
-            low, high = _ends([made.leak_interval_lpm for _, made in own])
+            low, high = _ends([ev.leak_interval_lpm for _, ev in own])
             error = np.array(given) - np.array(truth)
             error = error[np.isfinite(error)]
             flows.append(

@@ -81,7 +81,7 @@ def _main(judgement: Judgement, unit: str, known: Mapping[str, PriorKnowledge]) 
     rows = []
     for row in (*judgement.table, *judgement.overall):
         hour = row.per_hour
-        hourly = (None, None, None) if hour is None else (hour.per_hour, hour.low, hour.high)
+        hourly = (None, None, None) if hour is None else (hour.value, hour.low, hour.high)
         fractions = (*_of(row.detection), *_of(row.false_alarm), *_of(row.cannot_tell))
         given = known.get(row.detector)
         prior: tuple[Value, ...] = (None,) * 3 if known else ()

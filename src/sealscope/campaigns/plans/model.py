@@ -31,35 +31,44 @@ class RecordGroup:
     fault: str = ""
 
 
-@dataclass(frozen=True)
-class SimulatedPlan:
-    """A simulated campaign.
+@dataclass(frozen=True, kw_only=True)
+class _JudgedPlan:
+    """What plans over records of a machine have in common.
 
-    `profile`: the bench whose nuisances each record draws, "" for the rig without drift; `factors`: name -> levels,
-    every combination is a cell; `command` and `closed` are the duty, other names parameters of the rig; `seed`: the
-    base of every case's seed; `views`: sets of channels that detectors see (`detectors`); `assumed`: what detectors
-    may assume of the machine, None for the plan's rig.
+    `unit`: of the sizes of leaks; `views`: sets of channels that detectors see (`detectors`); `assumed`: what detectors
+    may assume of the machine, None for the plan's rig, or the thesis's where it has none.
     """
 
     name: str
     title: str
-    rig: Rig
-    profile: str
-    duration_s: float
-    onset_s: float
     false_alarm: float
     promise: Promise
     confidence: float
-    seed: int
     detectors: tuple[str, ...]
-    keep_recordings: bool
-    records: tuple[RecordGroup, ...]
-    factors: Mapping[str, tuple[str | float, ...]] = field(default_factory=dict)
     place: str = ""
     unit: str = "L/min"
     note: str = ""
     views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     assumed: Rig | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedPlan(_JudgedPlan):
+    """A simulated campaign.
+
+    `profile`: the bench whose nuisances each record draws, "" for the rig without drift; `factors`: name -> levels,
+    every combination is a cell; `command` and `closed` are the duty, other names parameters of the rig; `seed`: the
+    base of every case's seed.
+    """
+
+    rig: Rig
+    profile: str
+    duration_s: float
+    onset_s: float
+    seed: int
+    keep_recordings: bool
+    records: tuple[RecordGroup, ...]
+    factors: Mapping[str, tuple[str | float, ...]] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -83,27 +92,13 @@ class RecordingSet:
     label: str
 
 
-@dataclass(frozen=True)
-class RecordedPlan:
-    """A campaign over recordings in a folder of the caller.
+@dataclass(frozen=True, kw_only=True)
+class RecordedPlan(_JudgedPlan):
+    """A campaign over recordings in a folder of the caller."""
 
-    `unit`: of the sets' sizes; `views` and `assumed` as in `SimulatedPlan`, the thesis's rig where none is given.
-    """
-
-    name: str
-    title: str
     channel_map: Mapping[str, str]
     rate_hz: float | None
     sets: tuple[RecordingSet, ...]
-    unit: str
-    false_alarm: float
-    promise: Promise
-    confidence: float
-    detectors: tuple[str, ...]
-    place: str = ""
-    note: str = ""
-    views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    assumed: Rig | None = None
 
 
 @dataclass(frozen=True)

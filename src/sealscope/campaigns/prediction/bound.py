@@ -114,12 +114,11 @@ def cramer_rao(fisher: Array) -> Array:
 def leak_bound(
     experiment: Experiment,
     *,
-    channels: Sequence[str] = CHAMBERS,
     covariance: Array | None = None,
     unknown: Sequence[str] = (),
     progress: Callable[[float], None] | None = None,
 ) -> LeakBound:
-    """Return the bound on a small leak that is open over the whole experiment, with its channels and their noise.
+    """Return the bound on a small leak that is open over the whole experiment, from the chambers' pressures.
 
     `covariance` (c, c) of one sample, default that of the rig's sensors; `unknown`: parameters that the estimate must
     find beside the leak. The command and everything not named are taken as known.
@@ -127,12 +126,12 @@ def leak_bound(
     Raises InputError for a parameter that cannot vary and where the leak cannot be told from the unknown ones,
     SimulationFailed where a derivative cannot be had.
     """
-    R = noise_covariance(experiment.rig, channels) if covariance is None else covariance
+    R = noise_covariance(experiment.rig) if covariance is None else covariance
     progress = progress or (lambda share: None)
-    sensitivities = [leak_sensitivity(experiment, channels)]
+    sensitivities = [leak_sensitivity(experiment)]
     for k, name in enumerate(unknown):
         progress((k + 1.0) / (len(unknown) + 1.0))
-        sensitivities.append(parameter_sensitivity(experiment, name, channels))
+        sensitivities.append(parameter_sensitivity(experiment, name))
     progress(1.0)
     fisher = information(np.stack([sensitivity.slope for sensitivity in sensitivities]), R)
     return LeakBound(

@@ -48,8 +48,8 @@ class CommandRow:
     @property
     def best(self) -> str | None:
         """The detector that finds the smallest leak, None where none finds any."""
-        found = {name: size for name, size in self.detectors.items() if size is not None}
-        return min(found, key=lambda name: found[name]) if found else None
+        sizes = {name: size for name, size in self.detectors.items() if size is not None}
+        return min(sizes, key=lambda name: sizes[name]) if sizes else None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain values."""
@@ -168,10 +168,10 @@ class PredictionReport:
 
     def advice(self) -> str:
         """Return which of the compared commands finds the smallest leak."""
-        found = [(row.detectors[row.best], row) for row in self.commands if row.best is not None]
-        if not found:
+        smallest = [(row.detectors[row.best], row) for row in self.commands if row.best is not None]
+        if not smallest:
             return f"no command makes these detectors find a leak up to {self.largest_compared:.2g} L/min"
-        size, row = min(found, key=lambda pair: pair[0] or math.inf)
+        size, row = min(smallest, key=lambda pair: pair[0] or math.inf)
         return f"smallest of all: {size:.2g} L/min with {row.command}, throttles {row.orifices}, by {row.best}"
 
 

@@ -267,8 +267,8 @@ def bench_responses(
         return np.stack(changes), np.array(flows[1:])
 
     label = f"{draws} machines of the bench"
-    made = in_parallel([partial(draw, number) for number in range(draws)], label, progress)
-    machines = [machine for machine in made if machine is not None]
+    drawn = in_parallel([partial(draw, number) for number in range(draws)], label, progress)
+    machines = [machine for machine in drawn if machine is not None]
     if len(problems) > MOST_FAILED * draws or len(machines) < FEWEST:
         raise SimulationFailed(f"{len(problems)} of {draws} machines of the bench could not be run: {problems[0]}")
     changes = np.stack([change for change, _ in machines])

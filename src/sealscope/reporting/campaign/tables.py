@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 
 from sealscope.campaigns.judging.judge import Judgement
-from sealscope.evaluation.binomial import Proportion
-from sealscope.evaluation.estimates import Quantile
+from sealscope.evaluation.binomial import IntervalEstimate, Proportion
 
 
 def percent(proportion: Proportion | None) -> str:
@@ -85,7 +84,7 @@ def _share(proportion: Proportion) -> str:
     return f"{100 * proportion.value:.0f} %" if proportion.count else "·"
 
 
-def _quantile(quantile: Quantile) -> str:
+def _quantile(quantile: IntervalEstimate) -> str:
     if not math.isfinite(quantile.value):
         return "–"
     if not (math.isfinite(quantile.low) or math.isfinite(quantile.high)):
