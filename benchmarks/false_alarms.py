@@ -21,8 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
-from sealscope.diagnosis.examination import Examination
+from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, Examination
 from sealscope.diagnosis.registry import DETECTORS
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment

@@ -19,8 +19,8 @@ from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution.batches import StepChooser, place_of_run
 from sealscope.campaigns.plans.reader import read_plan
 from sealscope.campaigns.results import simulated_result, write_result
-from sealscope.diagnosis.calibration.calibrated import place_of
 from sealscope.diagnosis.calibration.scorers import Look
+from sealscope.diagnosis.calibration.thresholds import Place
 from sealscope.errors import InputError
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.simulate import simulate_with_truth
@@ -62,7 +62,7 @@ def alone(plan, case):
     experiment = replace(experiment, step=StepChooser(plan).of(case, experiment))
     made = simulate_with_truth(replace(experiment, leaks=sized_once(experiment)))
     look = Look(made.recording, plan.onset_s, plan.false_alarm, plan.rig)
-    return stated(look, plan.detectors, plan.views)[0], place_of(made.recording), made.truth
+    return stated(look, plan.detectors, plan.views)[0], Place.of(made.recording), made.truth
 
 
 def test_without_noise_the_scores_are_those_of_the_recordings(plan_with):
@@ -200,7 +200,7 @@ def test_a_place_under_other_commands_is_that_of_the_recording(plan_with, comman
     plan = plan_with([{"count": 1}], duration="8 s", onset="4 s", detectors=["sign rule: d3 of p_A fell"])
     case = cases_of(plan)[-1]
     experiment = replace(unsized(plan, case), command=parse_command(command), step=5e-4, allow_unresolved=True)
-    found, expected = place_of_run(experiment), place_of(simulate_with_truth(experiment).recording)
+    found, expected = place_of_run(experiment), Place.of(simulate_with_truth(experiment).recording)
     assert found.point.level == pytest.approx(expected.point.level, abs=0.03)
     assert replace(found.point, level=0.0) == replace(expected.point, level=0.0)
 

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis import registry
-from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.examination import Examination
+from sealscope.diagnosis.diagnose import Examination, diagnose
+from sealscope.diagnosis.isolation import isolated, other_cause, signatures, unasked
 from sealscope.diagnosis.verdict.diagnosis import next_check
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.verdict.isolation import isolated, other_cause, signatures, unasked
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 
 ONSET, RATE = 61.3, 500.0

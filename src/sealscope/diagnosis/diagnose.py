@@ -1,16 +1,25 @@
-"""Diagnose a recording: inspect the data first, run every detector its channels allow, state one verdict."""
+"""Diagnosis of a recording: inspect the data, run every detector that its channels allow, state one verdict."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.baseline.inspection import comparable, inspected
-from sealscope.diagnosis.examination import Examination
+from sealscope.diagnosis.detector import Detector, checked, failure, unusable
+from sealscope.diagnosis.isolation import Signatures, isolated, signatures, unasked
+from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.fusion import ORDER, fuse
 from sealscope.errors import InputError
+from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -19,6 +28,8 @@ if TYPE_CHECKING:
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
 FALSE_ALARM_PROBABILITY = 0.01
 _PROBABILITIES = (1e-4, 0.2)
+#: Detectors that name a cause by the pressures: they do so of nothing that another cause explains, alone either.
+_ISOLATED = ("pressure model", "observer")
 
 
 def check_probability(probability: float) -> None:
@@ -26,6 +37,133 @@ def check_probability(probability: float) -> None:
     low, high = _PROBABILITIES
     if not (isinstance(probability, float | int) and low <= probability <= high):
         raise InputError(f"false-alarm probability must be {low:g} to {high:g}, got {probability!r}")
+
+
+class Examination:
+    """One recording without gaps and missing samples, and what detectors are given beside it.
+
+    `baseline`: leak-free recordings that can be compared with it (`baseline.inspection`); `no_baseline`: why there is
+    none where one was asked for: then a leak within the recording is all that can be stated; `rig`: what detectors may
+    assume of the machine; `distrust`: why the pressures cannot be judged, None where they can: then no detector is run.
+    A recording that is to be its own baseline needs pressures that move throughout (`recordings.motion`).
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        baseline: Sequence[Recording] = (),
+        *,
+        false_alarm_probability: float,
+        rig: Rig | str | os.PathLike[str] = "thesis",
+        distrust: str | None = None,
+        no_baseline: str | None = None,
+    ) -> None:
+        self.recording, self.baseline, self.rig = recording, tuple(baseline), rig
+        self.false_alarm_probability = false_alarm_probability
+        self.distrust, self.no_baseline = distrust, no_baseline
+        if distrust is None and not self.baseline and (still := does_not_move(recording)) is not None:
+            self.distrust = f"the pressures cannot be trusted: {still}"
+        self._detectors: dict[str, Detector] = {}
+        self._evidence: dict[tuple[str, frozenset[str]], Evidence] = {}
+
+    def through(self, channels: Iterable[str]) -> Examination:
+        """Return the same recording with these channels alone; a detector that reads no other is not run again."""
+        wanted = set(channels)
+        view = Examination(
+            self.recording.only(name for name in self.recording.channels if name in wanted),
+            [own.only(name for name in own.channels if name in wanted) for own in self.baseline],
+            false_alarm_probability=self.false_alarm_probability,
+            rig=self.rig,
+            distrust=self.distrust,
+            no_baseline=self.no_baseline,
+        )
+        view._detectors, view._evidence = self._detectors, self._evidence
+        return view
+
+    def evidence(self, name: str) -> Evidence:
+        """Return a detector's evidence, `cannot tell` where the recording lacks what it needs or where it fails.
+
+        Raises KeyError for a detector that is not registered.
+        """
+        from threadpoolctl import threadpool_limits
+
+        from sealscope.parameters import load_rig
+
+        factory = detectors()[name]
+        # a detector may state the channels that it `reads` where there is no baseline: another view differs in no other
+        visible = frozenset(self.recording.channels)
+        key = (name, visible)
+        try:
+            if name not in self._detectors:
+                self._detectors[name] = factory(load_rig(self.rig))
+            detector = self._detectors[name]
+            reads = visible if self.baseline else frozenset(getattr(detector, "reads", visible))
+            key = (name, visible & reads)
+            if key not in self._evidence:
+                # small matrices: threads would cost more than they give, and how they share the work may not repeat to
+                # the bit
+                with np.errstate(all="ignore"), threadpool_limits(limits=1):
+                    self._evidence[key] = self._run(name, detector)
+        except Exception as error:
+            self._evidence[key] = Evidence(
+                "cannot tell", failure(name, getattr(factory, "distribution", None), error), detector=name, usable=False
+            )
+        return self._evidence[key]
+
+    def _run(self, name: str, detector: Detector) -> Evidence:
+        if detector.name != name:
+            raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
+        baseline, reason = self.baseline, unusable(detector, self.recording) or self.distrust
+        if reason is None and self.baseline:
+            reasons = [unusable(detector, own) for own in self.baseline]
+            baseline = tuple(own for own, why in zip(self.baseline, reasons, strict=True) if why is None)
+            if not baseline:
+                reason = f"no baseline recording can be used: {reasons[0]}"
+        if reason is not None:
+            return Evidence("cannot tell", reason, detector=name, usable=False)
+        evidence = checked(detector.examine(self.recording, baseline, self.false_alarm_probability))
+        evidence = replace(evidence, detector=name)
+        if self.no_baseline is not None:
+            if evidence.verdict == "leak" or evidence.cause is not None or evidence.alarmed:
+                evidence = replace(evidence, reason=f"{evidence.reason}; {self.no_baseline}")
+            else:
+                evidence = replace(evidence, verdict="cannot tell", reason=self.no_baseline)
+        return self._isolated(evidence) if name in _ISOLATED else evidence
+
+    def fused(self) -> Evidence:
+        """Return one verdict from all registered detectors.
+
+        Two run at a time: compiled code runs beside the interpreter, and a detector's evidence does not depend on the
+        others. A detector that sees a change in the pressures and cannot name its cause is believed where nothing else
+        stepped with it, and a verdict other than `leak` that names no cause gets that of a plain step (`isolation`).
+        """
+        from concurrent.futures import ThreadPoolExecutor
+
+        from threadpoolctl import threadpool_limits
+
+        # the limit is the process's: set here, it does not change while detectors come and go
+        with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
+            evidences = list(pool.map(self.evidence, detectors()))
+        fused = fuse([own if own.detector == ORDER[0] else self._isolated(own) for own in evidences])
+        if fused.verdict == "leak" or fused.cause is not None or self.distrust is not None or self._signatures is None:
+            return fused
+        with np.errstate(all="ignore"):
+            stepped = unasked(self._signatures)
+        if stepped is None:
+            return fused
+        onset, other = stepped
+        reason = f"{fused.reason}; near {onset:.0f} s {other.words}: {other.cause}"
+        return replace(fused, cause=other.cause, reason=reason)
+
+    def _isolated(self, evidence: Evidence) -> Evidence:
+        if evidence.verdict != "leak" or self._signatures is None:
+            return evidence
+        return isolated(evidence, self._signatures)
+
+    @cached_property
+    def _signatures(self) -> Signatures | None:
+        with np.errstate(all="ignore"):
+            return signatures(self.recording)
 
 
 @checked_call

@@ -37,6 +37,7 @@ class PlugIn:
     make: Callable[[Rig], Detector]
 
     def __call__(self, rig: Rig) -> Detector:
+        """Make the detector."""
         return self.make(rig)
 
     @property

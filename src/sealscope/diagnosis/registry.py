@@ -1,51 +1,35 @@
-"""Every detector by name: the built-in ones and those that installed distributions bring."""
+"""Registry of detectors by name: the built-in ones and those of installed distributions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from sealscope.diagnosis.detector import Detector, Factory
+from sealscope.diagnosis.plugins import plug_ins
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-def _rms_change(rig: Rig) -> Detector:
-    from sealscope.diagnosis.rms_change.detector import RmsChange
+def _built_in(room: str, name: str) -> Factory:
+    def make(rig: Rig) -> Detector:
+        detector: Detector = getattr(import_module(f"sealscope.diagnosis.{room}.detector"), name)(rig)
+        return detector
 
-    return RmsChange()
-
-
-def _volume_balance(rig: Rig) -> Detector:
-    from sealscope.diagnosis.volume_balance.detector import VolumeBalance
-
-    return VolumeBalance(rig)
+    return make
 
 
-def _pressure_model(rig: Rig) -> Detector:
-    from sealscope.diagnosis.pressure_model.detector import PressureModel
-
-    return PressureModel(rig)
-
-
-def _observer(rig: Rig) -> Detector:
-    from sealscope.diagnosis.observer.detector import Observer
-
-    return Observer(rig)
-
-
-#: The built-in detectors by name; `diagnose` runs those that the channels allow, and one contract test runs them all.
+#: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
-    "volume balance": _volume_balance,
-    "pressure model": _pressure_model,
-    "observer": _observer,
-    "rms change": _rms_change,
+    "volume balance": _built_in("volume_balance", "VolumeBalance"),
+    "pressure model": _built_in("pressure_model", "PressureModel"),
+    "observer": _built_in("observer", "Observer"),
+    "rms change": _built_in("rms_change", "RmsChange"),
 }
 
 
 def detectors() -> Mapping[str, Factory]:
-    """Every detector by name: the built-in ones, then those that installed distributions bring (`plugins`)."""
-    from sealscope.diagnosis.plugins import plug_ins
-
-    return {**DETECTORS, **{one.name: one for one in plug_ins(frozenset(DETECTORS))}}
+    """Return every detector by name: the built-in ones, then those of installed distributions (`plugins`)."""
+    return {**DETECTORS, **{plug_in.name: plug_in for plug_in in plug_ins(frozenset(DETECTORS))}}

@@ -13,7 +13,7 @@ from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
-from sealscope.reporting.series import TimeBase, coded, coded_times, time_base
+from sealscope.reporting.series import DrawnTimes, coded, coded_times, time_base
 
 SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
@@ -107,9 +107,7 @@ def label_of(name: str) -> str:
 
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """Return the charts of the recorded channels, those of one kind and unit together, channels without samples left
-    out.
-    """
+    """Return the charts of the channels that have samples, those of one kind and unit together."""
     kinds = [
         ("u", "Command", (("u", "a"),)),
         ("x", "Piston position", (("x", "a"),)),
@@ -183,7 +181,7 @@ class DrawnCharts:
 
     data: dict[str, Any]
     still: dict[str, dict[str, Any]]
-    base: TimeBase
+    base: DrawnTimes
 
 
 def draw(

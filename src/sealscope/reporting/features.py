@@ -55,9 +55,9 @@ class DetailChange:
 
 
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
-    """The details of one chamber over its usable stretches, and a sentence that says what was left out, or why all was.
+    """Return the details of one chamber over its usable stretches, and a sentence on what was left out.
 
-    Raises nothing for bad data: the reason is returned in words, with None.
+    Bad data raise nothing: then the details are None, and the sentence is the reason.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."

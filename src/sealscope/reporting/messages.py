@@ -13,7 +13,7 @@ ABSENT = "–"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """`value` with `digits` significant digits, without an exponent where that stays short; a dash for None or NaN."""
+    """Return `value` with `digits` significant digits, a dash for None or NaN; no exponent where that is short."""
     if value is None or isnan(value):
         return ABSENT
     if not isfinite(value):
@@ -28,7 +28,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def clock(seconds: float | None) -> str:
-    """A time on the recording's axis: seconds (one decimal, more below 10 s), from an hour on as h:mm:ss as well."""
+    """Return a time in seconds (one decimal, more below 10 s), from an hour on as h:mm:ss as well."""
     if seconds is None or not isfinite(seconds):
         return ABSENT
     text = (f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s").replace("-", "−")
@@ -40,27 +40,27 @@ def clock(seconds: float | None) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """What was found, in one line."""
-    said = {
+    """Return the verdict in one line."""
+    verdict = {
         "leak": "Leak: oil bypasses the piston",
         "no leak": "No leak found across the piston",
         "cannot tell": "Cannot tell whether oil bypasses the piston",
-    }.get(diagnosis.verdict, diagnosis.verdict)
+    }[diagnosis.verdict]
     other = cause(diagnosis)
     if diagnosis.verdict == "leak" and other == "piston or pump leak":
-        return f"{said}, or the pump"
-    return f"{said}, but something changed: {other}" if other and diagnosis.verdict != "leak" else said
+        return f"{verdict}, or the pump"
+    return f"{verdict}, but something changed: {other}" if other and diagnosis.verdict != "leak" else verdict
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """What the change is taken for; None where there is none, or it cannot be told."""
+    """Return what the change is attributed to; None where there is none, or it cannot be told."""
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
 
 
 def since(diagnosis: Diagnosis) -> str | None:
-    """Since when; None where there is no leak to date."""
+    """Return since when oil leaks; None where there is no leak to date."""
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
@@ -73,7 +73,7 @@ def since(diagnosis: Diagnosis) -> str | None:
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
-    """How much oil in L/min; where no leak was found, how much there can be at most. None where nothing is known."""
+    """Return how much oil leaks [L/min], or at most could where no leak was found; None where nothing is known."""
     interval = diagnosis.leak_interval_lpm
     if diagnosis.verdict == "no leak" and diagnosis.leak_lpm is not None and interval is not None and interval[1] > 0:
         return f"none found; at most {number(interval[1], 2)} L/min (95 % interval)"
@@ -88,7 +88,7 @@ def how_much(diagnosis: Diagnosis) -> str | None:
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """The score against its threshold, and what the threshold means."""
+    """Return the score against its threshold, and what the threshold means."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return "no score was formed"
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
@@ -99,7 +99,7 @@ def how_sure(diagnosis: Diagnosis) -> str:
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:
-    """What the threshold was set for."""
+    """Return what the threshold was set for."""
     p = diagnosis.false_alarm_probability
     if 0 < p < 1:
         every = 1 / p
@@ -115,27 +115,23 @@ def _fault(finding: Finding) -> str:
 
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """What to check next, most useful first."""
+    """Return what to check next, most useful first."""
     trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
     faults = ", ".join(dict.fromkeys(_fault(finding) for finding in trouble))
+    repeat = "Repeat the recording with the same command and oil temperature: a worn seal shows again."
+    plan = "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until then."
     if diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS):
-        steps = [diagnosis.next_check]
-        if diagnosis.verdict == "leak":
-            steps += [
-                "Repeat the recording with the same command and oil temperature: a worn seal shows again.",
-                "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until "
-                "then.",
-            ]
-        else:
-            steps.append("Record again under the same command when that is settled: a leak may hide behind it.")
+        steps = [diagnosis.next_check, repeat, plan]
+        if diagnosis.verdict != "leak":
+            steps[1:] = ["Record again under the same command when that is settled: a leak may hide behind it."]
         if trouble:
             steps.insert(0, f"Rule out a fault of the data first: {faults}.")
     elif diagnosis.verdict == "leak":
         steps = [
-            "Repeat the recording with the same command and oil temperature: a worn seal shows again.",
+            repeat,
             "Make sure that the bypass needle valve is shut. The pressures cannot tell it from the piston seal.",
             "Hold the piston against a load with the motor at rest and watch x: creep confirms the leak.",
-            "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until then.",
+            plan,
         ]
         if trouble:
             steps.insert(0, f"Rule out a fault of the data first: {faults}.")

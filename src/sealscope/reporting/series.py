@@ -16,7 +16,7 @@ _MISSING = -32768
 
 
 @dataclass(frozen=True)
-class TimeBase:
+class DrawnTimes:
     """Points of time at which all series of one recording are drawn.
 
     `t`: (m,) [s], never decreasing; `starts`, `stops`: (k,) first sample of each bucket and the one after its last;
@@ -60,7 +60,7 @@ def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
 
 
-def time_base(t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0) -> TimeBase:
+def time_base(t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0) -> DrawnTimes:
     """Return the drawing base of n samples with about `points` points, and every sample near the time `near` [s].
 
     `t`: (n,) [s]; `rate`: nominal rate [Hz]; `near_samples`: how many samples are drawn one by one there. Buckets hold
@@ -82,7 +82,7 @@ def time_base(t: Array, rate: float, points: int, *, near: float | None = None, 
     before = np.append(0, np.cumsum(np.where(sizes > 1, 2, 1)))  # points drawn ahead of each bucket
     breaks = before[np.searchsorted(starts, gaps)]
     drawn = np.insert(_paired(t[starts], t[stops - 1], sizes), breaks, t[gaps - 1])
-    return TimeBase(drawn, starts, stops, width, fine, breaks, by_sample)
+    return DrawnTimes(drawn, starts, stops, width, fine, breaks, by_sample)
 
 
 def coded(values: Array) -> dict[str, Any]:

@@ -48,7 +48,8 @@ def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback |
 
 def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
     from sealscope.diagnosis.baseline.inspection import inspected
-    from sealscope.diagnosis.calibration.calibrated import look_at, place_of
+    from sealscope.diagnosis.calibration.calibrated import look_at
+    from sealscope.diagnosis.calibration.thresholds import Place
     from sealscope.recordings import read
 
     row = partial(
@@ -67,6 +68,6 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
             return row(error=f"{name}: {record.defect}")
         look = look_at(record.part, 0.5, plan.false_alarm, plan.assumed or "thesis")
         scores, statements = stated(look, plan.detectors, plan.views)
-        return row(place=asdict(place_of(record.part)), scores=scores, statements=statements)
+        return row(place=asdict(Place.of(record.part)), scores=scores, statements=statements)
     except SealscopeError as error:
         return row(error=str(error))

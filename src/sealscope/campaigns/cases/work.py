@@ -29,8 +29,8 @@ def work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None = None) -> C
 def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow:
     from sealscope.campaigns.cases.scoring import stated
     from sealscope.diagnosis.baseline.inspection import inspected
-    from sealscope.diagnosis.calibration.calibrated import place_of
     from sealscope.diagnosis.calibration.scorers import Look
+    from sealscope.diagnosis.calibration.thresholds import Place
     from sealscope.simulation.simulate import simulate_with_truth
 
     simulated = simulate_with_truth(experiment_of(plan, case))
@@ -46,7 +46,7 @@ def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow
     return CaseRow.of(
         case,
         flow_lpm=simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0,
-        place=asdict(place_of(record.part)),
+        place=asdict(Place.of(record.part)),
         scores=scores,
         statements=statements,
     )

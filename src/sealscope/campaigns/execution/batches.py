@@ -257,7 +257,7 @@ def _chosen(experiment: Experiment) -> tuple[str, float]:
 
 
 def place_of_run(experiment: Experiment) -> Place:
-    """Return where the record of an experiment with a stated step and sized leaks is made, as `place_of` would.
+    """Return where the record of an experiment with a stated step and sized leaks is made, as `Place.of` would.
 
     Command and cycle are those of the whole record. Under a sine, pressure level and direction come from whole
     periods of a short run before any leak, without instruments and later drifts; under another command, or with

@@ -167,7 +167,7 @@ def calibration_of(
     return calibrate(
         [place_from(row.place) for row in leak_free],
         {name: [row.scores[name][0] for row in leak_free] for name in wanted},
-        rate=false_alarm,
+        false_alarm_probability=false_alarm,
         promise=promise,
         confidence=confidence,
         split_share=split_share,

@@ -1,4 +1,4 @@
-"""The operating point of a recording: what must be alike before two recordings may be compared."""
+"""Operating points of recordings."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Recording
 
-#: A stroke goes one way when its net way is more than this share of the whole way (or of the pressure difference's
-#: rms).
+#: A stroke has one direction when its displacement exceeds this share of the whole path (or the mean pressure
+#: difference this share of its rms).
 ONE_WAY = 0.5
 #: Pressure levels (rms of the pressure difference) are alike within this ratio when too few recordings tell how the
 #: details follow the level.
@@ -24,9 +24,12 @@ _SLOW_RATE = 20.0
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """`direction`: +1, -1 for a stroke one way, 0 for a back-and-forth duty; `level`: log of the rms of the pressure
-    difference; `rate` [Hz]; `units` of the chambers; `chambers`; `command_rms` [V] and `cycle` [s] where there is a
-    command."""
+    """What must be alike before two recordings may be compared.
+
+    `direction`: +1, -1 for a stroke in one direction, 0 for a back-and-forth duty; `level`: log of the rms of the
+    pressure difference; `rate` [Hz]; `units` of the chambers; `chambers`; `command_rms` [V] and `cycle` [s] where there
+    is a command.
+    """
 
     direction: Literal[-1, 0, 1]
     level: float
@@ -42,8 +45,8 @@ def _direction(recording: Recording) -> Literal[-1, 0, 1]:
     if "x" in recording and moves(recording["x"]):
         stride = max(1, int(recording.rate / _SLOW_RATE))
         x = recording["x"][::stride]
-        way = float(np.abs(np.diff(x)).sum())
-        share = float(x[-1] - x[0]) / way if way > 0 else 0.0
+        path = float(np.abs(np.diff(x)).sum())
+        share = float(x[-1] - x[0]) / path if path > 0 else 0.0
     elif all(name in recording for name in CHAMBERS):
         dp = recording["p_A"] - recording["p_B"]
         rms = float(np.sqrt(np.mean(dp**2)))
@@ -54,7 +57,7 @@ def _direction(recording: Recording) -> Literal[-1, 0, 1]:
 
 
 def operating_point(recording: Recording) -> OperatingPoint:
-    """The operating point of a recording without missing samples."""
+    """Return the operating point of a recording without missing samples."""
     chambers = chambers_of(recording)
     pressure = recording["p_A"] - recording["p_B"] if len(chambers) == 2 else recording[chambers[0]]
     if len(chambers) < 2:
@@ -72,7 +75,7 @@ def operating_point(recording: Recording) -> OperatingPoint:
 
 
 def difference(one: OperatingPoint, other: OperatingPoint) -> str | None:
-    """Why two recordings must not be compared, in words; None when they may. The pressure level is judged elsewhere."""
+    """Return why two recordings must not be compared, None where they may; the pressure level is judged elsewhere."""
     if one.chambers != other.chambers or one.units != other.units:
         return "other channels or units"
     if abs(one.rate / other.rate - 1.0) > 1e-3:

@@ -1,5 +1,4 @@
-"""Calibrate detectors to a false-alarm rate on leak-free recordings, and keep the thresholds with what they were made
-from."""
+"""Thresholds of detectors for a false-alarm probability, set on leak-free recordings, and their files."""
 
 from __future__ import annotations
 
@@ -11,11 +10,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingPoint, difference
+from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingPoint, difference, operating_point
 from sealscope.diagnosis.calibration.scorers import scorer, split_view
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 from sealscope.recordings.atomic import atomic_write
+from sealscope.recordings.recording import Recording
 
 FORMAT = "sealscope calibration 2"
 #: How far outside the calibrated pressure levels a recording may lie: this share of their range, and this ratio.
@@ -33,11 +33,19 @@ class Place:
     point: OperatingPoint
     duration_s: float
 
+    @classmethod
+    def of(cls, part: Recording) -> Place:
+        """Return the place of a recording without missing samples."""
+        return cls(operating_point(part), part.duration)
+
 
 @dataclass(frozen=True)
 class Group:
-    """One calibrated operating point: the `point` of its first recording, the ranges of all `records`, and the
-    threshold of each detector (none where the records are too few for the rate)."""
+    """One calibrated operating point.
+
+    The `point` of its first recording, the ranges of all `records`, and the threshold of each detector (none where the
+    records are too few for the probability).
+    """
 
     point: OperatingPoint
     records: int
@@ -46,7 +54,7 @@ class Group:
     thresholds: Mapping[str, Threshold]
 
     def refuses(self, place: Place) -> str | None:
-        """Why a recording is outside of this operating point, in words; None where it is inside."""
+        """Return why a recording is outside of this operating point, None where it is inside."""
         other = difference(place.point, self.point)
         if other is not None:
             return other
@@ -63,15 +71,15 @@ class Group:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Thresholds of `detectors` for a false-alarm `rate`, by operating point.
+    """Thresholds of `detectors` for a `false_alarm_probability`, by operating point.
 
-    The first detector makes the verdict, so that the rate is the verdict's own; the others are told beside it.
+    The first detector makes the verdict, so that the probability is the verdict's own; the others are stated beside it.
     `split_share`: where detectors that compare two sides of a moment split a recording, as a share of its length.
     `made_from`: plain values that say which recordings or which campaign it was made from; `views`: name -> channels,
     for detectors that saw no other (`rms change @ pressures`).
     """
 
-    rate: float
+    false_alarm_probability: float
     promise: Promise
     confidence: float
     detectors: tuple[str, ...]
@@ -81,7 +89,7 @@ class Calibration:
     views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def find(self, place: Place) -> Group | str:
-        """The calibrated operating point of a recording, or why it is outside of all, in words."""
+        """Return the calibrated operating point of a recording, or why it is outside of all, in words."""
         reasons = []
         for group in self.groups:
             reason = group.refuses(place)
@@ -89,9 +97,8 @@ class Calibration:
                 return group
             reasons.append(reason)
         # the most telling reason is that of the group that differs last, in its level or length
-        late = [one for one in reasons if one.startswith(("another pressure level", "another length"))]
-        told = (late or reasons)[0]
-        return f"outside the calibrated operating points: {told}"
+        late = [reason for reason in reasons if reason.startswith(("another pressure level", "another length"))]
+        return f"outside the calibrated operating points: {(late or reasons)[0]}"
 
 
 def _span(low: float, high: float, unit: str) -> str:
@@ -99,8 +106,10 @@ def _span(low: float, high: float, unit: str) -> str:
 
 
 def grouped(places: Sequence[Place]) -> list[list[int]]:
-    """Indices of the recordings of each operating point, both in the order given; levels are not told apart, lengths
-    within a tenth are alike."""
+    """Return the indices of the recordings of each operating point, both in the order given.
+
+    Pressure levels are not distinguished, lengths within a tenth are alike.
+    """
     groups: list[list[int]] = []
     for number, place in enumerate(places):
         for group in groups:
@@ -118,14 +127,14 @@ def calibrate(
     places: Sequence[Place],
     scores: Mapping[str, Sequence[float | None]],
     *,
-    rate: float,
+    false_alarm_probability: float,
     promise: Promise = "average",
     confidence: float = 0.95,
     split_share: float = 0.5,
     made_from: Mapping[str, Any] | None = None,
     views: Mapping[str, Sequence[str]] | None = None,
 ) -> Calibration:
-    """Thresholds from the scores of leak-free recordings.
+    """Set thresholds by the scores of leak-free recordings.
 
     `places` (n,): where each was made; `scores`: detector -> (n,) scores, None where it could not tell (such a record
     raises no alarm and counts as the lowest score). Each operating point gets, for each detector, the order statistic
@@ -143,7 +152,7 @@ def calibrate(
             raise InputError(
                 f"scores of {name!r} must be as many as the recordings, got {len(values)} for {len(places)}"
             )
-    needed = records_needed(rate, confidence if promise == "bound" else None)
+    needed = records_needed(false_alarm_probability, confidence if promise == "bound" else None)
     groups = []
     for members in grouped(places):
         thresholds: dict[str, Threshold] = {}
@@ -157,7 +166,7 @@ def calibrate(
                 continue
             floor = min(finite)
             thresholds[name] = quantile_threshold(
-                [floor if value is None else value for value in known], rate, confidence, promise
+                [floor if value is None else value for value in known], false_alarm_probability, confidence, promise
             )
         levels = [places[k].point.level for k in members]
         lengths = [places[k].duration_s for k in members]
@@ -173,12 +182,19 @@ def calibrate(
     if not any(group.thresholds for group in groups):
         most = max(group.records for group in groups)
         raise InputError(
-            f"leak-free recordings must be at least {needed} at an operating point for a false-alarm rate of {rate:g}, "
-            f"got at most {most}"
+            f"leak-free recordings must be at least {needed} at an operating point for a false-alarm rate of "
+            f"{false_alarm_probability:g}, got at most {most}"
         )
     used = {view: seen[view] for name in scores if (view := split_view(name)[1])}
     return Calibration(
-        rate, promise, confidence, tuple(scores), split_share, tuple(groups), dict(made_from or {}), used
+        false_alarm_probability,
+        promise,
+        confidence,
+        tuple(scores),
+        split_share,
+        tuple(groups),
+        dict(made_from or {}),
+        used,
     )
 
 
@@ -191,20 +207,20 @@ def _check(name: str, views: Mapping[str, tuple[str, ...]]) -> None:
 
 
 def as_dict(calibration: Calibration) -> dict[str, Any]:
-    """The calibration as plain JSON values."""
+    """Return the calibration as plain JSON values."""
     groups = [
         {
             "point": asdict(group.point),
             "records": group.records,
             "levels": list(group.levels),
             "durations_s": list(group.durations_s),
-            "thresholds": {name: asdict(one) for name, one in group.thresholds.items()},
+            "thresholds": {name: asdict(threshold) for name, threshold in group.thresholds.items()},
         }
         for group in calibration.groups
     ]
     return {
         "format": FORMAT,
-        "false_alarm_rate": calibration.rate,
+        "false_alarm_rate": calibration.false_alarm_probability,
         "promise": calibration.promise,
         "confidence": calibration.confidence,
         "detectors": list(calibration.detectors),
@@ -222,7 +238,7 @@ def save(calibration: Calibration, path: str | os.PathLike[str]) -> None:
 
 
 def load(path: str | os.PathLike[str]) -> Calibration:
-    """The calibration in a file; raises UnreadableFile, naming the file, where it is none."""
+    """Read a calibration from a file; raises UnreadableFile, naming the file, where it is none."""
     file = Path(path)
     try:
         if file.stat().st_size > _LARGEST_FILE:
@@ -250,34 +266,37 @@ def load(path: str | os.PathLike[str]) -> Calibration:
 def _from(tree: Mapping[str, Any]) -> Calibration:
     detectors = tuple(str(name) for name in tree["detectors"])
     groups = []
-    for one in tree["groups"]:
-        point = dict(one["point"])
+    for group in tree["groups"]:
+        point = dict(group["point"])
         point |= {name: tuple(point[name]) for name in ("units", "chambers")}
-        thresholds = {name: Threshold(**values) for name, values in one["thresholds"].items()}
+        thresholds = {name: Threshold(**values) for name, values in group["thresholds"].items()}
         for name, threshold in thresholds.items():
             if name not in detectors or not math.isfinite(threshold.value):
                 raise InputError(
                     f"a threshold must be a finite number of a listed detector, got {threshold.value} of {name!r}"
                 )
-        low, high = (float(value) for value in one["levels"])
-        short, long = (float(value) for value in one["durations_s"])
-        groups.append(Group(OperatingPoint(**point), int(one["records"]), (low, high), (short, long), thresholds))
-    views = {str(name): tuple(str(one) for one in channels) for name, channels in tree.get("views", {}).items()}
+        low, high = (float(value) for value in group["levels"])
+        short, long = (float(value) for value in group["durations_s"])
+        groups.append(Group(OperatingPoint(**point), int(group["records"]), (low, high), (short, long), thresholds))
+    views = {str(name): tuple(map(str, channels)) for name, channels in tree.get("views", {}).items()}
     for name in detectors:
         _check(name, views)
     if not detectors or not groups:
         raise InputError("a calibration must have detectors and operating points")
-    rate, confidence, split = (float(tree[name]) for name in ("false_alarm_rate", "confidence", "split_share"))
-    if not (0.0 < rate < 1.0 and 0.0 < confidence < 1.0 and 0.0 < split < 1.0):
+    probability, confidence, split = (float(tree[name]) for name in ("false_alarm_rate", "confidence", "split_share"))
+    if not (0.0 < probability < 1.0 and 0.0 < confidence < 1.0 and 0.0 < split < 1.0):
         raise InputError("false_alarm_rate, confidence and split_share must be between 0 and 1")
     return Calibration(
-        rate, tree["promise"], confidence, detectors, split, tuple(groups), dict(tree["made_from"]), views
+        probability, tree["promise"], confidence, detectors, split, tuple(groups), dict(tree["made_from"]), views
     )
 
 
 def with_judge(calibration: Calibration, name: str) -> Calibration:
-    """The same calibration with another of its detectors making the verdict; InputError for one it does not hold."""
+    """Return the calibration with another of its detectors making the verdict.
+
+    Raises InputError for a detector that it does not hold.
+    """
     if name not in calibration.detectors:
         known = ", ".join(calibration.detectors)
         raise InputError(f"the judging detector must be one of {known}, got {name!r}")
-    return replace(calibration, detectors=(name, *(one for one in calibration.detectors if one != name)))
+    return replace(calibration, detectors=(name, *(other for other in calibration.detectors if other != name)))

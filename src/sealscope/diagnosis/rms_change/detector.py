@@ -47,6 +47,9 @@ class RmsChange:
     name = "rms change"
     reads = ("u", "p_A", "p_B")
 
+    def __init__(self, rig: object = None) -> None:
+        """Nothing is assumed of the machine."""
+
     def usable(self, recording: Recording) -> str | None:
         """Return None when the recording has a chamber pressure that moves, else the reason why not."""
         chambers = chambers_of(recording)

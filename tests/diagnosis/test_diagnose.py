@@ -9,7 +9,7 @@ import pytest
 
 from sealscope.diagnosis import registry
 from sealscope.diagnosis.calibration.scorers import Look, scorer
-from sealscope.diagnosis.examination import Examination
+from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig

@@ -1,4 +1,4 @@
-"""What else than a leak stepped where a detector dates one: duty, a sensor, friction, the oil, its amount.
+"""Isolation: what else than a leak stepped where a detector dates one, such as duty, a sensor, friction or the oil.
 
 A leak across the piston damps the ringing of the pressures. It moves neither chamber's mean over a cycle, nor the mean
 pressure difference of the strokes (friction sets it), nor the ringing's frequency, and never the command. Each of these
@@ -55,10 +55,13 @@ class OtherCause:
 
 @dataclass(frozen=True, eq=False)
 class Signatures:
-    """A recording over n blocks of whole cycles: `t` (n,) middles [s]; `half` [s] half a block; `mean` (n, 2) of p_A
-    and p_B, `swing` (n,) log of the mean |p_A - p_B| about its mean, the ringing averaged out; `duty` (n, 2) log of the
-    command's rms and of its derivative's over it, None without a command; `power` (n, b) of p_A - p_B in bands about
-    `frequency` (b,) [Hz]; `noise` (n,) power of its noise in one line of the spectrum, `lines` (b,) of each band."""
+    """A recording over n blocks of whole cycles.
+
+    `t` (n,) middles [s]; `half` [s] half a block; `mean` (n, 2) of p_A and p_B; `swing` (n,) log of the mean
+    |p_A - p_B| about its mean, the ringing averaged out; `duty` (n, 2) log of the command's rms and of its derivative's
+    over it, None without a command; `power` (n, b) of p_A - p_B in bands about `frequency` (b,) [Hz]; `noise` (n,)
+    power of its noise in one line of the spectrum, `lines` (b,) of each band.
+    """
 
     t: Array
     half: float
@@ -72,7 +75,7 @@ class Signatures:
 
 
 def signatures(recording: Recording) -> Signatures | None:
-    """The signatures of a recording; None without both chamber pressures or where it is too short for a step."""
+    """Return the signatures of a recording; None without both chambers or where it is too short for a step."""
     if any(name not in recording for name in CHAMBERS) or len(recording) < 2 * FEWEST * _SHORTEST:
         return None
     rate = recording.rate
@@ -102,15 +105,18 @@ def signatures(recording: Recording) -> Signatures | None:
 
 
 def _smooth(rows: Array, rate: float) -> Array:
-    """Means over `SMOOTH_SECONDS` along each row."""
+    """Return means over `SMOOTH_SECONDS` along each row."""
     every = max(1, round(SMOOTH_SECONDS * rate))
     whole = rows.shape[1] // every * every
     return np.asarray(rows[:, :whole].reshape(len(rows), -1, every).mean(axis=2))
 
 
 def _bands(dp: Array, rate: float) -> tuple[Array, Array, Array, Array]:
-    """Power (n, b) in bands of half an octave, their middles (b,) [Hz], power (n,) of the noise in a line of the
-    spectrum, and the lines (b,) of each band."""
+    """Return the power (n, b) in bands of half an octave, and what it is compared with.
+
+    That is the middles (b,) of the bands [Hz], the power (n,) of the noise in a line of the spectrum, and the number of
+    lines (b,) in each band.
+    """
     length = dp.shape[1]
     spectrum = np.abs(np.fft.rfft(dp * np.hanning(length), axis=1)) ** 2
     f = np.fft.rfftfreq(length, 1.0 / rate)
@@ -123,20 +129,19 @@ def _bands(dp: Array, rate: float) -> tuple[Array, Array, Array, Array]:
 
 
 def other_cause(seen: Signatures, onset_s: float, strict: float = 1.0) -> OtherCause | None:
-    """What else stepped near `onset_s` [s], the most certain first; None where nothing did.
+    """Return what else stepped near `onset_s` [s], the most certain first; None where nothing did.
 
     `strict`: factor on what a step must be over its deviation, and over what sound machines show.
     """
-    for look in (_duty, _sensor, _air, _friction, _lost):
-        found = look(seen, onset_s, strict)
-        if found is not None:
-            return found
-    return None
+    causes = (find(seen, onset_s, strict) for find in (_duty, _sensor, _air, _friction, _lost))
+    return next((cause for cause in causes if cause is not None), None)
 
 
 def unasked(seen: Signatures) -> tuple[float, OtherCause] | None:
-    """What stepped anywhere in the recording, and about when [s], where no detector dates a change: by stricter limits,
-    since it is looked for at many instants; None where nothing did."""
+    """Return what stepped anywhere in the recording, and about when [s]; None where nothing did.
+
+    For recordings in which no detector dates a change; the limits are stricter, since many instants are tried.
+    """
     for at in np.arange(float(seen.t[0]) + NEAR, float(seen.t[-1]), 1.5 * NEAR):
         found = other_cause(seen, float(at), UNASKED)
         if found is not None:
@@ -145,7 +150,7 @@ def unasked(seen: Signatures) -> tuple[float, OtherCause] | None:
 
 
 def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
-    """The evidence of a leak as `cannot tell` with another cause, where one stepped at its onset; else as it is."""
+    """Return the evidence of a leak as `cannot tell` with another cause where one stepped at its onset."""
     if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS) or evidence.onset_s is None:
         return evidence
     found = other_cause(seen, evidence.onset_s)
@@ -211,8 +216,10 @@ def _air(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
 
 
 def _ringing(seen: Signatures, blocks: NDArray[np.bool_]) -> float:
-    """Mean frequency [Hz] of the ringing in these blocks: of the power beyond the noise times f^2, which makes the
-    overtones of the strokes (power as 1/f^2) even."""
+    """Return the mean frequency [Hz] of the ringing in these blocks.
+
+    That of the power beyond the noise times f^2, which makes the overtones of the strokes (power as 1/f^2) even.
+    """
     beyond = np.median(seen.power[blocks] - seen.noise[blocks, None] * seen.lines, axis=0)
     weight = np.maximum(beyond, 0.0) * seen.frequency**2
     if not weight.sum() > 0:
@@ -231,8 +238,10 @@ def _friction(seen: Signatures, onset: float, strict: float) -> OtherCause | Non
 
 
 def _lost(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
-    """Oil lost to the outside: both chambers' means fall away from the line they were on, under all they were before;
-    they need not step, since a make-up may hold them for a while."""
+    """Return whether oil is lost to the outside: both chambers' means fall below the line and the values before.
+
+    They need not step, since a make-up may hold them for a while.
+    """
     scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
     t = seen.t - onset
     before = (t + seen.half <= -NEAR) & (t > -NEAR - REACH)
