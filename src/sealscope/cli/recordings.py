@@ -41,7 +41,7 @@ class TextFormat(StrEnum):
 def _read_all(
     files: Sequence[Path], channel_map: dict[str, str], rate: float | None
 ) -> Iterator[tuple[Path, Recording | None]]:
-    """Each file and its recording; None, with one line on standard error, where it cannot be read."""
+    """Yield each file and its recording; None, with one line on standard error, where it cannot be read."""
     from sealscope.recordings import read
 
     for file in files:
@@ -61,7 +61,7 @@ def _diagnoses(
     calibration: Path | None,
     rig: Rig | None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
-    """Recording and diagnosis of each file, None for one that cannot be read; a file is never its own baseline."""
+    """Yield recording and diagnosis of each file, None for one that cannot be read; no file is its own baseline."""
     from sealscope.diagnosis.diagnose import check_probability, diagnose
 
     check_probability(false_alarm)
@@ -100,7 +100,7 @@ def _calibrated(
     calibration: Path,
     rig: Rig | None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
-    """Recording and diagnosis of each file by the thresholds of a calibration, at its false-alarm rate."""
+    """Yield recording and diagnosis of each file by the thresholds of a calibration."""
     from sealscope.diagnosis.calibration.calibrated import diagnose_calibrated
     from sealscope.diagnosis.calibration.thresholds import load
 
