@@ -16,7 +16,7 @@ def _null_rate(make, count: int, probability: float, **options) -> float:  # typ
     for seed in range(count):
         random = np.random.default_rng(seed)
         g = make(random)
-        alarms += find_leak_step(g, np.ones(g.size), probability, seed=seed, **options).alarm
+        alarms += find_leak_step(g, np.ones(g.size), probability, **options).alarm
     return alarms / count
 
 

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from sealscope.diagnosis.changepoint.random_walk import WalkScan
+from sealscope.diagnosis.changepoint.smooth_drift import STRENGTHS, DriftFamily, find_step
 from sealscope.diagnosis.changepoint.tails import (
     largest_normal,
+    null_threshold,
     rare_draws,
     seed_of,
     weighted_quantile,
@@ -56,3 +59,66 @@ def test_weights_make_rare_draws_normal() -> None:
 def test_weighted_quantile_of_equal_weights_is_the_order_statistic() -> None:
     values = np.random.default_rng(0).permutation(1000.0 * np.arange(1.0, 101.0))
     assert weighted_quantile(values, np.ones(100), 0.05) == 96_000.0
+
+
+def drift_null(n: int, number: int, draws: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    family = DriftFamily(np.arange(n, dtype=float), np.ones(n), np.zeros((n, 1)))
+    drift = family.drifts[number]
+    z, weights = rare_draws(drift.steps @ drift.root, 0.3 * 0.1 ** np.arange(8.0), draws, seed)
+    return family.scores(drift.root @ z, 1)[0].max(axis=0), weights
+
+
+def obtained(threshold: float, values: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
+    """Share over the threshold and its standard deviation."""
+    over = weights * (values > threshold)
+    return float(over.mean()), float(over.std() / np.sqrt(over.size))
+
+
+@pytest.mark.parametrize(("n", "number"), [(16, 0), (20, 12), (37, 5), (57, 0), (57, 20)])
+def test_drift_table_against_fresh_draws(n: int, number: int) -> None:
+    """At the blocks of the table and between them: within 15 % and three deviations of the fresh draws."""
+    values, weights = drift_null(n, number, 6000, 11)
+    for probability in (0.1, 0.01, 1e-3, 1e-4):
+        share, deviation = obtained(null_threshold("smooth_drift", probability, n, number), values, weights)
+        assert abs(share - probability) < 0.15 * probability + 3.0 * deviation
+
+
+@pytest.mark.parametrize(("n", "number", "expected"), [(16, 0, 3.0), (30, 4, 0.03), (50, 8, 0.05), (50, 3, 4.0)])
+def test_walk_table_against_fresh_draws(n: int, number: int, expected: float) -> None:
+    scan = WalkScan(np.ones(n), expected)
+    y = scan.walks[number].root @ np.random.default_rng(12).standard_normal((n, 20_000))
+    t = scan.scores(y)[0].max(axis=0)
+    for probability in (0.1, 0.01, 1e-3):
+        share = float(np.mean(t > null_threshold("random_walk", probability, n, number, expected)))
+        assert abs(share - probability) < 0.1 * probability + 3.0 * np.sqrt(probability / t.size)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "number", "expected"), [(16, 2, 3.0), (30, 4, 0.03)])
+def test_walk_table_at_one_in_ten_thousand(n: int, number: int, expected: float) -> None:
+    scan, random = WalkScan(np.ones(n), expected), np.random.default_rng(13)
+    threshold = null_threshold("random_walk", 1e-4, n, number, expected)
+    over = sum(
+        np.count_nonzero(
+            scan.scores(scan.walks[number].root @ random.standard_normal((n, 5000)))[0].max(axis=0) > threshold
+        )
+        for _ in range(120)
+    )
+    assert 60 - 3 * 8 - 18 < over < 60 + 3 * 8 + 18  # 60 of 600 000, three deviations and 30 % of the table
+
+
+def test_tables_have_every_strength_and_rise_with_rarity() -> None:
+    for number in range(len(STRENGTHS)):
+        thresholds = [null_threshold("smooth_drift", p, 60, number) for p in (0.2, 0.05, 0.01, 1e-3, 1e-4, 1e-5, 1e-7)]
+        assert thresholds == sorted(thresholds)
+    for number in range(14):
+        thresholds = [null_threshold("random_walk", p, 50, number, 0.05) for p in (0.2, 0.05, 0.01, 1e-3, 1e-4, 5e-5)]
+        assert thresholds == sorted(thresholds)
+
+
+def test_the_threshold_does_not_depend_on_noise_but_on_its_kind() -> None:
+    """Series of one kind share the table's threshold; it is no random number of the record."""
+    t = np.arange(40.0)
+    draws = [np.random.default_rng(k).standard_normal(40) for k in range(12)]
+    found = {find_step(t, g, np.ones(40), 0.01).threshold for g in draws}
+    assert found <= {null_threshold("smooth_drift", 0.01, 40, number) for number in range(len(STRENGTHS))}

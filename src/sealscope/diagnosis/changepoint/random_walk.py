@@ -3,12 +3,14 @@
 The series g_1..g_n (one estimate of the conductance a block) is taken as level + walk + noise + size S(onset): noise
 of the stated relative deviations and unknown scale, a random walk whose variance a block is `walk` times that of the
 noise, S the share of a block that lies behind the onset. `walk` is estimated beside every onset (restricted maximum
-likelihood), with a log-normal prior around the ratio that is expected of a healthy machine. With this knowledge a
-smaller step is found than by `smooth_drift.find_step`, which allows any smooth drift.
+likelihood), with a log-normal prior (a factor e) around the ratio that is expected of a healthy machine. With this
+knowledge a smaller step is found than by `smooth_drift.find_step`, which allows any smooth drift.
 
 The score is the largest t of the size over all onsets, where only a rise counts. The threshold is the quantile of the
 same maximum over series drawn from the walk estimated beside the step and, where the caller is `wary`, from the one
-estimated without a step too, whichever is higher.
+estimated without a step too, whichever is higher. It depends on the number of blocks, the expected and the estimated
+walk and is interpolated in a table (`tails.null_threshold`). Unequal deviations, which the table does not know, made
+the probability 0.6 to 1.9 times the stated one where they were tried (docs/decisions/0013-observer.md).
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.shapes import rises, warm_ups
-from sealscope.diagnosis.changepoint.tails import ONSET_CUT
+from sealscope.diagnosis.changepoint.tails import ONSET_CUT, null_threshold
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -33,7 +35,6 @@ _FINE = 0.05
 _RESOLUTION = 0.25
 #: The block of the onset and the next, whose other states still settle, are left out of the size: their weight.
 _UNSETTLED = 1e6
-_DRAWS, _TAIL = 600, 0.1
 #: Time constants of a warm-up, as shares of the series.
 _WARM_UPS = (0.03, 0.06, 0.12, 0.25, 0.5)
 _TINY = float(np.finfo(float).tiny)
@@ -95,17 +96,17 @@ class _Walk:
         return moved, np.maximum(np.sum(target**2, axis=0) - moved**2, _TINY), lengths
 
 
-class _WalkScan:
+class WalkScan:
     """All strengths of the walk and all onsets, for blocks of the relative deviations `relative` (n,)."""
 
-    def __init__(self, relative: Array, expected: float, spread: float) -> None:
+    def __init__(self, relative: Array, expected: float) -> None:
         self.n = relative.size
         self.freedom = self.n - 2
         self.onsets = np.arange(LEAST, self.n - LEAST + 0.25, 0.5)
         self.middles: Array = np.arange(self.n, dtype=np.float64) + 0.5
         self.shapes = rises(self.middles, self.onsets)
         self.walks = [_Walk(relative, float(walk)) for walk in _WALKS]
-        self.prior = (np.log(_WALKS / expected) / spread) ** 2
+        self.prior = np.log(_WALKS / expected) ** 2
 
     def scores(self, y: Array) -> tuple[Array, NDArray[np.int64]]:
         """Return for every onset (k, m) of series y (n, m) the t of a rise and the number of the likeliest walk."""
@@ -145,12 +146,10 @@ def find_leak_step(
     expected_walk: float,
     *,
     wary: bool = False,
-    spread: float = 1.0,
-    seed: int = 0,
 ) -> WalkStep:
     """Look for a rise in a series g (n,) whose blocks have the deviations sd (n,), of unknown common scale.
 
-    `expected_walk`: variance of a block's walk over that of a block's noise; `spread`: deviation of its logarithm;
+    `expected_walk`: variance of a block's walk over that of a block's noise;
     `wary`: the threshold must also hold for the walk that explains the series without a step.
 
     Raises InputError where there are fewer than 16 blocks or values that are not finite.
@@ -162,15 +161,14 @@ def find_leak_step(
         raise InputError("estimates and their deviations must be finite and of one shape, and deviations > 0")
     unit = float(np.median(sd))
     relative = sd / unit
-    scan = _WalkScan(relative, expected_walk, spread)
+    scan = WalkScan(relative, expected_walk)
     y = g[:, None] / unit
     t, number = (column[:, 0] for column in scan.scores(y))
     best = int(np.argmax(t))
     walk = scan.walks[number[best]]
-    drawn = np.random.default_rng(seed).standard_normal((n, _DRAWS))
     threshold = max(
-        _upper_tail(scan.scores(scan.walks[row].root @ drawn)[0].max(axis=0), false_alarm_probability)
-        for row in {int(number[best]), *([scan.without_step(y)] if wary else [])}
+        null_threshold("random_walk", false_alarm_probability, n, row, expected_walk)
+        for row in (int(number[best]), *([scan.without_step(y)] if wary else []))
     )
 
     fine: Array = np.clip(scan.onsets[best] + np.arange(-0.75, 0.75 + 1e-9, _FINE), 1.0, n - 1.0)
@@ -198,10 +196,3 @@ def find_leak_step(
         scale=scale,
         warms_up=warms_up,
     )
-
-
-def _upper_tail(null: Array, probability: float) -> float:
-    if probability >= _TAIL:
-        return float(np.quantile(null, 1.0 - probability))
-    start = float(np.quantile(null, 1.0 - _TAIL))
-    return start + float(np.mean(null[null > start] - start)) * float(np.log(_TAIL / probability))

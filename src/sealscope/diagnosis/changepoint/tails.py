@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zlib
+from functools import cache
+from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,3 +95,31 @@ def largest_normal(correlation: Array, probability: float, seed: int) -> float:
     levels = np.asarray(np.minimum(probability * _LEVELS, _LARGEST_LEVEL), dtype=np.float64)
     z, weights = rare_draws(root, levels, 2000, seed)
     return weighted_quantile((root @ z).max(axis=0), weights, probability)
+
+
+@cache
+def _null_table(scan: str) -> tuple[tuple[Array, ...], Array]:
+    """Return the axes of a table, positive ones as logarithms, the probabilities last, and its values on their grid."""
+    text = (resources.files(__package__) / f"{scan}.csv").read_text(encoding="utf-8").splitlines()
+    rows = np.array([[float(value) for value in line.split(",")] for line in text[1:]])
+    probabilities = [float(name) for name in text[0].split(",")[1:] if name[0].isdigit()]
+    places = rows.shape[1] - len(probabilities)
+    axes = [np.unique(column) for column in rows[:, :places].T] + [np.array(probabilities)]
+    values = rows[:, places:].reshape([axis.size for axis in axes])
+    axes[-1], values = axes[-1][::-1], values[..., ::-1]
+    return tuple(np.log(axis) if axis[0] > 0 else axis for axis in axes), values
+
+
+def null_threshold(scan: str, probability: float, *place: float) -> float:
+    """Return what the largest score of a scan exceeds with `probability` in series without a step.
+
+    Interpolated in the table `scan`.csv beside this file, which `benchmarks/null_tables.py` makes and whose accuracy
+    stands there. `place`: what the null distribution depends on, in the order of the table's columns.
+    """
+    axes, values = _null_table(scan)
+    for axis, wanted in zip(axes, (*place, probability), strict=True):
+        at = np.log(wanted) if axis[0] != 0 else wanted
+        k = int(np.clip(np.searchsorted(axis, at) - 1, 0, axis.size - 2))
+        share = float(np.clip((at - axis[k]) / (axis[k + 1] - axis[k]), 0.0, 1.0))
+        values = (1.0 - share) * values[k] + share * values[k + 1]
+    return float(values)
