@@ -15,12 +15,11 @@ from sealscope.physics.friction import stribeck_friction
 from sealscope.physics.lanes import WIDTH, anywhere, exponential, load, power_of_two, select, spread, store
 from sealscope.physics.motor import winding_current_rate
 from sealscope.physics.restrictors import implicit_orifice_flow, orifice_flow
-from sealscope.physics.rig import OUTPUTS, RigNumbers, initial_state, rig_numbers
+from sealscope.physics.rig import CHOICES, NUMBERS, OUTPUTS, RigNumbers, initial_state, rig_numbers
 from sealscope.physics.solvers.rk4 import RK4_NODES
 from sealscope.physics.vector.fixed import left_to_table
 from sealscope.physics.vector.runs import (
     ACCOUNTS,
-    LANE_FIELDS,
     LEAK_ROWS,
     LEAST,
     TOLD,
@@ -118,7 +117,7 @@ def test_the_laws_are_the_same_on_lanes_and_on_numbers():
 
 def test_the_fields_of_a_lane_are_all_the_numbers_of_a_rig(check_rig):
     numbers = rig_numbers(check_rig())
-    assert {name for name in RigNumbers._fields if isinstance(getattr(numbers, name), float)} == set(LANE_FIELDS)
+    assert {name for name in RigNumbers._fields if isinstance(getattr(numbers, name), float)} == set(NUMBERS)
 
 
 def test_every_lane_has_numbers_of_its_own(check_rig, drive):
@@ -137,7 +136,7 @@ def test_every_lane_has_numbers_of_its_own(check_rig, drive):
     h, n = 5e-4, 2000
     nodes = np.array(RK4_NODES) * h
     shape = np.sin(4.0 * (np.arange(n)[:, None] * h + nodes))
-    table = np.array([[getattr(rig_numbers(rig), name) for name in LANE_FIELDS] for rig in rigs]).T[None, None]
+    table = np.array([[getattr(rig_numbers(rig), name) for name in NUMBERS] for rig in rigs]).T[None, None]
     state = np.ascontiguousarray(np.array([initial_state(rig, 0.0) for rig in rigs]).T[None])
     drive_rows = np.zeros((1, 2, WIDTH))
     drive_rows[:, 0] = 3.0
@@ -145,7 +144,7 @@ def test_every_lane_has_numbers_of_its_own(check_rig, drive):
     account[:, LEAST] = np.inf
     advance_lanes_rk4(
         (0, 1), state, h, 0, nodes, shape, drive_rows, np.zeros((1, LEAK_ROWS, WIDTH)), np.ascontiguousarray(table),
-        np.array([0, n]), left_to_table(rig_numbers(rigs[0]), LANE_FIELDS), 1, told, 0, account,
+        np.array([0, n]), left_to_table(rig_numbers(rigs[0]), NUMBERS), 1, told, 0, account,
     )  # fmt: skip
     for lane, rig in enumerate(rigs):
         alone = drive(rig, n * h, rate=2000.0, step=h)
@@ -169,3 +168,15 @@ def test_the_machine_code_works_on_whole_registers():
     features = llvmlite.binding.get_host_cpu_features()
     if features.get("avx512f"):
         assert len(re.findall(operations + r"pd.*%zmm", text)) > 0.9 * packed
+
+
+def test_a_parameter_is_listed_once_and_every_list_of_numbers_follows(check_rig):
+    """The models declare the parameters; the laws' numbers are theirs, but for those within the throttles."""
+    rig = check_rig(True)
+    numbers = rig_numbers(rig)
+    symbols = {row.symbol: row.value for row in rig.table() if not row.name.startswith(("sensors.", "daq."))}
+    within = {"omega_max", "C_d", "d_line", "closed_A", "closed_B", "rho"}
+    taken = {symbol for symbol, value in symbols.items() if isinstance(value, float)} - within
+    assert set(NUMBERS) - taken == {"c_A_in", "c_A_out", "c_B_in", "c_B_out"}
+    assert all(getattr(numbers, symbol) == symbols[symbol] for symbol in taken)
+    assert len(numbers) == len(NUMBERS) + len(CHOICES)

@@ -19,9 +19,8 @@ import pytest
 from sealscope.compiled import kernel, law
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.physics.lanes import lowered, store
-from sealscope.physics.rig import rig_numbers
+from sealscope.physics.rig import CHOICES, NUMBERS, rig_numbers
 from sealscope.physics.vector.fixed import FIXED, left_to_table, pair, settled, taken
-from sealscope.physics.vector.runs import CHOICES, LANE_FIELDS
 from sealscope.simulation.batch.batch import runner_of, simulate_batch
 from sealscope.simulation.experiment import Experiment
 
@@ -248,8 +247,8 @@ def test_a_number_comes_from_the_table_where_it_is_left_out():
 
 def test_numbers_are_left_to_the_table_and_choices_settled(check_rig):
     numbers = rig_numbers(check_rig(True))
-    left = left_to_table(numbers, LANE_FIELDS)
-    assert {name for name in left._fields if getattr(left, name) == ()} >= set(LANE_FIELDS)
+    left = left_to_table(numbers, NUMBERS)
+    assert {name for name in left._fields if getattr(left, name) == ()} >= set(NUMBERS)
     assert all(getattr(left, name) == getattr(numbers, name) for name in CHOICES)
     known = left_to_table(numbers, ["F_v"], choices=True)
     assert (known.F_v, known.throttled, known.position_dependent) == ((), (True,), ())

@@ -68,12 +68,3 @@ def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: f
     root = math.sqrt(dp_0)
     w = _implicit_share(abs(total) / dp_0, g * c / root)
     return math.copysign(c * root * w, total)
-
-
-@contracted
-def implicit_orifice_drop(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
-    """Pressure difference d [Pa] of `implicit_orifice_flow`."""
-    c = one_way_coefficient(total, c_forward, c_reverse)
-    w = _implicit_share(abs(total) / dp_0, g * c / math.sqrt(dp_0))
-    square = w * w
-    return math.copysign(dp_0 * w * math.sqrt(0.5 * (square + math.sqrt(square * square + 4.0))), total)

@@ -10,12 +10,15 @@ milliseconds for all else), so the right-hand side comes in two parts: everythin
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections import namedtuple
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sealscope.compiled import contracted
 from sealscope.parameters import Rig
+from sealscope.parameters.fields import leaves, unit_of
 from sealscope.physics.cylinder import chamber_volumes, hard_stop_force, piston_acceleration, pressure_rate
 from sealscope.physics.external import accumulator_pressure, check_valve_flow, external_leakage
 from sealscope.physics.fluid import effective_bulk_modulus
@@ -42,67 +45,49 @@ from sealscope.physics.state import (
 )
 from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
 
+#: Parameters that no law takes under its own symbol: informative ones, and those within the throttles' coefficients.
+_NOT_TAKEN = {"pump.omega_max", "line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "fluid.rho"}
+#: Dotted name of each parameter that the laws take, by its symbol, as the models declare them.
+_PARAMETERS = {
+    name.rpartition(".")[2]: name
+    for name, field in leaves(Rig)
+    if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN
+}
+#: Choices that the laws take as truth values, each with the parameter and the word that stand for True.
+_CHOICES = {
+    "throttled": ("line.orifices", "present"),
+    "position_dependent": ("cylinder.volumes", "position"),
+    "coulomb_of_difference": ("friction.coulomb_pressure", "difference"),
+    "literal_bracket": ("friction.bracket", "literal"),
+    "made_up": ("makeup.check_valves", "present"),
+}
+#: The numbers of `RigNumbers`: parameters, and coefficients of throttle A (from the pump to the cylinder, back) and B.
+NUMBERS = (*_PARAMETERS, "c_A_in", "c_A_out", "c_B_in", "c_B_out")
+#: The choices: truth values, and two tuples that are empty, so that the compiler leaves the law out, where there is no
+#: air in the oil (`aerated`) and where no oil leaves or enters (`open_circuit`).
+CHOICES = (*_CHOICES, "aerated", "open_circuit")
 
-class RigNumbers(NamedTuple):
-    """A rig's parameters as the compiled laws take them: SI floats, choices as truth values."""
+if TYPE_CHECKING:
 
-    omega_per_volt: float
-    k_p: float
-    K_i: float
-    V_max: float
-    i_max: float
-    R_c: float
-    L_c: float
-    C_e: float
-    C_m: float
-    J_M: float
-    B_M: float
-    q_b: float
-    G_pump: float
-    throttled: bool
-    c_A_in: float  # throttle A, from the pump to the cylinder
-    c_A_out: float
-    c_B_in: float
-    c_B_out: float
-    dp_0: float
-    V_1: float
-    V_2: float
-    A_A: float
-    A_B: float
-    L: float
-    M_eq: float
-    V: float
-    position_dependent: bool
-    k_stop: float
-    d_stop: float
-    F_l: float
-    F_pr: float
-    F_cfr: float
-    C_c: float
-    K_brk: float
-    F_v: float
-    v_th: float
-    coulomb_of_difference: bool
-    literal_bracket: bool
-    K_oil: float
-    aerated: tuple[bool, ...]  # empty where there is no air in the oil
-    air: float
-    n_air: float
-    open_circuit: tuple[bool, ...]  # empty, and so left out by the compiler, where no oil leaves or enters
-    G_ext_A: float
-    G_ext_B: float
-    made_up: bool
-    p_crack: float
-    G_check: float
-    V_gas: float
-    p_charge: float
+    class RigNumbers(tuple[Any, ...]):
+        """A rig's parameters as the compiled laws take them: SI floats, choices as truth values."""
 
+        _fields: tuple[str, ...]
+        throttled: bool
+        position_dependent: bool
+        coulomb_of_difference: bool
+        literal_bracket: bool
+        made_up: bool
+        aerated: tuple[bool, ...]
+        open_circuit: tuple[bool, ...]
 
-#: The fields of `RigNumbers` that are numbers, and those that are choices.
-NUMBERS = tuple(
-    name for name, kind in RigNumbers.__annotations__.items() if getattr(kind, "__forward_arg__", kind) == "float"
-)
-CHOICES = tuple(name for name in RigNumbers._fields if name not in NUMBERS)
+        def __new__(cls, *values: Any, **fields: Any) -> RigNumbers: ...
+        def __getattr__(self, name: str) -> float: ...
+        def _replace(self, **fields: Any) -> RigNumbers: ...
+        def _asdict(self) -> dict[str, Any]: ...
+
+else:  # numba takes a named tuple apart; its fields are those of the models
+    RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
@@ -125,61 +110,15 @@ def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
-    """The rig's parameters for the compiled laws."""
-    motor, pump, line, cylinder, friction, fluid = rig.motor, rig.pump, rig.line, rig.cylinder, rig.friction, rig.fluid
-    c_A_in, c_A_out, c_B_in, c_B_out = throttle_coefficients(rig)
-    made_up = rig.makeup.check_valves == "present"
+    """Return the rig's parameters as the compiled laws take them."""
+    choices = {name: attrgetter(parameter)(rig) == word for name, (parameter, word) in _CHOICES.items()}
+    open_circuit = choices["made_up"] or rig.cylinder.G_ext_A > 0 or rig.cylinder.G_ext_B > 0
     return RigNumbers(
-        omega_per_volt=motor.omega_per_volt,
-        k_p=motor.k_p,
-        K_i=motor.K_i,
-        V_max=motor.V_max,
-        i_max=motor.i_max,
-        R_c=motor.R_c,
-        L_c=motor.L_c,
-        C_e=motor.C_e,
-        C_m=motor.C_m,
-        J_M=motor.J_M,
-        B_M=motor.B_M,
-        q_b=pump.q_b,
-        G_pump=pump.G_pump,
-        throttled=line.orifices == "present",
-        c_A_in=c_A_in,
-        c_A_out=c_A_out,
-        c_B_in=c_B_in,
-        c_B_out=c_B_out,
-        dp_0=line.dp_0,
-        V_1=line.V_1,
-        V_2=line.V_2,
-        A_A=cylinder.A_A,
-        A_B=cylinder.A_B,
-        L=cylinder.L,
-        M_eq=cylinder.M_eq,
-        V=cylinder.V,
-        position_dependent=cylinder.volumes == "position",
-        k_stop=cylinder.k_stop,
-        d_stop=cylinder.d_stop,
-        F_l=cylinder.F_l,
-        F_pr=friction.F_pr,
-        F_cfr=friction.F_cfr,
-        C_c=friction.C_c,
-        K_brk=friction.K_brk,
-        F_v=friction.F_v,
-        v_th=friction.v_th,
-        coulomb_of_difference=friction.coulomb_pressure == "difference",
-        literal_bracket=friction.bracket == "literal",
-        K_oil=fluid.K_oil,
-        aerated=(True,) if fluid.air > 0 else (),
-        air=fluid.air,
-        n_air=fluid.n_air,
-        open_circuit=(True,) if made_up or cylinder.G_ext_A > 0 or cylinder.G_ext_B > 0 else (),
-        G_ext_A=cylinder.G_ext_A,
-        G_ext_B=cylinder.G_ext_B,
-        made_up=made_up,
-        p_crack=rig.makeup.p_crack,
-        G_check=rig.makeup.G_check,
-        V_gas=rig.makeup.V_gas,
-        p_charge=fluid.p_charge,
+        *(attrgetter(name)(rig) for name in _PARAMETERS.values()),
+        *throttle_coefficients(rig),
+        **choices,
+        aerated=(True,) if rig.fluid.air > 0 else (),
+        open_circuit=(True,) if open_circuit else (),
     )
 
 

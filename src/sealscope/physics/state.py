@@ -44,16 +44,10 @@ def moved(y: State, h: float, dy: State) -> State:
 
 
 @contracted
-def with_pressures(y: State, pressures: Pressures) -> State:
-    """The state with other p_A, p_B, p_1, p_2."""
-    p_A, p_B, p_1, p_2 = pressures
-    return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10]
-
-
-@contracted
 def pressures_moved(y: State, h: float, s: Pressures) -> State:
     """The state with h s added to its pressures."""
-    return with_pressures(y, (y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]))
+    p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
+    return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10]
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 All stiffness sits in the two throttle flows, each of which couples one line volume to one chamber. They are taken
 implicitly, everything else explicitly, so that an implicit stage is no linear system but one scalar equation a side
-(`implicit_orifice_drop`). The implicit part is L-stable and stiffly accurate; both parts are of order four.
+(`implicit_orifice_flow`). The implicit part is L-stable and stiffly accurate; both parts are of order four.
 
 Source: C. A. Kennedy, M. H. Carpenter, Additive Runge-Kutta schemes for convection-diffusion-reaction equations,
 Applied Numerical Mathematics 44 (2003) 139-181, ARK4(3)6L[2]SA. `docs/decisions/0004-solvers.md` has the

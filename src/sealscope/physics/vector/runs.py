@@ -6,22 +6,19 @@ each lane has numbers, leaks and a gain and offset of the command of its own, an
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.lanes import load, store
 from sealscope.physics.leakage import piston_leakage
-from sealscope.physics.rig import RigNumbers
+from sealscope.physics.rig import CHOICES, NUMBERS, RigNumbers
 from sealscope.physics.solvers.imex import imex_step
 from sealscope.physics.solvers.rk4 import rk4_step
 from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, State
 from sealscope.physics.vector.fixed import settled, taken
 
-#: The fields of `RigNumbers` that differ from lane to lane, in the order of a table's rows, and those that do not.
-LANE_FIELDS = tuple(
-    name for name, kind in RigNumbers.__annotations__.items() if getattr(kind, "__forward_arg__", kind) == "float"
-)
-CHOICES = tuple(name for name in RigNumbers._fields if name not in LANE_FIELDS)
 #: Rows that describe a leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
 #: and the G and C whose flow goes to the account (those of the leak, or of one that is being sized).
 LEAK_ROWS = 6
@@ -36,62 +33,21 @@ Account = tuple[float, float, float, float, float]
 FLOW, OPEN, REACH, LEAST, SOUND = range(ACCOUNTS)
 
 
-@contracted
-def lane_numbers(table: np.ndarray, at: int, p: RigNumbers) -> RigNumbers:
-    """The numbers of a group: those of `p`, and where these are () (`fixed.left_to_table`) the group's own, from rows
-    at, at + 1, .. of a table of all `LANE_FIELDS`."""
-    return RigNumbers(
-        taken(p.omega_per_volt, table, at + 0),
-        taken(p.k_p, table, at + 1),
-        taken(p.K_i, table, at + 2),
-        taken(p.V_max, table, at + 3),
-        taken(p.i_max, table, at + 4),
-        taken(p.R_c, table, at + 5),
-        taken(p.L_c, table, at + 6),
-        taken(p.C_e, table, at + 7),
-        taken(p.C_m, table, at + 8),
-        taken(p.J_M, table, at + 9),
-        taken(p.B_M, table, at + 10),
-        taken(p.q_b, table, at + 11),
-        taken(p.G_pump, table, at + 12),
-        settled(p.throttled),
-        taken(p.c_A_in, table, at + 13),
-        taken(p.c_A_out, table, at + 14),
-        taken(p.c_B_in, table, at + 15),
-        taken(p.c_B_out, table, at + 16),
-        taken(p.dp_0, table, at + 17),
-        taken(p.V_1, table, at + 18),
-        taken(p.V_2, table, at + 19),
-        taken(p.A_A, table, at + 20),
-        taken(p.A_B, table, at + 21),
-        taken(p.L, table, at + 22),
-        taken(p.M_eq, table, at + 23),
-        taken(p.V, table, at + 24),
-        settled(p.position_dependent),
-        taken(p.k_stop, table, at + 25),
-        taken(p.d_stop, table, at + 26),
-        taken(p.F_l, table, at + 27),
-        taken(p.F_pr, table, at + 28),
-        taken(p.F_cfr, table, at + 29),
-        taken(p.C_c, table, at + 30),
-        taken(p.K_brk, table, at + 31),
-        taken(p.F_v, table, at + 32),
-        taken(p.v_th, table, at + 33),
-        settled(p.coulomb_of_difference),
-        settled(p.literal_bracket),
-        taken(p.K_oil, table, at + 34),
-        p.aerated,
-        taken(p.air, table, at + 35),
-        taken(p.n_air, table, at + 36),
-        p.open_circuit,
-        taken(p.G_ext_A, table, at + 37),
-        taken(p.G_ext_B, table, at + 38),
-        settled(p.made_up),
-        taken(p.p_crack, table, at + 39),
-        taken(p.G_check, table, at + 40),
-        taken(p.V_gas, table, at + 41),
-        taken(p.p_charge, table, at + 42),
-    )
+def _lane_numbers() -> Any:
+    """The compiled function (table, at, p): `p`, and where it is () the group's own numbers.
+
+    These stand in rows at, at + 1, .. of a table of all `NUMBERS`. Numba needs every field written out, so the text is
+    made from the lists of fields.
+    """
+    fields = [f"{name}=taken(p.{name}, table, at + {row})" for row, name in enumerate(NUMBERS)]
+    fields += [f"{name}=settled(p.{name})" for name in CHOICES if name not in ("aerated", "open_circuit")]
+    fields += ["aerated=p.aerated", "open_circuit=p.open_circuit"]
+    scope = {"RigNumbers": RigNumbers, "taken": taken, "settled": settled}
+    exec(f"def lane_numbers(table, at, p):\n    return RigNumbers({', '.join(fields)})", scope)
+    return contracted(scope["lane_numbers"])  # type: ignore[type-var]
+
+
+lane_numbers = _lane_numbers()
 
 
 @contracted
@@ -169,6 +125,7 @@ def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> A
 
 @contracted
 def advance(
+    implicit: bool,
     groups: tuple[int, int],
     y: np.ndarray,
     h: float,
@@ -180,13 +137,20 @@ def advance(
     table: np.ndarray,
     bounds: np.ndarray,
     p: RigNumbers,
-    implicit: bool,
     every: int,
     told: np.ndarray,
     begin: int,
     account: np.ndarray,
 ) -> None:
-    """`advance_lanes_rk4`, or `advance_lanes_imex` where `implicit`, for lanes or for the one number of a thread."""
+    """Advance groups first <= g < last of runs in place by n steps of h [s], the first of them step `start` of the run.
+
+    By the implicit-explicit method where `implicit`, else by RK4; for lanes, or on a GPU for a thread's one number.
+
+    `y`: (groups, 11, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
+    WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields, WIDTH) with
+    `bounds` (cells + 1,) the step at which each cell begins; `told`: (groups, outputs, TOLD, WIDTH), written from
+    output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).
+    """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
         z = lane_state(y, g * states)
@@ -232,50 +196,12 @@ def advance(
 
 
 @kernel
-def advance_lanes_rk4(
-    groups: tuple[int, int],
-    y: np.ndarray,
-    h: float,
-    start: int,
-    nodes: np.ndarray,
-    shape: np.ndarray,
-    drive: np.ndarray,
-    leaks: np.ndarray,
-    table: np.ndarray,
-    bounds: np.ndarray,
-    p: RigNumbers,
-    every: int,
-    told: np.ndarray,
-    begin: int,
-    account: np.ndarray,
-) -> None:
-    """Advance groups first <= g < last of runs in place by n steps of h [s], the first of them step `start` of the run.
-
-    `y`: (groups, 11, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
-    WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields, WIDTH) with
-    `bounds` (cells + 1,) the step at which each cell begins; `told`: (groups, outputs, TOLD, WIDTH), written from
-    output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).
-    """
-    advance(groups, y, h, start, nodes, shape, drive, leaks, table, bounds, p, False, every, told, begin, account)
+def advance_lanes_rk4(*run: Any) -> None:
+    """`advance` by RK4, compiled for lanes."""
+    advance(False, *run)
 
 
 @kernel
-def advance_lanes_imex(
-    groups: tuple[int, int],
-    y: np.ndarray,
-    h: float,
-    start: int,
-    nodes: np.ndarray,
-    shape: np.ndarray,
-    drive: np.ndarray,
-    leaks: np.ndarray,
-    table: np.ndarray,
-    bounds: np.ndarray,
-    p: RigNumbers,
-    every: int,
-    told: np.ndarray,
-    begin: int,
-    account: np.ndarray,
-) -> None:
-    """`advance_lanes_rk4` for throttled rigs, by the implicit-explicit method."""
-    advance(groups, y, h, start, nodes, shape, drive, leaks, table, bounds, p, True, every, told, begin, account)
+def advance_lanes_imex(*run: Any) -> None:
+    """`advance` for throttled rigs, by the implicit-explicit method, compiled for lanes."""
+    advance(True, *run)

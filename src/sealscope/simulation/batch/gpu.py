@@ -18,9 +18,9 @@ from numba import cuda
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.physics.lanes import WARP, load, store
-from sealscope.physics.rig import RigNumbers
+from sealscope.physics.rig import NUMBERS, RigNumbers
 from sealscope.physics.vector.fixed import left_to_table
-from sealscope.physics.vector.runs import LANE_FIELDS, TOLD, advance
+from sealscope.physics.vector.runs import TOLD, advance
 from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.layout import LaneSet
 from sealscope.simulation.batch.run import SetRun
@@ -49,7 +49,7 @@ def _advance_rk4(y, h, start, nodes, shape, drive, leaks, table, bounds, p, ever
     group = cuda.grid(1) // y.shape[2]
     if group < y.shape[0]:
         own = (group, group + 1)
-        advance(own, y, h, start, nodes, shape, drive, leaks, table, bounds, p, False, every, told, begin, account)
+        advance(False, own, y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, told, begin, account)
 
 
 @cuda.jit
@@ -57,7 +57,7 @@ def _advance_imex(y, h, start, nodes, shape, drive, leaks, table, bounds, p, eve
     group = cuda.grid(1) // y.shape[2]
     if group < y.shape[0]:
         own = (group, group + 1)
-        advance(own, y, h, start, nodes, shape, drive, leaks, table, bounds, p, True, every, told, begin, account)
+        advance(True, own, y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, told, begin, account)
 
 
 @cuda.jit
@@ -136,7 +136,7 @@ class DeviceRun(SetRun):
         stand in the table."""
         differ = np.any(self.cells.base != self.cells.base[0], axis=0)
         differ[list(self.cells.changing)] = True
-        own = [name for name, differs in zip(LANE_FIELDS, differ, strict=True) if differs]
+        own = [name for name, differs in zip(NUMBERS, differ, strict=True) if differs]
         return left_to_table(numbers, own, choices=True)
 
     def _check_against_processor(self, pool: ThreadPoolExecutor) -> None:

@@ -89,8 +89,7 @@ def _shape(command: Command) -> tuple[Any, Command, float, float]:
 def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
     """The experiments in sets; raises InputError where one cannot be in a batch, or their records differ in length or
     rate."""
-    from sealscope.physics.rig import rig_numbers
-    from sealscope.physics.vector.runs import CHOICES
+    from sealscope.physics.rig import CHOICES, rig_numbers
     from sealscope.simulation.experiment import choose_method
 
     if not experiments:
@@ -168,10 +167,10 @@ class Cells:
 def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     """Cells for a set at `rate` [Hz] of outputs: 0.5 s long, or so short (down to 0.05 s) that no effect moves by more
     than its resolution; a jump begins a cell."""
-    from sealscope.physics.vector.runs import LANE_FIELDS
+    from sealscope.physics.rig import NUMBERS
 
     numbers = {id(one.numbers): one.numbers for one in members}
-    rows = {key: [float(getattr(one, name)) for name in LANE_FIELDS] for key, one in numbers.items()}
+    rows = {key: [float(getattr(one, name)) for name in NUMBERS] for key, one in numbers.items()}
     base = np.array([rows[id(one.numbers)] for one in members])
     effects = [effect for one in members for effect in one.effects]
     if not effects:
@@ -182,11 +181,11 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     grid = np.arange(0, n_out, max(1, round(length * rate)))
     bounds = np.unique(np.r_[grid, n_out, jumps_of(effects, n_out, rate)])
     middles = 0.5 * (bounds[:-1] + bounds[1:]) / rate
-    fields = tuple(sorted({LANE_FIELDS.index(effect.field) for effect in effects}))
+    fields = tuple(sorted({NUMBERS.index(effect.field) for effect in effects}))
     values = np.repeat(base[:, list(fields), None], middles.size, axis=2)
     for run, one in enumerate(members):
         for name, found in values_of(one.effects, one.numbers, middles).items():
-            values[run, fields.index(LANE_FIELDS.index(name))] = found
+            values[run, fields.index(NUMBERS.index(name))] = found
     return Cells(bounds, base, fields, values)
 
 

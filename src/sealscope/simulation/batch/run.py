@@ -90,10 +90,10 @@ class SetRun:
 
     def _constants(self, numbers: RigNumbers) -> RigNumbers:
         """What the compiled code takes as constants of the set: the choices; the numbers stand in the table."""
+        from sealscope.physics.rig import NUMBERS
         from sealscope.physics.vector.fixed import left_to_table
-        from sealscope.physics.vector.runs import LANE_FIELDS
 
-        return left_to_table(numbers, LANE_FIELDS)
+        return left_to_table(numbers, NUMBERS)
 
     def _prepare_filters(self, rate: float) -> None:
         """The anti-alias filter, for each lane where a channel is late: first tap `before` and last `after` outputs

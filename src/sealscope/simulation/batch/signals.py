@@ -249,7 +249,15 @@ def sense(
     bounds: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """`sense_lanes` for any kind of number: lanes, or the one number of a thread."""
+    """Read samples first <= s < last of the groups' runs and add the squares of their details to `sums`.
+
+    `told`: (groups, outputs, TOLD, WIDTH), the first tap of sample `first` on output `begin`, `factor` outputs a
+    sample; `taps` of the anti-alias filter with (TILE - 1) factor zeros on both sides, or `own_taps` (groups, TOLD,
+    taps, WIDTH) where channels are late (one row elsewhere); `sensors`: (groups, TOLD, INSTRUMENT_ROWS, WIDTH), as at
+    sample `first`; `keys`: (groups, WIDTH) of the noise; `walks`: (groups, TOLD, WIDTH) zero drift so far [Pa];
+    `filters`: (groups, TOLD, FILTER_ROWS, WIDTH); `low`, `high`: the wavelet's taps; `bounds`: (segments + 1,) samples;
+    `sums`: (groups, TOLD, segments, QUANTITIES, WIDTH).
+    """
     segments = bounds.size - 1
     late = own_taps.shape[2]
     head = STARTS[0] + HISTORIES[0]
@@ -286,33 +294,6 @@ def sense(
 
 
 @kernel
-def sense_lanes(
-    groups: tuple[int, int],
-    told: np.ndarray,
-    begin: int,
-    factor: int,
-    taps: np.ndarray,
-    own_taps: np.ndarray,
-    first: int,
-    last: int,
-    sensors: np.ndarray,
-    keys: np.ndarray,
-    walks: np.ndarray,
-    filters: np.ndarray,
-    low: Taps,
-    high: Taps,
-    bounds: np.ndarray,
-    sums: np.ndarray,
-) -> None:
-    """Read samples first <= s < last of the groups' runs and add the squares of their details to `sums`.
-
-    `told`: (groups, outputs, TOLD, WIDTH), the first tap of sample `first` on output `begin`, `factor` outputs a
-    sample; `taps` of the anti-alias filter with (TILE - 1) factor zeros on both sides, or `own_taps` (groups, TOLD,
-    taps, WIDTH) where channels are late (one row elsewhere); `sensors`: (groups, TOLD, INSTRUMENT_ROWS, WIDTH), as at
-    sample `first`; `keys`: (groups, WIDTH) of the noise; `walks`: (groups, TOLD, WIDTH) zero drift so far [Pa];
-    `filters`: (groups, TOLD, FILTER_ROWS, WIDTH); `low`, `high`: the wavelet's taps; `bounds`: (segments + 1,) samples;
-    `sums`: (groups, TOLD, segments, QUANTITIES, WIDTH).
-    """
-    sense(
-        groups, told, begin, factor, taps, own_taps, first, last, sensors, keys, walks, filters, low, high, bounds, sums
-    )
+def sense_lanes(*run: Any) -> None:
+    """`sense`, compiled for lanes."""
+    sense(*run)
