@@ -11,10 +11,73 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "sealscope"
 FILES = sorted(SOURCE.rglob("*.py"))
+FOLDERS = sorted({path.parent for path in FILES})
+#: Most files and folders side by side in one folder, `__init__.py` not counted, and the longest chain of imports
+#: between them.
+MOST_ENTRIES = 15
+MOST_DEPTH = 6
 
 
 def name_of(path: Path) -> str:
     return path.relative_to(SOURCE).as_posix()
+
+
+def entries(folder: Path) -> set[str]:
+    """Modules and packages side by side in a folder of the source."""
+    modules = {path.stem for path in folder.glob("*.py")} - {"__init__"}
+    return modules | {path.parent.name for path in folder.glob("*/*.py")}
+
+
+def imported(path: Path) -> set[str]:
+    """Every module of the package that a file imports, wherever in the file, by its full name and that of its names."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("sealscope"):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names if alias.name.startswith("sealscope")}
+    return names
+
+
+def depth(folder: Path) -> int:
+    """Longest chain of imports between the entries of a folder; raises RecursionError where they form a circle."""
+    prefix = ".".join(("sealscope", *folder.relative_to(SOURCE).parts)) + "."
+    needs: dict[str, set[str]] = {entry: set() for entry in entries(folder)}
+    for path in folder.rglob("*.py"):
+        owner = path.relative_to(folder).with_suffix("").parts[0]
+        targets = {name.removeprefix(prefix).split(".")[0] for name in imported(path) if name.startswith(prefix)}
+        needs.setdefault(owner, set()).update(targets & needs.keys() - {owner})
+    known: dict[str, int] = {}
+
+    def chain(entry: str) -> int:
+        if entry not in known:
+            known[entry] = max((1 + chain(other) for other in needs[entry]), default=0)
+        return known[entry]
+
+    return max(map(chain, entries(folder)), default=0)
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: name_of(folder) or "sealscope")
+def test_a_folder_is_seen_at_a_glance(folder):
+    assert len(entries(folder)) <= MOST_ENTRIES + (folder == SOURCE)  # the package itself has its ground modules beside
+    if folder != SOURCE:  # the rooms' own order is import-linter's
+        assert depth(folder) <= MOST_DEPTH
+
+
+def test_the_depth_of_a_folder_is_measured():
+    assert depth(SOURCE / "diagnosis") >= 3
+    assert "physics" in entries(SOURCE)
+
+
+def test_a_class_name_stands_in_one_room():
+    rooms: dict[str, set[str]] = {}
+    for path in FILES:
+        room = path.relative_to(SOURCE).parts[0]
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                rooms.setdefault(node.name, set()).add(room)
+    assert len(rooms) > 100
+    assert {name: sorted(homes) for name, homes in rooms.items() if len(homes) > 1} == {}
 
 
 def test_nothing_is_called_utils():
