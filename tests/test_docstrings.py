@@ -21,7 +21,7 @@ def section(docstring: str, title: str) -> str:
 
 def documented(docstring: str) -> list[str]:
     """Names of the parameters in the section of that name, in their order; `a, b : float` documents two."""
-    lines = re.findall(r"^([\w*, ]+?) ?:", section(docstring, "Parameters"), re.MULTILINE)
+    lines = re.findall(r"^(\*{0,2}\w[\w*, ]*?) ?:", section(docstring, "Parameters"), re.MULTILINE)
     return [name.strip().lstrip("*") for line in lines for name in line.split(",")]
 
 
