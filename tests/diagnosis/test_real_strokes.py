@@ -1,7 +1,7 @@
 """Real strokes of two rotary actuators, one with a defective inner seal (public data set vtnsi/actuator_dataset).
 
-One specimen leaks and the two were recorded on different days: a verdict of `leak` here says that the strokes differ
-from the healthy ones, and no more.
+One specimen leaks and the two were recorded on different days: that its strokes differ from the healthy ones says
+nothing of why.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from sealscope.diagnosis.baseline.operating_point import operating_point
 from sealscope.diagnosis.diagnose import diagnose
@@ -49,14 +51,86 @@ def test_direction_is_that_of_the_angle(healthy: list[Recording], defective: lis
 
 
 def test_defective_against_healthy(healthy: list[Recording], defective: list[Recording]) -> None:
-    """30 of 30 are told from the healthy ones, each against those of its own direction alone."""
+    """30 of 30 differ from the healthy ones, and none is called a leak.
+
+    They were `leak` while strokes counted as exchangeable. Healthy specimens on other days differ from a baseline of
+    one session as much, and then 75 % of healthy strokes were `leak`, too: one specimen with a defect, recorded on
+    another day, cannot be told from a healthy one (docs/decisions/0020-baselines.md).
+    """
     directions = Counter(operating_point(one).direction for one in healthy)
     for stroke in defective:
         found = diagnose(stroke, healthy)
-        assert found.verdict == "leak"
+        assert found.verdict == "cannot tell"
         assert f"against {directions[operating_point(stroke).direction]} comparable leak-free" in found.reason
+        assert "another machine, temperature or wear" in found.reason
+        assert found.score < found.threshold
         assert found.leak_lpm is None  # counts allow no L/min
         json.dumps(found.as_dict(), allow_nan=False)
+
+
+SESSIONS = ("session_act_1_healthy", "session_act_2_healthy")
+
+
+@pytest.fixture(scope="module")
+def sessions() -> dict[str, list[Recording]]:
+    missing = [name for name in SESSIONS if not (FOLDER / name).is_dir()]
+    if missing:
+        pytest.skip(f"{missing} not in {FOLDER}")
+    return {name: [read(path, channel_map=MAP, rate=1000) for path in files(name)] for name in SESSIONS}
+
+
+def without_time(stroke: Recording) -> Recording:
+    return replace(stroke, provenance={})
+
+
+@pytest.mark.parametrize("name", SESSIONS)
+@pytest.mark.parametrize("times", [True, False])
+def test_later_strokes_of_a_session_are_no_leak(name: str, times: bool, sessions: dict[str, list[Recording]]) -> None:
+    """The first 20 strokes as baseline: 43 % of the later ones were `leak` while strokes counted as exchangeable."""
+    strokes = sessions[name] if times else [without_time(one) for one in sessions[name]]
+    verdicts = Counter(diagnose(stroke, strokes[:20]).verdict for stroke in strokes[20::2])
+    assert verdicts["leak"] <= 1  # of 42
+    assert (verdicts["no leak"] > 10) == times  # nothing is said to be healthy where the session is not known
+
+
+@pytest.mark.parametrize("times", [True, False])
+def test_another_healthy_specimen_is_no_leak(times: bool, sessions: dict[str, list[Recording]]) -> None:
+    """75 % of the strokes of one specimen were `leak` against the other, with no word of another machine."""
+    for name, other in (SESSIONS, SESSIONS[::-1]):
+        baseline = sessions[name] if times else [without_time(one) for one in sessions[name]]
+        for stroke in sessions[other][::5]:
+            found = diagnose(stroke if times else without_time(stroke), baseline)
+            assert found.verdict == "cannot tell"
+            assert any(reason in found.reason for reason in ("another machine", "cannot be trusted", "pressure level"))
+
+
+def test_a_defective_seal_is_not_called_healthy(
+    defective: list[Recording], sessions: dict[str, list[Recording]]
+) -> None:
+    """Against the other specimen 11 of 30 look like a repetition; of another session that says nothing."""
+    baseline = [without_time(one) for one in sessions["session_act_2_healthy"]]
+    verdicts = Counter(diagnose(without_time(stroke), baseline).verdict for stroke in defective[::3])
+    assert verdicts == {"cannot tell": 10}
+
+
+@pytest.mark.parametrize(("gain", "share"), [(1.0, 0.0), (1.1, 0.9), (1.3, 0.9)])
+def test_a_change_within_a_session_is_found(gain: float, share: float, sessions: dict[str, list[Recording]]) -> None:
+    """Pairs in turn as baseline; what is faster than d5 is scaled in the others of the session's second half."""
+    strokes = sessions["session_act_1_healthy"]
+    baseline = [one for k, one in enumerate(strokes) if (k // 2) % 2 == 0]
+    later = [one for k, one in enumerate(strokes) if (k // 2) % 2 and k > len(strokes) // 2]
+    verdicts = Counter(diagnose(scaled(stroke, gain), baseline).verdict for stroke in later)
+    assert verdicts["leak"] >= share * len(later)
+    assert gain > 1.0 or verdicts["leak"] == 0
+
+
+def scaled(stroke: Recording, gain: float) -> Recording:
+    """Scale the band of d2 to d4 of both pressures, in whole counts."""
+    channels = dict(stroke.channels)
+    for name in ("p_A", "p_B"):
+        band = gaussian_filter1d(stroke[name], 0.6) - gaussian_filter1d(stroke[name], 8.0)
+        channels[name] = np.rint(stroke[name] + (gain - 1.0) * band)
+    return replace(stroke, channels=channels)
 
 
 def test_healthy_against_its_own_other_half(healthy: list[Recording]) -> None:

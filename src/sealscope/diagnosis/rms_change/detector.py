@@ -5,40 +5,45 @@ it went down (p_A) or up (p_B). Here each of these changes is a part of the evid
 scatter, and all chambers and levels d2..d4 together make the verdict. d1 is noise alone: where it changes too, the
 sensors' noise is taken out of the other levels first.
 
-Within a recording the change is a step at any instant. Against leak-free recordings it is a change of the level: from
-three on by the scatter between recordings, with one or two by the scatter of blocks.
+Within a recording the change is a step at any instant. Against leak-free recordings it is a change of the level: of
+single strokes, and from three recordings of a repeated duty on, by the scatter between recordings (`by_recordings`),
+with one or two recordings of a repeated duty by the scatter of blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from sealscope.diagnosis.baseline.mixed_model import FEWEST_FOR_COVARIATE
 from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, operating_point
+from sealscope.diagnosis.baseline.sessions import sessions_of
 from sealscope.diagnosis.changepoint.scatter import HealthyDrift, StepScan
 from sealscope.diagnosis.changepoint.tails import near_best
-from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, RmsBlocks, cut, excess, whole_log_rms
+from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, cut, excess
+from sealscope.diagnosis.rms_change.by_recordings import (
+    WITHOUT_NOISE,
+    by_recordings,
+    change_text,
+    largest_changes,
+    part,
+    parts_against,
+)
 from sealscope.diagnosis.rms_change.drift import drift_beyond_noise, drift_of
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.motion import constant
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Recording
 from sealscope.signals.details import shortest
 
 #: Fewest blocks in which a change can be looked for (the covariance of six columns needs them), and fewest of each side
 #: where blocks of several recordings are compared.
 FEWEST_BLOCKS, FEWEST_BLOCKS_A_SIDE = 24, 12
-#: Fewest baseline recordings from which the scatter between recordings is estimated ...
+#: Fewest baseline recordings of a repeated duty from which the scatter between recordings is estimated.
 FEWEST_RECORDINGS = 3
-#: ... and from which the dependence of the details on the pressure level is estimated too.
-FEWEST_FOR_LEVEL = 6
 #: How far outside the baseline's range of levels a recording may lie, as a share of the range.
 LEVEL_MARGIN = 0.25
-#: Scatter of the log RMS between recordings below which they are copies of one another.
-_LEAST_SCATTER = 1e-9
-_WITHOUT_NOISE = "; the noise (d1) changed too, and was taken out of the other details"
 
 
 class RmsChange:
@@ -90,12 +95,12 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
     for k, name in enumerate(blocks.names):
         step = int(np.argmax(np.abs(result.single[:, k])))
         change = float(x[step + 1 :, k].mean() - x[: step + 1, k].mean())
-        reason = f"{_change(name, change)} at {blocks.edges[step + 1]:.1f} s"
-        parts.append(_part(name, float(result.single[step, k]), thresholds[k], reason))
+        reason = f"{change_text(name, change)} at {blocks.edges[step + 1]:.1f} s"
+        parts.append(part(name, float(result.single[step, k]), thresholds[k], reason))
 
     step = int(np.argmax(result.joint))
     changes = x[step + 1 :].mean(axis=0) - x[: step + 1].mean(axis=0)
-    changed = _largest_changes(blocks.names, result.single[step], changes, thresholds)
+    changed = largest_changes(blocks.names, result.single[step], changes, thresholds)
     noise_scan = StepScan(x[:, d1], list(range(len(d1))), HealthyDrift(drift.walks[d1], np.zeros((len(d1), 0))))
     noise = noise_scan.observed()
     even = result
@@ -141,7 +146,7 @@ def against(recording: Recording, baseline: Sequence[Recording], probability: fl
     point = operating_point(recording)
     levels = np.array([operating_point(other).level for other in baseline])
     margin = float(np.log(LEVEL_RATIO))
-    if len(levels) < FEWEST_FOR_LEVEL:
+    if len(levels) < FEWEST_FOR_COVARIATE:
         outside = bool(np.all(np.abs(levels - point.level) > margin))
     else:
         margin = max(LEVEL_MARGIN * float(np.ptp(levels)), margin)
@@ -152,102 +157,10 @@ def against(recording: Recording, baseline: Sequence[Recording], probability: fl
             f"the pressure level, {np.exp(point.level):.4g} {point.units[0]} rms, lies outside that of the "
             f"{len(baseline)} comparable baseline recordings, {np.exp(levels.min()):.4g} to {np.exp(levels.max()):.4g}",
         )
-    if len(baseline) >= FEWEST_RECORDINGS:
-        return _by_recordings(recording, baseline, point.level, levels, probability)
+    if len(baseline) >= FEWEST_RECORDINGS or point.direction != 0:
+        sessions = sessions_of(recording, baseline, single_strokes=point.direction != 0)
+        return by_recordings(recording, baseline, point.level, levels, sessions, probability)
     return _by_blocks(recording, baseline, probability)
-
-
-@dataclass(frozen=True)
-class HealthyLevels:
-    """Log RMS expected of a healthy recording, from leak-free ones at the same operating point.
-
-    `mean` and standard `deviation` (f,), degrees of `freedom`, and the `fitted` values (n, f) of the leak-free ones.
-    """
-
-    mean: Array
-    deviation: Array
-    freedom: int
-    fitted: Array
-
-
-def predict(log_rms: Array, levels: Array, level: float) -> HealthyLevels:
-    """Return the normal prediction for one more recording from n leak-free ones.
-
-    `log_rms`: (n, f); `levels`: (n,) log pressure levels. From six recordings on, the log RMS is a line over the
-    level (least squares), else a constant; the deviation includes the estimate's own error (Montgomery, Peck &
-    Vining, Introduction to Linear Regression Analysis, sec. 2.5).
-    """
-    n = len(levels)
-    with_level = n >= FEWEST_FOR_LEVEL and np.ptp(levels) > 0
-    design = np.stack([np.ones(n), levels - levels.mean()], axis=1) if with_level else np.ones((n, 1))
-    at = np.array([1.0, level - float(levels.mean())]) if with_level else np.ones(1)
-    coefficients, *_ = np.linalg.lstsq(design, log_rms, rcond=None)
-    freedom = n - design.shape[1]
-    residual = log_rms - design @ coefficients
-    variance = np.sum(residual**2, axis=0) / freedom
-    leverage = float(at @ np.linalg.solve(design.T @ design, at))
-    return HealthyLevels(at @ coefficients, np.sqrt(variance * (1.0 + leverage)), freedom, design @ coefficients)
-
-
-def student_threshold(probability: float, freedom: int) -> float:
-    """Return |t| that Student's t with `freedom` degrees of freedom exceeds with `probability`, both tails together."""
-    from scipy.special import stdtrit
-
-    return float(-stdtrit(freedom, probability / 2.0))
-
-
-def _by_recordings(
-    recording: Recording, baseline: Sequence[Recording], level: float, levels: Array, probability: float
-) -> Evidence:
-    known, measured = np.stack([whole_log_rms(other) for other in baseline]), whole_log_rms(recording)
-    expected = predict(known, levels, level)
-    if not (np.all(np.isfinite(measured)) and np.all(expected.deviation > _LEAST_SCATTER)):
-        return Evidence(
-            "cannot tell",
-            f"the {len(baseline)} comparable baseline recordings do not scatter, or a pressure does not move: "
-            "nothing to judge a change by",
-        )
-    changes = measured - expected.mean
-    t = changes / expected.deviation
-    names = [f"{quantity} of {chamber}" for chamber in chambers_of(recording) for quantity in QUANTITIES]
-    judged = [k for k, name in enumerate(names) if name.split()[0] in JUDGED]
-    own = student_threshold(probability, expected.freedom)
-    threshold = student_threshold(probability / len(judged), expected.freedom)
-    parts = _parts_against(names, t, np.full(len(names), own), changes)
-    noisy = any(abs(t[k]) > own for k, name in enumerate(names) if name.startswith("d1 "))
-    if noisy:
-        t = t.copy()
-        t[judged] = _without_noise(known, measured, expected, judged)
-    score = float(np.max(np.abs(t[judged])))
-    changed = "no change of the details' RMS"
-    if score > threshold:
-        limits = np.full(len(judged), threshold)
-        changed = _largest_changes([names[k] for k in judged], t[judged], changes[judged], limits)
-    reason = (
-        f"{changed} against {len(baseline)} comparable leak-free recordings (largest |t| {score:.1f}, threshold "
-        f"{threshold:.1f}){_WITHOUT_NOISE if noisy else ''}"
-    )
-    return Evidence("leak" if score > threshold else "no leak", reason, score, threshold, parts=parts)
-
-
-def _without_noise(known: Array, measured: Array, expected: HealthyLevels, judged: list[int]) -> Array:
-    """Return t of the judged quantities' energy beyond that of their chamber's d1, so that white noise drops out.
-
-    Energies are relative to what was expected of the quantity. More noise means more scatter of the energy, too: in
-    proportion to it.
-    """
-    noise = [k - k % len(QUANTITIES) for k in judged]
-
-    def energy(log_rms: Array, level: Array) -> Array:
-        return np.asarray(np.exp(2 * (log_rms - level)))
-
-    fitted, mean = expected.fitted[:, judged], expected.mean[judged]
-    before = energy(known[:, judged], fitted) - energy(known[:, noise], fitted)
-    after = energy(measured[judged], mean) - energy(measured[noise], mean)
-    added = energy(measured[noise], mean) - energy(expected.mean[noise], mean)
-    own = (1.0 + np.maximum(added, 0.0)) ** 2
-    scatter = np.sqrt(np.sum((before - before.mean(axis=0)) ** 2, axis=0) / expected.freedom * (own + 1.0 / len(known)))
-    return np.asarray((after - before.mean(axis=0)) / scatter)
 
 
 def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
@@ -278,39 +191,11 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
         threshold = scan.thresholds(probability, after=split)[0]
     changed = "no change of the details' RMS"
     if score > threshold:
-        changed = _largest_changes(after.names, single, changes, thresholds)
+        changed = largest_changes(after.names, single, changes, thresholds)
     reason = (
         f"{changed} against {len(baseline)} comparable leak-free recording{'s' if len(baseline) > 1 else ''} (T2 "
         f"{score:.1f}, threshold {threshold:.1f}, from the scatter within recordings alone: give {FEWEST_RECORDINGS} "
-        f"or more to have the drift between recordings in it){_WITHOUT_NOISE if noisy else ''}"
+        f"or more to have the drift between recordings in it){WITHOUT_NOISE if noisy else ''}"
     )
-    parts = _parts_against(after.names, single, thresholds, changes)
+    parts = parts_against(after.names, single, thresholds, changes)
     return Evidence("leak" if score > threshold else "no leak", reason, score, threshold, parts=parts)
-
-
-def _parts_against(names: list[str], scores: Array, thresholds: Array, changes: Array) -> tuple[Evidence, ...]:
-    return tuple(
-        _part(name, float(scores[k]), thresholds[k], f"{100 * np.expm1(changes[k]):+.1f} % against the baseline")
-        for k, name in enumerate(names)
-    )
-
-
-def _part(name: str, score: float, threshold: float, reason: str) -> Evidence:
-    """Return one quantity's evidence; a change of d1 alone is a change of the noise, never a leak."""
-    verdict: Verdict = "no leak"
-    if abs(score) > threshold:
-        verdict = "cannot tell" if name.startswith("d1 ") else "leak"
-    return Evidence(verdict, reason, abs(score), float(threshold), detector=f"RMS of {name}")
-
-
-def _change(name: str, change: float) -> str:
-    """Return a change of log RMS as text."""
-    percent = 100.0 * np.expm1(change)
-    return f"RMS of {name} {'rose' if percent > 0 else 'fell'} by {abs(percent):.1f} %"
-
-
-def _largest_changes(names: list[str], single: Array, changes: Array, thresholds: Array) -> str:
-    """Return the significant changes as text, the clearest first, at most three."""
-    order = [k for k in np.argsort(-np.abs(single) / thresholds) if not names[k].startswith("d3d4")]
-    significant = [k for k in order if abs(single[k]) > thresholds[k]][:3] or order[:1]
-    return ", ".join(_change(names[k], float(changes[k])) for k in significant)
