@@ -167,6 +167,9 @@ def law(function: _F) -> _F:
 
 
 def contracted(function: _F) -> _F:
-    """A law whose products and sums may be contracted to fused multiply-adds and whose divisions by what does not
-    change may become products: last digits depend on the processor, never on the block or the lane."""
+    """Compile a law whose products and sums may be contracted to fused multiply-adds.
+
+    Divisions by what does not change may become products. Last digits depend on the processor, never on the block or
+    the lane.
+    """
     return numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "arcp"}, forceinline=True)(function)  # type: ignore[no-any-return]

@@ -232,7 +232,7 @@ class _Parser:
 
 @lru_cache(maxsize=1024)
 def parse_unit(text: str) -> Unit:
-    """The unit that `text` names; raises InputError where it is not one."""
+    """Return the unit that `text` names; raises InputError where it is not one."""
     text = text.strip()
     text = _SPELLINGS.get(text, text)
     if text in _ATOMS:
@@ -244,7 +244,7 @@ def parse_unit(text: str) -> Unit:
 
 
 def _expected(si_unit: str) -> str:
-    """What a unit must measure, in words, for messages: `a unit of pressure, such as Pa`."""
+    """Return what a unit must measure, in words, for messages: `a unit of pressure, such as Pa`."""
     if parse_unit(si_unit).powers == ():
         return "no unit, or %"
     return f"a unit of {_KINDS[si_unit]}, such as {si_unit}" if si_unit in _KINDS else f"a unit such as {si_unit}"
@@ -335,7 +335,7 @@ def from_si(
 def parse_quantity(
     value: float | str, si_unit: str, *, name: str = "value", place: str | None = None, finite: bool = True
 ) -> float:
-    """The number that a text such as ``2[L/min]``, ``3 psi`` or ``5`` (already SI) stands for, in `si_unit`.
+    """Return the number that a text such as ``2[L/min]``, ``3 psi`` or ``5`` (already SI) stands for, in `si_unit`.
 
     A number is taken as SI. Raises InputError where there is no number, for another dimension, and, if `finite`, for an
     infinite one or NaN.

@@ -50,11 +50,10 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 
 def spread_baselines(arguments: Sequence[str]) -> list[str]:
-    """Give every file after `--baseline` an option of its own, so that `FILE... --baseline FILE...` works with a
-    shell's wildcards.
+    """Give every file after `--baseline` an option of its own.
 
-    All words after `--baseline` up to the next option belong to it; but where no other word could be a FILE, only the
-    first one does.
+    So `FILE... --baseline FILE...` works with a shell's wildcards. All words after `--baseline` up to the next option
+    belong to it; but where no other word could be a FILE, only the first one does.
     """
     if not arguments or arguments[0] not in ("diagnose", "report", "calibrate"):
         return list(arguments)
@@ -92,8 +91,10 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
 
 
 def main() -> None:
-    """Run the command line; every error a caller can act on is one line on standard error and a status, never a
-    traceback."""
+    """Run the command line.
+
+    Every error a caller can act on is one line on standard error and a status, never a traceback.
+    """
     # typer brings click along or holds a copy of its own, by version: the class is wherever BadParameter's base is
     wrong_call: type[Any] = sys.modules[typer.BadParameter.__module__].ClickException
     for stream in (sys.stdout, sys.stderr):
@@ -124,8 +125,10 @@ def main() -> None:
 
 
 def _let_go_of_output() -> None:
-    """Flush standard output; where nobody takes it any more, send the rest nowhere, so that Python's own flush at its
-    end is silent."""
+    """Flush standard output.
+
+    Where nobody takes it any more, send the rest nowhere, so that Python's own flush at its end is silent.
+    """
     try:
         sys.stdout.flush()
     except OSError:

@@ -77,7 +77,7 @@ SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the instruments
 
 @contextmanager
 def progress() -> Iterator[Progress]:
-    """A progress line on standard error, gone when done; silent where nobody looks."""
+    """Return a progress line on standard error, gone when done; silent where nobody looks."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -95,14 +95,14 @@ def progress() -> Iterator[Progress]:
 
 
 def assumed_rig(name: str | None) -> Rig | None:
-    """The rig of `--rig` that detectors may assume; None where none is given."""
+    """Return the rig of `--rig` that detectors may assume; None where none is given."""
     from sealscope.parameters import load_rig
 
     return None if name is None else load_rig(name)
 
 
 def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
-    """The rig of that name or file with the values of `--set`."""
+    """Return the rig of that name or file with the values of `--set`."""
     from sealscope.parameters import load_rig, parse_overrides
 
     rig = load_rig(name)

@@ -6,57 +6,32 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sealscope.parameters.actuator import Cylinder, Friction
-    from sealscope.parameters.drive import Fluid, Line, MakeUp, Motor, Pump
-    from sealscope.parameters.instruments import Daq, PressureTransducer, Sensors
-    from sealscope.parameters.load import load_rig, rig_names
-    from sealscope.parameters.names import parse_override, parse_overrides
-    from sealscope.parameters.rig import Entry, Rig, Row, declared_names
+    from sealscope.parameters.actuator import Cylinder as Cylinder
+    from sealscope.parameters.actuator import Friction as Friction
+    from sealscope.parameters.drive import Fluid as Fluid
+    from sealscope.parameters.drive import Motor as Motor
+    from sealscope.parameters.drive import Pump as Pump
+    from sealscope.parameters.instruments import Daq as Daq
+    from sealscope.parameters.instruments import PressureTransducer as PressureTransducer
+    from sealscope.parameters.load import load_rig as load_rig
+    from sealscope.parameters.load import rig_names as rig_names
+    from sealscope.parameters.names import parse_override as parse_override
+    from sealscope.parameters.names import parse_overrides as parse_overrides
+    from sealscope.parameters.rig import Rig as Rig
+    from sealscope.parameters.rig import declared_names as declared_names
 
-_HOMES = {
-    "Cylinder": "actuator",
-    "Daq": "instruments",
-    "Entry": "rig",
-    "Fluid": "drive",
-    "Friction": "actuator",
-    "Line": "drive",
-    "MakeUp": "drive",
-    "Motor": "drive",
-    "PressureTransducer": "instruments",
-    "Pump": "drive",
-    "Rig": "rig",
-    "Row": "rig",
-    "Sensors": "instruments",
-    "declared_names": "rig",
-    "load_rig": "load",
-    "parse_override": "names",
-    "parse_overrides": "names",
-    "rig_names": "load",
+_NAMES = {
+    "actuator": ("Cylinder", "Friction"),
+    "drive": ("Fluid", "Motor", "Pump"),
+    "instruments": ("Daq", "PressureTransducer"),
+    "load": ("load_rig", "rig_names"),
+    "names": ("parse_override", "parse_overrides"),
+    "rig": ("Rig", "declared_names"),
 }
-
-__all__ = [
-    "Cylinder",
-    "Daq",
-    "Entry",
-    "Fluid",
-    "Friction",
-    "Line",
-    "MakeUp",
-    "Motor",
-    "PressureTransducer",
-    "Pump",
-    "Rig",
-    "Row",
-    "Sensors",
-    "declared_names",
-    "load_rig",
-    "parse_override",
-    "parse_overrides",
-    "rig_names",
-]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOMES:  # pydantic loads with the first name used
-        return getattr(importlib.import_module(f"sealscope.parameters.{_HOMES[name]}"), name)
+    for module, names in _NAMES.items():
+        if name in names:  # pydantic loads with the first name used
+            return getattr(importlib.import_module(f"sealscope.parameters.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

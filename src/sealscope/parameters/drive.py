@@ -32,7 +32,7 @@ class Pump(Part):
     omega_max: Annotated[float, quantity("speed limit (informative)", "rad/s", gt=0, le=1e4)]
 
 
-class Line(Part):
+class HydraulicLine(Part):
     """Lines between pump and cylinder, and the one-way throttles in them, eqs. (4.7)-(4.12), (4.16), (4.17).
 
     `orifices = "absent"`: the pump is piped to the cylinder directly (p_1 = p_A, p_2 = p_B, V_1 and V_2 unused).

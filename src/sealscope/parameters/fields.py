@@ -39,18 +39,18 @@ def unit_of(field: FieldInfo) -> str:
 
 
 def choices_of(field: FieldInfo) -> tuple[str, ...]:
-    """The allowed words of a choice, () for a number."""
+    """Return the allowed words of a choice, () for a number."""
     annotation = field.annotation
     return get_args(annotation) if get_origin(annotation) is typing.Literal else ()
 
 
 def with_unit(number: float, unit: str) -> str:
-    """`number` followed by its unit, bare where it has none."""
+    """Return `number` followed by its unit, bare where it has none."""
     return f"{number:g}" if unit in ("", "1") else f"{number:g} {unit}"
 
 
 def rule_broken(error: ValidationError, model: type[BaseModel]) -> str:
-    """The sentence "SYMBOL must be ..., got ..." for the first error pydantic found in values of `model`."""
+    """Return the sentence "SYMBOL must be ..., got ..." for the first error pydantic found in values of `model`."""
     first = error.errors(include_url=False)[0]
     symbol = ".".join(str(part) for part in first["loc"])
     kind, got = first["type"], first.get("input")
@@ -92,7 +92,7 @@ class Part(BaseModel):
             raise (PartsDisagreeError if across else InputError)(rule_broken(error, type(self))) from None
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy; with `update` it raises InputError, because pydantic would not validate the new values."""
+        """Return a copy; with `update` it raises InputError, because pydantic would not validate the new values."""
         if update:
             raise InputError("a rig must be changed by Rig.with_overrides, got model_copy(update=...)")
         return super().model_copy(deep=deep)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sealscope.calls import checked_call, closest
 from sealscope.errors import InputError
-from sealscope.parameters.rig import Entry, Rig, flatten
+from sealscope.parameters.rig import ParameterEntry, Rig, flatten
 from sealscope.parameters.toml_file import read_toml
 
 _PACKAGED = Path(__file__).parent / "rigs"
@@ -78,7 +78,7 @@ def _build(path: Path, place: str) -> Rig:
     return Rig.from_entries(entries, name=head.get("name", path.stem), title=head.get("title", ""), place=place)
 
 
-def _collect(path: Path, place: str, seen: tuple[Path, ...]) -> tuple[dict[str, str], dict[str, Entry]]:
+def _collect(path: Path, place: str, seen: tuple[Path, ...]) -> tuple[dict[str, str], dict[str, ParameterEntry]]:
     """Head and entries of a file, on top of those of the rig it extends."""
     here = path.resolve()
     if here in seen or len(seen) >= _DEEPEST:
@@ -92,7 +92,7 @@ def _collect(path: Path, place: str, seen: tuple[Path, ...]) -> tuple[dict[str, 
             raise InputError(f"rig.{key} is not known; [rig] has name, title and extends ({place})")
         if not isinstance(value, str) or not value.strip():
             raise InputError(f"rig.{key} must be a text, got {value!r} ({place})")
-    entries: dict[str, Entry] = {}
+    entries: dict[str, ParameterEntry] = {}
     base = head.get("extends")
     if base in rig_names():
         entries = _collect(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*seen, here))[1]

@@ -9,7 +9,7 @@ from sealscope.errors import InputError
 
 
 def resolve(name: str, dotted: Sequence[str]) -> str:
-    """The dotted name that `name` stands for: itself, or the only one that ends with it (`V_1`, `p_A.noise`).
+    """Return the dotted name that `name` stands for: itself, or the only one that ends with it (`V_1`, `p_A.noise`).
 
     Raises InputError where no parameter has the name, or several have.
     """

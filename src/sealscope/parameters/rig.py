@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 from sealscope.calls import closest
 from sealscope.errors import InputError
 from sealscope.parameters.actuator import Cylinder, Friction
-from sealscope.parameters.drive import Fluid, Line, MakeUp, Motor, Pump
+from sealscope.parameters.drive import Fluid, HydraulicLine, MakeUp, Motor, Pump
 from sealscope.parameters.fields import Part, PartsDisagreeError, choices_of, leaves, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
 from sealscope.parameters.names import resolve
@@ -23,7 +23,7 @@ from sealscope.units import parse_quantity, to_si
 Value = float | int | str
 
 
-class Entry(NamedTuple):
+class ParameterEntry(NamedTuple):
     """One value as given: number or word, unit ("" for a choice), source, and the file or option it stands in."""
 
     value: Value
@@ -36,7 +36,7 @@ class Entry(NamedTuple):
         return str(self.value) if self.unit in ("", "1") else f"{self.value} {self.unit}"
 
 
-class Row(NamedTuple):
+class ParameterRow(NamedTuple):
     """One line of the table of parameters; `value` in the SI unit `unit`, `given` as the file states it."""
 
     symbol: str
@@ -57,7 +57,7 @@ class Rig(Part):
 
     motor: Motor
     pump: Pump
-    line: Line
+    line: HydraulicLine
     cylinder: Cylinder
     friction: Friction
     fluid: Fluid
@@ -66,7 +66,7 @@ class Rig(Part):
     daq: Daq
     _name: str = PrivateAttr(default="")
     _title: str = PrivateAttr(default="")
-    _entries: tuple[tuple[str, Entry], ...] = PrivateAttr(default=())
+    _entries: tuple[tuple[str, ParameterEntry], ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
@@ -104,17 +104,17 @@ class Rig(Part):
         return self._title
 
     def __getitem__(self, name: str) -> Value:
-        """The SI value of a parameter by its bare or dotted name."""
+        """Return the SI value of a parameter by its bare or dotted name."""
         value: Any = self
         for symbol in resolve(name, declared_names()).split("."):
             value = getattr(value, symbol)
         return value  # type: ignore[no-any-return]
 
-    def entry(self, name: str) -> Entry:
+    def entry(self, name: str) -> ParameterEntry:
         """Value, unit, source and place of a parameter, as given."""
         return self._given()[resolve(name, declared_names())]
 
-    def _given(self) -> dict[str, Entry]:
+    def _given(self) -> dict[str, ParameterEntry]:
         if not self._entries:
             raise InputError("a rig must have sources; make it with load_rig or Rig.from_entries, not from bare parts")
         return dict(self._entries)
@@ -135,14 +135,14 @@ class Rig(Part):
             if full in replaced:
                 raise InputError(f"{full} must be set once, got {replaced[full]} and {name}")
             replaced[full] = name
-            entries[full] = Entry(*_as_given(full, value, source), source, source)
+            entries[full] = ParameterEntry(*_as_given(full, value, source), source, source)
         return Rig.from_entries(entries, name=self._name, title=self._title, place=source)
 
-    def table(self) -> list[Row]:
+    def table(self) -> list[ParameterRow]:
         """Every parameter in the order of declaration."""
         entries = self._given()
         return [
-            Row(
+            ParameterRow(
                 name.rpartition(".")[2],
                 name,
                 str(field.title),
@@ -155,7 +155,7 @@ class Rig(Part):
         ]
 
     def as_dict(self) -> dict[str, Any]:
-        """The rig as plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
+        """Return the rig as plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
         tree: dict[str, Any] = {"rig": {"name": self._name, "title": self._title}}
         for name, entry in self._given().items():
             *groups, symbol = name.split(".")
@@ -168,15 +168,21 @@ class Rig(Part):
 
     @classmethod
     def from_dict(cls, tree: Mapping[str, Any], *, place: str) -> Rig:
-        """The rig that `as_dict` wrote down, for example in a recording's provenance; `place` is named in errors."""
+        """Return the rig that `as_dict` wrote down, for example in a recording's provenance.
+
+        `place` is named in errors.
+        """
         head = tree.get("rig")
         name, title = (head.get("name", ""), head.get("title", "")) if isinstance(head, Mapping) else ("", "")
         parts = ((key, item) for key, item in tree.items() if key != "rig")
         return cls.from_entries(flatten(parts, place), name=str(name), title=str(title), place=place)
 
     @classmethod
-    def from_entries(cls, entries: Mapping[str, Entry], *, name: str, title: str = "", place: str) -> Rig:
-        """A rig from one entry for each declared parameter, by dotted name; `place` is named where one is missing."""
+    def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
+        """Return a rig from one entry for each declared parameter, by dotted name.
+
+        `place` is named where one is missing.
+        """
         known = declared_names()
         for full in entries:
             if full not in _declared():
@@ -214,7 +220,7 @@ def declared_names() -> tuple[str, ...]:
 
 
 def _part(
-    owner: type[Part], symbol: str, values: dict[str, Any], path: str, entries: Mapping[str, Entry], place: str
+    owner: type[Part], symbol: str, values: dict[str, Any], path: str, entries: Mapping[str, ParameterEntry], place: str
 ) -> Part:
     """Build one group, its groups first; a broken rule is told with the place of its value, or of the whole rig."""
     model = owner.model_fields[symbol].annotation
@@ -245,8 +251,11 @@ def _shown(full: str) -> str:
     return _qualified(full, full.rpartition(".")[2])
 
 
-def _si_value(full: str, field: FieldInfo, entry: Entry) -> Value:
-    """The SI number or the word of one entry; raises InputError for a blank source, a wrong type or a wrong unit."""
+def _si_value(full: str, field: FieldInfo, entry: ParameterEntry) -> Value:
+    """Return the SI number or the word of one entry.
+
+    Raises InputError for a blank source, a wrong type or a wrong unit.
+    """
     shown, place = _shown(full), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():
         raise InputError(f"{shown} must have a source, got none ({place})")
@@ -281,9 +290,9 @@ def _as_given(full: str, value: Any, place: str) -> tuple[Value, str]:
     return (value.item() if isinstance(value, np.generic) else value), si_unit
 
 
-def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, Entry]:
+def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
     """Entries of nested tables `{group: {symbol: {value, unit, source}}}` by dotted name; else InputError."""
-    entries: dict[str, Entry] = {}
+    entries: dict[str, ParameterEntry] = {}
     for key, item in tree:
         full = prefix + key
         if full in _declared() or (isinstance(item, dict) and "value" in item):
@@ -295,7 +304,7 @@ def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> di
     return entries
 
 
-def _entry(full: str, item: Any, place: str) -> Entry:
+def _entry(full: str, item: Any, place: str) -> ParameterEntry:
     if full not in _declared():
         raise InputError(f"{full} is not a parameter{closest(full, declared_names())} ({place})")
     shown = _shown(full)
@@ -308,4 +317,4 @@ def _entry(full: str, item: Any, place: str) -> Entry:
     for key in ("unit", "source"):
         if not isinstance(item.get(key, ""), str):
             raise InputError(f"{key} of {shown} must be a text, got {item[key]!r} ({place})")
-    return Entry(item["value"], item.get("unit", ""), item.get("source", ""), place)
+    return ParameterEntry(item["value"], item.get("unit", ""), item.get("source", ""), place)

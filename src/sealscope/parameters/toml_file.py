@@ -13,7 +13,7 @@ LARGEST = 1_000_000
 
 
 def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
-    """The tables of the TOML file `path`; `what` it is ("a rig file") and its `place` stand in the errors.
+    """Return the tables of the TOML file `path`; `what` it is ("a rig file") and its `place` stand in the errors.
 
     Raises InputError where it cannot be read, is larger than `LARGEST`, is not UTF-8 or not TOML.
     """

@@ -10,8 +10,10 @@ from sealscope.physics.lanes import select
 
 @contracted
 def chamber_volumes(x: float, V: float, A_A: float, A_B: float, position_dependent: bool) -> tuple[float, float]:
-    """Oil volumes (V_A, V_B) [m^3] at piston position x [m] from mid-stroke: V on both sides (Table 4.1), or V + A_A
-    x and V - A_B x."""
+    """Return the oil volumes (V_A, V_B) [m^3] at piston position x [m] from mid-stroke.
+
+    V on both sides (Table 4.1), or V + A_A x and V - A_B x.
+    """
     if position_dependent:
         return V + A_A * x, V - A_B * x
     return V, V
@@ -19,8 +21,10 @@ def chamber_volumes(x: float, V: float, A_A: float, A_B: float, position_depende
 
 @contracted
 def pressure_rate(inflow: float, volume: float, K_oil: float) -> float:
-    """dp/dt [Pa/s] = K_oil/V (net inflow - volume growth), eqs. (4.16)-(4.19); `inflow` [m^3/s] is already net of
-    both."""
+    """Return dp/dt = K_oil/V (net inflow - volume growth) [Pa/s], eqs. (4.16)-(4.19).
+
+    `inflow` [m^3/s] is already net of both.
+    """
     return K_oil / volume * inflow
 
 
@@ -39,5 +43,5 @@ def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) 
 def piston_acceleration(
     p_A: float, p_B: float, friction: float, load: float, stop: float, A_A: float, A_B: float, M_eq: float
 ) -> float:
-    """a [m/s^2] = (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq, eq. (4.15) with the caps."""
+    """Return the acceleration a = (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq [m/s^2], eq. (4.15) with the caps."""
     return (p_A * A_A - p_B * A_B - friction - load + stop) / M_eq

@@ -10,8 +10,10 @@ from sealscope.physics.lanes import exponential, select
 
 @contracted
 def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, of_difference: bool) -> float:
-    """Coulomb force F_C [N] = F_pr + F_cfr (p_A + p_B), eq. (4.20); `of_difference` takes p_A - p_B, the literal
-    reading."""
+    """Return the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20).
+
+    `of_difference` takes p_A - p_B, the literal reading.
+    """
     return F_pr + F_cfr * ((p_A - p_B) if of_difference else (p_A + p_B))
 
 

@@ -1,5 +1,6 @@
-"""Lanes: a vector of doubles that the laws take in place of one number, so that one source serves one run, eight on a
-processor's vector registers, and one a thread on a GPU.
+"""Lanes: vectors of doubles that the laws take in place of one number.
+
+One source serves one run, eight on a processor's vector registers, and one a thread on a GPU.
 
 A law written without branches on its numbers (`select` instead of `if`) is compiled for plain floats and for `LANES`
 alike; each operation on lanes is one instruction over a whole vector register where the processor has it (two or four
@@ -38,6 +39,7 @@ class Lanes(types.Type):  # type: ignore[misc]
         super().__init__(name=f"Lanes({WIDTH})")
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
+        """Say that any number becomes lanes safely."""
         from numba.core.typeconv import Conversion
 
         return Conversion.safe if isinstance(other, types.Number) else None
@@ -67,7 +69,7 @@ class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _spread(builder: Any, scalar: Any) -> Any:
-    """The same number in every lane."""
+    """Return the same number in every lane."""
     zero = ir.Constant(ir.IntType(32), 0)
     first = builder.insert_element(ir.Constant(_DOUBLE, ir.Undefined), scalar, zero)
     return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
@@ -117,7 +119,7 @@ _define(operator.neg, LANES, lambda builder, a: builder.fneg(a))
 
 
 def _called(name: str, arity: int = 1) -> Any:
-    """An LLVM intrinsic over the lanes."""
+    """Return an LLVM intrinsic over the lanes."""
 
     def build(builder: Any, *values: Any) -> Any:
         kind = ir.FunctionType(_DOUBLE, [_DOUBLE] * arity)
@@ -146,9 +148,11 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
 
 
 def lowered(function: Any, arity: int, result: Any, build: Any) -> None:
-    """Give a plain function a compiled form too: `result(kinds, device)` is the kind of what it returns (None where it
-    does not take these kinds), and `build(context, builder, kinds, values)` makes the instructions. `device` is true
-    where code for a GPU is made."""
+    """Give a plain function a compiled form too.
+
+    `result(kinds, device)` is the kind of what it returns (None where it does not take these kinds), and
+    `build(context, builder, kinds, values)` makes the instructions. `device` is true where code for a GPU is made.
+    """
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
@@ -238,8 +242,10 @@ def _place(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
 
 
 def _own(array: Any, row: int) -> tuple[Any, int]:
-    """In plain Python: all numbers of an array, and where this thread's number of a row is among them. The simulator
-    wraps arrays twice, and each attribute of its wrappers is slow."""
+    """Return all numbers of an array, and the place of this thread's number of a row among them, in plain Python.
+
+    The simulator wraps arrays twice, and each attribute of its wrappers is slow.
+    """
     for wrapper in ("_item", "_ary"):
         array = getattr(array, wrapper, array)
     width = array.shape[-1]
@@ -247,14 +253,16 @@ def _own(array: Any, row: int) -> tuple[Any, int]:
 
 
 def load(array: Any, row: int) -> Any:
-    """The lanes of row `row` of a C-ordered array (..., WIDTH), rows counted through all leading axes; on a GPU the
-    thread's number of row `row` of an array (..., WARP)."""
+    """Return the lanes of row `row` of a C-ordered array (..., WIDTH), rows counted through all leading axes.
+
+    On a GPU the thread's number of row `row` of an array (..., WARP).
+    """
     numbers, at = _own(array, row)
     return numbers[at]
 
 
 def load_number(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    """The instructions of `load`."""
+    """Return the instructions of `load`."""
     return builder.load(_place(context, builder, kinds, values), align=8)
 
 
@@ -286,7 +294,7 @@ lowered(store, 3, _stored, _store)
 
 
 def spread(value: Any) -> Any:
-    """The same number in every lane."""
+    """Return the same number in every lane."""
     return float(value)
 
 

@@ -15,8 +15,10 @@ from sealscope.physics.restrictors import orifice_flow
 
 @contracted
 def laminar_leakage(dp: float, G: float) -> float:
-    """Q_L = G (p_A - p_B) [m^3/s]: laminar gap of leakage conductance G [m^3/(s Pa)] (Merritt, Hydraulic Control
-    Systems, 1967, leakage of an actuator)."""
+    """Return Q_L = G (p_A - p_B) [m^3/s] through a laminar gap of leakage conductance G [m^3/(s Pa)].
+
+    Source: Merritt, Hydraulic Control Systems, 1967, leakage of an actuator.
+    """
     return G * dp
 
 

@@ -1,5 +1,7 @@
-"""The servo motor with its speed loop: a PI controller, a limited voltage, a winding with a limited current, a
-shaft."""
+"""The servo motor with its speed loop.
+
+A PI controller, a limited voltage, a winding with a limited current, a shaft.
+"""
 
 from __future__ import annotations
 

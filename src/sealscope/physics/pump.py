@@ -9,8 +9,9 @@ from sealscope.compiled import contracted
 
 @contracted
 def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
-    """Flow [m^3/s] that the pump delivers into port 1: Q_1 = q_b omega / (2 pi) - G_pump (p_1 - p_2), eq. (4.1) with
-    internal leakage.
+    """Return the flow [m^3/s] that the pump delivers into port 1.
+
+    Q_1 = q_b omega / (2 pi) - G_pump (p_1 - p_2), eq. (4.1) with internal leakage.
 
     `omega` [rad/s], `dp` = p_1 - p_2 [Pa], `q_b` displacement [m^3/rev], `G_pump` [m^3/(s Pa)] (zero in the thesis).
     """

@@ -32,7 +32,7 @@ def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
 
 @contracted
 def _implicit_share(b: float, a: float) -> float:
-    """The share w with w r(w) + a w = b for b >= 0, a >= 0, where r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1.
+    """Return the share w with w r(w) + a w = b for b >= 0, a >= 0, where r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1.
 
     w = Q/(c sqrt(dp_0)) is the flow through an orifice and w r its pressure difference over dp_0 (`orifice_flow` solved
     for the difference). The left side grows and is convex, so the root is unique; Halley's method finds it, in one turn
@@ -58,8 +58,9 @@ def _implicit_share(b: float, a: float) -> float:
 
 @contracted
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
-    """Flow Q [m^3/s] of a one-way throttle between two volumes in an implicit stage: d + g Q(d) = total, g >= 0 [Pa
-    s/m^3].
+    """Return the flow Q [m^3/s] of a one-way throttle between two volumes in an implicit stage.
+
+    d + g Q(d) = total, g >= 0 [Pa s/m^3].
 
     This scalar equation is all that an implicit stage has to solve for one line volume against one chamber; the root
     is unique and has the sign of `total`.

@@ -81,7 +81,7 @@ if TYPE_CHECKING:
         aerated: tuple[bool, ...]
         open_circuit: tuple[bool, ...]
 
-        def __new__(cls, *values: Any, **fields: Any) -> RigNumbers: ...
+        def __init__(self, *values: Any, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> float: ...
         def _replace(self, **fields: Any) -> RigNumbers: ...
         def _asdict(self) -> dict[str, Any]: ...
@@ -91,12 +91,11 @@ else:  # numba takes a named tuple apart; its fields are those of the models
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
-    """Flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)] of the one-way throttles, eqs.
-    (4.7)-(4.12).
+    """Return the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
-    "Closed" is a share of the area (eq. 4.8) or of the diameter (the text). Metering "meter-out": free flow towards
-    the cylinder and throttled return on both sides (the text and Appendix A); "literal": as eqs. (4.9)-(4.12) are
-    printed, side B the other way round.
+    "Closed" is a share of the area (eq. 4.8) or of the diameter (the text). Metering "meter-out": free flow towards the
+    cylinder and throttled return on both sides (the text and Appendix A); "literal": as eqs. (4.9)-(4.12) are printed,
+    side B the other way round.
     """
     line = rig.line
     area = math.pi / 4.0 * line.d_line**2  # eq. (4.7)
@@ -132,7 +131,10 @@ def initial_state(rig: Rig, x_0: float) -> np.ndarray:
 
 @contracted
 def within_limits(y: State, p: RigNumbers) -> State:
-    """The state after a step: the drive's current is held within its limits; without lines p_1 = p_A and p_2 = p_B."""
+    """Return the state after a step: the drive's current is held within its limits.
+
+    Without lines p_1 = p_A and p_2 = p_B.
+    """
     current = min(max(y[CURRENT], -p.i_max), p.i_max)
     p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
     return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, y[10]
@@ -153,8 +155,10 @@ def friction_force(y: State, p: RigNumbers) -> float:
 
 @contracted
 def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Q_A [m^3/s] from line 1 into chamber A, eqs. (4.9)-(4.10), and Q_B from chamber B into line 2, eqs.
-    (4.11)-(4.12)."""
+    """Return the throttles' flows Q_A and Q_B [m^3/s].
+
+    Q_A runs from line 1 into chamber A, eqs. (4.9)-(4.10), and Q_B from chamber B into line 2, eqs. (4.11)-(4.12).
+    """
     dp_A, dp_B = y[P_1] - y[P_A], y[P_B] - y[P_2]
     Q_A = orifice_flow(dp_A, one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
     return Q_A, orifice_flow(dp_B, one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
@@ -170,7 +174,7 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 
 @contracted
 def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
-    """What the throttles' flows add to the rates of p_A, p_B, p_1, p_2 [Pa/s], eqs. (4.16)-(4.19)."""
+    """Return what the throttles' flows add to the rates of p_A, p_B, p_1, p_2 [Pa/s], eqs. (4.16)-(4.19)."""
     V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
     return (
         pressure_rate(Q_A, V_A, bulk_modulus(y[P_A], p)),  # eq. (4.18)
@@ -182,8 +186,10 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 
 @contracted
 def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Flows [m^3/s] of the make-up into side 1 (A) and side 2 (B): at the pump's ports, or at the chambers without
-    lines."""
+    """Return the flows [m^3/s] of the make-up into side 1 (A) and side 2 (B).
+
+    At the pump's ports, or at the chambers without lines.
+    """
     supply = accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
     one, two = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
     G_check = p.G_check if p.made_up else 0.0 * p.G_check
@@ -192,8 +198,10 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """What leaves at the rod seals and what the make-up feeds: rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed
-    [m^3/s]."""
+    """Return what leaves at the rod seals and what the make-up feeds.
+
+    Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s].
+    """
     V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     up_1, up_2 = make_up_flows(y, p)

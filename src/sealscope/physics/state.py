@@ -21,13 +21,13 @@ Pressures = tuple[float, float, float, float]
 
 @contracted
 def state_of(y: np.ndarray) -> State:
-    """The state (11,) as the tuple of numbers that the laws take."""
+    """Return the state (11,) as the tuple of numbers that the laws take."""
     return y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10]
 
 
 @contracted
 def moved(y: State, h: float, dy: State) -> State:
-    """y + h dy."""
+    """Return y + h dy."""
     return (
         y[0] + h * dy[0],
         y[1] + h * dy[1],
@@ -45,7 +45,7 @@ def moved(y: State, h: float, dy: State) -> State:
 
 @contracted
 def pressures_moved(y: State, h: float, s: Pressures) -> State:
-    """The state with h s added to its pressures."""
+    """Return the state with h s added to its pressures."""
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10]
 

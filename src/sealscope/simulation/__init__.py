@@ -1,0 +1,1 @@
+"""Experiments, and how they are simulated, recorded and run side by side."""

@@ -16,7 +16,7 @@ from sealscope.units import parse_quantity
 
 
 def number_text(value: float) -> str:
-    """The shortest text that reads back as exactly this number."""
+    """Return the shortest text that reads back as exactly this number."""
     return repr(float(value)).removesuffix(".0")
 
 
@@ -24,7 +24,7 @@ class Command(Protocol):
     """A command: volts as a function of time, and its own description in the words that `parse_command` reads."""
 
     def volts(self, t: Array) -> Array:
-        """u [V] at times t [s] (any shape); 0 before t = 0."""
+        """Return u [V] at times t [s] (any shape); 0 before t = 0."""
         ...
 
     def __str__(self) -> str: ...
@@ -40,6 +40,7 @@ class Sine:
     offset: float = 0.0
 
     def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
         return self.offset + self.amplitude * np.sin(self.omega * t + self.phase)
 
     def __str__(self) -> str:
@@ -58,6 +59,7 @@ class Step:
     at: float = 0.0
 
     def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
         return np.where(t >= self.at, self.level, 0.0)
 
     def __str__(self) -> str:
@@ -77,6 +79,7 @@ class Ramp:
             raise InputError(f"a ramp must stop after it starts, got {self.start:g} s to {self.stop:g} s")
 
     def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
         return self.level * np.clip((t - self.start) / (self.stop - self.start), 0.0, 1.0)
 
     def __str__(self) -> str:
@@ -85,8 +88,10 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Chirp:
-    """u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))): frequency from f_0 to f_1 [Hz] over T [s], f_1
-    afterwards."""
+    """u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))).
+
+    The frequency goes from f_0 to f_1 [Hz] over T [s] and stays at f_1 afterwards.
+    """
 
     amplitude: float
     f_0: float
@@ -98,6 +103,7 @@ class Chirp:
             raise InputError(f"a chirp must have frequencies >= 0 Hz and a duration > 0 s, got {self}")
 
     def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
         within = np.minimum(t, self.duration)
         cycles = self.f_0 * within + (self.f_1 - self.f_0) * within**2 / (2.0 * self.duration)
         return self.amplitude * np.sin(2.0 * np.pi * (cycles + self.f_1 * (t - within)))
@@ -124,6 +130,7 @@ class PseudoRandom:
             raise InputError(f"a pseudo-random command must hold each value for > 0 s, got {self.hold:g} s")
 
     def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
         slot = np.maximum(np.floor(t / self.hold), 0.0).astype(np.uint64)
         start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
         z = start + (slot + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
@@ -153,6 +160,7 @@ class Recorded:
             raise InputError(f"a recorded command must be finite and its time must rise ({self.origin})")
 
     def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
         return np.interp(t, self.t, self.u)
 
     def __str__(self) -> str:
@@ -160,13 +168,15 @@ class Recorded:
 
 
 def recorded_command(recording: Recording, origin: str) -> Recorded:
-    """The command channel `u` of a recording as a command of its own; the first sample is at t = 0."""
+    """Return the command channel `u` of a recording as a command of its own; the first sample is at t = 0."""
     return Recorded(recording.t - recording.t[0], recording["u"], origin)
 
 
 def check_command(command: Command, t: Array, limit: float) -> None:
-    """Raise InputError where the command leaves +-`limit` [V] (the converter's range) or is not a number at the times
-    `t` [s]."""
+    """Raise InputError where the command leaves +-`limit` [V], the converter's range.
+
+    That, or no number, at any of the times `t` [s].
+    """
     u = command.volts(t)
     bad = ~(np.abs(u) <= limit * (1 + 1e-12))
     if bad.any():
@@ -217,10 +227,11 @@ def _number(text: str | None, default: float) -> float:
 
 
 def parse_command(text: str) -> Command:
-    """A command from words: `3 sin(4t)`, `step 5 at 1 s`, `ramp 5 from 1 s to 3 s`, `chirp 3 from 0.1 Hz to 5 Hz over
-    60 s`, `prbs 2 every 0.5 s seed 1`, `file LOG` (the channel u of a recording).
+    """Read a command from text.
 
-    Raises InputError that shows the forms when the text is none of them.
+    The forms are ``3 sin(4t)``, ``step 5 at 1 s``, ``ramp 5 from 1 s to 3 s``, ``chirp 3 from 0.1 Hz to 5 Hz over 60
+    s``, ``prbs 2 every 0.5 s seed 1``, and ``file LOG`` (the channel u of a recording). Raises InputError that shows
+    the forms when the text is none of them.
     """
     stripped = text.strip()
     if stripped.lower().startswith("file "):

@@ -169,12 +169,12 @@ class Experiment:
         return command
 
     def effects(self) -> tuple[Effect, ...]:
-        """What changes in the machine within the run."""
+        """Return what changes in the machine within the run."""
         drifting = [effect for drift in self.drifts for effect in drift.effects()]
         return (*drifting, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def readings(self) -> Readings:
-        """What changes at the instruments within the run."""
+        """Return what changes at the instruments within the run."""
         drifting = [one for drift in self.drifts for one in drift.adjustments()]
         return Readings(
             (*drifting, *(one for fault in self.faults for one in fault.adjustments())),
@@ -192,7 +192,7 @@ class Experiment:
         return self.rig.daq.sample_rate
 
     def sample_times(self) -> Array:
-        """Times [s] of the recording's samples."""
+        """Return the times [s] of the recording's samples."""
         return np.arange(round(self.duration * self.rate)) / self.rate
 
     def onset(self) -> float | None:
@@ -202,7 +202,7 @@ class Experiment:
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """The experiment in plain words and numbers, without what only the truth may know (leaks, faults, drifts)."""
+        """Return the experiment as plain values, without what only the truth may know (leaks, faults, drifts)."""
         return {
             "rig": self.rig.name,
             "overrides": {
@@ -218,7 +218,7 @@ class Experiment:
         }
 
     def key(self) -> str:
-        """A short name that is the same for equal experiments only."""
+        """Return a short name that is the same for equal experiments only."""
         values = {row.name: repr(row.value) for row in self.rig.table()}
         inputs = [exact(self.command), *(exact(leak) for leak in self.leaks)]
         inputs += [exact(one) for one in (*self.faults, *self.drifts)]
@@ -229,7 +229,10 @@ class Experiment:
 
 
 def exact(value: Any) -> Any:
-    """A command or a leak as plain values that differ wherever its numbers do, in the last digit or deep in a table."""
+    """Return a command or a leak as plain values that differ wherever its numbers do.
+
+    Down to the last digit, and deep in a table.
+    """
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
     if is_dataclass(value):
@@ -238,7 +241,10 @@ def exact(value: Any) -> Any:
 
 
 def _each(given: Any, kind: type[_Kind], parse: Callable[[str], _Kind | None], name: str) -> tuple[_Kind, ...]:
-    """The leaks or faults of an argument: one or several, as texts or as objects; InputError for anything else."""
+    """Return the leaks or faults of an argument: one or several, as texts or as objects.
+
+    Raises InputError for anything else.
+    """
     several = [] if given is None else [given] if isinstance(given, (str, kind)) else given
     if not isinstance(several, Iterable):
         raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {given!r}")

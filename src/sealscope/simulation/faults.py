@@ -189,12 +189,12 @@ class Fault:
         return command
 
     def _times(self, name: str, factor: float) -> Effect:
-        """A number that is multiplied by `factor` when the fault is whole."""
+        """Return a number that is multiplied by `factor` when the fault is whole."""
         step = SHARE_RESOLUTION * max(abs(factor - 1.0), 1e-3)
         return Effect(name, lambda t: 1.0 + (factor - 1.0) * self.opening.share(t), step, jumps=bends(self.opening))
 
     def _plus(self, name: str, size: float) -> Effect:
-        """A number to which `size` is added when the fault is whole."""
+        """Return a number to which `size` is added when the fault is whole."""
         step = SHARE_RESOLUTION * size or math.inf
         return Effect(name, lambda t: size * self.opening.share(t), step, added=True, jumps=bends(self.opening))
 
@@ -465,7 +465,7 @@ _Part = dict[str, str | None]
 
 
 def _opening(part: _Part) -> From | Growing:
-    """The opening that the groups of `_WHEN` say; open from the start where they say nothing."""
+    """Return the opening that the groups of `_WHEN` say; open from the start where they say nothing."""
     if part["start"] is not None and part["stop"] is not None:
         return Growing(seconds(part["start"]), seconds(part["stop"]))
     return From(seconds(part["at"]))

@@ -30,8 +30,11 @@ class Outputs(Protocol):
 
 
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
-    """Taps of the zero-phase anti-alias filter at `factor` times the recording's rate, (2 FILTER_REACH factor + 1,):
-    a Kaiser-windowed sinc of gain 1, late by `delay` < 1 taps; a single 1 where there is nothing to filter."""
+    """Return the taps of the zero-phase anti-alias filter at `factor` times the recording's rate.
+
+    (2 FILTER_REACH factor + 1,): a Kaiser-windowed sinc of gain 1, late by `delay` < 1 taps; a single 1 where there is
+    nothing to filter.
+    """
     if factor == 1 and delay == 0.0:
         return np.ones(1)
     reach = FILTER_REACH * factor
@@ -42,12 +45,11 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 
 
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
-    """`n` samples out of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc (-6 dB at 0.9 of the new
-    Nyquist frequency).
+    """Return `n` samples out of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc.
 
-    `values` runs FILTER_REACH new samples beyond the last one; before the first the signal is at rest at its first
-    value. `delay` >= 0 in samples of `values`, whole or not: the samples are those of that much earlier (for a fraction
-    the same sinc, taken between its taps).
+    The sinc is at -6 dB at 0.9 of the new Nyquist frequency. `values` runs FILTER_REACH new samples beyond the last
+    one; before the first the signal is at rest at its first value. `delay` >= 0 in samples of `values`, whole or not:
+    the samples are those of that much earlier (for a fraction the same sinc, taken between its taps).
     """
     if factor == 1 and delay == 0.0:
         return np.array(values[:n])
@@ -62,8 +64,10 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
 
 
 def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
-    """Pressure [Pa] as read back from the converter: the transducer saturates at its range, the converter counts in
-    steps of `daq.step` [V]."""
+    """Return the pressure [Pa] as read back from the converter.
+
+    The transducer saturates at its range, the converter counts in steps of `daq.step` [V].
+    """
     volts_per_pascal = (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
     volts = (
         daq.sensor_volts_lo + (np.clip(pressure, sensor.range_lo, sensor.range_hi) - sensor.range_lo) * volts_per_pascal
@@ -82,8 +86,11 @@ def read_pressure(
     random: np.random.Generator,
     of: Callable[[str, float], Array | float] = lambda _, own: own,
 ) -> Array:
-    """What one pressure channel reads [Pa]: gain and offset, own and common noise, drift, hum, saturation,
-    conversion, stuck and lost samples; `of(symbol, own)` is a parameter of the sensor over time."""
+    """Return what one pressure channel reads [Pa].
+
+    Gain and offset, own and common noise, drift, hum, saturation, conversion, stuck and lost samples; `of(symbol, own)`
+    is a parameter of the sensor over time.
+    """
     t = np.arange(true.size) / rate
     walk = np.cumsum(random.standard_normal(true.size)) * sensor.drift / np.sqrt(rate)
     hum = of("hum", sensor.hum) * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
@@ -104,7 +111,7 @@ def _counted(values: Array, resolution: float) -> Array:
 def record(
     rig: Rig, trajectory: Outputs, u: Array, factor: int, seed: int, readings: Readings | None = None
 ) -> Recording:
-    """The Recording that the rig's instruments make of a trajectory.
+    """Return the Recording that the rig's instruments make of a trajectory.
 
     `trajectory` is sampled `factor` times faster than the recording and runs FILTER_REACH samples longer; `u`: (n,)
     command [V] at the recording's samples. Analog channels (pressures, flow meter) pass the anti-alias filter,

@@ -51,7 +51,7 @@ class Sensitivity:
 def clean_channels(
     experiment: Experiment, leaks: Sequence[Leak] = (), channels: Sequence[str] = CHAMBERS, *, step: float | None = None
 ) -> Array:
-    """The channels (c, n) without noise, at the recording's samples and behind its anti-alias filter.
+    """Return the channels (c, n) without noise, at the recording's samples and behind its anti-alias filter.
 
     `leaks` take the place of the experiment's and have coefficients; `step` [s] of the solver, default its own.
     Raises SimulationFailed as `sealscope.simulation.simulate.simulate_with_truth` does.
@@ -66,8 +66,10 @@ def _rms(values: Array) -> float:
 
 
 def _settled(name: str, channels: tuple[str, ...], first: float, quotient: Callable[[float], Array]) -> Sensitivity:
-    """The derivative at a step over which the answer is a straight line, both orders of difference extrapolated by
-    the caller's `quotient`."""
+    """Return the derivative at a step over which the answer is a straight line.
+
+    The caller's `quotient` extrapolates both orders of difference.
+    """
     step, coarse = first, quotient(first)
     for _ in range(_MOST_HALVINGS):
         fine = quotient(step / 2.0)
@@ -83,7 +85,7 @@ def _settled(name: str, channels: tuple[str, ...], first: float, quotient: Calla
 
 
 def leak_sensitivity(experiment: Experiment, channels: Sequence[str] = CHAMBERS) -> Sensitivity:
-    """d channel / d G at G = 0, a laminar leak open over the whole run: (c, n) [Pa per m^3/(s Pa)] for pressures.
+    """Return d channel / d G at G = 0 of a laminar leak open over the whole run: (c, n) [Pa per m^3/(s Pa)].
 
     ``D(h) = (y(h) - y(0)) / h``; returned is ``2 D(h/2) - D(h)``, whose error is O(h^2). h begins at `FIRST_LEAK`
     over `REFERENCE_DP` and is halved until D(h) and D(h/2) are within `LINEARITY`. Leaks of the experiment are left
@@ -100,7 +102,7 @@ def leak_sensitivity(experiment: Experiment, channels: Sequence[str] = CHAMBERS)
 
 
 def parameter_sensitivity(experiment: Experiment, name: str, channels: Sequence[str] = CHAMBERS) -> Sensitivity:
-    """d channel / d ln(parameter), no leak: (c, n) [Pa] for pressures; central difference from `FIRST_SHARE` on.
+    """Return d channel / d ln(parameter), no leak: (c, n) [Pa] for pressures; central difference from `FIRST_SHARE` on.
 
     Raises InputError for a parameter that is a choice or zero (its logarithm has no derivative), SimulationFailed
     where no step is small enough.

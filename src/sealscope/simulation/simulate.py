@@ -82,7 +82,7 @@ class Proof:
         return all(one.resolved for one in self.differences)
 
     def text(self) -> str:
-        """The proof as lines of text: what moved, by how much, and how much it may."""
+        """Return the proof as lines of text: what moved, by how much, and how much it may."""
         lines = [f"halving the step ({self.method}, {self.step:.3g} s to {self.halved:.3g} s) moves"]
         for one in self.differences:
             limit = "" if one.tolerance is None else f" (at most {one.tolerance:.3g})"
@@ -92,7 +92,7 @@ class Proof:
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """The difference furthest beyond, or nearest to, its tolerance."""
+        """Return the difference furthest beyond, or nearest to, its tolerance."""
         judged = [one for one in self.differences if one.tolerance]
         return max(judged, key=lambda one: one.difference / (one.tolerance or math.inf))
 

@@ -65,14 +65,16 @@ W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
 
 @contracted
 def _after(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
-    """The state with a stage's explicit and implicit rates added, each with its weight."""
+    """Return the state with a stage's explicit and implicit rates added, each with its weight."""
     return pressures_moved(moved(z, h * e, f), h * i, s)
 
 
 @contracted
 def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
-    """An implicit stage: the state with the pressures that the throttles' flows leave, and what these flows add to the
-    rates."""
+    """Solve an implicit stage.
+
+    Return the state with the pressures that the throttles' flows leave, and what these flows add to the rates.
+    """
     V_A, V_B = chamber_volumes(z[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
     step = GAMMA * h
     total_A, total_B = z[P_1] - z[P_A], z[P_B] - z[P_2]
@@ -98,7 +100,7 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 
 @contracted
 def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, p: RigNumbers) -> State:
-    """The state a step of h [s] later; `u`, `G`, `C` at the nodes of the step."""
+    """Return the state a step of h [s] later; `u`, `G`, `C` at the nodes of the step."""
     Q_A, Q_B = throttle_flows(y, p)
     s1 = throttle_rates(y, Q_A, Q_B, p)
     f1 = rates_without_throttles(y, u[0], G[0], C[0], p)

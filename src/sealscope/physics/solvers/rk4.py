@@ -1,5 +1,7 @@
-"""The classical Runge-Kutta method, the thesis's own (h = 1e-4 s there): exact enough without throttles, unstable
-with them."""
+"""The classical Runge-Kutta method, the thesis's own (h = 1e-4 s there).
+
+Exact enough without throttles, unstable with them.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,14 @@ Nodes = tuple[float, float, float]
 
 @contracted
 def held_integral(dy: State, euler_integral: bool) -> State:
-    """The rates with the controller's integral standing still where eq. (4.2) is taken literally."""
+    """Return the rates with the controller's integral standing still where eq. (4.2) is taken literally."""
     still = 0.0 * dy[0] if euler_integral else dy[0]
     return still, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10]
 
 
 @contracted
 def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, p: RigNumbers, euler_integral: bool) -> State:
-    """The state a step of h [s] later; `u`, `G`, `C` at the nodes of the step."""
+    """Return the state a step of h [s] later; `u`, `G`, `C` at the nodes of the step."""
     first = rates(y, u[0], G[0], C[0], p)
     k1 = held_integral(first, euler_integral)
     k2 = held_integral(rates(moved(y, 0.5 * h, k1), u[1], G[1], C[1], p), euler_integral)

@@ -100,12 +100,15 @@ def _divide(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 
 def taken(number: Any, table: Any, at: int) -> Any:
-    """`number` itself where it is one for all runs; where it is (), that of row `at` of a table (`lanes.load`)."""
+    """Return `number` itself where it is one for all runs.
+
+    Where it is (), that of row `at` of a table (`lanes.load`).
+    """
     return load(table, at) if isinstance(number, tuple) else number
 
 
 def pair(context: Any, builder: Any, value: Any) -> Any:
-    """The instructions that make a fixed number of a double."""
+    """Return the instructions that make a fixed number of a double."""
     made = cgutils.create_struct_proxy(FIXED)(context, builder)
     made.value, made.reciprocal = value, builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), value)
     return made._getvalue()
@@ -127,8 +130,11 @@ lowered(taken, 3, _taken, _take)
 
 
 def settled(choice: Any) -> Any:
-    """A choice as a truth value; () and (True,) stand for choices that are known when the code is made, so that what
-    they leave out is left out of the code (on a GPU a branch not taken costs too)."""
+    """Return a choice as a truth value.
+
+    () and (True,) stand for choices that are known when the code is made, so that what they leave out is left out of
+    the code (on a GPU a branch not taken costs too).
+    """
     return bool(choice)
 
 
@@ -141,7 +147,7 @@ lowered(settled, 1, lambda *_: types.boolean, _settle)
 
 
 def left_to_table(numbers: RigNumbers, fields: Collection[str], choices: bool = False) -> RigNumbers:
-    """The numbers with () in place of those that stand in a table, and with settled `choices` if asked."""
+    """Return the numbers with () in place of those that stand in a table, and with settled `choices` if asked."""
     found: dict[str, Any] = dict.fromkeys(fields, ())
     if choices:
         found |= {name: (True,) if own else () for name, own in numbers._asdict().items() if isinstance(own, bool)}

@@ -34,7 +34,7 @@ FLOW, OPEN, REACH, LEAST, SOUND = range(ACCOUNTS)
 
 
 def _lane_numbers() -> Any:
-    """The compiled function (table, at, p): `p`, and where it is () the group's own numbers.
+    """Return the compiled function (table, at, p): `p`, and where it is () the group's own numbers.
 
     These stand in rows at, at + 1, .. of a table of all `NUMBERS`. Numba needs every field written out, so the text is
     made from the lists of fields.
@@ -52,7 +52,7 @@ lane_numbers = _lane_numbers()
 
 @contracted
 def lane_state(y: np.ndarray, at: int) -> State:
-    """The state of a group from rows at .. at + 10."""
+    """Return the state of a group from rows at .. at + 10."""
     return (
         load(y, at),
         load(y, at + 1),
@@ -110,7 +110,7 @@ def _imex(
 
 @contracted
 def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> Account:
-    """The account with an output more in it."""
+    """Return the account with an output more in it."""
     flow, opened, reach, least, sound = account
     share = opening(leak, t)
     flow = flow + abs(piston_leakage(z[P_A] - z[P_B], leak[4] * share, leak[5] * share, q.dp_0))

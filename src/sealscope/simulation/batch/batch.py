@@ -83,7 +83,9 @@ class Batch:
         return np.asarray(100.0 * (rms[:, after] / rms[:, before] - 1.0))
 
     def to_pandas(self) -> pd.DataFrame:
-        """The batch as a table, one row for each run and segment; raises MissingExtra where pandas is not installed.
+        """Return the batch as a table, one row for each run and segment.
+
+        Raises MissingExtra where pandas is not installed.
 
         Columns: run, segment, start [s], stop [s], the RMS of each detail of each channel (`d3 of p_A [Pa]`), mean_leak
         [L/min], coefficient, step [s].
@@ -200,7 +202,7 @@ def simulate_batch(
 
 
 def _split_by_step(sets: Sequence[LaneSet]) -> list[LaneSet]:
-    """The sets with a step or an error of their own apart from those without."""
+    """Return the sets with a step or an error of their own apart from those without."""
     found = []
     for one in sets:
         kinds: dict[tuple[float | None, float | None], list] = {}  # type: ignore[type-arg]
@@ -211,7 +213,7 @@ def _split_by_step(sets: Sequence[LaneSet]) -> list[LaneSet]:
 
 
 def runner_of(device: str) -> type[SetRun]:
-    """What runs a set on a device: cpu, or gpu (extra `gpu`); raises InputError for one that is not there."""
+    """Return what runs a set on a device: cpu, or gpu (extra `gpu`); raises InputError for one that is not there."""
     if device not in DEVICES:
         raise InputError(f"device must be one of {', '.join(DEVICES)}, got {device!r}")
     if device == "cpu":
@@ -251,8 +253,10 @@ def _run(
 
 
 def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
-    """The finest of the steps [s] that `integrate` chooses for some members of the set over its first seconds, and that
-    all members' numbers and leaks allow."""
+    """Return the finest of the steps [s] that `integrate` chooses for some members over their first seconds.
+
+    It is no longer than all members' numbers and leaks allow.
+    """
     from sealscope.simulation.integrate import RunInputs, integrate, oversampling
 
     steps = [allowed_step(part, sizes)]
@@ -276,7 +280,7 @@ def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
 
 
 def allowed_step(part: LaneSet, sizes: Array) -> float:
-    """The longest step [s] that all members' numbers and leaks allow, down to the finest that `integrate` takes."""
+    """Return the longest step [s] that all members' numbers and leaks allow, down to the finest of `integrate`."""
     from sealscope.physics.solvers.limits import longest_step
 
     limits = []

@@ -75,7 +75,7 @@ def _sense(  # type: ignore[no-untyped-def]
 
 @cuda.jit
 def _move(told, source, step, count):  # type: ignore[no-untyped-def]
-    """Outputs source, source + step, .. to outputs 0 .. count - 1 of each run."""
+    """Move outputs source, source + step, .. to outputs 0 .. count - 1 of each run."""
     group = cuda.grid(1) // told.shape[3]
     if group < told.shape[0]:
         at = group * told.shape[1] * TOLD
@@ -132,8 +132,10 @@ class DeviceRun(SetRun):
         self._check((0, self.groups), self.outputs)
 
     def _constants(self, numbers: RigNumbers) -> RigNumbers:
-        """What a kernel is compiled for: the choices, and which numbers are one for all runs throughout. The others
-        stand in the table."""
+        """Return what a kernel is compiled for: the choices, and which numbers are one for all runs throughout.
+
+        The others stand in the table.
+        """
         differ = np.any(self.cells.base != self.cells.base[0], axis=0)
         differ[list(self.cells.changing)] = True
         own = [name for name, differs in zip(NUMBERS, differ, strict=True) if differs]
@@ -163,7 +165,7 @@ class DeviceRun(SetRun):
         return list(itertools.pairwise(cuts))
 
     def _piece(self, a: int, b: int) -> None:
-        """Groups a <= g < b from rest to the end."""
+        """Run the groups a <= g < b from rest to the end."""
         threads = 2 * self.width if SIMULATED else THREADS
         grid = -(-(b - a) * self.width // threads), threads
         chunks, shapes, kept = self._chunks(), self._shapes(), self._kept

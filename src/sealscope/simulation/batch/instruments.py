@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """(runs, 2, INSTRUMENT_ROWS) of p_A and p_B for samples first .. last, even between these."""
+    """Return (runs, 2, INSTRUMENT_ROWS) of p_A and p_B for samples first .. last, even between these."""
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE, INSTRUMENT_ROWS
     from sealscope.simulation.changes import Readings
 
@@ -42,8 +42,10 @@ def _channels(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
 
 
 def _row(rig: Rig, name: str, readings: Readings, ends: Array, samples: int) -> Array:
-    """(INSTRUMENT_ROWS,) of one pressure channel, even between the two times `ends` [s], `samples` apart; the hum's
-    phase is the run's own and left 0."""
+    """Return (INSTRUMENT_ROWS,) of one pressure channel, even between the two times `ends` [s], `samples` apart.
+
+    The hum's phase is the run's own and left 0.
+    """
     from sealscope.simulation.batch import signals as rows
 
     sensor, daq = getattr(rig.sensors, name), rig.daq

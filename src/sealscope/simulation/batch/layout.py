@@ -25,8 +25,10 @@ AT_ONCE = 1e15
 
 @dataclass(frozen=True)
 class Member:
-    """One experiment of a set: its place among all, its numbers and what changes them, the command's gain and
-    offset [V]."""
+    """One experiment of a set.
+
+    Its place among all, its numbers and what changes them, the command's gain and offset [V].
+    """
 
     place: int
     experiment: Experiment
@@ -77,7 +79,7 @@ def refuse(experiment: Experiment, place: int) -> None:
 
 
 def _shape(command: Command) -> tuple[Any, Command, float, float]:
-    """What commands of one shape have in common, that shape, and gain and offset that make the command of it."""
+    """Return what commands of one shape have in common, that shape, and gain and offset that make the command of it."""
     if isinstance(command, Sine):
         shape = Sine(1.0, command.omega, command.phase)
         return ("sine", command.omega, command.phase), shape, command.amplitude, command.offset
@@ -87,8 +89,10 @@ def _shape(command: Command) -> tuple[Any, Command, float, float]:
 
 
 def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
-    """The experiments in sets; raises InputError where one cannot be in a batch, or their records differ in length or
-    rate."""
+    """Return the experiments in sets.
+
+    Raises InputError where one cannot be in a batch, or their records differ in length or rate.
+    """
     from sealscope.physics.rig import CHOICES, rig_numbers
     from sealscope.simulation.experiment import choose_method
 
@@ -125,13 +129,13 @@ def in_lanes(values: Array, width: int) -> Array:
 
 
 def out_of_lanes(lanes: Array, runs: int) -> Array:
-    """The inverse of `in_lanes`: (groups, ..., width) as (runs, ...)."""
+    """Return the inverse of `in_lanes`: (groups, ..., width) as (runs, ...)."""
     moved = np.moveaxis(lanes, -1, 1)
     return moved.reshape(-1, *moved.shape[2:])[:runs]
 
 
 def leak_rows(members: Sequence[Member], sizes: Array, measured: Array) -> Array:
-    """(runs, LEAK_ROWS): leaks of the stated sizes, and the sizes of which the flow is accounted."""
+    """Return (runs, LEAK_ROWS): leaks of the stated sizes, and the sizes of which the flow is accounted."""
     rows = []
     for member, size, told in zip(members, sizes, measured, strict=True):
         leak = member.leak
@@ -148,8 +152,10 @@ def leak_rows(members: Sequence[Member], sizes: Array, measured: Array) -> Array
 
 @dataclass(frozen=True)
 class Cells:
-    """Numbers over the run, held within cells: `bounds` (cells + 1,) in outputs; `base` (runs, fields); `changing`, the
-    fields that change, with `values` (runs, changing, cells)."""
+    """Numbers over the run, held within cells: `bounds` (cells + 1,) in outputs.
+
+    `base` (runs, fields); `changing`, the fields that change, with `values` (runs, changing, cells).
+    """
 
     bounds: np.ndarray
     base: Array
@@ -157,7 +163,7 @@ class Cells:
     values: Array
 
     def table(self, first: int, last: int, width: int) -> Array:
-        """(groups, cells, fields, width) of cells first .. last."""
+        """Return (groups, cells, fields, width) of cells first .. last."""
         table = np.repeat(self.base[:, None, :], last - first, axis=1)
         for k, field in enumerate(self.changing):
             table[:, :, field] = self.values[:, k, first:last]
@@ -165,8 +171,10 @@ class Cells:
 
 
 def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Cells for a set at `rate` [Hz] of outputs: 0.5 s long, or so short (down to 0.05 s) that no effect moves by more
-    than its resolution; a jump begins a cell."""
+    """Cells for a set at `rate` [Hz] of outputs.
+
+    0.5 s long, or so short (down to 0.05 s) that no effect moves by more than its resolution; a jump begins a cell.
+    """
     from sealscope.physics.rig import NUMBERS
 
     numbers = {id(one.numbers): one.numbers for one in members}
@@ -190,7 +198,7 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
 
 
 def with_sizes(one: Experiment, size: float) -> Experiment:
-    """The experiment with its leak's coefficient found."""
+    """Return the experiment with its leak's coefficient found."""
     if not one.leaks:
         return one
     return replace(one, leaks=(replace(one.leaks[0], mean=None, coefficient=size),))

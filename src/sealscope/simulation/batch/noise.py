@@ -36,7 +36,7 @@ def _bits(x: float) -> int:
 
 
 def keys(seeds: list[int]) -> Array:
-    """A key for each run's noise, as the bits of doubles: (runs,)."""
+    """Return a key for each run's noise, as the bits of doubles: (runs,)."""
     states = [np.random.SeedSequence(seed).generate_state(1, np.uint64) for seed in seeds]
     return np.concatenate(states).view(np.float64)
 
@@ -67,7 +67,7 @@ def _uniform(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
 
 
 def _exponent(x: Any) -> Any:
-    """The exponent of positive normal doubles, as doubles."""
+    """Return the exponent of positive normal doubles, as doubles."""
     return float((_bits(x) >> 52) - 1023)
 
 
@@ -78,7 +78,7 @@ def _raised(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
 
 
 def _fraction(x: Any) -> Any:
-    """The fraction of positive normal doubles, 1 <= m < 2."""
+    """Return the fraction of positive normal doubles, 1 <= m < 2."""
     return float(np.uint64(_bits(x) & _MANTISSA | _ONE_BITS).view(np.float64))
 
 
@@ -99,7 +99,7 @@ lowered(_fraction, 1, _number_or_lanes, _mantissa)
 
 @contracted
 def logarithm(x: Any) -> Any:
-    """ln x for lanes of normal numbers x > 0, within 2e-15 (absolute near 1, relative elsewhere).
+    """Return ln x for lanes of normal numbers x > 0, within 2e-15 (absolute near 1, relative elsewhere).
 
     ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)), m in sqrt(1/2)..sqrt(2), by the artanh's series.
     """
@@ -127,8 +127,10 @@ def half_turn_sine(v: Any) -> Any:
 
 @contracted
 def normals(key: Any, place: int) -> tuple[Any, Any]:
-    """Two independent standard normal numbers a lane, from places 2 k and 2 k + 1 of the keys' sequences (Box and
-    Muller, Annals of Mathematical Statistics 29 (1958) 610-611)."""
+    """Return two independent standard normal numbers a lane, from places 2 k and 2 k + 1 of the keys' sequences.
+
+    Source: Box and Muller, Annals of Mathematical Statistics 29 (1958) 610-611.
+    """
     radius = math.sqrt(-2.0 * logarithm(uniform(key, 2 * place)))
     s = half_turn_sine(uniform(key, 2 * place + 1) - 0.5)
     c = math.sqrt(max(1.0 - s * s, 0.0))

@@ -29,9 +29,12 @@ CHUNK_STEPS = 4096
 
 
 class SetRun:
-    """The runs of a set: `sizes` (runs,) are the leaks' coefficients, `measured` those whose flow is accounted,
-    `bounds` [s] the segments of the statistics, None for none (flows alone are then of interest). `most` samples are
-    run where that is less than all."""
+    """The runs of a set.
+
+    `sizes` (runs,) are the leaks' coefficients, `measured` those whose flow is accounted, `bounds` [s] the segments of
+    the statistics, None for none (flows alone are then of interest). `most` samples are run where that is less than
+    all.
+    """
 
     #: Runs of a group.
     width: ClassVar[int] = 8
@@ -89,15 +92,17 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _constants(self, numbers: RigNumbers) -> RigNumbers:
-        """What the compiled code takes as constants of the set: the choices; the numbers stand in the table."""
+        """Return what the compiled code takes as constants of the set: the choices; the numbers stand in the table."""
         from sealscope.physics.rig import NUMBERS
         from sealscope.physics.vector.fixed import left_to_table
 
         return left_to_table(numbers, NUMBERS)
 
     def _prepare_filters(self, rate: float) -> None:
-        """The anti-alias filter, for each lane where a channel is late: first tap `before` and last `after` outputs
-        from the sample's."""
+        """Lay out the anti-alias filter, for each lane where a channel is late.
+
+        Its first tap is `before` and its last `after` outputs from the sample's.
+        """
         from sealscope.simulation.batch.signals import TILE
 
         taps = anti_alias_taps(self.factor)
@@ -169,13 +174,13 @@ class SetRun:
         return self.before + self.after + self.factor
 
     def _due(self, stop: int) -> int:
-        """The sample before which all can be read once outputs up to `stop` are there."""
+        """Return the sample before which all can be read once outputs up to `stop` are there."""
         if stop == self.outputs:
             return self.samples
         return min(max(0, (stop - self.after - 1) // self.factor + 1), self.samples)
 
     def _some(self, groups: tuple[int, int], tell: Callable[[float], None]) -> None:
-        """The groups first <= g < last from rest to the end."""
+        """Run the groups first <= g < last from rest to the end."""
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.simulation.batch.signals import FILTER_ROWS, sense_lanes
 
@@ -214,11 +219,11 @@ class SetRun:
             tell((stop - start) / self.outputs * (b - a) / self.groups)
 
     def _cell_bounds(self, first: int, last: int, start: int, stop: int) -> np.ndarray:
-        """Steps of the chunk of outputs start .. stop at which its cells begin."""
+        """Return the steps of the chunk of outputs start .. stop at which its cells begin."""
         return np.asarray((np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * self.every)
 
     def _shapes(self) -> Callable[[int, int], Array]:
-        """The command's shape at the nodes of the steps between two outputs, for one thread's use."""
+        """Return the command's shape at the nodes of the steps between two outputs, for one thread's use."""
         from sealscope.simulation.commands import Sine
         from sealscope.simulation.integrate import NodeSines
 

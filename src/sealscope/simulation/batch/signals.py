@@ -73,7 +73,7 @@ def _read(true: Any, sensor: np.ndarray, at: int, own: Any, common: Any, walk: A
 
 @contracted
 def _filtered(told: np.ndarray, at: int, taps: np.ndarray, first: int, count: int) -> Any:
-    """The anti-alias filter at one sample; `at`: row of its first tap, taps first .. first + count - 1."""
+    """Return the filtered value of one sample; `at`: row of its first tap, taps first .. first + count - 1."""
     total = spread(0.0)
     for k in range(count):
         total = total + taps[first + k] * load(told, at + TOLD * k)
@@ -82,8 +82,11 @@ def _filtered(told: np.ndarray, at: int, taps: np.ndarray, first: int, count: in
 
 @contracted
 def _filter_tile(told: np.ndarray, at: int, taps: np.ndarray, factor: int, rows: np.ndarray, to: int) -> None:
-    """The anti-alias filter at TILE samples, `factor` outputs apart, into rows from `to` on; each output is loaded
-    once. `taps` begin and end with (TILE - 1) factor zeros, so that all samples take the same outputs."""
+    """Filter TILE samples, `factor` outputs apart, into rows from `to` on.
+
+    Each output is loaded once. `taps` begin and end with (TILE - 1) factor zeros, so that all samples take the same
+    outputs.
+    """
     t_0, t_1, t_2, t_3 = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
     t_4, t_5, t_6, t_7 = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
     zeros = (TILE - 1) * factor
@@ -110,7 +113,7 @@ def _filter_tile(told: np.ndarray, at: int, taps: np.ndarray, factor: int, rows:
 
 @contracted
 def _filter_block(told: np.ndarray, at: int, factor: int, taps: np.ndarray, rows: np.ndarray, to: int, m: int) -> None:
-    """The anti-alias filter at m samples, into rows from `to` on."""
+    """Filter m samples, into rows from `to` on."""
     zeros = (TILE - 1) * factor
     count = taps.size - 2 * zeros
     i = 0
@@ -135,13 +138,13 @@ def _filter_late(
 
 @contracted
 def _behind(w: Any, x: Any) -> Any:
-    """The last TAPS values with a new one before them."""
+    """Return the last TAPS values with a new one before them."""
     return x, w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7], w[8], w[9], w[10], w[11], w[12], w[13], w[14]
 
 
 @contracted
 def _weighed(c: Any, w: Any) -> Any:
-    """The sum of TAPS products, in their order."""
+    """Return the sum of TAPS products, in their order."""
     total = c[0] * w[0] + c[1] * w[1] + c[2] * w[2] + c[3] * w[3] + c[4] * w[4] + c[5] * w[5] + c[6] * w[6]
     total = total + c[7] * w[7] + c[8] * w[8] + c[9] * w[9] + c[10] * w[10] + c[11] * w[11] + c[12] * w[12]
     return total + c[13] * w[13] + c[14] * w[14] + c[15] * w[15]

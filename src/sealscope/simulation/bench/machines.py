@@ -41,8 +41,11 @@ class BenchMachine:
     closed: float
 
     def experiment(self, **others: Any) -> Experiment:
-        """This machine on its duty, from a start that centres its strokes; `others` are `Experiment.of`'s (leak,
-        fault), and the machine's own seed, duration and drifts where they are not among them."""
+        """Make the experiment of this machine on its duty, from a start that centres its strokes.
+
+        `others` are arguments of `Experiment.of` (leak, fault), and the machine's own seed, duration and drifts where
+        they are not among them.
+        """
         built = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         own = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
         given = {**own, **others}
@@ -73,12 +76,12 @@ def centred_start(rig: Rig, command: Command | str, duration: float) -> float:
 
 
 def _random(seed: int, name: str) -> np.random.Generator:
-    """The stream of one nuisance: no other nuisance of the profile changes what it draws."""
+    """Return the stream of one nuisance: no other nuisance of the profile changes what it draws."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 def _path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
-    """A path with a distance of 1 between its extremes: even, up or down, or wandering."""
+    """Return a path with a distance of 1 between its extremes: even, up or down, or wandering."""
     shape = shapes[int(random.integers(len(shapes)))]
     up = random.random() < 0.5 or warms
     weights = random.standard_normal(WANDER_TERMS) / (np.arange(WANDER_TERMS) + 0.5)
@@ -110,7 +113,9 @@ def _drawn(one: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], lis
 def draw(
     profile: Profile | str = "bench", seed: int = 0, *, rig: Rig | str = "thesis", duration: float = 180.0
 ) -> BenchMachine:
-    """A healthy machine of a rig's kind, drawn from a profile (or its name, or its file); one seed, one machine.
+    """Return a healthy machine of a rig's kind, drawn from a profile (or its name, or its file).
+
+    One seed, one machine.
 
     `duration` [s] is the record over which the drifts have their sizes. Raises InputError for a seed below 0, and where
     a drawn value is out of its parameter's range.

@@ -19,8 +19,11 @@ _SHAPES = ("linear", "wander")
 
 @dataclass(frozen=True)
 class DriftRange:
-    """How far a parameter drifts: `size` low and high of the distance between its extremes (a share, or SI if
-    `absolute`); forms it may take; weight `oil` of the oil's temperature in it, the rest wanders."""
+    """How far a parameter drifts.
+
+    `size` low and high of the distance between its extremes (a share, or SI if `absolute`); forms it may take; weight
+    `oil` of the oil's temperature in it, the rest wanders.
+    """
 
     size: tuple[float, float]
     absolute: bool
@@ -30,8 +33,10 @@ class DriftRange:
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One thing that differs between machines, uniformly between `low` and `high`: a value in SI, or a factor on the
-    rig's own (`scales`); `each`: a draw for each parameter, else one for all."""
+    """One thing that differs between machines, uniformly between `low` and `high`.
+
+    a value in SI, or a factor on the rig's own (`scales`); `each`: a draw for each parameter, else one for all.
+    """
 
     name: str
     parameters: tuple[str, ...]
@@ -45,8 +50,10 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class BenchDuty:
-    """What the machines are asked for: one of `commands`, times a factor within `amplitude`, both throttles `closed`
-    by one of these shares."""
+    """What the machines are asked for.
+
+    One of `commands`, times a factor within `amplitude`, both throttles `closed` by one of these shares.
+    """
 
     commands: tuple[str, ...]
     closed: tuple[float, ...]
@@ -71,7 +78,7 @@ def profile_names() -> tuple[str, ...]:
 
 
 def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
-    """The profile of that name, or of a TOML file laid out like `profiles/bench.toml`.
+    """Return the profile of that name, or of a TOML file laid out like `profiles/bench.toml`.
 
     Raises InputError where the file cannot be read, a name or unit is unknown, a range is none or a reason is missing.
     """
