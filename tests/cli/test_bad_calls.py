@@ -13,8 +13,8 @@ THROTTLED = ("--set", "orifices=present", "--set", "closed_A=50 %", "--set", "cl
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("--set", "V_1=-3"), "V_1 must be > 0 m^3, got -3.0 (set by --set)"),
-        (("--set", "L_c=0"), "L_c must be > 0 H, got 0.0 (set by --set)"),
+        (("--set", "V_1=-3"), "V_1 must be greater than 0 m^3, got -3.0 (set by --set)"),
+        (("--set", "L_c=0"), "L_c must be greater than 0 H, got 0.0 (set by --set)"),
         (("--set", "V_1=50[bar]"), "V_1 must have a unit of volume, such as m^3, got bar (set by --set)"),
         (("--set", "V_1=nan"), "V_1 must be a finite number, got nan (set by --set)"),
         (("--set", "wibble=3"), "'wibble' is not a parameter"),
@@ -107,7 +107,7 @@ def test_an_unresolved_run_comes_through_only_when_asked_for_and_is_marked(call,
         (("convert", "log.csv", "log.xls"), "a recording's file must end in .nc"),
         (("convert", "log.csv", "nowhere/log.nc"), "the folder of a file to write must exist, got nowhere"),
         (("parameters", "nowhere"), "'nowhere' is no packaged rig (thesis, thesis-calibrated) and no .toml file"),
-        (("parameters", "--set", "V_1=0"), "V_1 must be > 0 m^3, got 0.0 (set by --set)"),
+        (("parameters", "--set", "V_1=0"), "V_1 must be greater than 0 m^3, got 0.0 (set by --set)"),
     ],
 )
 def test_a_call_that_breaks_a_rule(words, complaint, call, untouched, tmp_path):

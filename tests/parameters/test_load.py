@@ -72,7 +72,7 @@ def test_byte_order_mark_is_no_obstacle(tmp_path: Path) -> None:
         ('V_1 = { value = true, unit = "cm^3", source = "x" }', "V_1 must be a number, got True"),
         ('V_1 = { value = nan, unit = "cm^3", source = "x" }', "V_1 must be finite, got nan"),
         ('V_1 = { value = 1e308, unit = "Gm^3", source = "x" }', "V_1 must be finite, got 1e+308"),
-        ('V_1 = { value = -3.0, unit = "m^3", source = "x" }', "V_1 must be > 0 m^3, got -3.0"),
+        ('V_1 = { value = -3.0, unit = "m^3", source = "x" }', "V_1 must be greater than 0 m^3, got -3.0"),
         ('V_1 = { value = 3, unit = "kg", source = "x" }', "V_1 must have a unit of volume, such as m^3, got kg"),
         ('V_1 = 3', "V_1 must be { value = ..., unit = ..., source = ... }, got 3"),
         ('V1 = { value = 3, unit = "m^3", source = "x" }', "line.V1 is not a parameter; did you mean line.V_1?"),

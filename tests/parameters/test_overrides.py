@@ -87,15 +87,15 @@ def test_immutable() -> None:
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        ({"V_1": -3.0}, "V_1 must be > 0 m^3, got -3.0 (set by caller)"),
-        ({"F_v": -1}, "F_v must be >= 0 N s/m, got -1.0 (set by caller)"),
-        ({"d_line": "7 m"}, "d_line must be <= 0.5 m, got 7.0 (set by caller)"),
-        ({"closed_A": 1.0}, "closed_A must be <= 0.99, got 1.0 (set by caller)"),
-        ({"closed_B": "-1%"}, "closed_B must be >= 0, got -0.01 (set by caller)"),
-        ({"K_brk": 0.5}, "K_brk must be >= 1, got 0.5 (set by caller)"),
-        ({"p_A.noise": -1}, "sensors.p_A.noise must be >= 0 Pa, got -1.0 (set by caller)"),
-        ({"bits": 3.5}, "bits must be a whole number, got 3.5 (set by caller)"),
-        ({"bits": 40}, "bits must be <= 32 bit, got 40 (set by caller)"),
+        ({"V_1": -3.0}, "V_1 must be greater than 0 m^3, got -3.0 (set by caller)"),
+        ({"F_v": -1}, "F_v must be greater than or equal to 0 N s/m, got -1.0 (set by caller)"),
+        ({"d_line": "7 m"}, "d_line must be less than or equal to 0.5 m, got 7.0 (set by caller)"),
+        ({"closed_A": 1.0}, "closed_A must be less than or equal to 0.99, got 1.0 (set by caller)"),
+        ({"closed_B": "-1%"}, "closed_B must be greater than or equal to 0, got -0.01 (set by caller)"),
+        ({"K_brk": 0.5}, "K_brk must be greater than or equal to 1, got 0.5 (set by caller)"),
+        ({"p_A.noise": -1}, "sensors.p_A.noise must be greater than or equal to 0 Pa, got -1.0 (set by caller)"),
+        ({"bits": 3.5}, "bits must be a valid integer, got 3.5 (set by caller)"),
+        ({"bits": 40}, "bits must be less than or equal to 32 bit, got 40 (set by caller)"),
         ({"V_1": True}, "V_1 must be a number, got True (set by caller)"),
         ({"V_1": None}, "V_1 must be a number, got None (set by caller)"),
         ({"V_1": math.nan}, "V_1 must be finite, got nan (set by caller)"),
@@ -134,7 +134,7 @@ def test_dead_volume_must_be_positive_when_volumes_move() -> None:
 def test_parts_made_by_hand_obey_the_same_rules() -> None:
     values = RIG.motor.model_dump()
     assert Motor(**values) == RIG.motor
-    with pytest.raises(InputError, match=r"^R_c must be > 0 ohm, got -1.0$"):
+    with pytest.raises(InputError, match=r"^R_c must be greater than 0 ohm, got -1.0$"):
         Motor(**{**values, "R_c": -1.0})
     with pytest.raises(InputError, match=r"^R_d is not a parameter$"):
         Motor(**values, R_d=1.0)

@@ -14,13 +14,6 @@ from pydantic.fields import FieldInfo
 
 from sealscope.errors import InputError
 
-_BOUNDS = {
-    "greater_than": (">", "gt"),
-    "greater_than_equal": (">=", "ge"),
-    "less_than": ("<", "lt"),
-    "less_than_equal": ("<=", "le"),
-}
-
 
 def quantity(name: str, unit: str, **bounds: float) -> Any:
     """Declare a number: human `name`, SI `unit` ("1" where it has none), bounds `gt`, `ge`, `lt`, `le` in that unit."""
@@ -50,29 +43,17 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def rule_broken(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return the sentence "SYMBOL must be ..., got ..." for the first error pydantic found in values of `model`."""
+    """Return pydantic's first message on values of `model` as "SYMBOL must be ..., got ...", bounds with their unit."""
     first = error.errors(include_url=False)[0]
-    symbol = ".".join(str(part) for part in first["loc"])
-    kind, got = first["type"], first.get("input")
-    if kind == "value_error":
+    if first["type"] == "value_error":
         return str(first["ctx"]["error"])
-    if kind == "missing":
-        return f"{symbol} is missing"
-    if kind == "extra_forbidden":
-        return f"{symbol} is not a parameter"
-    field = model.model_fields.get(symbol)
-    unit = unit_of(field) if field is not None else ""
-    if kind in _BOUNDS:
-        sign, key = _BOUNDS[kind]
-        return f"{symbol} must be {sign} {with_unit(first['ctx'][key], unit)}, got {got}"
-    if kind == "literal_error" and field is not None:
-        return f"{symbol} must be one of {', '.join(choices_of(field))}, got {got!r}"
-    if kind == "finite_number":
-        return f"{symbol} must be finite, got {got}"
-    wanted = {"int_type": "a whole number", "float_type": "a number"}.get(kind)
-    if wanted:
-        return f"{symbol} must be {wanted}, got {got!r}"
-    return f"{symbol}: {first['msg']}, got {got!r}"
+    symbol = ".".join(str(part) for part in first["loc"])
+    if plain := {"missing": "is missing", "extra_forbidden": "is not a parameter"}.get(first["type"]):
+        return f"{symbol} {plain}"
+    bounded = symbol in model.model_fields and any(key in first.get("ctx", {}) for key in ("gt", "ge", "lt", "le"))
+    unit = unit_of(model.model_fields[symbol]) if bounded else ""
+    rule = first["msg"].replace("Input should be", "must be", 1)
+    return f"{symbol} {rule}{'' if unit in ('', '1') else ' ' + unit}, got {first.get('input')!r}"
 
 
 class PartsDisagreeError(InputError):

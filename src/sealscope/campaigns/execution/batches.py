@@ -60,7 +60,7 @@ def bounds_of(plan: SimulatedPlan) -> IntArray:
 
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     """Raise InputError for what a plan asks that no batch can do, naming it."""
-    from sealscope.simulation.batch.layout import refuse
+    from sealscope.simulation.batch.run import refuse
 
     def no(rule: str) -> InputError:
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
@@ -175,7 +175,7 @@ class _Batches:
         from sealscope.physics.rig import rig_numbers
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.simulation.batch.batch import simulate_batch
-        from sealscope.simulation.batch.layout import with_sizes
+        from sealscope.simulation.batch.run import with_sizes
 
         sized = list(experiments)
         leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]

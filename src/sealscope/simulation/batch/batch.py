@@ -19,8 +19,7 @@ from sealscope.calls import checked_call
 from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.batch.layout import LaneSet, sets_of, with_sizes
-from sealscope.simulation.batch.run import SetRun
+from sealscope.simulation.batch.run import LaneSet, SetRun, sets_of, with_sizes
 from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment
 from sealscope.simulation.integrate import FINEST, FIRST_WINDOW, LONGEST_STEP
 from sealscope.simulation.sizing import scaled_size

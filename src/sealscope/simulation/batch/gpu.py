@@ -22,8 +22,7 @@ from sealscope.physics.rig import NUMBERS, RigNumbers
 from sealscope.physics.vector.fixed import left_to_table
 from sealscope.physics.vector.runs import TOLD, advance
 from sealscope.recordings.recording import Array
-from sealscope.simulation.batch.layout import LaneSet
-from sealscope.simulation.batch.run import SetRun
+from sealscope.simulation.batch.run import LaneSet, SetRun
 from sealscope.simulation.batch.signals import FILTER_ROWS, INSTRUMENT_ROWS, sense
 
 #: Whether numba's simulator stands in for a GPU: threads of plain Python, for tests of a few runs.
