@@ -49,7 +49,7 @@ class Nuisance:
 
 
 @dataclass(frozen=True)
-class BenchDuty:
+class Duty:
     """What the machines are asked for.
 
     One of `commands`, times a factor within `amplitude`, both throttles `closed` by one of these shares.
@@ -67,7 +67,7 @@ class Profile:
 
     name: str
     title: str
-    duty: BenchDuty
+    duty: Duty
     nuisances: tuple[Nuisance, ...]
     place: str
 
@@ -203,7 +203,7 @@ def _drift(table: Any, name: str, parameters: tuple[str, ...], place: str) -> Dr
     return DriftRange((low, high), absolute, tuple(shapes), float(oil))
 
 
-def _duty(table: Any, place: str) -> BenchDuty:
+def _duty(table: Any, place: str) -> Duty:
     if table is None:
         raise InputError(f"a profile must have [duty], got none ({place})")
     _known(table, ("commands", "closed", "amplitude", "why"), "[duty]", place)
@@ -222,7 +222,7 @@ def _duty(table: Any, place: str) -> BenchDuty:
     if not isinstance(closed, list) or not closed or not all(_percent(one) for one in closed):
         raise InputError(f"closed of [duty] must be a list of per cent, 0 to 99, got {closed!r} ({place})")
     shares = tuple(one / 100.0 for one in closed)
-    return BenchDuty(tuple(commands), shares, amplitude, _text(table, "why", "[duty]", place))
+    return Duty(tuple(commands), shares, amplitude, _text(table, "why", "[duty]", place))
 
 
 def _percent(value: Any) -> bool:
