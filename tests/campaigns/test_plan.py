@@ -14,7 +14,6 @@ from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan, plan_names
 from sealscope.errors import InputError
 
-
 #: Digests of the ids and noise seeds of every packaged plan's cases. A change draws new machines: the published figures
 #: of the plan no longer belong to its records.
 DRAWN = {
