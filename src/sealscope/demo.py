@@ -35,10 +35,10 @@ class Demo:
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
     """Simulate, write the recording, read it back, diagnose it and write the page, all into `folder`."""
     experiment = Experiment.of(**EXPERIMENT, seed=seed)  # type: ignore[arg-type]
-    made = simulate_with_truth(experiment, progress)
+    result = simulate_with_truth(experiment, progress)
     folder.mkdir(parents=True, exist_ok=True)
     file, page = folder / "recording.nc", folder / "report.html"
-    write(made.recording, file)
+    write(result.recording, file)
     recording = read(file)
     if progress is not None:
         progress("diagnosing", 0.0)
@@ -50,10 +50,10 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
         recording,
         diagnosis,
         rig=experiment.rig,
-        truth_onset_s=made.truth.onset_s,
-        truth_leak_lpm=made.truth.mean_leak_lpm,
+        truth_onset_s=result.truth.onset_s,
+        truth_leak_lpm=result.truth.mean_leak_lpm,
         title="Sealscope demo: a leak of 0.0042 L/min from 90 s",
     )
     if progress is not None:
         progress("writing the page", 1.0)
-    return Demo(diagnosis, made.truth, file, page)
+    return Demo(diagnosis, result.truth, file, page)

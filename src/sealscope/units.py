@@ -165,8 +165,8 @@ def _atom(name: str) -> Unit:
             powers[long_name] = powers.get(long_name, Fraction(0)) + exact
             continue
         result *= unit.factor ** int(exact) if exact.denominator == 1 else Fraction(float(unit.factor) ** float(exact))
-        for symbol, one in unit.powers:
-            powers[symbol] = powers.get(symbol, Fraction(0)) + one * exact
+        for symbol, exponent in unit.powers:
+            powers[symbol] = powers.get(symbol, Fraction(0)) + exponent * exact
     return Unit(result, Fraction(0), tuple(sorted(powers.items())))
 
 
@@ -203,25 +203,25 @@ class _Parser:
                 sign = -1
                 continue
             if kind == "(":
-                one = self.product(depth + 1)
+                unit = self.product(depth + 1)
                 if not self.tokens or self.tokens.pop(0)[0] != ")":
                     break
             elif kind == "name":
-                one = _atom(value)
+                unit = _atom(value)
             else:
                 break
             power = Fraction(sign)
             if self.tokens and self.tokens[0][0] == "^":
                 power = sign * Fraction(self.tokens.pop(0)[1])
-            if abs(power) * max(one.factor.numerator, one.factor.denominator).bit_length() > _MOST_BITS:
+            if abs(power) * max(unit.factor.numerator, unit.factor.denominator).bit_length() > _MOST_BITS:
                 break
-            factor *= Fraction(one.factor**power)
-            pi_power += one.pi_power * power
+            factor *= Fraction(unit.factor**power)
+            pi_power += unit.pi_power * power
             if max(factor.numerator, factor.denominator).bit_length() > _MOST_BITS or abs(pi_power) > _MOST_PI:
                 break
-            for base, exponent in one.powers:
+            for base, exponent in unit.powers:
                 powers[base] = powers.get(base, Fraction(0)) + exponent * power
-            alone = one if count == 0 and power == 1 else None
+            alone = unit if count == 0 and power == 1 else None
             sign, count = 1, count + 1
         else:
             if count and sign > 0 and (not self.tokens or depth):

@@ -20,9 +20,9 @@ from sealscope.physics.solvers.rk4 import RK4_NODES
 from sealscope.physics.vector.fixed import left_to_table
 from sealscope.physics.vector.runs import (
     ACCOUNTS,
+    CHANNELS,
     LEAK_ROWS,
     LEAST,
-    TOLD,
     advance_lanes_rk4,
 )
 
@@ -140,17 +140,17 @@ def test_every_lane_has_numbers_of_its_own(check_rig, drive):
     state = np.ascontiguousarray(np.array([initial_state(rig, 0.0) for rig in rigs]).T[None])
     drive_rows = np.zeros((1, 2, WIDTH))
     drive_rows[:, 0] = 3.0
-    told, account = np.zeros((1, n, TOLD, WIDTH)), np.zeros((1, ACCOUNTS, WIDTH))
+    pressures, account = np.zeros((1, n, CHANNELS, WIDTH)), np.zeros((1, ACCOUNTS, WIDTH))
     account[:, LEAST] = np.inf
     advance_lanes_rk4(
         (0, 1), state, h, 0, nodes, shape, drive_rows, np.zeros((1, LEAK_ROWS, WIDTH)), np.ascontiguousarray(table),
-        np.array([0, n]), left_to_table(rig_numbers(rigs[0]), NUMBERS), 1, told, 0, account,
+        np.array([0, n]), left_to_table(rig_numbers(rigs[0]), NUMBERS), 1, pressures, 0, account,
     )  # fmt: skip
     for lane, rig in enumerate(rigs):
         alone = drive(rig, n * h, rate=2000.0, step=h)
-        np.testing.assert_allclose(told[0, :, 0, lane], alone["p_A"], rtol=0, atol=1e-4)
+        np.testing.assert_allclose(pressures[0, :, 0, lane], alone["p_A"], rtol=0, atol=1e-4)
         assert account[0, LEAST, lane] == pytest.approx(min(alone["p_A"].min(), alone["p_B"].min()), abs=1e-4)
-    assert np.ptp(told[0, -1, 0]) > 1000.0
+    assert np.ptp(pressures[0, -1, 0]) > 1000.0
     assert len(OUTPUTS) == 18
 
 

@@ -21,7 +21,7 @@ def quantity(name: str, unit: str, **bounds: float) -> Any:
 
 
 def choice(name: str) -> Any:
-    """Declare a choice between readings of the source; the annotation is a Literal of the allowed words."""
+    """Declare a choice between readings of the source; the annotation is a Literal of the allowed values."""
     return Field(title=name, json_schema_extra={"unit": ""})
 
 
@@ -32,7 +32,7 @@ def unit_of(field: FieldInfo) -> str:
 
 
 def choices_of(field: FieldInfo) -> tuple[str, ...]:
-    """Return the allowed words of a choice, () for a number."""
+    """Return the allowed values of a choice, () for a number."""
     annotation = field.annotation
     return get_args(annotation) if get_origin(annotation) is typing.Literal else ()
 

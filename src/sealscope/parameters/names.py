@@ -15,11 +15,11 @@ def resolve(name: str, dotted: Sequence[str]) -> str:
     """
     if name in dotted:
         return name
-    found = [full for full in dotted if full.endswith("." + name)] if name else []
-    if len(found) == 1:
-        return found[0]
-    if found:
-        shown = ", ".join(found[:6]) + (", ..." if len(found) > 6 else "")
+    matches = [full for full in dotted if full.endswith("." + name)] if name else []
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        shown = ", ".join(matches[:6]) + (", ..." if len(matches) > 6 else "")
         raise InputError(f"parameter {name} is not unique, give one of {shown}")
     bare = [full.rpartition(".")[2] for full in dotted]
     raise InputError(f"{name!r} is not a parameter{closest(name, dotted if '.' in name else [*dict.fromkeys(bare)])}")

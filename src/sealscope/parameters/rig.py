@@ -24,7 +24,7 @@ Value = float | int | str
 
 
 class ParameterEntry(NamedTuple):
-    """One value as given: number or word, unit ("" for a choice), source, and the file or option it stands in."""
+    """One value as given: number or choice, unit ("" for a choice), source, and the file or option it stands in."""
 
     value: Value
     unit: str
@@ -123,7 +123,7 @@ class Rig(Part):
         """Another rig with some values replaced, `source` written beside each.
 
         A name is bare where it is unique (`V_1`), else dotted (`sensors.p_A.noise`). A number is in SI; a text carries
-        its unit (`"0.8[ohm]"`, `"50 %"`) or is a choice's word. Raises InputError for an unknown or ambiguous name, a
+        its unit (`"0.8[ohm]"`, `"50 %"`) or is a choice's value. Raises InputError for an unknown or ambiguous name, a
         wrong unit or a value out of range.
         """
         if not source.strip():
@@ -222,7 +222,7 @@ def declared_names() -> tuple[str, ...]:
 def _part(
     owner: type[Part], symbol: str, values: dict[str, Any], path: str, entries: Mapping[str, ParameterEntry], place: str
 ) -> Part:
-    """Build one group, its groups first; a broken rule is told with the place of its value, or of the whole rig."""
+    """Build one group, its groups first; a broken rule is reported with the place of its value, or of the whole rig."""
     model = owner.model_fields[symbol].annotation
     assert isinstance(model, type)
     assert issubclass(model, Part)
@@ -252,16 +252,16 @@ def _shown(full: str) -> str:
 
 
 def _si_value(full: str, field: FieldInfo, entry: ParameterEntry) -> Value:
-    """Return the SI number or the word of one entry.
+    """Return the SI number or the choice of one entry.
 
     Raises InputError for a blank source, a wrong type or a wrong unit.
     """
     shown, place = _shown(full), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():
         raise InputError(f"{shown} must have a source, got none ({place})")
-    if words := choices_of(field):
-        if entry.value not in words:
-            raise InputError(f"{shown} must be one of {', '.join(words)}, got {entry.value!r} ({place})")
+    if allowed := choices_of(field):
+        if entry.value not in allowed:
+            raise InputError(f"{shown} must be one of {', '.join(allowed)}, got {entry.value!r} ({place})")
         if entry.unit:
             raise InputError(f"{shown} is a choice and must have no unit, got {entry.unit!r} ({place})")
         return entry.value

@@ -53,7 +53,7 @@ _PARAMETERS = {
     for name, field in leaves(Rig)
     if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN
 }
-#: Choices that the laws take as truth values, each with the parameter and the word that stand for True.
+#: Choices that the laws take as truth values, each with the parameter and the value that stand for True.
 _CHOICES = {
     "throttled": ("line.orifices", "present"),
     "position_dependent": ("cylinder.volumes", "position"),
@@ -110,7 +110,7 @@ def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
 
 def rig_numbers(rig: Rig) -> RigNumbers:
     """Return the rig's parameters as the compiled laws take them."""
-    choices = {name: attrgetter(parameter)(rig) == word for name, (parameter, word) in _CHOICES.items()}
+    choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
     open_circuit = choices["made_up"] or rig.cylinder.G_ext_A > 0 or rig.cylinder.G_ext_B > 0
     return RigNumbers(
         *(attrgetter(name)(rig) for name in _PARAMETERS.values()),
@@ -191,9 +191,9 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     At the pump's ports, or at the chambers without lines.
     """
     supply = accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
-    one, two = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
+    p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
     G_check = p.G_check if p.made_up else 0.0 * p.G_check
-    return check_valve_flow(supply - one, p.p_crack, G_check), check_valve_flow(supply - two, p.p_crack, G_check)
+    return check_valve_flow(supply - p_1, p.p_crack, G_check), check_valve_flow(supply - p_2, p.p_crack, G_check)
 
 
 @contracted
@@ -207,11 +207,11 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     up_1, up_2 = make_up_flows(y, p)
     out_A, out_B = external_leakage(y[P_A], p.G_ext_A), external_leakage(y[P_B], p.G_ext_B)
     if p.throttled:
-        one = pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
-        two = pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
-        return (-pressure_rate(out_A, V_A, K_A), -pressure_rate(out_B, V_B, K_B), one, two), up_1 + up_2
-    one, two = pressure_rate(up_1 - out_A, V_A, K_A), pressure_rate(up_2 - out_B, V_B, K_B)
-    return (one, two, one, two), up_1 + up_2
+        rate_1 = pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
+        rate_2 = pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
+        return (-pressure_rate(out_A, V_A, K_A), -pressure_rate(out_B, V_B, K_B), rate_1, rate_2), up_1 + up_2
+    rate_1, rate_2 = pressure_rate(up_1 - out_A, V_A, K_A), pressure_rate(up_2 - out_B, V_B, K_B)
+    return (rate_1, rate_2, rate_1, rate_2), up_1 + up_2
 
 
 @contracted

@@ -102,7 +102,7 @@ class Schedule:
         self.bounds = np.r_[self.bounds[:-1][new], n_out]
         # a run has one kind of numbers throughout: what the compiler leaves out is left out from its beginning
         kinds: dict[str, Any] = {}
-        if any(name.startswith("G_ext") and np.any(found > 0) for name, found in values.items()):
+        if any(name.startswith("G_ext") and np.any(series > 0) for name, series in values.items()):
             kinds["open_circuit"] = (True,)
         if "air" in values and np.any(values["air"] > 0):
             kinds["aerated"] = (True,)

@@ -21,7 +21,7 @@ def number_text(value: float) -> str:
 
 
 class Command(Protocol):
-    """A command: volts as a function of time, and its own description in the words that `parse_command` reads."""
+    """A command: volts as a function of time, and its own description in the form that `parse_command` reads."""
 
     def volts(self, t: Array) -> Array:
         """Return u [V] at times t [s] (any shape); 0 before t = 0."""
@@ -240,9 +240,9 @@ def parse_command(text: str) -> Command:
         path = stripped[5:].strip()
         return recorded_command(read(path), path)
     for pattern, make in _FORMS:
-        found = re.fullmatch(pattern, stripped, re.IGNORECASE)
-        if found:
-            return make(list(found.groups()))
+        match = re.fullmatch(pattern, stripped, re.IGNORECASE)
+        if match:
+            return make(list(match.groups()))
     raise InputError(
         "command must be like '3 sin(4t)', 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'chirp 3 from 0.1 Hz to 5 "
         "Hz over 60 s', "

@@ -157,7 +157,7 @@ class Experiment:
 
     def __repr__(self) -> str:
         parts = [f"rig {self.rig.name}", str(self.command), f"{self.duration:g} s at {self.rate:g} Hz"]
-        parts += [str(one) for one in (*self.leaks, *self.faults, *self.drifts)]
+        parts += [str(change) for change in (*self.leaks, *self.faults, *self.drifts)]
         return f"<Experiment: {', '.join(parts)}, seed {self.seed}>"
 
     @property
@@ -175,9 +175,9 @@ class Experiment:
 
     def readings(self) -> Readings:
         """Return what changes at the instruments within the run."""
-        drifting = [one for drift in self.drifts for one in drift.adjustments()]
+        drifting = [adjustment for drift in self.drifts for adjustment in drift.adjustments()]
         return Readings(
-            (*drifting, *(one for fault in self.faults for one in fault.adjustments())),
+            (*drifting, *(adjustment for fault in self.faults for adjustment in fault.adjustments())),
             tuple(hold for fault in self.faults for hold in fault.holds()),
         )
 
@@ -221,7 +221,7 @@ class Experiment:
         """Return a short name that is the same for equal experiments only."""
         values = {row.name: repr(row.value) for row in self.rig.table()}
         inputs = [exact(self.command), *(exact(leak) for leak in self.leaks)]
-        inputs += [exact(one) for one in (*self.faults, *self.drifts)]
+        inputs += [exact(change) for change in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
         solver += [] if self.error is None else [self.error]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
@@ -236,7 +236,7 @@ def exact(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
     if is_dataclass(value):
-        return [type(value).__name__, *(exact(getattr(value, one.name)) for one in fields(value))]
+        return [type(value).__name__, *(exact(getattr(value, part.name)) for part in fields(value))]
     return repr(value)
 
 

@@ -164,7 +164,7 @@ class Fault:
     Its `opening` says when: 0 is a healthy machine, 1 the whole fault; its text is what `parse_fault` reads.
     """
 
-    #: One word for all faults of a kind, for tables and confusion matrices.
+    #: One name for all faults of a kind, for tables and confusion matrices.
     kind: ClassVar[str]
     opening: Opening
 

@@ -382,13 +382,13 @@ def _refuse_rows(rows: Array, first: int, rate: float, allow_unresolved: bool) -
 def windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     """Return the outputs (start, stop) of the windows in which a run of `n_out` outputs at `rate` [Hz] is checked."""
     first = min(n_out, round(FIRST_WINDOW * rate))
-    found = [(0, first)]
+    checked = [(0, first)]
     length = round(LATER_WINDOW * rate)
     for share in LATER:
         start = round(share * n_out)
-        if length and start >= found[-1][1] and start + length <= n_out:
-            found.append((start, start + length))
-    return found
+        if length and start >= checked[-1][1] and start + length <= n_out:
+            checked.append((start, start + length))
+    return checked
 
 
 class Judge:

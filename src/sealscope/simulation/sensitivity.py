@@ -97,8 +97,8 @@ def leak_sensitivity(experiment: Experiment, channels: Sequence[str] = CHAMBERS)
     def quotient(h: float) -> Array:
         return np.asarray((clean_channels(experiment, (Leak("laminar", coefficient=h),), names) - none) / h)
 
-    found = _settled("G", names, FIRST_LEAK / REFERENCE_DP, quotient)
-    return replace(found, slope=2.0 * found.slope - quotient(found.step))
+    sensitivity = _settled("G", names, FIRST_LEAK / REFERENCE_DP, quotient)
+    return replace(sensitivity, slope=2.0 * sensitivity.slope - quotient(sensitivity.step))
 
 
 def parameter_sensitivity(experiment: Experiment, name: str, channels: Sequence[str] = CHAMBERS) -> Sensitivity:

@@ -79,22 +79,22 @@ class Proof:
     @property
     def resolved(self) -> bool:
         """Whether every difference is within its tolerance."""
-        return all(one.resolved for one in self.differences)
+        return all(difference.resolved for difference in self.differences)
 
     def text(self) -> str:
         """Return the proof as lines of text: what moved, by how much, and how much it may."""
         lines = [f"halving the step ({self.method}, {self.step:.3g} s to {self.halved:.3g} s) moves"]
-        for one in self.differences:
-            limit = "" if one.tolerance is None else f" (at most {one.tolerance:.3g})"
+        for row in self.differences:
+            limit = "" if row.tolerance is None else f" (at most {row.tolerance:.3g})"
             lines.append(
-                f"  {one.name:<18} {one.difference:10.3g} {one.unit}{limit}{'' if one.resolved else '  NOT RESOLVED'}"
+                f"  {row.name:<18} {row.difference:10.3g} {row.unit}{limit}{'' if row.resolved else '  NOT RESOLVED'}"
             )
         return "\n".join(lines)
 
     def worst(self) -> Difference:
         """Return the difference furthest beyond, or nearest to, its tolerance."""
-        judged = [one for one in self.differences if one.tolerance]
-        return max(judged, key=lambda one: one.difference / (one.tolerance or math.inf))
+        judged = [row for row in self.differences if row.tolerance]
+        return max(judged, key=lambda row: row.difference / (row.tolerance or math.inf))
 
 
 @dataclass(frozen=True)

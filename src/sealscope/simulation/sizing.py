@@ -38,8 +38,8 @@ def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
     return float(flow.sum()) / total if total > 0 else 0.0
 
 
-def scaled_size(asked: float, before: tuple[float, float], now: tuple[float, float]) -> float:
-    """Return the coefficient to try next for a mean flow `asked` [m^3/s].
+def scaled_size(mean: float, before: tuple[float, float], now: tuple[float, float]) -> float:
+    """Return the coefficient to try next for a mean flow `mean` [m^3/s].
 
     `before`, `now`: coefficient and mean flow of the run before and of this run; with a coefficient of 0, the flow is
     that of a coefficient of 1. The slope d log flow / d log coefficient between the two is kept within what a leak can
@@ -47,11 +47,11 @@ def scaled_size(asked: float, before: tuple[float, float], now: tuple[float, flo
     """
     (c_0, q_0), (c_1, q_1) = before, now
     if c_1 == 0.0:
-        return asked / q_1
+        return mean / q_1
     slope = 1.0
     if min(c_0, q_0, c_1, q_1) > 0.0 and abs(c_1 / c_0 - 1.0) >= 1e-6:
         slope = min(max(math.log(q_1 / q_0) / math.log(c_1 / c_0), _LEAST_SLOPE), 1.0)
-    return float(c_1 * (asked / q_1) ** (1.0 / slope))
+    return float(c_1 * (mean / q_1) ** (1.0 / slope))
 
 
 def unsettled(leaks: Sequence[Leak]) -> SimulationFailed:
@@ -86,22 +86,22 @@ def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] |
         dp = run["p_A"] - run["p_B"]
         worst = 0.0
         following = []
-        for k, (asked, now) in enumerate(zip(leaks, current, strict=True)):
-            if asked.mean is None or asked.mean == 0.0:
+        for k, (leak, now) in enumerate(zip(leaks, current, strict=True)):
+            if leak.mean is None or leak.mean == 0.0:
                 following.append(now)
                 continue
-            if attempt == 0 and asked.mean >= pump_flow:
+            if attempt == 0 and leak.mean >= pump_flow:
                 raise InputError(
                     f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for "
-                    f"this command, got {asked.mean / LITRE_PER_MINUTE:.4g} L/min ({asked})"
+                    f"this command, got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
                 )
             size = now.coefficient or 0.0
             unit = mean_while_open(now, run.t, leak_flow(replace(now, coefficient=1.0), run.t, dp, dp_0))
             if not unit > 0:
-                raise InputError(f"a leak with a mean flow must be open within the run, got {asked}")
+                raise InputError(f"a leak with a mean flow must be open within the run, got {leak}")
             got = unit * size
-            worst = max(worst, abs(got / asked.mean - 1.0))
-            scaled = scaled_size(asked.mean, before[k], (size, got if size > 0.0 else unit))
+            worst = max(worst, abs(got / leak.mean - 1.0))
+            scaled = scaled_size(leak.mean, before[k], (size, got if size > 0.0 else unit))
             before[k] = (size, got)
             following.append(replace(now, coefficient=scaled))
         if worst <= TOLERANCE:

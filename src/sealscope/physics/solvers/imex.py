@@ -78,24 +78,24 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     V_A, V_B = chamber_volumes(z[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
     step = GAMMA * h
     total_A, total_B = z[P_1] - z[P_A], z[P_B] - z[P_2]
-    found = z
+    moved = z
     s = (z[P_A], z[P_B], z[P_1], z[P_2])
     for _ in range(1 if len(p.aerated) == 0 else AIR_TURNS):
-        K_A, K_B = bulk_modulus(found[P_A], p), bulk_modulus(found[P_B], p)
-        K_1, K_2 = bulk_modulus(found[P_1], p), bulk_modulus(found[P_2], p)
+        K_A, K_B = bulk_modulus(moved[P_A], p), bulk_modulus(moved[P_B], p)
+        K_1, K_2 = bulk_modulus(moved[P_1], p), bulk_modulus(moved[P_2], p)
         g_A = step * (pressure_rate(1.0, V_A, K_A) + pressure_rate(1.0, p.V_1, K_1))
         g_B = step * (pressure_rate(1.0, V_B, K_B) + pressure_rate(1.0, p.V_2, K_2))
         Q_A = implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
         Q_B = implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
-        s = throttle_rates(found, Q_A, Q_B, p)
-        before = found
-        found = pressures_moved(z, step, s)
+        s = throttle_rates(moved, Q_A, Q_B, p)
+        before = moved
+        moved = pressures_moved(z, step, s)
         if len(p.aerated) > 0:
-            settled_A = max(abs(found[P_A] - before[P_A]), abs(found[P_1] - before[P_1]))
-            settled_B = max(abs(found[P_B] - before[P_B]), abs(found[P_2] - before[P_2]))
+            settled_A = max(abs(moved[P_A] - before[P_A]), abs(moved[P_1] - before[P_1]))
+            settled_B = max(abs(moved[P_B] - before[P_B]), abs(moved[P_2] - before[P_2]))
             if not anywhere(max(settled_A, settled_B) >= AIR_SETTLED):
                 break
-    return found, s
+    return moved, s
 
 
 @contracted

@@ -56,10 +56,10 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     loop = _longest_for_pair(p.R_c / p.L_c + p.B_M / p.J_M, (p.R_c * p.B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M))
     column = p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) / p.M_eq
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
-    standing = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
-    standing += 0.0 if p.literal_bracket else p.F_v
+    breakaway = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
+    breakaway += 0.0 if p.literal_bracket else p.F_v
     running = _longest_for_pair(p.F_v / p.M_eq, column)
-    stuck = _longest_for_pair(standing / p.M_eq, column)
+    stuck = _longest_for_pair(breakaway / p.M_eq, column)
     pump = _longest_for_pair(ports * p.G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
     leak = _longest_for_pair(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
     outward = _longest_for_pair(chambers * max(p.G_ext_A, p.G_ext_B) + ports * p.G_check * p.made_up, 0.0)

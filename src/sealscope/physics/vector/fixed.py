@@ -109,9 +109,9 @@ def taken(number: Any, table: Any, at: int) -> Any:
 
 def pair(context: Any, builder: Any, value: Any) -> Any:
     """Return the instructions that make a fixed number of a double."""
-    made = cgutils.create_struct_proxy(FIXED)(context, builder)
-    made.value, made.reciprocal = value, builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), value)
-    return made._getvalue()
+    number = cgutils.create_struct_proxy(FIXED)(context, builder)
+    number.value, number.reciprocal = value, builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), value)
+    return number._getvalue()
 
 
 def _take(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
@@ -148,7 +148,7 @@ lowered(settled, 1, lambda *_: types.boolean, _settle)
 
 def left_to_table(numbers: RigNumbers, fields: Collection[str], choices: bool = False) -> RigNumbers:
     """Return the numbers with () in place of those that stand in a table, and with settled `choices` if asked."""
-    found: dict[str, Any] = dict.fromkeys(fields, ())
+    replaced: dict[str, Any] = dict.fromkeys(fields, ())
     if choices:
-        found |= {name: (True,) if own else () for name, own in numbers._asdict().items() if isinstance(own, bool)}
-    return numbers._replace(**found)
+        replaced |= {name: (True,) if own else () for name, own in numbers._asdict().items() if isinstance(own, bool)}
+    return numbers._replace(**replaced)

@@ -22,15 +22,15 @@ from sealscope.physics.vector.fixed import settled, taken
 #: Rows that describe a leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
 #: and the G and C whose flow goes to the account (those of the leak, or of one that is being sized).
 LEAK_ROWS = 6
-#: Rows of what a run tells at each output: p_A, p_B [Pa].
-TOLD = 2
+#: Channels that a run writes at each output: p_A, p_B [Pa].
+CHANNELS = 2
 #: Rows of a lane's account: sum of |Q_L| [m^3/s] over the outputs, sum of the leak's opening, largest |x| [m],
 #: lowest pressure [Pa], 0 while all is finite.
 ACCOUNTS = 5
 Drive = tuple[float, float]
 Leak = tuple[float, float, float, float, float, float]
 Account = tuple[float, float, float, float, float]
-FLOW, OPEN, REACH, LEAST, SOUND = range(ACCOUNTS)
+FLOW, OPEN, REACH, LEAST, DIVERGED = range(ACCOUNTS)
 
 
 def _lane_numbers() -> Any:
@@ -111,7 +111,7 @@ def _imex(
 @contracted
 def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> Account:
     """Return the account with an output more in it."""
-    flow, opened, reach, least, sound = account
+    flow, opened, reach, least, diverged = account
     share = opening(leak, t)
     flow = flow + abs(piston_leakage(z[P_A] - z[P_B], leak[4] * share, leak[5] * share, q.dp_0))
     least = min(least, z[P_A])
@@ -120,7 +120,7 @@ def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> A
         least = min(least, z[P_1])
         least = min(least, z[P_2])
     total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10]
-    return flow, opened + share, max(abs(z[POSITION]), reach), least, sound + 0.0 * total
+    return flow, opened + share, max(abs(z[POSITION]), reach), least, diverged + 0.0 * total
 
 
 @contracted
@@ -138,7 +138,7 @@ def advance(
     bounds: np.ndarray,
     p: RigNumbers,
     every: int,
-    told: np.ndarray,
+    pressures: np.ndarray,
     begin: int,
     account: np.ndarray,
 ) -> None:
@@ -148,8 +148,8 @@ def advance(
 
     `y`: (groups, 11, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
     WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields, WIDTH) with
-    `bounds` (cells + 1,) the step at which each cell begins; `told`: (groups, outputs, TOLD, WIDTH), written from
-    output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).
+    `bounds` (cells + 1,) the step at which each cell begins; `pressures`: (groups, outputs, CHANNELS, WIDTH), written
+    from output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).
     """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
@@ -172,7 +172,7 @@ def advance(
             load(account, a + 3),
             load(account, a + 4),
         )
-        out = (g * told.shape[1] + begin) * TOLD
+        out = (g * pressures.shape[1] + begin) * CHANNELS
         for cell in range(cells):
             q = lane_numbers(table, (g * cells + cell) * fields, p)
             due = 0  # steps before the next output; cells begin at one
@@ -180,9 +180,9 @@ def advance(
                 t = (start + step) * h
                 if due == 0:
                     due = every
-                    store(told, out, z[P_A])
-                    store(told, out + 1, z[P_B])
-                    out += TOLD
+                    store(pressures, out, z[P_A])
+                    store(pressures, out + 1, z[P_B])
+                    out += CHANNELS
                     noted = _noted(z, leak, t + nodes[0], noted, q)
                 due -= 1
                 if implicit:

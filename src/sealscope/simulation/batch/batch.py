@@ -190,25 +190,25 @@ def simulate_batch(
     with ThreadPoolExecutor(workers) as pool:
         for part in _split_by_step(sets):
 
-            def told(share: float, begun: float = done, size: int = len(part.members)) -> None:
+            def report(share: float, begun: float = done, size: int = len(part.members)) -> None:
                 if progress is not None:
                     progress(min(1.0, begun + share * size / n))
 
             own = part.experiment.error
-            _run(part, batch, error if own is None else own, pool, workers, told, runner)
+            _run(part, batch, error if own is None else own, pool, workers, report, runner)
             done += len(part.members) / n
     return batch
 
 
 def _split_by_step(sets: Sequence[LaneSet]) -> list[LaneSet]:
     """Return the sets with a step or an error of their own apart from those without."""
-    found = []
-    for one in sets:
+    split = []
+    for lane_set in sets:
         kinds: dict[tuple[float | None, float | None], list] = {}  # type: ignore[type-arg]
-        for member in one.members:
+        for member in lane_set.members:
             kinds.setdefault((member.experiment.step, member.experiment.error), []).append(member)
-        found += [LaneSet(tuple(members), one.shape) for members in kinds.values()]
-    return found
+        split += [LaneSet(tuple(members), lane_set.shape) for members in kinds.values()]
+    return split
 
 
 def runner_of(device: str) -> type[SetRun]:
@@ -239,9 +239,9 @@ def _run(
     places = [member.place for member in part.members]
     sizes = np.array([member.leak.coefficient or 0.0 for member in part.members])
     step = part.experiment.step or chosen_step(part, sizes, error)
-    asked = np.array([member.leak.mean or 0.0 for member in part.members])
-    if np.any(asked > 0):
-        sizes = _sized(part, step, sizes, asked, pool, workers, runner)
+    means = np.array([member.leak.mean or 0.0 for member in part.members])
+    if np.any(means > 0):
+        sizes = _sized(part, step, sizes, means, pool, workers, runner)
         step = part.experiment.step or min(step, chosen_step(part, sizes, error))
     run = runner(part, step, sizes, sizes, batch.bounds)
     run.all(pool, workers, progress)
@@ -261,18 +261,18 @@ def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
     steps = [allowed_step(part, sizes)]
     picked = np.unique(np.linspace(0, len(part.members) - 1, _SCOUTS).round().astype(int))
     for k in picked:
-        one = with_sizes(part.members[k].experiment, float(sizes[k]))
-        rate = one.rate * oversampling(one)
+        experiment = with_sizes(part.members[k].experiment, float(sizes[k]))
+        rate = experiment.rate * oversampling(experiment)
         run = integrate(
-            one.rig,
-            RunInputs(one, one.leaks),
-            min(one.duration, _SCOUTED),
+            experiment.rig,
+            RunInputs(experiment, experiment.leaks),
+            min(experiment.duration, _SCOUTED),
             rate,
-            x_0=one.x_0,
-            method=one.method,
+            x_0=experiment.x_0,
+            method=experiment.method,
             error=error,
-            allow_unresolved=one.allow_unresolved,
-            effects=one.effects(),
+            allow_unresolved=experiment.allow_unresolved,
+            effects=experiment.effects(),
         )
         steps.append(run.step)
     return float(min(steps))
@@ -293,15 +293,15 @@ def _sized(
     part: LaneSet,
     step: float,
     sizes: Array,
-    asked: Array,
+    means: Array,
     pool: ThreadPoolExecutor,
     workers: int,
     runner: type[SetRun],
 ) -> Array:
-    """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members at once."""
+    """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members together."""
     from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, unsettled
 
-    wanted = asked > 0
+    wanted = means > 0
     before = np.zeros((2, len(sizes)))
     for _ in range(MOST_RUNS):
         fine = part.experiment.step or min(step, allowed_step(part, sizes))
@@ -312,11 +312,11 @@ def _sized(
             run_place = part.members[int(np.flatnonzero(wanted & (got <= 0))[0])].place
             raise InputError(f"a leak with a mean flow must be open within the run (run {run_place})")
         known = wanted & (sizes > 0)
-        if np.all(known[wanted]) and np.all(np.abs(got[wanted] / asked[wanted] - 1.0) <= TOLERANCE):
+        if np.all(known[wanted]) and np.all(np.abs(got[wanted] / means[wanted] - 1.0) <= TOLERANCE):
             return sizes
         following = sizes.copy()
         for k in np.flatnonzero(wanted):
-            following[k] = scaled_size(asked[k], (before[0, k], before[1, k]), (sizes[k], got[k]))
+            following[k] = scaled_size(means[k], (before[0, k], before[1, k]), (sizes[k], got[k]))
         before = np.where(known, np.stack([sizes, got]), 0.0)
         sizes = following
     raise unsettled([member.leak for member in part.members])

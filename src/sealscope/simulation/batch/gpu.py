@@ -20,7 +20,7 @@ from sealscope.errors import InputError, SimulationFailed
 from sealscope.physics.lanes import WARP, load, store
 from sealscope.physics.rig import NUMBERS, RigNumbers
 from sealscope.physics.vector.fixed import left_to_table
-from sealscope.physics.vector.runs import TOLD, advance
+from sealscope.physics.vector.runs import CHANNELS, advance
 from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.run import LaneSet, SetRun
 from sealscope.simulation.batch.signals import FILTER_ROWS, INSTRUMENT_ROWS, sense
@@ -44,43 +44,47 @@ def require_device() -> None:
 
 
 @cuda.jit
-def _advance_rk4(y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, told, begin, account):  # type: ignore[no-untyped-def]
+def _advance_rk4(y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, pressures, begin, account):  # type: ignore[no-untyped-def]
     group = cuda.grid(1) // y.shape[2]
     if group < y.shape[0]:
         own = (group, group + 1)
-        advance(False, own, y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, told, begin, account)
+        advance(False, own, y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, pressures, begin, account)
 
 
 @cuda.jit
-def _advance_imex(y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, told, begin, account):  # type: ignore[no-untyped-def]
+def _advance_imex(y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, pressures, begin, account):  # type: ignore[no-untyped-def]
     group = cuda.grid(1) // y.shape[2]
     if group < y.shape[0]:
         own = (group, group + 1)
-        advance(True, own, y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, told, begin, account)
+        advance(True, own, y, h, start, nodes, shape, drive, leaks, table, bounds, p, every, pressures, begin, account)
 
 
 @cuda.jit
 def _sense(  # type: ignore[no-untyped-def]
-    told, begin, factor, taps, own_taps, first, last, sensors, keys, walks, filters, low, high, bounds, sums
+    pressures, begin, factor, taps, own_taps, first, last, sensors, keys, walks, filters, low, high, bounds, sums
 ):
-    group = cuda.grid(1) // told.shape[3]
-    if group < told.shape[0]:
+    group = cuda.grid(1) // pressures.shape[3]
+    if group < pressures.shape[0]:
         own = (group, group + 1)
         sense(
-            own, told, begin, factor, taps, own_taps, first, last, sensors, keys, walks, filters, low, high, bounds,
-            sums,
+            own, pressures, begin, factor, taps, own_taps, first, last, sensors, keys, walks, filters, low, high,
+            bounds, sums,
         )  # fmt: skip
 
 
 @cuda.jit
-def _move(told, source, step, count):  # type: ignore[no-untyped-def]
+def _move(pressures, source, step, count):  # type: ignore[no-untyped-def]
     """Move outputs source, source + step, .. to outputs 0 .. count - 1 of each run."""
-    group = cuda.grid(1) // told.shape[3]
-    if group < told.shape[0]:
-        at = group * told.shape[1] * TOLD
+    group = cuda.grid(1) // pressures.shape[3]
+    if group < pressures.shape[0]:
+        at = group * pressures.shape[1] * CHANNELS
         for k in range(count):
-            for channel in range(TOLD):
-                store(told, at + TOLD * k + channel, load(told, at + TOLD * (source + step * k) + channel))
+            for channel in range(CHANNELS):
+                store(
+                    pressures,
+                    at + CHANNELS * k + channel,
+                    load(pressures, at + CHANNELS * (source + step * k) + channel),
+                )
 
 
 @cuda.jit
@@ -105,10 +109,10 @@ def refuse_disagreement(gpu: Array, processor: Array, places: Sequence[int]) -> 
     if np.quantile(off, 0.75) <= ROUNDING and off.max() <= COUNTS:
         return
     run, what = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
-    found, expected = gpu[run, what], processor[run, what]
+    computed, expected = gpu[run, what], processor[run, what]
     raise SimulationFailed(
         f"the GPU must find what the processor finds, but in the first seconds of run {places[int(run)]} an RMS is "
-        f"{found:.10g} on the GPU and {expected:.10g} on the processor; use device cpu and report this"
+        f"{computed:.10g} on the GPU and {expected:.10g} on the processor; use device cpu and report this"
     )
 
 
@@ -149,14 +153,16 @@ class DeviceRun(SetRun):
         ours = DeviceRun(part, self.asked_step, sizes, sizes, bounds, until)
         ours.numbers, ours._checked = self.numbers, True
         theirs = SetRun(part, self.asked_step, sizes, sizes, bounds, until)
-        for one in (ours, theirs):
-            one.all(pool, 1, None)
+        for runs in (ours, theirs):
+            runs.all(pool, 1, None)
         refuse_disagreement(ours.rms(), theirs.rms(), [member.place for member in part.members])
 
     def _pieces(self) -> list[tuple[int, int]]:
         chunks = self._chunks()
-        rows = TOLD * (self._kept + max(stop - start for _, _, start, stop in chunks) + FILTER_ROWS + INSTRUMENT_ROWS)
-        rows += TOLD * self.own_taps.shape[2] + 100
+        rows = CHANNELS * (
+            self._kept + max(stop - start for _, _, start, stop in chunks) + FILTER_ROWS + INSTRUMENT_ROWS
+        )
+        rows += CHANNELS * self.own_taps.shape[2] + 100
         rows += max(last - first for first, last, _, _ in chunks) * self.cells.base.shape[1]
         free = 1e9 if SIMULATED else cuda.current_context().get_memory_info()[0]
         most = max(1, int(_SHARE * free / (8 * rows * self.width)))
@@ -173,7 +179,7 @@ class DeviceRun(SetRun):
         )
         nodes = cuda.to_device(self.nodes)
         longest = max(stop - start for _, _, start, stop in chunks)
-        told = cuda.device_array((b - a, kept + longest, TOLD, self.width))
+        pressures = cuda.device_array((b - a, kept + longest, CHANNELS, self.width))
         advance_chunk: Any = _advance_imex if self.method == "imex" else _advance_rk4
         senses = None if self.bounds is None else _Senses(self, a, b, grid)
         table, cells = None, (-1, -1)
@@ -183,13 +189,13 @@ class DeviceRun(SetRun):
             advance_chunk[grid](
                 state, self.h, start * self.every, nodes, cuda.to_device(np.ascontiguousarray(shapes(start, stop))),
                 drive, leaks, table, cuda.to_device(self._cell_bounds(first, last, start, stop)), self.numbers,
-                self.every, told, kept, account,
+                self.every, pressures, kept, account,
             )  # fmt: skip
             if senses is not None:
                 if start == 0:
-                    _move[grid](told, kept, 0, kept)  # at rest before the beginning
-                senses.read(told, start, self._due(stop))
-                _move[grid](told, stop - start, 1, kept)
+                    _move[grid](pressures, kept, 0, kept)  # at rest before the beginning
+                senses.read(pressures, start, self._due(stop))
+                _move[grid](pressures, stop - start, 1, kept)
         self.account[a:b] = account.copy_to_host()
         if senses is not None:
             self.sums[a:b] = senses.sums.copy_to_host()
@@ -200,7 +206,7 @@ class _Senses:
 
     def __init__(self, run: DeviceRun, a: int, b: int, grid: tuple[int, int]) -> None:
         self.run, self.groups, self.grid, self.sampled = run, (a, b), grid, 0
-        shape = (b - a, TOLD)
+        shape = (b - a, CHANNELS)
         self.walks, self.sums = cuda.to_device(np.zeros((*shape, run.width))), cuda.to_device(run.sums[a:b])
         self.filters = cuda.device_array((*shape, FILTER_ROWS, run.width))
         _clear[grid](self.filters)
@@ -209,7 +215,7 @@ class _Senses:
         self.wavelet = (run.low, run.high, cuda.to_device(run.segments))
         self.sensors: Any = None
 
-    def read(self, told: Any, start: int, until: int) -> None:
+    def read(self, pressures: Any, start: int, until: int) -> None:
         """Read the samples before `until`, with outputs from `start` on behind those that were kept."""
         run, first = self.run, self.sampled
         if until <= first:
@@ -218,7 +224,7 @@ class _Senses:
             self.sensors = cuda.to_device(run.sensors(self.groups, first, until))
         begin = first * run.factor - run.before - (start - run._kept)
         _sense[self.grid](
-            told, begin, run.factor, *self.fixed, first, until, self.sensors, self.keys, self.walks, self.filters,
+            pressures, begin, run.factor, *self.fixed, first, until, self.sensors, self.keys, self.walks, self.filters,
             *self.wavelet, self.sums,
         )  # fmt: skip
         self.sampled = until

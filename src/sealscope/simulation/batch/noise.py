@@ -55,8 +55,8 @@ def _uniform(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     step = context.cast(builder, values[1], kinds[1], types.int64)
     step = builder.mul(builder.add(step, ir.Constant(_WORD, 1)), ir.Constant(_WORD, _GOLDEN))
     if isinstance(kinds[0], Lanes):
-        one = builder.insert_element(ir.Constant(word, ir.Undefined), step, ir.Constant(ir.IntType(32), 0))
-        step = builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
+        lane = builder.insert_element(ir.Constant(word, ir.Undefined), step, ir.Constant(ir.IntType(32), 0))
+        step = builder.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
     z = builder.add(builder.bitcast(values[0], word), step)
     for shift, factor in _MIX:
         z = builder.mul(builder.xor(z, builder.lshr(z, constant(shift))), constant(factor))

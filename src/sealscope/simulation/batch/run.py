@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.physics.rig import RigNumbers
 
-#: Slope [1/s] of an opening that is open at once.
-AT_ONCE = 1e15
+#: Slope [1/s] of an abrupt opening.
+ABRUPT = 1e15
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def refuse(experiment: Experiment, place: int) -> None:
     if len(experiment.leaks) > 1:
         raise no(f"at most one leak, got {len(experiment.leaks)}")
     if experiment.leaks and not isinstance(experiment.leaks[0].opening, From | Growing):
-        raise no(f"a leak that opens at once or evenly, got {experiment.leaks[0].opening}")
+        raise no(f"a leak that opens abruptly or evenly, got {experiment.leaks[0].opening}")
     if experiment.rig.motor.integrator == "euler":
         raise no("motor.integrator = state, got euler")
     if any(fault.adjustments() or fault.holds() for fault in experiment.faults):
@@ -120,26 +120,29 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
     if not experiments:
         raise InputError("a batch must have experiments, got none")
     first = experiments[0]
-    found: dict[Any, list[Member]] = {}
+    by_kind: dict[Any, list[Member]] = {}
     shapes: dict[Any, Command] = {}
     known: dict[int, RigNumbers] = {}  # by rig: most batches have few of them
-    for place, one in enumerate(experiments):
-        for name, own, common in (("duration", one.duration, first.duration), ("rate", one.rate, first.rate)):
+    for place, experiment in enumerate(experiments):
+        for name, own, common in (
+            ("duration", experiment.duration, first.duration),
+            ("rate", experiment.rate, first.rate),
+        ):
             if own != common:
                 raise InputError(f"runs of a batch must have one {name}, got {common:g} and {own:g} (run {place})")
-        refuse(one, place)
-        numbers = known.get(id(one.rig)) or known.setdefault(id(one.rig), rig_numbers(one.rig))
-        effects = one.effects()
+        refuse(experiment, place)
+        numbers = known.get(id(experiment.rig)) or known.setdefault(id(experiment.rig), rig_numbers(experiment.rig))
+        effects = experiment.effects()
         if any(effect.field.startswith("G_ext") for effect in effects):
             numbers = numbers._replace(open_circuit=(True,))
         if any(effect.field == "air" for effect in effects):
             numbers = numbers._replace(aerated=(True,))
-        key, shape, gain, offset = _shape(one.commanded)
+        key, shape, gain, offset = _shape(experiment.commanded)
         choices = tuple(getattr(numbers, name) for name in CHOICES)
-        kind = (key, choices, choose_method(one.rig, one.method))
+        kind = (key, choices, choose_method(experiment.rig, experiment.method))
         shapes[kind] = shape
-        found.setdefault(kind, []).append(Member(place, one, numbers, effects, gain, offset))
-    return [LaneSet(tuple(members), shapes[kind]) for kind, members in found.items()]
+        by_kind.setdefault(kind, []).append(Member(place, experiment, numbers, effects, gain, offset))
+    return [LaneSet(tuple(members), shapes[kind]) for kind, members in by_kind.items()]
 
 
 def in_lanes(values: Array, width: int) -> Array:
@@ -158,15 +161,15 @@ def out_of_lanes(lanes: Array, runs: int) -> Array:
 def leak_rows(members: Sequence[Member], sizes: Array, measured: Array) -> Array:
     """Return (runs, LEAK_ROWS): leaks of the stated sizes, and the sizes of which the flow is accounted."""
     rows = []
-    for member, size, told in zip(members, sizes, measured, strict=True):
+    for member, size, accounted in zip(members, sizes, measured, strict=True):
         leak = member.leak
         laminar = leak.law == "laminar"
         opening = leak.opening
         if isinstance(opening, Growing):
             when = (opening.start, 1.0 / (opening.stop - opening.start))
         else:
-            when = (opening.onset(), AT_ONCE)
-        laws = (size, 0.0, told, 0.0) if laminar else (0.0, size, 0.0, told)
+            when = (opening.onset(), ABRUPT)
+        laws = (size, 0.0, accounted, 0.0) if laminar else (0.0, size, 0.0, accounted)
         rows.append([laws[0], laws[1], *when, laws[2], laws[3]])
     return np.array(rows)
 
@@ -198,10 +201,10 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     """
     from sealscope.physics.rig import NUMBERS
 
-    numbers = {id(one.numbers): one.numbers for one in members}
-    rows = {key: [float(getattr(one, name)) for name in NUMBERS] for key, one in numbers.items()}
-    base = np.array([rows[id(one.numbers)] for one in members])
-    effects = [effect for one in members for effect in one.effects]
+    numbers = {id(member.numbers): member.numbers for member in members}
+    rows = {key: [float(getattr(own, name)) for name in NUMBERS] for key, own in numbers.items()}
+    base = np.array([rows[id(member.numbers)] for member in members])
+    effects = [effect for member in members for effect in member.effects]
     if not effects:
         return Cells(np.array([0, n_out]), base, (), np.empty((len(members), 0, 1)))
     coarse = np.arange(0, n_out + 1, max(1, round(LONGEST_BLOCK * rate)))
@@ -212,17 +215,17 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     middles = 0.5 * (bounds[:-1] + bounds[1:]) / rate
     fields = tuple(sorted({NUMBERS.index(effect.field) for effect in effects}))
     values = np.repeat(base[:, list(fields), None], middles.size, axis=2)
-    for run, one in enumerate(members):
-        for name, found in values_of(one.effects, one.numbers, middles).items():
-            values[run, fields.index(NUMBERS.index(name))] = found
+    for run, member in enumerate(members):
+        for name, series in values_of(member.effects, member.numbers, middles).items():
+            values[run, fields.index(NUMBERS.index(name))] = series
     return Cells(bounds, base, fields, values)
 
 
-def with_sizes(one: Experiment, size: float) -> Experiment:
+def with_sizes(experiment: Experiment, size: float) -> Experiment:
     """Return the experiment with its leak's coefficient found."""
-    if not one.leaks:
-        return one
-    return replace(one, leaks=(replace(one.leaks[0], mean=None, coefficient=size),))
+    if not experiment.leaks:
+        return experiment
+    return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=size),))
 
 
 def instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
@@ -233,15 +236,15 @@ def instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
     ends = np.array([first, last]) / members[0].experiment.rate
     steady: dict[int, Array] = {}  # by rig, of runs whose instruments do not drift
     for run, member in enumerate(members):
-        one = member.experiment
-        if one.drifts:
-            rows[run] = _channels(one.rig, one.readings(), ends, last - first)
+        experiment = member.experiment
+        if experiment.drifts:
+            rows[run] = _channels(experiment.rig, experiment.readings(), ends, last - first)
         else:
-            if id(one.rig) not in steady:
-                steady[id(one.rig)] = _channels(one.rig, Readings(), ends, last - first)
-            rows[run] = steady[id(one.rig)]
+            if id(experiment.rig) not in steady:
+                steady[id(experiment.rig)] = _channels(experiment.rig, Readings(), ends, last - first)
+            rows[run] = steady[id(experiment.rig)]
         if rows[run, :, HUM].any():
-            rows[run, :, HUM_PHASE] = np.random.default_rng([one.seed, 1]).random(len(CHAMBERS))
+            rows[run, :, HUM_PHASE] = np.random.default_rng([experiment.seed, 1]).random(len(CHAMBERS))
     return rows
 
 
@@ -260,9 +263,9 @@ def _row(rig: Rig, name: str, readings: Readings, ends: Array, samples: int) -> 
     row = np.zeros(rows.INSTRUMENT_ROWS)
 
     def set_even(own: str, value: float, at: int, rise: int, plus: float = 0.0) -> None:
-        found = np.broadcast_to(readings.value(own, value, ends), (2,))
-        row[at] = found[0] + plus
-        row[rise] = (found[1] - found[0]) / samples
+        at_ends = np.broadcast_to(readings.value(own, value, ends), (2,))
+        row[at] = at_ends[0] + plus
+        row[rise] = (at_ends[1] - at_ends[0]) / samples
 
     set_even(f"sensors.{name}.gain_error", sensor.gain_error, rows.GAIN, rows.GAIN_RISE, 1.0)
     set_even(f"sensors.{name}.offset", sensor.offset, rows.OFFSET, rows.OFFSET_RISE)
@@ -305,11 +308,11 @@ class SetRun:
         from sealscope.physics.solvers.imex import IMEX_NODES
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.physics.solvers.rk4 import RK4_NODES
-        from sealscope.physics.vector.runs import ACCOUNTS, LEAST, TOLD
+        from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAST
 
         members, common = part.members, part.experiment
         self.asked_step, self.sizes = step, sizes
-        self.part, self.runs, self.told_rows = part, len(members), TOLD
+        self.part, self.runs, self.channels = part, len(members), CHANNELS
         self.method = choose_method(common.rig, common.method)
         self.factor = oversampling_of(common.rate, step)
         rate = common.rate * self.factor
@@ -361,15 +364,15 @@ class SetRun:
         self.before = self.after = taps.size // 2
         self.taps = np.pad(taps, (TILE - 1) * self.factor)
         sensors = [member.experiment.rig.sensors for member in self.part.members]
-        delays = np.array([[getattr(one, name).delay * rate for name in CHAMBERS] for one in sensors])
+        delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
         whole = np.floor(delays).astype(np.int64)
         if not delays.any():
-            self.own_taps = np.zeros((self.groups, self.told_rows, 1, self.width))
+            self.own_taps = np.zeros((self.groups, self.channels, 1, self.width))
             return
         filters = [[anti_alias_taps(self.factor, delay % 1.0) for delay in run] for run in delays]
-        self.after = max(one.size // 2 for run in filters for one in run)
+        self.after = max(taps.size // 2 for run in filters for taps in run)
         self.before = self.after + int(whole.max())
-        own = np.zeros((self.runs, self.told_rows, self.before + self.after + 1))
+        own = np.zeros((self.runs, self.channels, self.before + self.after + 1))
         for run, channel in np.ndindex(*delays.shape):
             taps = filters[run][channel]
             start = self.before - int(whole[run, channel]) - taps.size // 2
@@ -386,7 +389,7 @@ class SetRun:
         at = np.round(bounds * rate).astype(np.int64)
         self.segments = np.clip(at, before, self.samples - after)
         self.low, self.high = (tuple(taps.tolist()) for taps in decomposition_filters("db8"))
-        shape = (self.groups, self.told_rows)
+        shape = (self.groups, self.channels)
         self.sums = np.zeros((*shape, self.segments.size - 1, QUANTITIES, self.width))
         self.keys = in_lanes(keys([m.experiment.seed for m in self.part.members]), self.width)
 
@@ -409,16 +412,16 @@ class SetRun:
         """Cells first .. last and outputs start .. stop of each chunk."""
         most = max(1, CHUNK_STEPS // self.every)
         edges = self.cells.bounds
-        found = []
+        chunks = []
         first = 0
         while first < edges.size - 1:
             last = first + 1
             while last < edges.size - 1 and edges[last + 1] - edges[first] <= most:
                 last += 1
             start, stop = int(edges[first]), int(edges[last])
-            found += [(first, last, a, min(a + most, stop)) for a in range(start, stop, most)]
+            chunks += [(first, last, a, min(a + most, stop)) for a in range(start, stop, most)]
             first = last
-        return found
+        return chunks
 
     @property
     def _kept(self) -> int:
@@ -443,31 +446,31 @@ class SetRun:
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
         chunks, shapes, kept = self._chunks(), self._shapes(), self._kept
         longest = max(stop - start for _, _, start, stop in chunks)
-        told = np.zeros((b - a, kept + longest, self.told_rows, self.width))
-        walks = np.zeros((b - a, self.told_rows, self.width))
-        filters = np.zeros((b - a, self.told_rows, FILTER_ROWS if self.bounds is not None else 0, self.width))
+        pressures = np.zeros((b - a, kept + longest, self.channels, self.width))
+        walks = np.zeros((b - a, self.channels, self.width))
+        filters = np.zeros((b - a, self.channels, FILTER_ROWS if self.bounds is not None else 0, self.width))
         sampled = 0
         for first, last, start, stop in chunks:
             if cells != (first, last):
                 table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
             advance(
                 own, state, self.h, start * self.every, self.nodes, shapes(start, stop), drive, leaks, table,
-                self._cell_bounds(first, last, start, stop), self.numbers, self.every, told, kept, account,
+                self._cell_bounds(first, last, start, stop), self.numbers, self.every, pressures, kept, account,
             )  # fmt: skip
             self._check(groups, stop)
             if self.bounds is not None:
                 if start == 0:
-                    told[:, :kept] = told[:, kept : kept + 1]  # at rest before the beginning
+                    pressures[:, :kept] = pressures[:, kept : kept + 1]  # at rest before the beginning
                 until = self._due(stop)
                 if until > sampled:
                     sensors = self.sensors(groups, sampled, until)
                     begin = sampled * self.factor - self.before - (start - kept)
                     sense_lanes(
-                        own, told, begin, self.factor, self.taps, self.own_taps[a:b], sampled, until, sensors,
+                        own, pressures, begin, self.factor, self.taps, self.own_taps[a:b], sampled, until, sensors,
                         self.keys[a:b], walks, filters, self.low, self.high, self.segments, self.sums[a:b],
                     )  # fmt: skip
                     sampled = until
-                told[:, :kept] = told[:, stop - start : stop - start + kept].copy()
+                pressures[:, :kept] = pressures[:, stop - start : stop - start + kept].copy()
             tell((stop - start) / self.outputs * (b - a) / self.groups)
 
     def _cell_bounds(self, first: int, last: int, start: int, stop: int) -> np.ndarray:
@@ -505,20 +508,20 @@ class SetRun:
     def _check(self, groups: tuple[int, int], stop: int) -> None:
         """Raise SimulationFailed for a run that diverged, fell below vacuum or hit a stop too hard for the step."""
         from sealscope.physics.solvers.limits import longest_step_on_stop
-        from sealscope.physics.vector.runs import LEAST, REACH, SOUND
+        from sealscope.physics.vector.runs import DIVERGED, LEAST, REACH
 
         account = self.account[groups[0] : groups[1]]
         time = stop / (self.part.experiment.rate * self.factor)
         lowest = account[:, LEAST]
-        if np.all(account[:, SOUND] == 0.0) and lowest.min() >= VACUUM and account[:, REACH].max() <= self._half:
+        if np.all(account[:, DIVERGED] == 0.0) and lowest.min() >= VACUUM and account[:, REACH].max() <= self._half:
             return
-        found = out_of_lanes(account, account.shape[0] * self.width)
-        for k, (reach, least, sound) in enumerate(found[:, [REACH, LEAST, SOUND]]):
+        accounts = out_of_lanes(account, account.shape[0] * self.width)
+        for k, (reach, least, diverged) in enumerate(accounts[:, [REACH, LEAST, DIVERGED]]):
             place = groups[0] * self.width + k
             if place >= self.runs:
                 break
             member = self.part.members[place]
-            if not sound == 0.0:
+            if not diverged == 0.0:
                 raise SimulationFailed(
                     f"run {member.place} diverged before t = {time:.4g} s; take a smaller step or smaller gains"
                 )
@@ -547,6 +550,6 @@ class SetRun:
         """Mean |Q| [m^3/s] of the accounted leaks while open, (runs,)."""
         from sealscope.physics.vector.runs import FLOW, OPEN
 
-        found = out_of_lanes(self.account, self.runs)
-        opened = found[:, OPEN]
-        return np.where(opened > 0, found[:, FLOW] / np.where(opened > 0, opened, 1.0), 0.0)
+        accounts = out_of_lanes(self.account, self.runs)
+        opened = accounts[:, OPEN]
+        return np.where(opened > 0, accounts[:, FLOW] / np.where(opened > 0, opened, 1.0), 0.0)

@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.lanes import anywhere, load, spread, store
-from sealscope.physics.vector.runs import TOLD
+from sealscope.physics.vector.runs import CHANNELS
 from sealscope.simulation.batch.noise import half_turn_sine, normals
 
 LEVELS = 4
@@ -54,9 +54,9 @@ def converted(pressure: Any, sensor: np.ndarray, at: int) -> Any:
 def _hum(sensor: np.ndarray, at: int, sample: int) -> Any:
     turns = load(sensor, at + HUM_PHASE) + load(sensor, at + HUM_TURNS) * sample
     turns = turns - ((turns + _ROUND) - _ROUND)  # -1/2 .. 1/2 of a turn
-    half = half_turn_sine(turns)
-    other = half_turn_sine(0.5 - abs(turns))  # cos(pi turns)
-    return load(sensor, at + HUM) * (2.0 * half * other)
+    sine = half_turn_sine(turns)
+    cosine = half_turn_sine(0.5 - abs(turns))  # cos(pi turns)
+    return load(sensor, at + HUM) * (2.0 * sine * cosine)
 
 
 @contracted
@@ -72,16 +72,16 @@ def _read(true: Any, sensor: np.ndarray, at: int, own: Any, common: Any, walk: A
 
 
 @contracted
-def _filtered(told: np.ndarray, at: int, taps: np.ndarray, first: int, count: int) -> Any:
+def _filtered(pressures: np.ndarray, at: int, taps: np.ndarray, first: int, count: int) -> Any:
     """Return the filtered value of one sample; `at`: row of its first tap, taps first .. first + count - 1."""
     total = spread(0.0)
     for k in range(count):
-        total = total + taps[first + k] * load(told, at + TOLD * k)
+        total = total + taps[first + k] * load(pressures, at + CHANNELS * k)
     return total
 
 
 @contracted
-def _filter_tile(told: np.ndarray, at: int, taps: np.ndarray, factor: int, rows: np.ndarray, to: int) -> None:
+def _filter_tile(pressures: np.ndarray, at: int, taps: np.ndarray, factor: int, rows: np.ndarray, to: int) -> None:
     """Filter TILE samples, `factor` outputs apart, into rows from `to` on.
 
     Each output is loaded once. `taps` begin and end with (TILE - 1) factor zeros, so that all samples take the same
@@ -91,7 +91,7 @@ def _filter_tile(told: np.ndarray, at: int, taps: np.ndarray, factor: int, rows:
     t_4, t_5, t_6, t_7 = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
     zeros = (TILE - 1) * factor
     for k in range(taps.size - zeros):
-        x = load(told, at + TOLD * k)
+        x = load(pressures, at + CHANNELS * k)
         tap = zeros + k
         t_0 = t_0 + taps[tap] * x
         t_1 = t_1 + taps[tap - factor] * x
@@ -112,27 +112,37 @@ def _filter_tile(told: np.ndarray, at: int, taps: np.ndarray, factor: int, rows:
 
 
 @contracted
-def _filter_block(told: np.ndarray, at: int, factor: int, taps: np.ndarray, rows: np.ndarray, to: int, m: int) -> None:
+def _filter_block(
+    pressures: np.ndarray, at: int, factor: int, taps: np.ndarray, rows: np.ndarray, to: int, m: int
+) -> None:
     """Filter m samples, into rows from `to` on."""
     zeros = (TILE - 1) * factor
     count = taps.size - 2 * zeros
     i = 0
     while count > 1 and i + TILE <= m:
-        _filter_tile(told, at + i * factor * TOLD, taps, factor, rows, to + i)
+        _filter_tile(pressures, at + i * factor * CHANNELS, taps, factor, rows, to + i)
         i += TILE
     for k in range(i, m):
-        store(rows, to + k, _filtered(told, at + k * factor * TOLD, taps, zeros, count))
+        store(rows, to + k, _filtered(pressures, at + k * factor * CHANNELS, taps, zeros, count))
 
 
 @contracted
 def _filter_late(
-    told: np.ndarray, at: int, factor: int, taps: np.ndarray, row: int, count: int, rows: np.ndarray, to: int, m: int
+    pressures: np.ndarray,
+    at: int,
+    factor: int,
+    taps: np.ndarray,
+    row: int,
+    count: int,
+    rows: np.ndarray,
+    to: int,
+    m: int,
 ) -> None:
     """`_filter_block` with taps of each lane's own, from row `row` of `taps` on."""
     for i in range(m):
         total = spread(0.0)
         for k in range(count):
-            total = total + load(taps, row + k) * load(told, at + (i * factor + k) * TOLD)
+            total = total + load(taps, row + k) * load(pressures, at + (i * factor + k) * CHANNELS)
         store(rows, to + i, total)
 
 
@@ -171,7 +181,7 @@ def _split(rows: np.ndarray, source: int, hole: int, low: Taps, high: Taps, m: i
 def _summed(
     rows: np.ndarray,
     d: int,
-    other: int,
+    partner: int,
     product: bool,
     m: int,
     first: int,
@@ -179,7 +189,7 @@ def _summed(
     sums: np.ndarray,
     at: int,
 ) -> None:
-    """Add the squares of m details (or of their products with `other`) to the segments that they fall into.
+    """Add the squares of m details (or of their products with `partner`) to the segments that they fall into.
 
     The details are those of samples first, first + 1, ..; `sums` rows at, at + QUANTITIES, .. are the segments'.
     """
@@ -194,7 +204,7 @@ def _summed(
         for k in range(i, stop):
             x = load(rows, d + k)
             if product:
-                x = x * load(rows, other + k)
+                x = x * load(rows, partner + k)
             total = total + x * x
         store(sums, at + segment * QUANTITIES, total)
         i = stop
@@ -236,7 +246,7 @@ def _transform(
 @contracted
 def sense(
     groups: tuple[int, int],
-    told: np.ndarray,
+    pressures: np.ndarray,
     begin: int,
     factor: int,
     taps: np.ndarray,
@@ -254,46 +264,46 @@ def sense(
 ) -> None:
     """Read samples first <= s < last of the groups' runs and add the squares of their details to `sums`.
 
-    `told`: (groups, outputs, TOLD, WIDTH), the first tap of sample `first` on output `begin`, `factor` outputs a
-    sample; `taps` of the anti-alias filter with (TILE - 1) factor zeros on both sides, or `own_taps` (groups, TOLD,
-    taps, WIDTH) where channels are late (one row elsewhere); `sensors`: (groups, TOLD, INSTRUMENT_ROWS, WIDTH), as at
-    sample `first`; `keys`: (groups, WIDTH) of the noise; `walks`: (groups, TOLD, WIDTH) zero drift so far [Pa];
-    `filters`: (groups, TOLD, FILTER_ROWS, WIDTH); `low`, `high`: the wavelet's taps; `bounds`: (segments + 1,) samples;
-    `sums`: (groups, TOLD, segments, QUANTITIES, WIDTH).
+    `pressures`: (groups, outputs, CHANNELS, WIDTH), the first tap of sample `first` on output `begin`, `factor` outputs
+    a sample; `taps` of the anti-alias filter with (TILE - 1) factor zeros on both sides, or `own_taps` (groups,
+    CHANNELS, taps, WIDTH) where channels are late (one row elsewhere); `sensors`: (groups, CHANNELS, INSTRUMENT_ROWS,
+    WIDTH), as at sample `first`; `keys`: (groups, WIDTH) of the noise; `walks`: (groups, CHANNELS, WIDTH) zero drift so
+    far [Pa]; `filters`: (groups, CHANNELS, FILTER_ROWS, WIDTH); `low`, `high`: the wavelet's taps; `bounds`:
+    (segments + 1,) samples; `sums`: (groups, CHANNELS, segments, QUANTITIES, WIDTH).
     """
     segments = bounds.size - 1
     late = own_taps.shape[2]
     head = STARTS[0] + HISTORIES[0]
     for g in range(groups[0], groups[1]):
         key = load(keys, g)
-        walk_A, walk_B = load(walks, TOLD * g), load(walks, TOLD * g + 1)
-        one, two = TOLD * g * INSTRUMENT_ROWS, (TOLD * g + 1) * INSTRUMENT_ROWS
-        a, b = TOLD * g * FILTER_ROWS, (TOLD * g + 1) * FILTER_ROWS
+        walk_A, walk_B = load(walks, CHANNELS * g), load(walks, CHANNELS * g + 1)
+        sensor_A, sensor_B = CHANNELS * g * INSTRUMENT_ROWS, (CHANNELS * g + 1) * INSTRUMENT_ROWS
+        a, b = CHANNELS * g * FILTER_ROWS, (CHANNELS * g + 1) * FILTER_ROWS
         for start in range(first, last, BLOCK):
             m = min(BLOCK, last - start)
-            at = (g * told.shape[1] + begin + (start - first) * factor) * TOLD
+            at = (g * pressures.shape[1] + begin + (start - first) * factor) * CHANNELS
             if late > 1:
-                _filter_late(told, at, factor, own_taps, TOLD * g * late, late, filters, a + head, m)
-                _filter_late(told, at + 1, factor, own_taps, (TOLD * g + 1) * late, late, filters, b + head, m)
+                _filter_late(pressures, at, factor, own_taps, CHANNELS * g * late, late, filters, a + head, m)
+                _filter_late(pressures, at + 1, factor, own_taps, (CHANNELS * g + 1) * late, late, filters, b + head, m)
             else:
-                _filter_block(told, at, factor, taps, filters, a + head, m)
-                _filter_block(told, at + 1, factor, taps, filters, b + head, m)
+                _filter_block(pressures, at, factor, taps, filters, a + head, m)
+                _filter_block(pressures, at + 1, factor, taps, filters, b + head, m)
             for i in range(m):
                 s = start + i
                 own_A, own_B = normals(key, 3 * s)
                 common, step_A = normals(key, 3 * s + 1)
                 step_B, _ = normals(key, 3 * s + 2)
-                walk_A = walk_A + load(sensors, one + WALK) * step_A
-                walk_B = walk_B + load(sensors, two + WALK) * step_B
+                walk_A = walk_A + load(sensors, sensor_A + WALK) * step_A
+                walk_B = walk_B + load(sensors, sensor_B + WALK) * step_B
                 since = float(s - first)
-                read_A = _read(load(filters, a + head + i), sensors, one, own_A, common, walk_A, s, since)
-                read_B = _read(load(filters, b + head + i), sensors, two, own_B, common, walk_B, s, since)
+                read_A = _read(load(filters, a + head + i), sensors, sensor_A, own_A, common, walk_A, s, since)
+                read_B = _read(load(filters, b + head + i), sensors, sensor_B, own_B, common, walk_B, s, since)
                 store(filters, a + head + i, read_A)
                 store(filters, b + head + i, read_B)
-            _transform(filters, a, m, start, low, high, bounds, sums, TOLD * g * segments * QUANTITIES)
-            _transform(filters, b, m, start, low, high, bounds, sums, (TOLD * g + 1) * segments * QUANTITIES)
-        store(walks, TOLD * g, walk_A)
-        store(walks, TOLD * g + 1, walk_B)
+            _transform(filters, a, m, start, low, high, bounds, sums, CHANNELS * g * segments * QUANTITIES)
+            _transform(filters, b, m, start, low, high, bounds, sums, (CHANNELS * g + 1) * segments * QUANTITIES)
+        store(walks, CHANNELS * g, walk_A)
+        store(walks, CHANNELS * g + 1, walk_B)
 
 
 @kernel

@@ -40,15 +40,15 @@ class BenchMachine:
     command: Command
     closed: float
 
-    def experiment(self, **others: Any) -> Experiment:
+    def experiment(self, **arguments: Any) -> Experiment:
         """Make the experiment of this machine on its duty, from a start that centres its strokes.
 
-        `others` are arguments of `Experiment.of` (leak, fault), and the machine's own seed, duration and drifts where
+        `arguments`: those of `Experiment.of` (leak, fault), and the machine's own seed, duration and drifts where
         they are not among them.
         """
         built = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         own = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
-        given = {**own, **others}
+        given = {**own, **arguments}
         given.setdefault("x_0", centred_start(built, given["command"], given["duration"]))
         return Experiment.of(rig=built, **given)
 
@@ -96,17 +96,17 @@ def _drift(random: np.random.Generator, wanted: DriftRange, oil: Wander) -> Wand
     return both.scaled(float(random.uniform(*wanted.size)))
 
 
-def _drawn(one: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
+def _drawn(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
     """Values (or factors) and drifts of one nuisance."""
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []
-    for group in [(name,) for name in one.parameters] if one.each else [one.parameters]:
-        random = _random(seed, f"{one.name}/{group[0]}" if one.each else one.name)
-        value = float(random.uniform(one.low, one.high)) if one.high > one.low else one.low
+    for group in [(name,) for name in nuisance.parameters] if nuisance.each else [nuisance.parameters]:
+        random = _random(seed, f"{nuisance.name}/{group[0]}" if nuisance.each else nuisance.name)
+        value = float(random.uniform(nuisance.low, nuisance.high)) if nuisance.high > nuisance.low else nuisance.low
         values |= dict.fromkeys(group, value)
-        if one.drift is not None:
-            shape = _drift(random, one.drift, oil)
-            drifts += [ParameterDrift(name, shape, one.drift.absolute) for name in group]
+        if nuisance.drift is not None:
+            shape = _drift(random, nuisance.drift, oil)
+            drifts += [ParameterDrift(name, shape, nuisance.drift.absolute) for name in group]
     return values, drifts
 
 
@@ -122,7 +122,7 @@ def draw(
     """
     from sealscope.parameters import load_rig
 
-    found = load_profile(profile) if isinstance(profile, str) else profile
+    given = load_profile(profile) if isinstance(profile, str) else profile
     base = load_rig(rig)
     if seed < 0:
         raise InputError(f"seed must be >= 0, got {seed}")
@@ -131,17 +131,17 @@ def draw(
     oil = _path(_random(seed, "temperature of the oil"), ("linear", "wander"), duration, warms=True)
     overrides: dict[str, float | str] = {}
     drifts: list[ParameterDrift] = []
-    for one in found.nuisances:
-        values, drifting = _drawn(one, seed, oil)
-        overrides |= {name: float(base[name]) * value for name, value in values.items()} if one.scales else values
+    for nuisance in given.nuisances:
+        values, drifting = _drawn(nuisance, seed, oil)
+        overrides |= {name: float(base[name]) * value for name, value in values.items()} if nuisance.scales else values
         drifts += drifting
     random = _random(seed, "duty")
-    command = parse_command(found.duty.commands[int(random.integers(len(found.duty.commands)))])
-    closed = found.duty.closed[int(random.integers(len(found.duty.closed)))]
+    command = parse_command(given.duty.commands[int(random.integers(len(given.duty.commands)))])
+    closed = given.duty.closed[int(random.integers(len(given.duty.closed)))]
     overrides |= {"line.closed_A": closed, "line.closed_B": closed}
     if closed > 0:
         overrides["line.orifices"] = "present"
-    amplitude = float(random.uniform(*found.duty.amplitude))
+    amplitude = float(random.uniform(*given.duty.amplitude))
     if amplitude != 1.0:
         command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, attr-defined]
-    return BenchMachine(found.name, seed, base, duration, overrides, tuple(drifts), command, closed)
+    return BenchMachine(given.name, seed, base, duration, overrides, tuple(drifts), command, closed)

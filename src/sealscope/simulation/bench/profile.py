@@ -100,13 +100,13 @@ def _profile(path: Path, place: str) -> Profile:
         raise InputError(f"nuisances must be [[nuisance]] tables, got {entries!r} ({place})")
     nuisances = tuple(_nuisance(entry, place) for entry in entries)
     owner: dict[str, str] = {}
-    for one in nuisances:
-        for parameter in one.parameters:
-            if owner.setdefault(parameter, one.name) != one.name:
+    for nuisance in nuisances:
+        for parameter in nuisance.parameters:
+            if owner.setdefault(parameter, nuisance.name) != nuisance.name:
                 raise InputError(
-                    f"{parameter} must be in one nuisance, got {owner[parameter]} and {one.name} ({place})"
+                    f"{parameter} must be in one nuisance, got {owner[parameter]} and {nuisance.name} ({place})"
                 )
-    if len({one.name for one in nuisances}) < len(nuisances):
+    if len({nuisance.name for nuisance in nuisances}) < len(nuisances):
         raise InputError(f"nuisances must have names of their own ({place})")
     name, title = (_text(head, key, "[profile]", place) for key in ("name", "title"))
     return Profile(name, title, _duty(tree.get("duty"), place), nuisances, place)
@@ -145,14 +145,16 @@ def _nuisance(entry: Any, place: str) -> Nuisance:
     name = _text(entry, "name", "a nuisance", place)
     why = _text(entry, "why", name, place)
     given = entry.get("parameters")
-    if not isinstance(given, list) or not given or not all(isinstance(one, str) for one in given):
+    if not isinstance(given, list) or not given or not all(isinstance(item, str) for item in given):
         raise InputError(f"parameters of {name} must be a list of names, got {given!r} ({place})")
     try:
-        parameters = tuple(resolve(one, declared_names()) for one in given)
+        parameters = tuple(resolve(item, declared_names()) for item in given)
     except InputError as error:
         raise InputError(f"{error} ({name}, {place})") from None
-    fields = [_declared()[one] for one in parameters]
-    if choice := next((one for one, field in zip(parameters, fields, strict=True) if choices_of(field)), None):
+    fields = [_declared()[parameter] for parameter in parameters]
+    if choice := next(
+        (parameter for parameter, field in zip(parameters, fields, strict=True) if choices_of(field)), None
+    ):
         raise InputError(f"{choice} is a choice and cannot be drawn from a range ({name}, {place})")
     scales = "scale" in entry
     if scales == ("range" in entry) or (scales and "unit" in entry):
@@ -184,8 +186,8 @@ def _drift(table: Any, name: str, parameters: tuple[str, ...], place: str) -> Dr
     unit = _text(table, "unit", f"the drift of {name}", place)
     try:
         absolute = drifts_absolutely(parameters[0])
-        for one in parameters:
-            ParameterDrift(one, Linear(0.0, 1.0), absolute)
+        for parameter in parameters:
+            ParameterDrift(parameter, Linear(0.0, 1.0), absolute)
     except InputError as error:
         raise InputError(f"{error} ({name}, {place})") from None
     si_unit = unit_of(_declared()[parameters[0]]) if absolute else "1"
@@ -208,20 +210,20 @@ def _duty(table: Any, place: str) -> Duty:
         raise InputError(f"a profile must have [duty], got none ({place})")
     _known(table, ("commands", "closed", "amplitude", "why"), "[duty]", place)
     commands = table.get("commands")
-    if not isinstance(commands, list) or not commands or not all(isinstance(one, str) for one in commands):
+    if not isinstance(commands, list) or not commands or not all(isinstance(item, str) for item in commands):
         raise InputError(f"commands of [duty] must be a list of texts, got {commands!r} ({place})")
     amplitude = _pair(table.get("amplitude", [1.0, 1.0]), "amplitude of [duty]", place)
-    for words in commands:
+    for text in commands:
         try:
-            command = parse_command(words)
+            command = parse_command(text)
         except InputError as error:
             raise InputError(f"{error} ({place})") from None
         if amplitude != (1.0, 1.0) and not hasattr(command, "amplitude"):
-            raise InputError(f"{words!r} has no amplitude to be drawn ({place})")
+            raise InputError(f"{text!r} has no amplitude to be drawn ({place})")
     closed = table.get("closed", [0])
-    if not isinstance(closed, list) or not closed or not all(_percent(one) for one in closed):
+    if not isinstance(closed, list) or not closed or not all(_percent(share) for share in closed):
         raise InputError(f"closed of [duty] must be a list of per cent, 0 to 99, got {closed!r} ({place})")
-    shares = tuple(one / 100.0 for one in closed)
+    shares = tuple(share / 100.0 for share in closed)
     return Duty(tuple(commands), shares, amplitude, _text(table, "why", "[duty]", place))
 
 
