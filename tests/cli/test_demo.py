@@ -79,7 +79,5 @@ def test_a_folder_that_cannot_be_one_is_refused_before_the_work(call, untouched,
         raise AssertionError("simulated before the folder was looked at")
 
     monkeypatch.setattr("sealscope.demo.simulate_with_truth", not_called)
-    assert call("demo", "-o", "taken").refused() == (
-        "a folder to write into must be one or become one, got: File exists (taken)"
-    )
+    assert call("demo", "-o", "taken").refused() == "cannot create folder: File exists (taken)"
     assert call("demo", "-o", "taken/below").refused().endswith("(taken/below)")

@@ -19,6 +19,7 @@ from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, 
 from sealscope.diagnosis.calibration.scorers import scorer
 from sealscope.diagnosis.calibration.thresholds import Calibration, save
 from sealscope.errors import InputError
+from sealscope.recordings.atomic import make_folder
 
 CALIBRATION = "calibration.json"
 
@@ -132,7 +133,7 @@ def _check_table(checks: Sequence[HeldOutCheck]) -> ResultTable:
 
 def write_result(result: CampaignResult, folder: Path) -> list[Path]:
     """Write tables (and the calibration, where there is one) into the folder; return the files."""
-    store.make_folder(folder)
+    make_folder(folder)
     unit = result.plan.unit
     tables = [
         *tables_of(result.judgement, unit, result.known),

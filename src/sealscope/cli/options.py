@@ -86,12 +86,12 @@ def progress() -> Iterator[Progress]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         tasks: dict[str, Any] = {}
 
-        def told(words: str, share: float) -> None:
-            if words not in tasks:
-                tasks[words] = bar.add_task(words, total=1.0)
-            bar.update(tasks[words], completed=share)
+        def update(task: str, share: float) -> None:
+            if task not in tasks:
+                tasks[task] = bar.add_task(task, total=1.0)
+            bar.update(tasks[task], completed=share)
 
-        yield told
+        yield update
 
 
 def assumed_rig(name: str | None) -> Rig | None:
@@ -113,29 +113,19 @@ def channel_map_of(options: Sequence[str] | None) -> dict[str, str]:
     """Channel -> column of the `--map` options; raises InputError where a channel is given twice."""
     from sealscope.recordings import split_map_option
 
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for option in options or ():
         channel, column = split_map_option(option)
-        if channel in found:
-            raise InputError(f"--map {channel} must be given once, got {found[channel]} and {column}")
-        found[channel] = column
-    return found
+        if channel in columns:
+            raise InputError(f"--map {channel} must be given once, got {columns[channel]} and {column}")
+        columns[channel] = column
+    return columns
 
 
-def complain(words: object) -> None:
+def complain(message: object) -> None:
     """One line on standard error, whatever characters a file's name or header brought."""
-    printable = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(words))
+    printable = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(message))
     typer.echo(f"sealscope: {printable}", err=True)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder to write into; raises InputError where it cannot be one."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"a folder to write into must be one or become one, got: {error.strerror} ({folder})"
-        ) from None
 
 
 def check_folder(file: Path) -> None:

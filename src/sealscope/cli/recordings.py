@@ -21,7 +21,6 @@ from sealscope.cli.options import (
     channel_map_of,
     check_folder,
     complain,
-    make_folder,
 )
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
 
@@ -81,7 +80,7 @@ def _diagnoses(
         if recording is None:
             yield None
             continue
-        others = [one for path, one in known if path.resolve() != file.resolve()]
+        others = [other for path, other in known if path.resolve() != file.resolve()]
         if baseline and not others:
             complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
@@ -131,13 +130,13 @@ def diagnose(
     from sealscope.reporting import diagnosis_text
 
     complete = True
-    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed_rig(rig)):
-        if found is None:
+    for result in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed_rig(rig)):
+        if result is None:
             complete = False
         elif output is TextFormat.jsonl:
-            typer.echo(json.dumps(found[1].as_dict(), allow_nan=False))
+            typer.echo(json.dumps(result[1].as_dict(), allow_nan=False))
         else:
-            typer.echo(diagnosis_text(found[1]))
+            typer.echo(diagnosis_text(result[1]))
     if not complete:
         raise typer.Exit(1)
 
@@ -153,6 +152,7 @@ def report(
     rig: AssumeOption = None,
 ) -> None:
     """Diagnose each file and write a self-contained HTML page of it."""
+    from sealscope.recordings.atomic import make_folder
     from sealscope.reporting import write_page
     from sealscope.reporting.template import check_page
 
@@ -172,11 +172,11 @@ def report(
         check_folder(check_page(output))
     complete = True
     assumed = assumed_rig(rig)
-    for found in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed):
-        if found is None:
+    for result in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed):
+        if result is None:
             complete = False
             continue
-        recording, diagnosis = found
+        recording, diagnosis = result
         page = output / f"{Path(diagnosis.file).stem}.html" if several else output
         write_page(page, recording, diagnosis, rig=assumed)
         typer.echo(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")

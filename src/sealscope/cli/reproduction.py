@@ -62,25 +62,25 @@ def reproduce(
         raise InputError("an item must be named: an id, chapter-N or all (sealscope reproduce --list)")
     require_drawing()
     with _progress() as progress:
-        made = build(ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish, progress=progress)
-    products = ((status, made.products(status)) for status in made.statuses)
-    page = write_thesis_page(output, products, quick=quick, sheet=made.job.sheet is not None)
-    _summarise(made, page)
-    if made.among("failed"):
+        reproduction = build(ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish, progress=progress)
+    products = ((status, reproduction.products(status)) for status in reproduction.statuses)
+    page = write_thesis_page(output, products, quick=quick, sheet=reproduction.job.sheet is not None)
+    _summarise(reproduction, page)
+    if reproduction.among("failed"):
         raise typer.Exit(1)
 
 
-def _summarise(made: Reproduction, page: Path) -> None:
-    for status in made.among("failed"):
+def _summarise(reproduction: Reproduction, page: Path) -> None:
+    for status in reproduction.among("failed"):
         complain(f"{status.item.id} failed: {status.reason}")
     counts = {
-        "made": len(made.among("made")),
-        "drawn anew": len(made.among("drawn")),
-        "kept from before": len(made.among("kept")),
-        "failed": len(made.among("failed")),
+        "made": len(reproduction.among("made")),
+        "drawn anew": len(reproduction.among("drawn")),
+        "kept from before": len(reproduction.among("kept")),
+        "failed": len(reproduction.among("failed")),
     }
     typer.echo("items: " + ", ".join(f"{count} {state}" for state, count in counts.items() if count))
-    left_out = made.among("left out")
+    left_out = reproduction.among("left out")
     if left_out:
         typer.echo(f"left out: {len(left_out)} ({left_out[0].reason})")
     typer.echo(f"page:  {page}")

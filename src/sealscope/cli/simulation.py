@@ -17,7 +17,6 @@ from sealscope.cli.options import (
     SetOption,
     check_folder,
     complete_rigs,
-    make_folder,
     progress,
     rig_with,
 )
@@ -159,12 +158,13 @@ def demo(
 ) -> None:
     """Simulate 180 s with a leak of 0.0042 L/min from second 90, record it, diagnose the recording, write the page."""
     from sealscope.demo import run_demo
+    from sealscope.recordings.atomic import make_folder
     from sealscope.reporting import diagnosis_text
 
     make_folder(folder)
-    with progress() as told:
-        made = run_demo(folder, seed, told)
-    typer.echo(diagnosis_text(made.diagnosis))
-    typer.echo(f"truth:     {made.truth.mean_leak_lpm:.4f} L/min from {made.truth.onset_s:.1f} s")
-    typer.echo(f"recording: {made.recording}")
-    typer.echo(f"page:      {made.page}")
+    with progress() as report_progress:
+        result = run_demo(folder, seed, report_progress)
+    typer.echo(diagnosis_text(result.diagnosis))
+    typer.echo(f"truth:     {result.truth.mean_leak_lpm:.4f} L/min from {result.truth.onset_s:.1f} s")
+    typer.echo(f"recording: {result.recording}")
+    typer.echo(f"page:      {result.page}")

@@ -152,7 +152,7 @@ class Examination:
         if stepped is None:
             return fused
         onset, other = stepped
-        reason = f"{fused.reason}; near {onset:.0f} s {other.words}: {other.cause}"
+        reason = f"{fused.reason}; near {onset:.0f} s {other.description}: {other.cause}"
         return replace(fused, cause=other.cause, reason=reason)
 
     def _isolated(self, evidence: Evidence) -> Evidence:

@@ -2,7 +2,7 @@
 
 A leak across the piston damps the ringing of the pressures. It moves neither chamber's mean over a cycle, nor the mean
 pressure difference of the strokes (friction sets it), nor the ringing's frequency, and never the command. Each of these
-is followed over whole cycles; one that steps at the instant of the alarm, by more than sound machines and leaks show,
+is followed over whole cycles; one that steps at the instant of the alarm, by more than healthy machines and leaks show,
 is the likelier cause. A detector that sees the pressures as a whole cannot say so itself.
 """
 
@@ -47,10 +47,10 @@ _SHORTEST = 64
 
 @dataclass(frozen=True)
 class OtherCause:
-    """What stepped, and in words by how much."""
+    """What stepped, and a description that says by how much."""
 
     cause: Cause
-    words: str
+    description: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def _bands(dp: Array, rate: float) -> tuple[Array, Array, Array, Array]:
 def other_cause(seen: Signatures, onset_s: float, strict: float = 1.0) -> OtherCause | None:
     """Return what else stepped near `onset_s` [s], the most certain first; None where nothing did.
 
-    `strict`: factor on what a step must be over its deviation, and over what sound machines show.
+    `strict`: factor on what a step must be over its deviation, and over what healthy machines show.
     """
     causes = (find(seen, onset_s, strict) for find in (_duty, _sensor, _air, _friction, _lost))
     return next((cause for cause in causes if cause is not None), None)
@@ -143,9 +143,9 @@ def unasked(seen: Signatures) -> tuple[float, OtherCause] | None:
     For recordings in which no detector dates a change; the limits are stricter, since many instants are tried.
     """
     for at in np.arange(float(seen.t[0]) + NEAR, float(seen.t[-1]), 1.5 * NEAR):
-        found = other_cause(seen, float(at), UNASKED)
-        if found is not None:
-            return float(at), found
+        other = other_cause(seen, float(at), UNASKED)
+        if other is not None:
+            return float(at), other
     return None
 
 
@@ -153,16 +153,16 @@ def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
     """Return the evidence of a leak as `cannot tell` with another cause where one stepped at its onset."""
     if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS) or evidence.onset_s is None:
         return evidence
-    found = other_cause(seen, evidence.onset_s)
-    if found is None:
+    other = other_cause(seen, evidence.onset_s)
+    if other is None:
         return evidence
     return replace(
         evidence,
         verdict="cannot tell",
-        reason=f"{evidence.reason}; but {found.words}: {found.cause}, which may be all of it",
+        reason=f"{evidence.reason}; but {other.description}: {other.cause}, which may be all of it",
         leak_lpm=None,
         leak_interval_lpm=None,
-        cause=found.cause,
+        cause=other.cause,
         course=None,
     )
 
@@ -184,15 +184,15 @@ def _duty(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
 def _sensor(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
     scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
     size, surely = np.array([_step(seen, values / scale, onset) for values in seen.mean.T]).T
-    one = int(np.argmax(np.abs(size)))
-    if abs(size[one]) < strict * MEAN or abs(surely[one]) < strict * SURE:
+    largest = int(np.argmax(np.abs(size)))
+    if abs(size[largest]) < strict * MEAN or abs(surely[largest]) < strict * SURE:
         return None
-    if abs(size[1 - one]) > ALONE * abs(size[one]):
+    if abs(size[1 - largest]) > ALONE * abs(size[largest]):
         return None
     return OtherCause(
         "sensor fault",
-        f"the mean of {CHAMBERS[one]} alone steps by {size[one]:+.1%} of the strokes' pressure difference, which "
-        "a piston that floats between both chambers does not allow",
+        f"the mean of {CHAMBERS[largest]} alone steps by {size[largest]:+.1%} of the strokes' pressure difference, "
+        "which a piston that floats between both chambers does not allow",
     )
 
 

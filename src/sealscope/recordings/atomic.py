@@ -1,4 +1,4 @@
-"""Writing files whole or not at all."""
+"""Write files whole or not at all, and create the folders they go to."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sealscope.errors import InputError
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder with its parents where there is none; raise InputError where it cannot be created."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot create folder: {error.strerror} ({folder})") from None
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
 from sealscope.reporting.series import DrawnTimes, coded, coded_times, time_base
+from sealscope.units import LITRE_PER_MINUTE
 
 SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
@@ -32,7 +33,7 @@ PRESSURE_UNITS: dict[str, tuple[float, str, float]] = {
 _SHOWN = {
     "m": ("mm", 1e-3),
     "rad/s": ("rpm", np.pi / 30),
-    "m^3/s": ("L/min", 1e-3 / 60),
+    "m^3/s": ("L/min", LITRE_PER_MINUTE),
 }
 
 

@@ -242,13 +242,13 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     rows: list[tuple[Cell, ...]] = [("the sheet", *[1.0] * 4, *measured, *[41] * 4)]
     rig = _identified_rig()
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
-        made = predicted_sheet(rig, hypothesis)
+        predicted = predicted_sheet(rig, hypothesis)
         rows.append(
             (
                 hypothesis.name,
-                *(float(np.exp(np.mean(np.log(made.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])))) for c, q in shown),
-                *(100 * (float(np.exp(np.mean(made.log_change(c, q)))) - 1.0) for c, q in changed),
-                *(int(np.sum(signs(made, c, q) == signs(sheet, c, q))) for c, q in shown),
+                *(float(np.exp(np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])))) for c, q in shown),
+                *(100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in changed),
+                *(int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in shown),
             )
         )
     notes = "Nothing here was fitted to the leak columns. Changes are geometric means over the 41 tests."

@@ -15,7 +15,7 @@ from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.atomic import atomic_write
+from sealscope.recordings.atomic import atomic_write, make_folder
 
 #: What rows of one folder must share, and how messages call it.
 _SAME = {
@@ -154,14 +154,6 @@ def head(folder: Path) -> dict[str, Any] | None:
     if not isinstance(tree, dict):
         raise UnreadableFile(f"a campaign's head must be a JSON object, got something else ({path})")
     return tree
-
-
-def make_folder(folder: Path) -> None:
-    """Make a campaign's folder where there is none; raise InputError where it cannot be made."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot create folder: {error.strerror} ({folder})") from None
 
 
 def begin(folder: Path, source: Mapping[str, Any]) -> None:

@@ -74,21 +74,23 @@ def operating_point(recording: Recording) -> OperatingPoint:
     )
 
 
-def difference(one: OperatingPoint, other: OperatingPoint) -> str | None:
+def difference(point: OperatingPoint, other: OperatingPoint) -> str | None:
     """Return why two recordings must not be compared, None where they may; the pressure level is judged elsewhere."""
-    if one.chambers != other.chambers or one.units != other.units:
+    if point.chambers != other.chambers or point.units != other.units:
         return "other channels or units"
-    if abs(one.rate / other.rate - 1.0) > 1e-3:
-        return f"another sampling rate ({one.rate:g} Hz and {other.rate:g} Hz)"
-    if one.direction != other.direction:
+    if abs(point.rate / other.rate - 1.0) > 1e-3:
+        return f"another sampling rate ({point.rate:g} Hz and {other.rate:g} Hz)"
+    if point.direction != other.direction:
         return "another direction of the stroke"
-    if (one.command_rms is None) != (other.command_rms is None):
+    if (point.command_rms is None) != (other.command_rms is None):
         return "only one of them has a command"
-    if one.command_rms is not None and other.command_rms is not None:
-        if not math.isclose(one.command_rms, other.command_rms, rel_tol=0.05, abs_tol=0.01):
-            return f"another command ({one.command_rms:.3g} V and {other.command_rms:.3g} V rms)"
-        if (one.cycle is None) != (other.cycle is None) or (
-            one.cycle is not None and other.cycle is not None and not math.isclose(one.cycle, other.cycle, rel_tol=0.05)
+    if point.command_rms is not None and other.command_rms is not None:
+        if not math.isclose(point.command_rms, other.command_rms, rel_tol=0.05, abs_tol=0.01):
+            return f"another command ({point.command_rms:.3g} V and {other.command_rms:.3g} V rms)"
+        if (point.cycle is None) != (other.cycle is None) or (
+            point.cycle is not None
+            and other.cycle is not None
+            and not math.isclose(point.cycle, other.cycle, rel_tol=0.05)
         ):
             return "another cycle of the command"
     return None

@@ -90,7 +90,7 @@ def sessions_of(recording: Recording, baseline: Sequence[Recording], *, single_s
     if len(known) < len(baseline):
         if not single_strokes:
             return Sessions(None, None, None, None, True)
-        lengths = np.array([one.duration for one in baseline])
+        lengths = np.array([leak_free.duration for leak_free in baseline])
         return Sessions(np.cumsum(lengths) - lengths, np.zeros(len(baseline), dtype=np.int64), None, None, False)
     own = start_seconds(recording)
     together = np.array(known if own is None else [*known, own])

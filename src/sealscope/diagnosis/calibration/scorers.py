@@ -220,7 +220,7 @@ def _all() -> Iterator[Scorer]:
     yield _on_sides(f"sign rule: {both}", "split", f"{about}; any change at all", _both_products, 0.0)
     about = "the largest T2 of a step of d2..d4 of both chambers at any instant"
     yield Scorer("rms change", "search", about, _scan)
-    about = "T2 less the threshold that random orders of the recording's own blocks with a sound machine's drift give"
+    about = "T2 less the threshold that random orders of the recording's own blocks with a healthy machine's drift give"
     yield Scorer("rms change, own threshold", "search", about, _own_scan, 0.0)
 
 

@@ -76,7 +76,7 @@ def by_recordings(
     been found, or it is of a session of the baseline and differs no more than a repetition would. Else `cannot tell`:
     it differs as drift, another session or another machine would, too.
     """
-    known, measured = np.stack([whole_log_rms(one) for one in baseline]), whole_log_rms(recording)
+    known, measured = np.stack([whole_log_rms(leak_free) for leak_free in baseline]), whole_log_rms(recording)
     copies = len(known) > 1 and np.any(np.ptp(known, axis=0) < _LEAST_SCATTER)
     if copies or not np.all(np.isfinite(measured)) or not np.all(np.isfinite(known)):
         return Evidence(
@@ -106,13 +106,13 @@ def by_recordings(
         changed = largest_changes(chosen, z, changes[columns], np.full(len(z), threshold))
         return Evidence("leak", f"{changed} {against} ({figures}){note}", score, threshold, parts=parts)
     smallest = judged.smallest_found(expected, threshold)
-    found = f"a change of {100 * np.expm1(smallest):.2g} % would have been found"
+    sensitivity = f"a change of {100 * np.expm1(smallest):.2g} % would have been found"
     if smallest <= WORTH_FINDING:
-        reason = f"no change of the details' RMS {against} ({figures}; {found}){note}"
+        reason = f"no change of the details' RMS {against} ({figures}; {sensitivity}){note}"
         return Evidence("no leak", reason, score, threshold, parts=parts)
     repetitions = _repetitions(sessions)
     if not repetitions:
-        reason = f"no change of the details' RMS {against}, but only {found} ({figures}){note}"
+        reason = f"no change of the details' RMS {against}, but only {sensitivity} ({figures}){note}"
         return Evidence("cannot tell", reason, score, threshold, parts=parts)
     near = [judged.z(judged.model.predict(level, time, label)) for time, label in repetitions]
     nearest = int(np.argmin([np.max(own_z) for own_z in near]))
@@ -120,11 +120,11 @@ def by_recordings(
         reason = f"no change of the details' RMS {against} beyond that of a repetition ({figures}){note}"
         if sessions.label is not None:
             return Evidence("no leak", reason, score, threshold, parts=parts)
-        reason += f"; but it may be of another session or of another machine, and then only {found}"
+        reason += f"; but it may be of another session or of another machine, and then only {sensitivity}"
         return Evidence("cannot tell", reason, score, threshold, parts=parts)
     changes = measured - model.predict(level, *repetitions[nearest]).mean
     changed = largest_changes(chosen, near[nearest], changes[columns], np.full(len(z), threshold))
-    reason = f"{changed} {against}: {_possible(sessions)} ({figures}; only {found}){note}"
+    reason = f"{changed} {against}: {_possible(sessions)} ({figures}; only {sensitivity}){note}"
     return Evidence("cannot tell", reason, score, threshold, parts=parts)
 
 

@@ -23,7 +23,6 @@ Cause = Literal[
 Figure = Literal["onset_s", "leak_lpm"]
 #: The causes for which the verdict is `leak`: piston and pump lie in parallel, and often no channel tells them apart.
 LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak")
-LITRE_PER_MINUTE = 1e-3 / 60.0
 
 
 @dataclass(frozen=True, eq=False)

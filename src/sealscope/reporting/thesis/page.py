@@ -67,9 +67,9 @@ def render_thesis_page(
     statuses: list[ItemStatus] = []
     shown: list[tuple[ItemStatus, Figure | ThesisTable, str]] = []
     claims: dict[str, Claim] = {}
-    for status, made in products:
+    for status, item_products in products:
         statuses.append(status)
-        for product in made:
+        for product in item_products:
             if isinstance(product, Claim):
                 claims.setdefault(product.id, product)
             elif status.item.id != "claims":  # the claims have a section of their own

@@ -244,10 +244,10 @@ def _legend(ax: Axes, panel: Panel) -> None:
         return
     wide = sum(map(len, labels)) + 6 * len(labels) + len(panel.title)
     if wide <= 92 and len(labels) <= 5:
-        made = ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(labels), borderaxespad=0.1)
+        legend = ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(labels), borderaxespad=0.1)
     else:
-        made = ax.legend(loc="upper left", bbox_to_anchor=(1.005, 1.02), borderaxespad=0.1)
-    _plain(made)
+        legend = ax.legend(loc="upper left", bbox_to_anchor=(1.005, 1.02), borderaxespad=0.1)
+    _plain(legend)
 
 
 def _plain(legend: Legend) -> None:

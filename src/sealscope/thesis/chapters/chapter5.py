@@ -262,9 +262,9 @@ def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array
     before, after = (int(samples) for samples in reach("db8", 4)[-1])
     series = detail_series(recording, chamber)
     inside = slice(before, len(recording) - after)
-    made = {name: windowed_rms(series[name][inside], first=before) for name in _WINDOWED}
-    centres = (made["d3"].ends - WINDOW_SIZE / 2) / recording.rate
-    return np.asarray(centres, dtype=np.float64), {name: windows.rms for name, windows in made.items()}
+    windows_of = {name: windowed_rms(series[name][inside], first=before) for name in _WINDOWED}
+    centres = (windows_of["d3"].ends - WINDOW_SIZE / 2) / recording.rate
+    return np.asarray(centres, dtype=np.float64), {name: windows.rms for name, windows in windows_of.items()}
 
 
 @dataclass(frozen=True)

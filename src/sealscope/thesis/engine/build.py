@@ -242,7 +242,7 @@ class Builder:
             "key": self._key(item),
             "sheet": self.sheet_key if context.saw_sheet else None,
             "runs": sources_key(_RUNS) if context.ran else None,
-            "asked": context.asked,
+            "asked": context.product_stamps,
         }
         self.folder.keep(item.id, self.job.quick, record, products)
         return products
@@ -263,7 +263,7 @@ class BuildContext:
         self.quick = builder.job.quick
         self.saw_sheet = item.needs_sheet
         self.ran = False
-        self.asked: dict[str, str] = {}
+        self.product_stamps: dict[str, str] = {}
 
     @property
     def sheet(self) -> DataSheet | None:
@@ -281,7 +281,7 @@ class BuildContext:
         if item not in self._item.needs:
             raise InputError(f"{self._item.id} must name {item} among its needs to ask for its products")
         builder = self._builder
-        self.asked[item] = stamp = builder._stamp(item)
+        self.product_stamps[item] = stamp = builder._stamp(item)
         if stamp == LEFT_OUT:
             return ()
         products = builder.folder.products(item, builder.job.quick) if stamp else None

@@ -29,10 +29,12 @@ def experiment_of(spec: RunSpec) -> Experiment:
 def simulated_run(spec: RunSpec, experiment: Experiment) -> SimulatedRun:
     """Simulate the run of a spec, with its halving test where the spec asks for it."""
     try:
-        made = simulate_with_truth(experiment, prove=spec.prove)
+        simulated = simulate_with_truth(experiment, prove=spec.prove)
     except SimulationFailed as error:
         return SimulatedRun(None, np.empty(0), {}, 0.0, False if spec.prove else None, diverged=str(error))
-    proof = made.proof
+    proof = simulated.proof
     moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
-    return SimulatedRun(made.recording, made.truth.t, made.truth.outputs, made.truth.mean_leak_lpm, resolved, moved)
+    return SimulatedRun(
+        simulated.recording, simulated.truth.t, simulated.truth.outputs, simulated.truth.mean_leak_lpm, resolved, moved
+    )

@@ -162,14 +162,14 @@ def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
         sized = sized_leaks(_experiment(condition, SETTLING + _SIZING, leak))
         leaks = tuple(replace(leak, opening=From(half)) for leak in sized)
         experiment = replace(_experiment(condition, 2 * half, seed=condition.number), leaks=leaks)
-        made = simulate_with_truth(experiment)
+        simulated = simulate_with_truth(experiment)
         resolved = None
         if not quick and condition.group not in proved:
             proved.add(condition.group)
             resolved = prove(replace(experiment, allow_unresolved=True)).resolved
-        rms = detail_rms(made.recording, ((SETTLING, half), (half, 2 * half)))
-        ranges = _range_MPa(made.truth.t, made.truth.outputs, half)
-        yield SimulatedTest(condition, rms, made.truth.mean_leak_lpm, ranges, resolved, "leak opened")
+        rms = detail_rms(simulated.recording, ((SETTLING, half), (half, 2 * half)))
+        ranges = _range_MPa(simulated.truth.t, simulated.truth.outputs, half)
+        yield SimulatedTest(condition, rms, simulated.truth.mean_leak_lpm, ranges, resolved, "leak opened")
 
 
 def without_leak(quick: bool = False) -> Iterator[SimulatedTest]:

@@ -183,7 +183,7 @@ THRESHOLDS = (
 
 def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
-    made, leak = simulated_sheet(context, "appendix-c-leak")
+    leak_runs, leak = simulated_sheet(context, "appendix-c-leak")
     _, still = simulated_sheet(context, "appendix-c-no-leak")
     _, drift = simulated_sheet(context, "appendix-c-drift")
     measured = context.sheet
@@ -193,10 +193,10 @@ def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         item.title,
         RATES,
         tuple(counts(measured, leak, still, drift)),
-        resolved=made.resolved,
+        resolved=leak_runs.resolved,
         notes="A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
         f"(Clopper-Pearson) and take the tests as independent, which repeats of one condition are not.{none} The bench "
-        f"had no leak-free test, so its own false-alarm rate is unknown. {made.notes}",
+        f"had no leak-free test, so its own false-alarm rate is unknown. {leak_runs.notes}",
     )
     sheets = {"sheet": measured, "simulated leak": leak, "simulated, no leak": still, "simulated, drift only": drift}
     columns = ThesisTable(
@@ -204,7 +204,7 @@ def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         "Sign tests of every column of Appendix C",
         COLUMNS,
         tuple((name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet)),
-        resolved=made.resolved,
+        resolved=leak_runs.resolved,
         notes="Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the "
         "leak always came second.",
     )
@@ -213,7 +213,7 @@ def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms",
         THRESHOLDS,
         tuple(thresholds(measured, leak, drift)),
-        resolved=made.resolved,
+        resolved=leak_runs.resolved,
         notes="On the sheet the threshold is 1.645 times the scatter of d1's changes about zero in the same chamber: "
         "they are the only leak-free ones; in simulation it is the 95 % point of the drift-only tests.",
     )

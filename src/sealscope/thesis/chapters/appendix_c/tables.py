@@ -141,7 +141,7 @@ def appendix(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the change of a detail's RMS against the mean leak: measured, simulated, simulated without a leak."""
-    chamber, name, way = (str(item.input(key)) for key in ("chamber", "detail", "way"))
+    chamber, name, direction = (str(item.input(key)) for key in ("chamber", "detail", "way"))
     table, sheet = simulated_sheet(context, "appendix-c-leak")
     leak = np.array([row.mean_leak_lpm for row in APPENDIX_C])
     sources: list[tuple[DataSheet | None, str, Role]] = [
@@ -158,10 +158,10 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
         absolute.append(FigureCurve(leak, pairs[:, 1] - pairs[:, 0], label, role, "points"))
         relative.append(FigureCurve(leak, _difference(pairs), label, role, "points"))
         change = source.log_change(chamber, name)
-        k = int(np.sum(change < 0 if way == "down" else change > 0))
+        k = int(np.sum(change < 0 if direction == "down" else change > 0))
         low, high = clopper_pearson(k, change.size)
         numbers += [
-            Number(f"{label}: tests that go {way}", f"{k} of {change.size}"),
+            Number(f"{label}: tests that go {direction}", f"{k} of {change.size}"),
             Number(f"{label}: rate, 95 % interval", f"{k / change.size:.3f} ({low:.3f} to {high:.3f})"),
             Number(f"{label}: correlation of the change with the leak", float(np.corrcoef(change, leak)[0, 1])),
         ]
@@ -185,9 +185,9 @@ ITEMS: tuple[Item, ...] = (
             "figure",
             f"Change of the RMS of {name} of {chamber} against the mean leak",
             difference_figure,
-            inputs=(("chamber", chamber), ("detail", name), ("way", way)),
+            inputs=(("chamber", chamber), ("detail", name), ("way", direction)),
             needs=("appendix-c-leak", "appendix-c-no-leak"),
         )
-        for figure, chamber, name, way in DIFFERENCES
+        for figure, chamber, name, direction in DIFFERENCES
     ),
 )
