@@ -185,9 +185,28 @@ def test_a_missing_baseline_among_good_ones(call, recordings, untouched):
     assert done.err.splitlines()[1] == "sealscope: no baseline could be read, so nothing is diagnosed"
 
 
-def test_foreign_logs_with_a_map_and_a_rate(call, strokes):
+def in_one_session(strokes: Path, folder: Path) -> tuple[list[Path], list[Path]]:
+    """The strokes under names that say when each was taken, one every 12 s: the leaking ones and the healthy ones."""
+    copies: dict[str, list[Path]] = {"leak": [], "healthy": []}
+    for k, file in enumerate([*sorted(strokes.glob("healthy_*")), *sorted(strokes.glob("leak_*"))]):
+        copy = folder / f"2026-01-05_10-{12 * k // 60:02d}-{12 * k % 60:02d}_{file.name}"
+        copy.write_bytes(file.read_bytes())
+        copies[file.name.split("_")[0]].append(copy)
+    return copies["leak"], copies["healthy"]
+
+
+def test_foreign_logs_without_times_may_be_of_another_day(call, strokes):
     files = sorted(strokes.glob("leak_*")) + sorted(strokes.glob("healthy_*"))[:4]
-    healthy = sorted(strokes.glob("healthy_*"))
+    done = call("diagnose", *files, "--baseline", *sorted(strokes.glob("healthy_*")), *FOREIGN, "--format", "jsonl")
+    assert (done.status, done.err) == (0, "")
+    assert {one["verdict"] for one in done.objects} == {"cannot tell"}
+    for one in done.objects[:4]:
+        assert "another machine, temperature or wear" in one["reason"]
+
+
+def test_foreign_logs_with_a_map_and_a_rate(call, strokes, tmp_path):
+    leaking, healthy = in_one_session(strokes, tmp_path)
+    files = leaking + healthy[:4]
     done = call("diagnose", *files, "--baseline", *healthy, *FOREIGN, "--format", "jsonl")
     assert (done.status, done.err) == (0, "")
     assert [one["file"] for one in done.objects] == [str(file) for file in files]
@@ -219,8 +238,9 @@ def test_every_real_stroke_gets_a_verdict(call):
     done = call("diagnose", *worn, "--baseline", *healthy, *FOREIGN, "--format", "jsonl")
     assert (done.status, done.err) == (0, "")
     assert [one["file"] for one in done.objects] == [str(file) for file in worn]
-    verdicts = Counter(one["verdict"] for one in done.objects)
-    assert verdicts["leak"] > len(worn) / 2
+    # another specimen, recorded on another day: a worn seal cannot be told from these (docs/decisions/0020-baselines.md)
+    assert Counter(one["verdict"] for one in done.objects) == {"cannot tell": len(worn)}
+    assert all("another machine, temperature or wear" in one["reason"] for one in done.objects)
     own = call("diagnose", *healthy[:15], "--baseline", *healthy[15:], *FOREIGN, "--format", "jsonl")
     assert (own.status, own.err) == (0, "")
     assert len(own.objects) == 15

@@ -106,7 +106,8 @@ def by_recordings(
         changed = largest_changes(chosen, z, changes[columns], np.full(len(z), threshold))
         return Evidence("leak", f"{changed} {against} ({figures}){note}", score, threshold, parts=parts)
     smallest = judged.smallest_found(expected, threshold)
-    sensitivity = f"a change of {100 * np.expm1(smallest):.2g} % would have been found"
+    percent = float(100.0 * np.expm1(smallest))
+    sensitivity = f"a change of {percent:.{0 if percent >= 10 else 1}f} % would have been found"
     if smallest <= WORTH_FINDING:
         reason = f"no change of the details' RMS {against} ({figures}; {sensitivity}){note}"
         return Evidence("no leak", reason, score, threshold, parts=parts)
