@@ -45,7 +45,7 @@ def test_false_alarms_are_those_asked_for(expected: float, true: float) -> None:
 )
 def test_smooth_drifts_are_no_steps(name: str, drift) -> None:  # type: ignore[no-untyped-def]
     t = np.arange(50.0)
-    rate = _null_rate(lambda r: r.standard_normal(50) + drift(t, r), 40, 0.01, expected_walk=3.0, wary=True)
+    rate = _null_rate(lambda r: r.standard_normal(50) + drift(t, r), 200, 0.01, expected_walk=3.0, wary=True)
     assert rate <= 0.05, name
 
 
