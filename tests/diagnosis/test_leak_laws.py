@@ -31,3 +31,17 @@ def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
     assert evidence.leak_interval_lpm is not None
     assert evidence.leak_interval_lpm[0] <= true <= evidence.leak_interval_lpm[1]
     assert evidence.onset_s == pytest.approx(ONSET, abs=0.3)
+
+
+@pytest.mark.parametrize("law", ["", "orifice "])
+def test_half_of_the_blocks_leak_much(law: str) -> None:
+    """The blocks with the leak take part, although position and angle go together by another ratio there."""
+    throttles = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"}
+    experiment = Experiment.of(
+        command="3 sin(4t)", duration=120.0, leak=f"0.2 L/min {law}from 60 s", set=throttles, seed=3
+    )
+    result = simulate_with_truth(experiment)
+    evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
+    assert evidence.verdict == "leak"
+    assert evidence.leak_lpm == pytest.approx(result.truth.mean_leak_lpm, rel=0.02)
+    assert evidence.onset_s == pytest.approx(60.0, abs=0.3)

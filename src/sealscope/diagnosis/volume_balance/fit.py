@@ -150,13 +150,13 @@ def _left(gram: Array, shared: list[int], beta: Array) -> Array:
 
 
 def _one_motion(gram: Array) -> NDArray[np.bool_]:
-    """Return the blocks (n,) in which position and angle move in the usual ratio, or do beyond the integral of dp.
+    """Return the blocks (n,) in which position and angle move in the usual ratio, or do beyond what a leak takes.
 
-    A large leak changes the first ratio and not the second; where the integral is nearly the motion itself, noise
-    changes the second and not the first.
+    A large leak changes the ratio as it stands, but not that beyond the integral of its law (of dp, or of its root);
+    where an integral is nearly the motion itself, noise changes the ratio beyond it, and not the one as it stands.
     """
     usual = np.zeros(len(gram), dtype=bool)
-    for sums in (gram, _beyond(gram, I_AB)):
+    for sums in (gram, _beyond(gram, I_AB), _beyond(gram, I_ROOT)):
         ratio = sums[:, THETA, Y] / np.maximum(sums[:, THETA, THETA], np.finfo(float).tiny)
         median = float(np.median(ratio))
         usual |= np.abs(ratio - median) <= _OTHER_RATIO * abs(median)
