@@ -11,6 +11,7 @@ from sealscope.recordings import read, write
 from sealscope.reporting import write_page
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import Progress, Truth, simulate_with_truth
+from sealscope.storage.folders import make_folder
 
 #: The demo's experiment: the thesis's rig with both throttles half closed (its Table 4.3 d), its smallest leak from
 #: half time on.
@@ -36,7 +37,7 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     """Simulate, write the recording, read it back, diagnose it and write the page, all into `folder`."""
     experiment = Experiment.of(**EXPERIMENT, seed=seed)  # type: ignore[arg-type]
     result = simulate_with_truth(experiment, progress)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     file, page = folder / "recording.nc", folder / "report.html"
     write(result.recording, file)
     recording = read(file)

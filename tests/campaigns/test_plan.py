@@ -44,7 +44,7 @@ def test_a_plan_is_read_with_its_units(tiny):
 @pytest.mark.parametrize(
     ("before", "after", "told"),
     [
-        ('name = "tiny"', 'name = "../tiny"', "name must be of letters"),
+        ('name = "tiny"', 'name = "../tiny"', "name must be of at most 80 letters"),
         ('duration = "6 s"', 'duration = "6 V"', "duration"),
         ('onset = "3 s"', 'onset = "7 s"', "onset must be within the duration, 0 s to 6 s, got 7"),
         ("false_alarm = 0.2", "false_alarm = 1.5", "false_alarm must be between 0 and 1, got 1.5"),

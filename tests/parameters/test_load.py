@@ -149,7 +149,7 @@ def test_what_is_no_text_file(tmp_path: Path) -> None:
     assert "rig file must be readable, got: " in refused(tmp_path / "none.toml")
     folder = tmp_path / "folder.toml"
     folder.mkdir()
-    assert "rig file must be readable, got: " in refused(folder)
+    assert refused(folder) == f"a rig file must be a file, got a folder ({folder})"
 
 
 def test_an_unknown_name_lists_the_rigs() -> None:

@@ -19,7 +19,7 @@ from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, 
 from sealscope.diagnosis.calibration.scorers import scorer
 from sealscope.diagnosis.calibration.thresholds import Calibration, save
 from sealscope.errors import InputError
-from sealscope.recordings.atomic import make_folder
+from sealscope.storage.folders import make_folder
 
 CALIBRATION = "calibration.json"
 

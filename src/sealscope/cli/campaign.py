@@ -138,7 +138,14 @@ def report(plan: PlanArgument, folder: FolderOption = None, sheet: SheetOption =
 
 
 def _folder(plan: AnyPlan, given: Path | None) -> Path:
-    return given if given is not None else Path("sealscope-campaigns") / plan.name
+    """Return the campaign's folder; InputError where the default one is a link that a stranger may have left here."""
+    if given is not None:
+        return given
+    folder = Path("sealscope-campaigns") / plan.name
+    for part in (folder.parent, folder):
+        if part.is_symlink():
+            raise InputError(f"the default folder must not be a link, got one ({part}); name a folder with --output")
+    return folder
 
 
 def _progress_text(state: CampaignProgress) -> str:

@@ -129,6 +129,9 @@ def complain(message: object) -> None:
 
 
 def check_folder(file: Path) -> None:
-    """Refuse a file whose folder is not there before the long work, not after it."""
+    """Refuse a file whose folder is not there before the long work, not after it; remove what a killed call left."""
     if not file.parent.is_dir():
         raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
+    from sealscope.storage.atomic import remove_temporaries
+
+    remove_temporaries(file.parent, file.name)

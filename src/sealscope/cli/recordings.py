@@ -152,9 +152,9 @@ def report(
     rig: AssumeOption = None,
 ) -> None:
     """Diagnose each file and write a self-contained HTML page of it."""
-    from sealscope.recordings.atomic import make_folder
     from sealscope.reporting import write_page
     from sealscope.reporting.template import check_page
+    from sealscope.storage.folders import make_folder
 
     several = len(files) > 1 or output.is_dir()
     read_too = {path.resolve() for path in (*files, *(baseline or ()))}
@@ -195,6 +195,7 @@ def convert(
     from sealscope.recordings.files import check_target
 
     check_target(target)
+    check_folder(target)
     recording = read(source, channel_map=channel_map_of(maps) or None, rate=rate)
     write(recording, target)
     typer.echo(f"{target}: {len(recording)} samples at {recording.rate:g} Hz, channels {', '.join(recording.channels)}")

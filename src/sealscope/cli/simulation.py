@@ -81,6 +81,7 @@ def simulate(
     from sealscope.simulation.simulate import simulate_with_truth, write_truth
 
     check_target(output)
+    check_folder(output)
     if truth is not None:
         check_folder(truth)
         if truth.resolve() == output.resolve():
@@ -158,8 +159,8 @@ def demo(
 ) -> None:
     """Simulate 180 s with a leak of 0.0042 L/min from second 90, record it, diagnose the recording, write the page."""
     from sealscope.demo import run_demo
-    from sealscope.recordings.atomic import make_folder
     from sealscope.reporting import diagnosis_text
+    from sealscope.storage.folders import make_folder
 
     make_folder(folder)
     with progress() as report_progress:

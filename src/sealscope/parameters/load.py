@@ -9,7 +9,7 @@ from pathlib import Path
 from sealscope.calls import checked_call, closest
 from sealscope.errors import InputError
 from sealscope.parameters.rig import ParameterEntry, Rig, flatten
-from sealscope.parameters.toml_file import read_toml
+from sealscope.storage.toml_file import read_toml
 
 _PACKAGED = Path(__file__).parent / "rigs"
 _DEEPEST = 8

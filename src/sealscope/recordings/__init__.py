@@ -8,7 +8,6 @@ from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
-    from sealscope.recordings.atomic import atomic_write
     from sealscope.recordings.files import read, write
     from sealscope.recordings.formats.columns import split_map_option
     from sealscope.recordings.quality import Finding, inspect, uniform_segments
@@ -20,7 +19,6 @@ _HOMES = {
     "Finding": "quality",
     "inspect": "quality",
     "uniform_segments": "quality",
-    "atomic_write": "atomic",
 }
 
 __all__ = [
@@ -28,7 +26,6 @@ __all__ = [
     "COUNTS",
     "Finding",
     "Recording",
-    "atomic_write",
     "inspect",
     "read",
     "split_map_option",

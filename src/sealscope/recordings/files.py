@@ -11,11 +11,12 @@ from pathlib import Path
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
-from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import check_call, choose_columns
 from sealscope.recordings.formats.table import Choose, RawTable
 from sealscope.recordings.recording import Recording
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.opening import open_regular
 
 Reader = Callable[[Path, Choose], RawTable]
 Writer = Callable[..., None]
@@ -52,9 +53,7 @@ def _format_of(path: Path) -> str:
     """Return the format of a file by its content; raise UnreadableFile where it is none that is read."""
     place = str(path)
     try:
-        if path.is_dir():
-            raise UnreadableFile(f"a recording must be a file, got a folder ({place})")
-        with path.open("rb") as file:
+        with open_regular(path, "a recording") as file:
             head = file.read(16)
             if head.startswith(_HDF5):
                 return "netcdf"
@@ -69,6 +68,8 @@ def _format_of(path: Path) -> str:
                     return "netcdf"
     except UnreadableFile:
         raise
+    except InputError as error:
+        raise UnreadableFile(str(error)) from None
     except FileNotFoundError:
         raise UnreadableFile(f"a recording must exist, got no such file ({place})") from None
     except (OSError, ValueError) as error:

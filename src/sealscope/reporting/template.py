@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sealscope.errors import InputError
-from sealscope.recordings.atomic import atomic_write
+from sealscope.storage.atomic import atomic_write
 
 if TYPE_CHECKING:
     import jinja2

@@ -13,7 +13,6 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.changes import ParameterDrift
@@ -22,6 +21,7 @@ from sealscope.simulation.faults import Fault, Leak
 from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import DETAIL_TOLERANCE, Trajectory, oversampling, trajectory
 from sealscope.simulation.sizing import leak_flow, mean_while_open, sized_leaks
+from sealscope.storage.atomic import atomic_write
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:

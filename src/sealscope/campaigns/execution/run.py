@@ -18,6 +18,7 @@ from sealscope.campaigns.execution.cluster import on_cluster
 from sealscope.campaigns.execution.workers import Workers
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
+from sealscope.storage.folders import inner_folder
 
 #: Carries out one case of a plan; the last argument is the folder to write its recording into, None for none.
 Task = Callable[[SimulatedPlan, CampaignCase, "Path | None"], CaseRow]
@@ -68,8 +69,7 @@ def run(
             progress(done, plan.size, failures)
         keep = None
         if plan.keep_recordings:
-            keep = place / RECORDINGS
-            keep.mkdir(exist_ok=True)
+            keep = inner_folder(place, RECORDINGS)
         jobs = jobs or _cores()
         if batch:
             new_rows = batches.in_batches(plan, waiting, jobs, device)

@@ -15,7 +15,9 @@ from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.atomic import atomic_write, make_folder
+from sealscope.storage import folders
+from sealscope.storage.atomic import atomic_write, remove_temporaries
+from sealscope.storage.opening import open_inner
 
 #: What rows of one folder must share, and how messages call it.
 _SAME = {
@@ -32,6 +34,8 @@ _SAME = {
 #: The form of a row: 2 since rows hold what each detector stated.
 FORMAT = 2
 ROWS, HEAD, LOCK = "rows.jsonl", "campaign.json", ".lock"
+#: Longest line of a row, and largest head [bytes].
+_LONGEST_ROW = _LARGEST_HEAD = 1_000_000
 #: How rows are made unless in batches.
 RUN_BY_RUN = "run by run"
 
@@ -106,20 +110,24 @@ def read_rows(folder: Path) -> dict[str, CaseRow]:
     Raises UnreadableFile for a line that is no row.
     """
     path = folder / ROWS
-    if not path.is_file():
-        return {}
     rows: dict[str, CaseRow] = {}
-    with path.open("rb") as file:
-        for number, line in enumerate(file, 1):
-            if not line.endswith(b"\n"):
-                break
-            try:
-                row = CaseRow.from_dict(json.loads(line))
-            except (ValueError, TypeError, KeyError, AttributeError, IndexError):
-                raise UnreadableFile(
-                    f"a line of a campaign must be a row, got something else ({path}, line {number})"
-                ) from None
-            rows[row.id] = row
+    try:
+        with open_inner(path, "a campaign's file of rows") as file:
+            for number, line in enumerate(iter(lambda: file.readline(_LONGEST_ROW), b""), 1):
+                if not line.endswith(b"\n") and len(line) < _LONGEST_ROW:
+                    break
+                try:
+                    row = CaseRow.from_dict(json.loads(line))
+                except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RecursionError):
+                    raise UnreadableFile(
+                        f"a line of a campaign must be a row, got something else ({path}, line {number})"
+                    ) from None
+                rows[row.id] = row
+    except OSError as error:
+        if not isinstance(error, FileNotFoundError):
+            raise UnreadableFile(
+                f"a campaign's file of rows must be readable, got: {error.strerror or error} ({path})"
+            ) from None
     return rows
 
 
@@ -145,11 +153,14 @@ def progress_of(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
 def head(folder: Path) -> dict[str, Any] | None:
     """Return what the folder's campaign was made from, None where there is none yet."""
     path = folder / HEAD
-    if not path.is_file():
-        return None
     try:
-        tree = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        with open_inner(path, "a campaign's head") as file:
+            tree = json.loads(file.read(_LARGEST_HEAD))
+    except FileNotFoundError:
+        return None
+    except InputError:
+        raise
+    except (OSError, ValueError, RecursionError):
         tree = None
     if not isinstance(tree, dict):
         raise UnreadableFile(f"a campaign's head must be a JSON object, got something else ({path})")
@@ -158,7 +169,7 @@ def head(folder: Path) -> dict[str, Any] | None:
 
 def begin(folder: Path, source: Mapping[str, Any]) -> None:
     """Make the folder a campaign's, or continue in it; raise InputError where it holds rows of another campaign."""
-    make_folder(folder)
+    folders.make_folder(folder)
     before = head(folder)
     if before is not None and (folder / ROWS).is_file():
         for key, name in _SAME.items():
@@ -174,7 +185,7 @@ def begin(folder: Path, source: Mapping[str, Any]) -> None:
 @contextmanager
 def appending(folder: Path) -> Iterator[Callable[[CaseRow], None]]:
     """Give a function that appends a row to the folder; each line is on disk before the next is begun."""
-    with (folder / ROWS).open("ab+") as file:
+    with open_inner(folder / ROWS, "a campaign's file of rows", "ab+") as file:
         size = keep = file.seek(0, os.SEEK_END)
         while keep and _byte(file, keep - 1) != b"\n":  # a line that was being written when the power went
             keep -= 1
@@ -200,10 +211,7 @@ def locked(folder: Path) -> Iterator[None]:
 
     The lock ends with the process, however that ends.
     """
-    from filelock import FileLock, Timeout
-
-    try:
-        with FileLock(folder / LOCK, timeout=0):
-            yield
-    except Timeout:
-        raise InputError(f"a campaign must be run by one process at a time, got another at work ({folder})") from None
+    busy = f"a campaign must be run by one process at a time, got another at work ({folder})"
+    with folders.locked(folder / LOCK, busy):
+        remove_temporaries(folder)
+        yield

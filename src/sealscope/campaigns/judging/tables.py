@@ -12,7 +12,7 @@ from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.judging.judge import Judgement
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.evaluation.binomial import Proportion
-from sealscope.recordings.atomic import atomic_write
+from sealscope.storage.atomic import atomic_write
 
 Value = str | float | int | None
 

@@ -28,7 +28,7 @@ from sealscope.campaigns.plans.model import (
 )
 from sealscope.campaigns.plans.table import PlanTable
 from sealscope.errors import InputError
-from sealscope.parameters.toml_file import read_toml
+from sealscope.storage.toml_file import read_toml
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -37,6 +37,7 @@ _T = TypeVar("_T")
 _PACKAGED = Path(__file__).parent / "packaged"
 #: Most records of a campaign: a mistyped count shall not plan a year of work.
 MOST_RECORDS = 1_000_000
+_LONGEST_NAME = 80
 #: Most groups of features to choose from: more have too many unions to try them all.
 MOST_GROUPS = 8
 
@@ -101,9 +102,7 @@ def _in(entry: str, place: str, read: Callable[[], _T]) -> _T:
 
 def _simulated(tree: Mapping[str, Any], place: str) -> SimulatedPlan:
     head = PlanTable(tree.get("campaign", {}), "campaign", place)
-    name = head.text("name")
-    if not all(c.isalnum() or c in "-_." for c in name) or name.startswith("."):
-        raise head.fail(f"name must be of letters, digits, '-', '_' and '.', got {name!r}")
+    name = _name(head)
     duration = head.number("duration", unit="s")
     onset = head.number("onset", duration / 2, unit="s")
     if not 0.0 < onset < duration:
@@ -127,6 +126,15 @@ def _simulated(tree: Mapping[str, Any], place: str) -> SimulatedPlan:
         raise InputError(f"a campaign must have at most {MOST_RECORDS} records, got {plan.size} ({place})")
     _enough_records(plan)
     return plan
+
+
+def _name(head: PlanTable) -> str:
+    """Return the campaign's name, which is that of its folder as well."""
+    name = head.text("name")
+    if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _LONGEST_NAME:
+        most = f"{_LONGEST_NAME} letters, digits, '-', '_' and '.'"
+        raise head.fail(f"name must be of at most {most}, got {name[:99]!r}")
+    return name
 
 
 def _rig(head: PlanTable) -> Rig:
@@ -236,7 +244,7 @@ def _recorded(tree: Mapping[str, Any], place: str) -> RecordedPlan:
     channel_map = part.take("map", {})
     if not isinstance(channel_map, dict) or not all(isinstance(column, str) for column in channel_map.values()):
         raise part.fail(f"map must be a table of channel = column, got {channel_map!r}")
-    name = head.text("name")
+    name = _name(head)
     plan = RecordedPlan(
         name=name,
         title=head.text("title", name),
@@ -273,7 +281,7 @@ def _recording_set(table: PlanTable) -> RecordingSet:
 def _held_out(tree: Mapping[str, Any], place: str) -> HeldOutPlan:
     head = PlanTable(tree.get("campaign", {}), "campaign", place)
     part = PlanTable(tree["held_out"], "held_out", place)
-    name, data = head.text("name"), part.choice("data", get_args(DataSet))
+    name, data = _name(head), part.choice("data", get_args(DataSet))
     plan = HeldOutPlan(
         name=name,
         title=head.text("title", name),

@@ -14,8 +14,9 @@ from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingP
 from sealscope.diagnosis.calibration.scorers import scorer, split_view
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
-from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.recording import Recording
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.opening import open_regular
 
 FORMAT = "sealscope calibration 2"
 #: How far outside the calibrated pressure levels a recording may lie: this share of their range, and this ratio.
@@ -241,9 +242,13 @@ def load(path: str | os.PathLike[str]) -> Calibration:
     """Read a calibration from a file; raises UnreadableFile, naming the file, where it is none."""
     file = Path(path)
     try:
-        if file.stat().st_size > _LARGEST_FILE:
+        with open_regular(file, "a calibration") as opened:
+            text = opened.read(_LARGEST_FILE + 1)
+        if len(text) > _LARGEST_FILE:
             raise UnreadableFile(f"a calibration must be at most {_LARGEST_FILE} bytes, got more ({file})")
-        tree = json.loads(file.read_bytes())
+        tree = json.loads(text)
+    except InputError as error:
+        raise UnreadableFile(str(error)) from None
     except OSError as error:
         raise UnreadableFile(f"a calibration must be readable, got: {error.strerror or error} ({file})") from None
     except (ValueError, RecursionError):

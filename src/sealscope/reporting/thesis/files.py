@@ -9,8 +9,9 @@ from dataclasses import astuple, fields
 from itertools import zip_longest
 from pathlib import Path
 
-from sealscope.recordings.atomic import atomic_write
 from sealscope.reporting.thesis.plots import draw, visible
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.folders import inner_folder
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
 
@@ -24,7 +25,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
     (`tables/ID-claims.csv` where a table has that name). Raises ValueError for an id that is no file name.
     """
     for name in ("figures", "tables"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+        inner_folder(folder, name)
     files: list[str] = []
 
     def put(name: str, content: bytes) -> None:

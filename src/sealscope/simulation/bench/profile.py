@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.errors import InputError
-from sealscope.parameters.toml_file import read_toml
 from sealscope.simulation.changes import Linear, ParameterDrift, drifts_absolutely
 from sealscope.simulation.commands import parse_command
+from sealscope.storage.toml_file import read_toml
 
 _PACKAGED = Path(__file__).parent / "profiles"
 _SHAPES = ("linear", "wander")

@@ -216,7 +216,7 @@ class Builder:
         record = self.folder.record(name, self.job.quick)
         valid = (
             record is not None
-            and record["key"] == self._key(item)
+            and record.get("key") == self._key(item)
             and record["sheet"] in (None, self.sheet_key)
             and record["runs"] in (None, sources_key(_RUNS))
             and all(self._stamp(other) == stamp for other, stamp in record["asked"].items())

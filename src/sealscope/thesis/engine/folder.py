@@ -9,23 +9,21 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
-from sealscope.errors import InputError
-from sealscope.recordings.atomic import atomic_write
+from sealscope.storage.atomic import atomic_write, remove_temporaries
+from sealscope.storage.folders import inner_folder, locked
+from sealscope.storage.opening import open_inner
 from sealscope.thesis.engine.context import SimulatedRun
 from sealscope.thesis.engine.products import Claim, Product
 from sealscope.thesis.engine.serialization import load, load_note, save
 
 #: Most bytes of runs that are kept; the ones unused for the longest time go first.
 MOST_RUN_BYTES = 1_000_000_000
-_TEMPORARY_AGE = 3600.0
+_LARGEST_NOTE = 1_000_000
 
 
 class ResultsFolder:
@@ -33,22 +31,16 @@ class ResultsFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._kept = folder / "kept"
-        try:
-            for name in ("items", "drawn", "runs", "failed"):
-                (self._kept / name).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot create folder: {error.strerror} ({folder})") from None
+        self._kept = inner_folder(folder, "kept")
+        for name in ("items", "drawn", "runs", "failed"):
+            inner_folder(self._kept, name)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Hold the folder while the block runs; raise InputError where another call holds it."""
-        try:
-            with FileLock(self._kept / "lock", timeout=0):
-                self._remove_temporaries()
-                yield
-        except Timeout:
-            raise InputError(f"a results folder must be used by one call at a time, got {self.folder}") from None
+        with locked(self._kept / "lock", f"a results folder must be used by one call at a time, got {self.folder}"):
+            remove_temporaries(self.folder)
+            yield
 
     def _item(self, item: str, quick: bool) -> Path:
         return self._kept / "items" / f"{item}{'.quick' if quick else ''}.npz"
@@ -69,28 +61,32 @@ class ResultsFolder:
 
     def keep_failure(self, item: str, trace: str) -> None:
         """Keep the traceback of an item that failed."""
-        (self._kept / "failed" / f"{item}.txt").write_text(trace, encoding="utf-8")
+        with atomic_write(self._kept / "failed" / f"{item}.txt") as temporary:
+            temporary.write_text(trace, encoding="utf-8")
 
     def drawn(self, item: str) -> tuple[str, tuple[str, ...]]:
         """Return the key of what was last drawn of an item, empty where a file of it is gone, and the drawn files."""
         try:
-            note = json.loads((self._kept / "drawn" / f"{item}.json").read_text(encoding="utf-8"))
+            with open_inner(self._kept / "drawn" / f"{item}.json", "a note of drawn files") as file:
+                note = json.loads(file.read(_LARGEST_NOTE))
             key, files = str(note["key"]), tuple(map(str, note["files"]))
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return "", ()
         return key if all((self.folder / name).is_file() for name in files) else "", files
 
     def keep_drawn(self, item: str, key: str, files: tuple[str, ...]) -> None:
         """Note what was drawn; remove files of an earlier drawing that are no longer made."""
         for name in set(self.drawn(item)[1]) - set(files):
-            (self.folder / name).unlink(missing_ok=True)
+            path = self.folder / name
+            if path.parent.resolve().is_relative_to(self.folder.resolve()):  # the note may be a stranger's
+                path.unlink(missing_ok=True)
         with atomic_write(self._kept / "drawn" / f"{item}.json") as temporary:
             temporary.write_text(json.dumps({"key": key, "files": files}, indent=1) + "\n", encoding="utf-8")
 
     def run(self, key: str, simulate: Callable[[], SimulatedRun]) -> SimulatedRun:
         """Return the run kept under `key`, or simulate it while other processes that want it wait."""
         path = self._kept / "runs" / f"{key}.npz"
-        with FileLock(path.with_name(f"{key[:2]}.lock")):
+        with locked(path.with_name(f"{key[:2]}.lock"), None):
             run = load(path)
             if isinstance(run, SimulatedRun):
                 with suppress(OSError):
@@ -113,11 +109,3 @@ class ResultsFolder:
             with suppress(OSError):
                 path.unlink()
                 total -= size
-
-    def _remove_temporaries(self) -> None:
-        """Remove the temporary files that a killed call left."""
-        old = time.time() - _TEMPORARY_AGE
-        for path in self.folder.rglob(".*.part"):
-            with suppress(OSError):
-                if path.stat().st_mtime < old:
-                    path.unlink()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import zipfile
+import logging
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -11,11 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.recordings.atomic import atomic_write
 from sealscope.recordings.recording import Recording
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.opening import open_inner
 from sealscope.thesis.engine.context import SimulatedRun
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 
+_log = logging.getLogger(__name__)
+#: Most bytes that a kept file may unpack to.
+_LARGEST = 4_000_000_000
 _TYPES = {
     kind.__name__: kind
     for kind in (Claim, Figure, Image, Number, Panel, FigureCurve, ThesisTable, SimulatedRun, Recording)
@@ -48,10 +52,14 @@ def load_note(path: Path) -> dict[str, Any] | None:
 
 def _read(path: Path, member: str) -> Any:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_inner(path, "a kept file") as opened, np.load(opened, allow_pickle=False) as file:
+            if sum(entry.file_size for entry in file.zip.infolist()) > _LARGEST:
+                return None
             content = json.loads(bytes(file[member]))
             return _unpacked(content, file) if member == "value" else content
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+    except Exception as error:  # unpacking a damaged file raises many kinds, as does building a product of its parts
+        if not isinstance(error, FileNotFoundError):
+            _log.debug("%s holds no %s: %s", path, member, error)
         return None
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.errors import InputError
+from sealscope.storage.opening import open_regular
 
 #: Largest file read [bytes]; what is larger is no file of settings.
 LARGEST = 1_000_000
@@ -18,8 +19,10 @@ def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
     Raises InputError where it cannot be read, is larger than `LARGEST`, is not UTF-8 or not TOML.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path, what) as file:
             data = file.read(LARGEST + 1)
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{what} must be readable, got: {reason} ({place})") from None

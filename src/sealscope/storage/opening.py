@@ -1,0 +1,62 @@
+"""Open files from outside: a pipe is not waited for, and in a folder of results no link is followed out of it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+from sealscope.errors import InputError
+
+_NO_WAITING = getattr(os, "O_NONBLOCK", 0)
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+#: How messages call what is no regular file.
+_KINDS = (
+    (stat.S_ISLNK, "a link"),
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def kind_of(mode: int) -> str | None:
+    """Return what a file of this `st_mode` is, in words; None for a regular file."""
+    return next((name for is_kind, name in _KINDS if is_kind(mode)), None)
+
+
+def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
+    """Open the regular file `path` to read; `what` it is ("a recording") stands in the error.
+
+    Raises InputError for a folder, pipe, socket or device, which may never end; OSError where it cannot be opened.
+    """
+    return _opened(path, what, "rb", _NO_WAITING)
+
+
+def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:
+    """Open a file of a folder of results: `rb` to read, `ab+` to append to it, and to create it first if need be.
+
+    The folder may come from a stranger. Raises InputError for a link, for anything else that is no regular file and,
+    to write, for a file with another name beside this one (a hard link); OSError where it cannot be opened.
+    """
+    if Path(path).is_symlink():
+        raise InputError(f"{what} must be a file, got a link ({path})")
+    return _opened(path, what, mode, _NO_WAITING | _NO_LINK)
+
+
+def _opened(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"], more: int) -> BinaryIO:
+    flags = os.O_RDONLY if mode == "rb" else os.O_RDWR | os.O_CREAT | os.O_APPEND
+    try:
+        number = os.open(path, flags | more | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0), 0o666)
+    except IsADirectoryError:
+        raise InputError(f"{what} must be a file, got a folder ({path})") from None
+    status = os.fstat(number)
+    kind = kind_of(status.st_mode)
+    if kind is None and mode != "rb" and status.st_nlink > 1:
+        kind = f"one of {status.st_nlink} hard links"
+    if kind is not None:
+        os.close(number)
+        raise InputError(f"{what} must be a file, got {kind} ({path})")
+    return os.fdopen(number, mode)

@@ -1,0 +1,187 @@
+"""A stranger's folder of results: whatever is a link in it, nothing outside is written, emptied or removed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sealscope.campaigns.execution import store
+from sealscope.campaigns.execution.run import run
+from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.campaigns.plans.reader import load_plan
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.storage.atomic import atomic_write, remove_temporaries
+from sealscope.storage.opening import open_inner, open_regular
+from sealscope.thesis.engine.build import reproduce
+from sealscope.thesis.engine.folder import ResultsFolder
+
+PLAN = """
+[campaign]
+name = "linked"
+duration = "6 s"
+detectors = ["sign rule: d3 of p_A fell"]
+keep_recordings = true
+
+[[records]]
+count = 1
+"""
+
+
+@pytest.fixture
+def outside(tmp_path: Path) -> Iterator[Path]:
+    """A folder with a file, outside the folder of results; both must stay as they are."""
+    folder = tmp_path / "outside"
+    folder.mkdir()
+    (folder / "diary.txt").write_text("what was there before\n")
+    yield folder
+    assert [path.name for path in folder.iterdir()] == ["diary.txt"]
+    assert (folder / "diary.txt").read_text() == "what was there before\n"
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> SimulatedPlan:
+    (tmp_path / "plan.toml").write_text(PLAN)
+    return load_plan(tmp_path / "plan.toml")  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("name", [store.LOCK, store.ROWS, store.HEAD])
+@pytest.mark.parametrize("kind", ["link", "link to nothing", "hard link"])
+def test_a_campaign_follows_no_link(name: str, kind: str, plan: SimulatedPlan, outside: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "campaign"
+    folder.mkdir()
+    if kind == "hard link":
+        os.link(outside / "diary.txt", folder / name)
+    else:
+        (folder / name).symlink_to(outside / ("diary.txt" if kind == "link" else "new.txt"))
+    with pytest.raises(InputError, match=r"got (a link|one of 2 hard links|something else) .*" + re.escape(name)):
+        run(plan, folder, jobs=1)
+
+
+def test_a_campaign_writes_no_recording_through_a_linked_folder(
+    plan: SimulatedPlan, outside: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "campaign").mkdir()
+    (tmp_path / "campaign" / "recordings").symlink_to(outside)
+    with pytest.raises(InputError, match=r"a folder of results must not be a link, got one .*recordings"):
+        run(plan, tmp_path / "campaign", jobs=1)
+
+
+@pytest.mark.parametrize("name", ["rows.jsonl", "campaign.json", ".lock"])
+def test_a_pipe_in_a_folder_is_not_waited_for(name: str, plan: SimulatedPlan, tmp_path: Path) -> None:
+    (tmp_path / "campaign").mkdir()
+    os.mkfifo(tmp_path / "campaign" / name)
+    with pytest.raises(InputError, match="got a pipe"):
+        run(plan, tmp_path / "campaign", jobs=1)
+
+
+@pytest.mark.parametrize("name", ["kept", "kept/items", "kept/drawn", "kept/runs", "kept/failed", "kept/lock"])
+def test_a_reproduction_follows_no_link(name: str, outside: Path, tmp_path: Path) -> None:
+    path = tmp_path / "thesis" / name
+    path.parent.mkdir(parents=True)
+    path.symlink_to(outside / "diary.txt" if name.endswith("lock") else outside)
+    with pytest.raises(InputError, match=r"got (a link|one) "):
+        reproduce(["table-5.1"], tmp_path / "thesis", jobs=1)
+
+
+@pytest.mark.parametrize("name", ["figures", "tables"])
+def test_products_go_into_no_linked_folder(name: str, outside: Path, tmp_path: Path) -> None:
+    from sealscope.reporting.thesis.files import publish
+
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / name).symlink_to(outside)
+    with pytest.raises(InputError, match="a folder of results must not be a link"):
+        publish(None, (), tmp_path / "thesis")  # type: ignore[arg-type]  # the folders are first
+
+
+def test_a_note_of_drawn_files_removes_nothing_elsewhere(outside: Path, tmp_path: Path) -> None:
+    kept = ResultsFolder(tmp_path / "thesis")
+    (tmp_path / "thesis" / "linked").symlink_to(outside)
+    names = ["../outside/diary.txt", str(outside / "diary.txt"), "linked/diary.txt", "tables/old.csv"]
+    (tmp_path / "thesis" / "tables").mkdir()
+    (tmp_path / "thesis" / "tables" / "old.csv").touch()
+    (tmp_path / "thesis" / "kept" / "drawn" / "tab-1.json").write_text(json.dumps({"key": "k", "files": names}))
+    kept.keep_drawn("tab-1", "new", ())
+    assert not (tmp_path / "thesis" / "tables" / "old.csv").exists()
+
+
+def test_a_kept_file_or_failure_is_no_link(outside: Path, tmp_path: Path) -> None:
+    kept = ResultsFolder(tmp_path / "thesis")
+    for place in ("failed/tab-1.txt", "items/tab-1.npz", "drawn/tab-1.json"):
+        (tmp_path / "thesis" / "kept" / place).symlink_to(outside / "diary.txt")
+    kept.keep_failure("tab-1", "trace")
+    kept.keep_drawn("tab-1", "key", ())
+    kept.keep("tab-2", True, {}, ())
+    assert kept.products("tab-1", False) is None
+    assert (tmp_path / "thesis" / "kept" / "failed" / "tab-1.txt").read_text() == "trace"
+
+
+@pytest.mark.parametrize("name", ["out.nc", "out.csv", "page.html", "calibration.json"])
+def test_a_file_to_write_takes_the_place_of_a_link(name: str, outside: Path, tmp_path: Path) -> None:
+    """simulate, convert, report and calibrate write their one file with `atomic_write`."""
+    (tmp_path / name).symlink_to(outside / "diary.txt")
+    with atomic_write(tmp_path / name) as temporary:
+        temporary.write_text("new")
+    assert not (tmp_path / name).is_symlink()
+    assert (tmp_path / name).read_text() == "new"
+
+
+@pytest.mark.parametrize("kind", ["simulated", "recordings", "held out"])
+@pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "a" * 81])
+def test_a_plan_names_no_folder_elsewhere(kind: str, name: str, tmp_path: Path) -> None:
+    more = {
+        "simulated": 'duration = "6 s"\ndetectors = ["rms change"]\n[[records]]\ncount = 1',
+        "recordings": 'detectors = ["rms change"]\n[recordings]\n[[recordings.sets]]\nfiles = "*.csv"',
+        "held out": '[held_out]\ndata = "appendix-c"\n[[held_out.detectors]]\nname = "a"\nfeatures = ["b"]',
+    }[kind]
+    (tmp_path / "plan.toml").write_text(f'[campaign]\nname = "{name}"\n{more}\n')
+    with pytest.raises(InputError, match="name must be of at most 80 letters, digits"):
+        load_plan(tmp_path / "plan.toml")
+
+
+def test_what_is_no_file_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "a pipe"), (tmp_path / "link", "a pipe"), (tmp_path, "a folder")):
+        with pytest.raises(InputError, match=f"a plan must be a file, got {kind}"):
+            open_regular(path, "a plan")
+    with pytest.raises(InputError, match="got a device"):
+        open_regular("/dev/zero", "a plan")
+    with pytest.raises(InputError, match="got a link"):
+        open_inner(tmp_path / "link", "a plan")
+
+
+def test_readers_do_not_wait_for_a_pipe(tmp_path: Path) -> None:
+    from sealscope.diagnosis.calibration.thresholds import load
+    from sealscope.parameters import load_rig
+    from sealscope.recordings import read
+
+    for name, reader in (("log.csv", read), ("calibration.json", load), ("rig.toml", load_rig), ("p.toml", load_plan)):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(InputError, match="must be a file, got a pipe") as caught:
+            reader(tmp_path / name)  # type: ignore[operator]
+        assert isinstance(caught.value, UnreadableFile) == (reader in (read, load))
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "out.nc") as temporary:
+        alive = temporary.name
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+    gone = re.sub(r"-\d+\.", "-999999999.", alive)
+    strange = re.sub(r"[0-9a-f]{6}-", "000000-", gone)
+    (tmp_path / "inner").mkdir()
+    others = [".vimrc.part", "film.part", gone.replace("out.nc", "other.nc"), alive, strange]
+    for name in (gone, *others, f"inner/{gone}"):
+        (tmp_path / name).touch()
+    old = tmp_path / strange.replace("out", "old")
+    old.touch()
+    os.utime(old, (0, 0))
+    remove_temporaries(tmp_path, "out.nc")
+    assert {path.name for path in tmp_path.iterdir()} == {*others, "inner", old.name}
+    remove_temporaries(tmp_path)
+    assert {path.name for path in tmp_path.rglob("*")} == {".vimrc.part", "film.part", alive, strange, "inner"}
