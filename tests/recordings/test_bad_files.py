@@ -82,11 +82,11 @@ def test_text(tmp_path: Path, content: str, message: str) -> None:
     ("content", "part"),
     [
         (bytes(range(256)) * 40, "other binary data"),
-        (b"MATLAB 5.0 MAT-file, Platform", "a MATLAB file"),
-        (b"TDSm" + bytes(40), "a TDMS file"),
-        (b"MDF     4.10", "an MDF file"),
-        (b"PK\x03\x04" + bytes(40), "ZIP archive or an Excel workbook"),
-        (b"\x1f\x8b\x08\x00" + bytes(40), "a gzip archive"),
+        (b"MATLAB 5.0 MAT-file, Platform", "a MATLAB file must be whole"),
+        (b"TDSm" + bytes(40), "a TDMS file must be whole"),
+        (b"MDF     4.10", "an MDF file must be whole"),
+        (b"PK\x03\x04" + bytes(40), "a zip archive must be whole"),
+        (b"\x1f\x8b\x08\x00" + bytes(40), "a gzip archive must be whole"),
         (b"CDF\x01" + bytes(40), "a NetCDF-3 file"),
         (b"\x89HDF\r\n\x1a\n" + bytes(40), "a NetCDF or HDF5 file must be whole"),
         (b"\x89HDF\r\n\x1a\n", "a NetCDF or HDF5 file must be whole"),
@@ -176,7 +176,10 @@ def test_missing_mapped_column(tmp_path: Path) -> None:
     [
         ({"rate": 0.0}, "rate must be > 0 Hz, got 0.0"),
         ({"rate": float("nan")}, "rate must be > 0 Hz, got nan"),
-        ({"format": "xlsx"}, "format must be one of netcdf, parquet, text, got xlsx"),
+        (
+            {"format": "xlsx"},
+            "format must be one of lvm, matlab, .*, text, got xlsx",
+        ),
         ({"channel_map": {"P_X": "a"}}, "a mapped channel must be one of"),
     ],
 )

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError, UnreadableFile
@@ -182,6 +182,7 @@ def test_a_time_axis_that_starts_late_stays(tmp_path: Path) -> None:
     units_row=st.booleans(),
     preamble=st.lists(st.sampled_from(["Rig", "Operator: N. N.", "Rate = 500 Hz", "# remark"]), max_size=3),
 )
+@example("  ", False, [[0.0] * 3] * 2, False, ["Rig", "Rate = 500 Hz", "Rate = 500 Hz"])
 def test_any_layout_gives_the_same_numbers(
     tmp_path: Path, delimiter: str, comma: bool, values: list[list[float]], units_row: bool, preamble: list[str]
 ) -> None:

@@ -7,13 +7,19 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
+from typing import cast
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
+from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import check_call, choose_columns
+from sealscope.recordings.formats.lvm import is_lvm
+from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.table import Choose, RawTable
+from sealscope.recordings.formats.text_layout import SNIFF
 from sealscope.recordings.recording import Recording
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular
@@ -21,7 +27,7 @@ from sealscope.storage.opening import open_regular
 Reader = Callable[[Path, Choose], RawTable]
 Writer = Callable[..., None]
 _log = logging.getLogger(__name__)
-#: Suffix -> format.
+#: Suffix -> format of a file to write.
 SUFFIXES: Mapping[str, str] = {
     ".nc": "netcdf",
     ".nc4": "netcdf",
@@ -33,65 +39,79 @@ SUFFIXES: Mapping[str, str] = {
     ".parquet": "parquet",
     ".pq": "parquet",
 }
+#: Suffix -> format of a file that is read only.
+_READ_ONLY = {
+    ".mat": "matlab",
+    ".tdms": "tdms",
+    ".mdf": "mdf",
+    ".mf4": "mdf",
+    ".lvm": "lvm",
+    ".xlsx": "spreadsheet",
+    ".xlsm": "spreadsheet",
+    ".xlsb": "spreadsheet",
+    ".xls": "spreadsheet",
+    ".ods": "spreadsheet",
+}
+#: Formats that are read, and what each is in words.
+_NAMES = {
+    "netcdf": "a NetCDF or HDF5",
+    "parquet": "a Parquet",
+    "text": "a text",
+    "matlab": "a MATLAB",
+    "tdms": "a TDMS",
+    "mdf": "an MDF",
+    "lvm": "a LabVIEW measurement",
+    "spreadsheet": "a spreadsheet",
+}
+#: First bytes -> format.
+_MAGIC = {
+    b"PAR1": "parquet",
+    b"MATLAB 5.0": "matlab",
+    b"MATLAB 7.": "matlab",
+    b"TDSm": "tdms",
+    b"MDF     ": "mdf",
+    b"UnFinMF ": "mdf",
+    b"PK\x03\x04": "spreadsheet",
+    b"\xd0\xcf\x11\xe0": "spreadsheet",
+    b"\x89HDF\r\n\x1a\n": "netcdf",
+}
 #: First bytes of formats that are known and not read.
 _FOREIGN = {
     b"CDF\x01": "a NetCDF-3 file: convert it to NetCDF-4",
     b"CDF\x02": "a NetCDF-3 file: convert it to NetCDF-4",
     b"CDF\x05": "a NetCDF-3 file: convert it to NetCDF-4",
-    b"MATLAB 5.0": "a MATLAB file: save it as -v7.3 or CSV",
-    b"TDSm": "a TDMS file: export it as CSV",
-    b"MDF     ": "an MDF file: export it as CSV",
-    b"PK\x03\x04": "a ZIP archive or an Excel workbook: export it as CSV",
-    b"\x1f\x8b": "a gzip archive: unpack it",
     b"%PDF": "a PDF document",
 }
-_NAMES = {"netcdf": "NetCDF or HDF5", "parquet": "Parquet", "text": "text"}
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def _format_of(path: Path) -> str:
     """Return the format of a file by its content; raise UnreadableFile where it is none that is read."""
-    place = str(path)
-    try:
-        with open_regular(path, "a recording") as file:
-            head = file.read(16)
-            if head.startswith(_HDF5):
+    with open_regular(path, "a recording") as file:
+        head = file.read(SNIFF)
+        for magic, kind in _MAGIC.items():
+            if head.startswith(magic):
+                return kind
+        for magic, name in _FOREIGN.items():
+            if head.startswith(magic):
+                raise UnreadableFile(f"a recording must be in a format that is read, got {name} ({path})")
+        for offset in (512, 1024, 2048, 4096):  # HDF5 may begin after a block of the user's
+            file.seek(offset)
+            if file.read(8) == _HDF5:
                 return "netcdf"
-            if head.startswith(b"PAR1"):
-                return "parquet"
-            for magic, name in _FOREIGN.items():
-                if head.startswith(magic):
-                    raise UnreadableFile(f"a recording must be text, NetCDF, HDF5 or Parquet, got {name} ({place})")
-            for offset in (512, 1024, 2048, 4096):  # HDF5 may begin after a block of the user's, as MATLAB's does
-                file.seek(offset)
-                if file.read(8) == _HDF5:
-                    return "netcdf"
-    except UnreadableFile:
-        raise
-    except InputError as error:
-        raise UnreadableFile(str(error)) from None
-    except FileNotFoundError:
-        raise UnreadableFile(f"a recording must exist, got no such file ({place})") from None
-    except (OSError, ValueError) as error:
-        raise UnreadableFile(
-            f"a recording must be readable, got: {getattr(error, 'strerror', None) or error} ({place})"
-        ) from error
-    return "text"
+    if is_matlab_4(head):
+        return "matlab"
+    return "lvm" if is_lvm(head) else "text"
 
 
-def _functions(kind: str) -> tuple[Reader, Writer]:
-    """Return what reads and what writes a format; its library is loaded now."""
-    if kind == "netcdf":
-        from sealscope.recordings.formats.netcdf import read_netcdf, write_netcdf
+def _reader(kind: str) -> Reader:
+    """Return ``read_KIND`` of the format's module; its library is loaded now."""
+    return cast("Reader", getattr(import_module(f"sealscope.recordings.formats.{kind}"), f"read_{kind}"))
 
-        return read_netcdf, write_netcdf
-    if kind == "parquet":
-        from sealscope.recordings.formats.parquet import read_parquet, write_parquet
 
-        return read_parquet, write_parquet
-    from sealscope.recordings.formats.text import read_text, write_text
-
-    return read_text, write_text
+def _writer(kind: str) -> Writer:
+    """Return ``write_KIND`` of the format's module; its library is loaded now."""
+    return cast("Writer", getattr(import_module(f"sealscope.recordings.formats.{kind}"), f"write_{kind}"))
 
 
 @checked_call
@@ -102,7 +122,11 @@ def read(
     rate: float | None = None,
     format: str | None = None,
 ) -> Recording:
-    r"""Read the recording in a file: the text of any logger, NetCDF-4, HDF5 or Parquet.
+    r"""Read the recording in a file: the text of any logger, or the file of a measurement program.
+
+    Formats: text, NetCDF-4, HDF5, Parquet, TDMS, MATLAB (v4 to v7.3), MDF 3 and 4, LabVIEW's .lvm and spreadsheets
+    (.xlsx, .xlsb, .xls, .ods), each also inside .gz, .bz2, .xz, .zst or .zip. Channels of different rates are brought
+    to the clock of the chamber pressures; the history says how.
 
     Parameters
     ----------
@@ -113,7 +137,7 @@ def read(
         without any unit is raw counts.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
-    format : {"text", "netcdf", "parquet"}, optional
+    format : {"text", "netcdf", "parquet", "matlab", "tdms", "mdf", "lvm", "spreadsheet"}, optional
         What the content must be.
 
     Returns
@@ -128,7 +152,7 @@ def read(
     InputError
         If `channel_map`, `rate` or `format` is wrong.
     MissingExtra
-        If the file is a Parquet table and pyarrow is not installed.
+        If the library that reads the format is not installed.
 
     Examples
     --------
@@ -143,18 +167,39 @@ def read(
     """
     file, channel_map = Path(path), channel_map or {}
     check_call(channel_map, rate)
-    if format is not None and format not in SUFFIXES.values():
-        raise InputError(f"format must be one of {', '.join(sorted(set(SUFFIXES.values())))}, got {format}")
+    if format is not None and format not in _NAMES:
+        raise InputError(f"format must be one of {', '.join(sorted(_NAMES))}, got {format}")
+    try:
+        archive = archive_of(file)
+        if archive is None:
+            return _read(file, file.name, channel_map, rate, format)
+    except UnreadableFile:
+        raise
+    except InputError as error:
+        raise UnreadableFile(str(error)) from None
+    except FileNotFoundError:
+        raise UnreadableFile(f"a recording must exist, got no such file ({file})") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UnreadableFile(f"a recording must be readable, got: {reason} ({file})") from error
+    with unpacked(file, archive) as inner:
+        try:
+            return _read(inner, file.name, channel_map, rate, format)
+        except UnreadableFile as error:
+            raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
+
+
+def _read(file: Path, name: str, channel_map: Mapping[str, str], rate: float | None, format: str | None) -> Recording:
+    """Read a file that is no archive; `name`: what the recording's provenance calls it."""
     kind = _format_of(file)
     if format not in (None, kind):
         raise UnreadableFile(f"a file read as {format} must be {format}, got {kind} ({file})")
     choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(file))
-    read_table, _ = _functions(kind)
     try:
-        table = read_table(file, choose)
-        if format is None and SUFFIXES.get(file.suffix.lower(), kind) != kind:
+        table = _reader(kind)(file, choose)
+        if format is None and {**SUFFIXES, **_READ_ONLY}.get(file.suffix.lower(), kind) != kind:
             table = replace(table, notes=(f"name ends in {file.suffix}, content is {table.kind}", *table.notes))
-        return Recording(*table.samples({"file": file.name}, rate=rate, infer_rate=bool(channel_map)))
+        return Recording(*table.samples({"file": name}, rate=rate, infer_rate=bool(channel_map)))
     except (MissingExtra, UnreadableFile):
         raise
     except InputError as error:
@@ -164,7 +209,7 @@ def read(
     except Exception as error:  # format libraries raise whatever a damaged file makes them
         _log.debug("cannot read %s", file, exc_info=True)
         text = " ".join(str(error).split())[:160] or type(error).__name__
-        raise UnreadableFile(f"a {_NAMES[kind]} file must be whole, got: {text} ({file})") from error
+        raise UnreadableFile(f"{_NAMES[kind]} file must be whole, got: {text} ({file})") from error
 
 
 def check_target(path: str | os.PathLike[str]) -> str:
@@ -221,7 +266,7 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
             raise InputError(f"a channel to write must be one of {', '.join(CHANNEL_UNITS)}, got {name}")
         if unit not in (CHANNEL_UNITS[name], COUNTS):
             raise InputError(f"channel {name} must be in {CHANNEL_UNITS[name]} or {COUNTS} to be written, got {unit}")
-    _, write_table = _functions(kind)
+    write_table = _writer(kind)
     delimiter = {"delimiter": "," if file.suffix.lower() == ".csv" else "\t"} if kind == "text" else {}
     values, units, description = recording.series()
     with atomic_write(file) as temporary:

@@ -44,7 +44,7 @@ def read_netcdf(path: Path, choose: Choose) -> RawTable:
                     f"{name} must have as many samples as {first} ({data.size}), got {other.size} ({place})"
                 )
         for name, data in chosen:
-            _refuse_elsewhere(name, data, place)
+            refuse_elsewhere(name, data, place)
         check_size(data.size, len(chosen), place)
         columns = [
             _values(data, name, time, place) for (_, time), (name, data) in zip(choice.columns, chosen, strict=True)
@@ -62,7 +62,7 @@ def _is_series(item: Any) -> bool:
     return not (isinstance(remark, bytes) and remark.startswith(b"This is a netCDF dimension but not"))
 
 
-def _refuse_elsewhere(name: str, data: Any, place: str) -> None:
+def refuse_elsewhere(name: str, data: Any, place: str) -> None:
     """Raise UnreadableFile for a data set whose samples are in other files, which nobody has given to be read."""
     if data.external or data.is_virtual:
         what = "external storage" if data.external else "a virtual data set"

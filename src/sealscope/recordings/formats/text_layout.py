@@ -107,9 +107,11 @@ def _look(body: Sequence[str]) -> tuple[str, str, int]:
         valued = [(row, many) for row, many in zip(rows, values, strict=True) if many and len(row) > 1]
         if not valued:
             continue
-        counts = Counter(len(row) for row, _ in valued)
-        width = max(counts, key=lambda w: (counts[w], w))
-        if counts[width] < 0.5 * len(valued):
+        held = Counter[int]()  # values by the width of their row
+        for row, many in valued:
+            held[len(row)] += many
+        width = max(held, key=lambda w: (held[w], w))
+        if 2 * held[width] < held.total():
             continue
         present = sum(cell.strip().lower() not in MISSING for row, _ in valued for cell in row)
         share = sum(many for row, many in valued if len(row) == width) / present
@@ -201,7 +203,8 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
     body = content[max(1, min(len(content) // 2, len(content) - 20)) :][-_SAMPLE_ROWS:] or content
     delimiter, decimal, width = _look(body)
     rows = [row for row in (cells_of(line, delimiter) for line in body) if len(row) == width]
-    rows = [row for row in rows if any(_is_value(cell, decimal) for cell in row)]
+    values = [sum(_is_value(cell, decimal) for cell in row) for row in rows]
+    rows = [row for row, count in zip(rows, values, strict=True) if 0 < max(values) <= 2 * count]  # no preamble
     numeric = [
         i
         for i in range(width)

@@ -1,0 +1,105 @@
+"""Recordings inside an archive (.gz, .bz2, .xz, .zst, .zip), unpacked into a private folder while they are read."""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, cast
+
+from sealscope.errors import MissingExtra, UnreadableFile
+from sealscope.storage.opening import open_regular
+
+#: First bytes -> archive.
+_MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "xz", b"\x28\xb5\x2f\xfd": "zstd", b"PK\x03\x04": "zip"}
+#: A workbook is a ZIP archive with one of these members.
+_WORKBOOK = ("[Content_Types].xml", "mimetype")
+#: Most bytes that an archive may unpack to.
+LARGEST = 8 * 2**30
+_CHUNK = 2**20
+
+
+def archive_of(path: Path) -> str | None:
+    """Return the kind of archive that a file is by its first bytes; None for a workbook and any other file."""
+    with open_regular(path, "a recording") as file:
+        head = file.read(8)
+    kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
+    return None if kind == "zip" and is_workbook(path) else kind
+
+
+def is_workbook(path: Path) -> bool:
+    """Return whether a ZIP archive is a spreadsheet."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name in archive.NameToInfo for name in _WORKBOOK)
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        return False
+
+
+@contextmanager
+def unpacked(path: Path, kind: str) -> Iterator[Path]:
+    """Unpack the single file of an archive, and remove it at the end.
+
+    Raises UnreadableFile where a ZIP holds no file or several, where the archive is damaged, and where it unpacks to
+    more than `LARGEST` bytes; MissingExtra for .zst without pyarrow.
+    """
+    with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
+        name = path.stem if path.suffix.lower() in (".gz", ".bz2", ".xz", ".zst", ".zip") else path.name
+        try:
+            with _opened(path, kind) as (source, member):
+                last = Path(member or name).name
+                target = Path(folder) / (last if last.strip(".") else "recording")
+                _copy(source, target, path)
+        except (UnreadableFile, MissingExtra):
+            raise
+        except Exception as error:  # each library has kinds of its own for a damaged archive
+            text = " ".join(str(error).split())[:160] or type(error).__name__
+            raise UnreadableFile(f"a {kind} archive must be whole, got: {text} ({path})") from error
+        yield target
+
+
+@contextmanager
+def _opened(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str]]:
+    if kind == "zip":
+        with zipfile.ZipFile(path) as archive:
+            members = [info for info in archive.infolist() if not info.is_dir() and "__MACOSX" not in info.filename]
+            if len(members) != 1:
+                names = ", ".join(info.filename[:40] for info in members[:6]) or "none"
+                raise UnreadableFile(f"an archive must hold a single file, got {len(members)}: {names} ({path})")
+            with archive.open(members[0]) as file:
+                yield file, members[0].filename
+        return
+    with cast("IO[bytes]", _stream(path, kind)) as file:
+        yield file, ""
+
+
+def _stream(path: Path, kind: str) -> Any:
+    if kind == "gzip":
+        import gzip
+
+        return gzip.open(path)
+    if kind == "bz2":
+        import bz2
+
+        return bz2.open(path)
+    if kind == "xz":
+        import lzma
+
+        return lzma.open(path)
+    try:
+        import pyarrow
+    except ImportError as error:
+        raise MissingExtra(".zst archives need pyarrow: pip install 'sealscope[io]'") from error
+    return pyarrow.CompressedInputStream(str(path), "zstd")
+
+
+def _copy(source: IO[bytes], target: Path, path: Path) -> None:
+    written = 0
+    with target.open("wb") as file:
+        while data := source.read(_CHUNK):
+            written += len(data)
+            if written > LARGEST:
+                raise UnreadableFile(f"an archive must unpack to at most {LARGEST} bytes, got more ({path})")
+            file.write(data)

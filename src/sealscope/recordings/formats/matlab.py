@@ -1,0 +1,211 @@
+"""MATLAB files of any version, with mat-io: vectors, matrices, structs, tables, timetables, timeseries, Simulink logs.
+
+A file is walked as a tree. A vector of either direction is a series, a matrix one a column of it; a struct, a table or
+an object is a group. What has the fields of a time series (``time`` and ``signals``, or ``Time`` and ``Data``) gives
+its series a clock.
+"""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.errors import MissingExtra, UnreadableFile
+from sealscope.recordings.formats.columns import Label
+from sealscope.recordings.formats.netcdf import refuse_elsewhere
+from sealscope.recordings.formats.series import Clock, Series, table_of
+from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable
+
+#: Deepest nesting that is walked, and most columns of a matrix that are taken for series.
+_DEEPEST = 8
+_MOST_COLUMNS = 256
+
+
+def is_matlab_4(head: bytes) -> bool:
+    """Return whether a file that begins with `head` is a MATLAB 4 file: five integers, and a name that ends in zero."""
+    for order in "<>" if len(head) > 20 else "":
+        kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head[:20])
+        machine, zero, precision, storage = kind // 1000, kind // 100 % 10, kind // 10 % 10, kind % 10
+        if (
+            machine == ("<>".index(order))
+            and zero == 0
+            and precision <= 5
+            and storage <= 2
+            and min(rows, columns) >= 0
+            and imaginary in (0, 1)
+            and 1 < length <= 64
+            and head[20 : 20 + length].find(b"\0") == length - 1
+        ):
+            return True
+    return False
+
+
+def read_matlab(path: Path, choose: Choose) -> RawTable:
+    """Read the chosen series of a MATLAB file; raise MissingExtra where mat-io is absent."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what its own libraries will change one day
+            from matio import load_from_mat, whosmat
+    except ImportError as error:
+        raise MissingExtra("MATLAB files need mat-io: pip install 'sealscope[io]'") from error
+    place = str(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on classes that have no meaning here
+        for name, (shape, *_) in whosmat(path).items():
+            if np.prod([float(length) for length in shape]) > MAX_VALUES:
+                raise UnreadableFile(f"{name} must have at most {MAX_VALUES} values, got the shape {shape} ({place})")
+        _refuse_elsewhere(path, place)
+        held = load_from_mat(path, add_table_attrs=True)
+    series = [
+        member for name, value in held.items() if not name.startswith("__") for member in _walk("", name, value, None)
+    ]
+    return table_of(series, choose, "MATLAB", place)
+
+
+def _refuse_elsewhere(path: Path, place: str) -> None:
+    """Raise UnreadableFile where a version 7.3 file, which is HDF5, refers to other files."""
+    import h5py
+
+    if not h5py.is_hdf5(path):
+        return
+    with h5py.File(path, "r") as file:
+        folders = [file]
+        while folders:
+            folder = folders.pop()
+            for name in folder:
+                if isinstance(folder.get(name, getlink=True), h5py.ExternalLink):
+                    raise UnreadableFile(f"{name} must be in the file itself, got a link to another file ({place})")
+                if isinstance(folder.get(name, getlink=True), h5py.HardLink):
+                    item = folder[name]
+                    if isinstance(item, h5py.Group):
+                        folders.append(item)
+                    elif isinstance(item, h5py.Dataset):
+                        refuse_elsewhere(name, item, place)
+
+
+def _walk(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
+    """Yield the series in a value called `name`, of the group `group`."""
+    inner = f"{group}/{name}" if group else name
+    if depth > _DEEPEST:
+        return
+    if (fields := _fields(value)) is not None:
+        yield from _group(group, name, fields, clock, depth)
+    elif hasattr(value, "columns") and hasattr(value, "index"):
+        yield from _frame(inner, value)
+    elif isinstance(value, np.ndarray) and value.dtype == object:
+        for number, member in enumerate(value.reshape(-1), start=1):
+            yield from _walk(group, name if value.size == 1 else f"{name}({number})", member, clock, depth + 1)
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiubmMU":
+        yield from _columns(group, name, value, None, clock)
+
+
+def _fields(value: Any) -> Mapping[str, Any] | None:
+    """Return the fields of a struct or the properties of an object; None for anything else."""
+    properties = getattr(value, "properties", None)
+    if isinstance(properties, Mapping):
+        return properties
+    if isinstance(value, Mapping):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
+        only = value.reshape(-1)[0]
+        return {name: only[name] for name in value.dtype.names}
+    if isinstance(value, np.ndarray) and value.dtype.names and 1 < value.size <= _MOST_COLUMNS:
+        members = value.reshape(-1)
+        return {f"({number})": members[number - 1 : number] for number in range(1, value.size + 1)}
+    return None
+
+
+def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
+    by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
+    time = _times(by_name)
+    if time is not None:
+        clock = Clock((group, name, depth), partial(np.asarray, time))
+        if "signals" in by_name:  # a structure with time, as Simulink's scopes write
+            for number, signal in enumerate(_members(by_name["signals"]), start=1):
+                label = _text(signal.get("label")) or f"{name}({number})"
+                yield from _columns("", label, np.asarray(signal.get("values")), None, clock)
+            return
+        if "data" in by_name:
+            label = _text(by_name.get("name")) or name
+            unit = _text((_fields(by_name.get("datainfo")) or {}).get("Units"))
+            yield from _columns(group, label, np.asarray(by_name["data"]), unit, clock)
+            return
+        clock = None  # a struct of vectors beside a vector called time: that is a column like the others
+    elif "values" in by_name and _text(by_name.get("name")):  # a signal of a Simulink log, named by the log
+        yield from _walk(group, _text(by_name["name"]), by_name["values"], clock, depth + 1)
+        return
+    inner = f"{group}/{name}" if group else name
+    for key, value in fields.items():
+        yield from _walk(inner, key, value, clock, depth + 1)
+
+
+def _times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """Return the times (n,) [s] that fields hold, as numbers or as start, increment and length; None without."""
+    if "signals" not in by_name and "data" not in by_name:
+        return None
+    time = by_name.get("time")
+    if isinstance(time, np.ndarray) and time.dtype.kind in "fiu" and time.size > 1:
+        return np.asarray(time, dtype=np.float64).reshape(-1)
+    info = _fields(by_name.get("timeinfo")) or {}
+    numbers = {key.rstrip("_"): _number(value) for key, value in info.items()}
+    step, length = numbers.get("Increment"), numbers.get("Length")
+    if step is None or length is None or not 1 < length <= MAX_VALUES:
+        return None
+    return (numbers.get("Start") or 0.0) + step * np.arange(int(length), dtype=np.float64)
+
+
+def _members(value: Any) -> list[Mapping[str, Any]]:
+    fields = _fields(value) or {}
+    members = [_fields(member) for member in fields.values()]
+    whole = [member for member in members if member is not None]
+    return whole if whole and all(key.startswith("(") for key in fields) else [fields]
+
+
+def _columns(group: str, name: str, value: NDArray[Any], unit: str | None, clock: Clock | None) -> Iterator[Series]:
+    """Yield a series for a vector, and one a column for a matrix, called `name(:,1)` and so on."""
+    if value.dtype.kind not in "fiubmMU":
+        return
+    flat = np.squeeze(value)
+    if flat.ndim == 1 and flat.size > 1:
+        yield Series(group, Label.parse(name, unit), flat.size, partial(np.asarray, flat), clock)
+    elif flat.ndim == 2 and min(flat.shape) <= _MOST_COLUMNS:
+        upright = flat if flat.shape[0] >= flat.shape[1] else flat.T
+        for number in range(upright.shape[1]):
+            label = Label(f"{name}(:,{number + 1})", f"{name}(:,{number + 1})", unit)
+            yield Series(group, label, upright.shape[0], partial(np.asarray, upright[:, number]), clock)
+
+
+def _frame(group: str, frame: Any) -> Iterator[Series]:
+    """Yield the columns of a table; the row times of a timetable are their clock."""
+    units = [str(unit) for unit in frame.attrs.get("VariableUnits", frame.attrs.get("varUnits", ()))]
+    clock = None
+    index = np.asarray(frame.index)
+    if index.dtype.kind == "m":
+        clock = Clock((group, "row times"), lambda: index.astype("timedelta64[ns]").astype(np.float64) / 1e9)
+    elif index.dtype.kind == "M":
+        start = index[0].astype("datetime64[ns]")
+        clock = Clock((group, "row times"), lambda: (index - index[0]) / np.timedelta64(1, "ns") / 1e9, start)
+    for number, name in enumerate(frame.columns):
+        unit = units[number] if number < len(units) and units[number] else None
+        values = np.asarray(frame[name])
+        yield Series(group, Label.parse(str(name), unit), len(values), partial(np.asarray, values), clock)
+
+
+def _text(value: Any) -> str:
+    """Return the text of a value of MATLAB's, empty where it is none."""
+    flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
+    return str(flat[0]).strip() if flat.size == 1 and isinstance(flat[0], str) else ""
+
+
+def _number(value: Any) -> float | None:
+    flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
+    if flat.size != 1 or flat.dtype.kind not in "fiu" or not np.isfinite(flat[0]):
+        return None
+    return float(flat[0])

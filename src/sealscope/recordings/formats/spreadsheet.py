@@ -1,0 +1,71 @@
+"""Spreadsheets (Excel's .xlsx, .xlsb and .xls, OpenDocument's .ods), with python-calamine: the sheet with a log.
+
+A sheet is written as text with tabs between its cells and read as any text log, so that headings, unit rows, lines
+above the header, stamps and missing cells follow the same rules.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from sealscope.errors import MissingExtra, UnreadableFile
+from sealscope.recordings.formats.table import Choose, RawTable, check_size
+from sealscope.recordings.formats.text import read_text
+
+
+def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
+    """Read the chosen columns of the first sheet that holds them, sheets with most rows first.
+
+    Raises MissingExtra where python-calamine is absent, and what the largest sheet lacks where no sheet holds a log.
+    """
+    try:
+        from python_calamine import CalamineWorkbook
+    except ImportError as error:
+        raise MissingExtra("spreadsheets need python-calamine: pip install 'sealscope[io]'") from error
+    place = str(path)
+    workbook = CalamineWorkbook.from_path(str(path))
+    sheets = [workbook.get_sheet_by_name(name) for name in workbook.sheet_names]
+    sheets = sorted((sheet for sheet in sheets if sheet.total_height), key=lambda sheet: -sheet.total_height)
+    if not sheets:
+        raise UnreadableFile(f"a workbook must have a sheet with rows, got none ({place})")
+    reason: UnreadableFile | None = None
+    for sheet in sheets:
+        check_size(sheet.total_height, sheet.total_width, place)
+        try:
+            table = _read_sheet(sheet, choose, place)
+        except UnreadableFile as error:
+            reason = reason or error
+            continue
+        notes = (f"sheet {sheet.name} of {len(workbook.sheet_names)}",) if len(workbook.sheet_names) > 1 else ()
+        return replace(table, kind="spreadsheet", notes=(*notes, *table.notes))
+    assert reason is not None
+    raise reason
+
+
+def _read_sheet(sheet: Any, choose: Choose, place: str) -> RawTable:
+    with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
+        text = Path(folder) / "sheet.tsv"
+        with text.open("w", encoding="utf-8", newline="\n") as file:
+            for row in sheet.iter_rows():
+                file.write("\t".join(map(_cell, row)) + "\n")
+        try:
+            return read_text(text, choose)
+        except UnreadableFile as error:
+            raise UnreadableFile(str(error).replace(str(text), f"sheet {sheet.name}, {place}")) from None
+
+
+def _cell(value: Any) -> str:
+    """Return a cell as text: numbers with all their digits, moments as ISO stamps, lengths of time in seconds."""
+    if isinstance(value, bool | None):
+        return ""
+    if isinstance(value, float | int):
+        return repr(value)
+    if isinstance(value, dt.timedelta):
+        return repr(value.total_seconds())
+    if isinstance(value, dt.datetime | dt.date | dt.time):
+        return value.isoformat()
+    return str(value).translate(str.maketrans("\t\r\n", "   "))

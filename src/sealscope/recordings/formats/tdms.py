@@ -1,0 +1,61 @@
+"""TDMS files of LabVIEW and its relatives, with npTDMS: groups of channels, each with the rate of its waveform."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.errors import MissingExtra
+from sealscope.recordings.formats.columns import Label
+from sealscope.recordings.formats.series import Clock, Series, table_of, uniform
+from sealscope.recordings.formats.table import Choose, RawTable
+
+_UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
+
+
+def read_tdms(path: Path, choose: Choose) -> RawTable:
+    """Read the chosen channels of a TDMS file; raise MissingExtra where npTDMS is absent.
+
+    A channel with the waveform's interval (``wf_increment``) has a clock; one without needs a time column or a rate.
+    """
+    try:
+        from nptdms import TdmsFile
+    except ImportError as error:
+        raise MissingExtra("TDMS needs npTDMS: pip install 'sealscope[io]'") from error
+    with TdmsFile.open(path) as file:
+        series = [
+            Series(
+                group.name,
+                Label.parse(channel.name, _unit(channel.properties)),
+                len(channel),
+                partial(_values, channel),
+                _clock(channel.properties, len(channel)),
+            )
+            for group in file.groups()
+            for channel in group.channels()
+        ]
+        return table_of(series, choose, "TDMS", str(path))
+
+
+def _values(channel: Any) -> NDArray[Any]:
+    return np.asarray(channel[:])
+
+
+def _unit(properties: Mapping[str, Any]) -> str | None:
+    return next((str(properties[key]) for key in _UNITS if properties.get(key)), None)
+
+
+def _clock(properties: Mapping[str, Any], count: int) -> Clock | None:
+    step = properties.get("wf_increment")
+    if not isinstance(step, float | int) or not step > 0:
+        return None
+    start = properties.get("wf_start_time")
+    moment = None if start is None else np.datetime64(start).astype("datetime64[ns]")
+    if moment is not None and (np.isnat(moment) or moment < np.datetime64("1971-01-01")):
+        moment = None  # a logger without a clock writes 1904
+    return uniform("waveform", count, float(step), float(properties.get("wf_start_offset", 0.0)), moment)
