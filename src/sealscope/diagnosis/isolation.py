@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.baseline.duty import DutyChange, duty_changes
 from sealscope.diagnosis.changepoint.even_drift import step_near
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence
 from sealscope.recordings.chambers import CHAMBERS
@@ -47,9 +48,9 @@ _SHORTEST = 64
 
 @dataclass(frozen=True)
 class OtherCause:
-    """What stepped, and a description that says by how much."""
+    """What stepped, and a description that says by how much; no cause where a leak may be it, too."""
 
-    cause: Cause
+    cause: Cause | None
     description: str
 
 
@@ -60,7 +61,7 @@ class Signatures:
     `t` (n,) middles [s]; `half` [s] half a block; `mean` (n, 2) of p_A and p_B; `swing` (n,) log of the mean
     |p_A - p_B| about its mean, the ringing averaged out; `duty` (n, 2) log of the command's rms and of its derivative's
     over it, None without a command; `power` (n, b) of p_A - p_B in bands about `frequency` (b,) [Hz]; `noise` (n,)
-    power of its noise in one line of the spectrum, `lines` (b,) of each band.
+    power of its noise in one line of the spectrum, `lines` (b,) of each band; `motion`: where the strokes changed.
     """
 
     t: Array
@@ -72,6 +73,7 @@ class Signatures:
     frequency: Array
     noise: Array
     lines: Array
+    motion: tuple[DutyChange, ...]
 
 
 def signatures(recording: Recording) -> Signatures | None:
@@ -101,7 +103,9 @@ def signatures(recording: Recording) -> Signatures | None:
             duty = np.log(np.stack([size, np.diff(u, axis=1).std(axis=1) / size], axis=1))
     power, frequency, noise, lines = _bands(dp, rate)
     t = np.asarray(float(recording.t[0]) + (np.arange(count) + 0.5) * length / rate, dtype=np.float64)
-    return Signatures(t, 0.5 * length / rate, mean, swing, duty, power, frequency, noise, lines)
+    return Signatures(
+        t, 0.5 * length / rate, mean, swing, duty, power, frequency, noise, lines, duty_changes(recording)
+    )
 
 
 def _smooth(rows: Array, rate: float) -> Array:
@@ -144,7 +148,7 @@ def unasked(seen: Signatures) -> tuple[float, OtherCause] | None:
     """
     for at in np.arange(float(seen.t[0]) + NEAR, float(seen.t[-1]), 1.5 * NEAR):
         other = other_cause(seen, float(at), UNASKED)
-        if other is not None:
+        if other is not None and other.cause is not None:
             return float(at), other
     return None
 
@@ -159,7 +163,7 @@ def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
     return replace(
         evidence,
         verdict="cannot tell",
-        reason=f"{evidence.reason}; but {other.description}: {other.cause}, which may be all of it",
+        reason=f"{evidence.reason}; but {other.description}: {other.cause or 'a changed duty'}, which may be all of it",
         leak_lpm=None,
         leak_interval_lpm=None,
         cause=other.cause,
@@ -172,6 +176,10 @@ def _step(seen: Signatures, values: Array, onset: float) -> tuple[float, float]:
 
 
 def _duty(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
+    near = [change for change in seen.motion if abs(change.t - onset) <= NEAR]
+    if near:
+        certain = any(change.certain for change in near)
+        return OtherCause("changed duty" if certain else None, "the " + ", ".join(change.text for change in near))
     if seen.duty is None:
         return None
     for values, what in zip(seen.duty.T, ("size", "rate"), strict=True):

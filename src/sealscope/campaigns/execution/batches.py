@@ -261,19 +261,22 @@ def place_of_run(experiment: Experiment) -> Place:
 
     Command and cycle are those of the whole record. Under a sine, pressure level and direction come from whole
     periods of a short run before any leak, without instruments and later drifts; under another command, or with
-    another fault, from a run of full length.
+    another fault, from a run of full length. The strokes are not
+    measured: runs of a batch differ in them by command and rig alone.
     """
     command = experiment.commanded
     samples = round(experiment.duration * experiment.rate)
     duration = samples / experiment.rate
     if experiment.faults or not isinstance(command, Sine) or not (command.amplitude and command.omega):
-        return Place(operating_point(_clean(experiment, 0.0, duration, with_command=True)), duration)
+        return Place(
+            replace(operating_point(_clean(experiment, 0.0, duration, with_command=True)), motion=None), duration
+        )
     period = 2.0 * math.pi / abs(command.omega)
     length = min(max(LEAST_SECONDS, PERIODS * period), experiment.duration)
     looked = max(1, int(length / 2.0 / period)) * period
     point = operating_point(_clean(experiment, max(0.0, length - looked), length))
     rms, cycle = _of_command(command, samples, experiment.rate)
-    return Place(replace(point, command_rms=rms, cycle=cycle), duration)
+    return Place(replace(point, command_rms=rms, cycle=cycle, motion=None), duration)
 
 
 def _clean(experiment: Experiment, start: float, stop: float, *, with_command: bool = False) -> Recording:

@@ -141,11 +141,7 @@ class Judgement:
 
 def place_from(tree: Mapping[str, Any]) -> Place:
     """Return the place of a row from its plain values."""
-    point = dict(tree["point"])
-    return Place(
-        OperatingPoint(**{**point, **{name: tuple(point[name]) for name in ("units", "chambers")}}),
-        float(tree["duration_s"]),
-    )
+    return Place(OperatingPoint.of_dict(tree["point"]), float(tree["duration_s"]))
 
 
 def calibration_of(

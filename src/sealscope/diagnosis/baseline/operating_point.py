@@ -1,13 +1,15 @@
-"""Operating points of recordings."""
+"""Operating points of recordings: what must be alike before any detector compares them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from sealscope.diagnosis.baseline.duty import Motion, motion_difference, motion_of
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import moves
@@ -19,6 +21,8 @@ ONE_WAY = 0.5
 #: Pressure levels (rms of the pressure difference) are alike within this ratio when too few recordings tell how the
 #: details follow the level.
 LEVEL_RATIO = 1.15
+#: Stroke, speed and time of a stroke are alike within this difference of their logarithms.
+MOTION = 0.05
 _SLOW_RATE = 20.0
 
 
@@ -28,7 +32,7 @@ class OperatingPoint:
 
     `direction`: +1, -1 for a stroke in one direction, 0 for a back-and-forth duty; `level`: log of the rms of the
     pressure difference; `rate` [Hz]; `units` of the chambers; `chambers`; `command_rms` [V] and `cycle` [s] where there
-    is a command.
+    is a command; `motion`: stroke, speed and time from stroke to stroke, None where no reading shows them.
     """
 
     direction: Literal[-1, 0, 1]
@@ -38,6 +42,16 @@ class OperatingPoint:
     chambers: tuple[str, ...]
     command_rms: float | None
     cycle: float | None
+    motion: Motion | None = None
+
+    @classmethod
+    def of_dict(cls, tree: Mapping[str, Any]) -> OperatingPoint:
+        """Return the operating point of which `dataclasses.asdict` gave `tree`, also by way of JSON."""
+        values = dict(tree) | {name: tuple(tree[name]) for name in ("units", "chambers")}
+        if (motion := tree.get("motion")) is not None:
+            fields: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in motion.items()}
+            values["motion"] = Motion(**fields)
+        return cls(**values)
 
 
 def _direction(recording: Recording) -> Literal[-1, 0, 1]:
@@ -71,6 +85,7 @@ def operating_point(recording: Recording) -> OperatingPoint:
         chambers=chambers,
         command_rms=None if command is None else float(np.sqrt(np.mean(command**2))),
         cycle=None if command is None else find_cycle(recording),
+        motion=motion_of(recording),
     )
 
 
@@ -93,4 +108,7 @@ def difference(point: OperatingPoint, other: OperatingPoint) -> str | None:
             and not math.isclose(point.cycle, other.cycle, rel_tol=0.05)
         ):
             return "another cycle of the command"
+    moved = motion_difference(point.motion, other.motion, MOTION)
+    if moved is not None:
+        return moved.text if moved.certain else f"{moved.text}, or a leak that takes as much"
     return None

@@ -272,8 +272,6 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
     detectors = tuple(str(name) for name in tree["detectors"])
     groups = []
     for group in tree["groups"]:
-        point = dict(group["point"])
-        point |= {name: tuple(point[name]) for name in ("units", "chambers")}
         thresholds = {name: Threshold(**values) for name, values in group["thresholds"].items()}
         for name, threshold in thresholds.items():
             if name not in detectors or not math.isfinite(threshold.value):
@@ -282,7 +280,8 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
                 )
         low, high = (float(value) for value in group["levels"])
         short, long = (float(value) for value in group["durations_s"])
-        groups.append(Group(OperatingPoint(**point), int(group["records"]), (low, high), (short, long), thresholds))
+        point = OperatingPoint.of_dict(group["point"])
+        groups.append(Group(point, int(group["records"]), (low, high), (short, long), thresholds))
     views = {str(name): tuple(map(str, channels)) for name, channels in tree.get("views", {}).items()}
     for name in detectors:
         _check(name, views)

@@ -7,15 +7,18 @@ sensors' noise is taken out of the other levels first.
 
 Within a recording the change is a step at any instant. Against leak-free recordings it is a change of the level: of
 single strokes, and from three recordings of a repeated duty on, by the scatter between recordings (`by_recordings`),
-with one or two recordings of a repeated duty by the scatter of blocks.
+with one or two recordings of a repeated duty by the scatter of blocks. The details follow the duty: where strokes
+change within the recording, before and after cannot be compared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.baseline.duty import DutyChange, duty_changes
 from sealscope.diagnosis.baseline.mixed_model import FEWEST_FOR_COVARIATE
 from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, operating_point
 from sealscope.diagnosis.baseline.sessions import sessions_of
@@ -50,7 +53,7 @@ class RmsChange:
     """Change of the details' RMS, within a recording or against leak-free ones."""
 
     name = "rms change"
-    reads = ("u", "p_A", "p_B")
+    reads = ("u", "omega", "theta", "x", "p_A", "p_B")
 
     def __init__(self, rig: object = None) -> None:
         """Nothing is assumed of the machine."""
@@ -81,7 +84,24 @@ class RmsChange:
             )
         if blocks.still is not None:
             return Evidence("cannot tell", f"the pressures cannot be trusted: {blocks.still}")
-        return within(blocks.settled(), false_alarm_probability)
+        return _of_one_duty(within(blocks.settled(), false_alarm_probability), duty_changes(recording))
+
+
+def _of_one_duty(evidence: Evidence, changes: Sequence[DutyChange]) -> Evidence:
+    """Return the evidence within a recording as `cannot tell` where the duty changed."""
+    if not changes:
+        return evidence
+    certain = any(change.certain for change in changes)
+    more = f" (and {len(changes) - 1} more changes)" if len(changes) > 1 else ""
+    other = "" if certain else ", by another duty or by a leak that takes as much"
+    return replace(
+        evidence,
+        verdict="cannot tell",
+        reason=f"{changes[0].text}{more}{other}: before and after cannot be compared; {evidence.reason}",
+        onset_s=None,
+        onset_interval_s=None,
+        cause="changed duty" if certain else None,
+    )
 
 
 def within(blocks: RmsBlocks, probability: float) -> Evidence:
