@@ -34,14 +34,24 @@ def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
 
 
 @pytest.mark.parametrize("law", ["", "orifice "])
-def test_half_of_the_blocks_leak_much(law: str) -> None:
-    """The blocks with the leak take part, although position and angle go together by another ratio there."""
+@pytest.mark.parametrize(
+    "command, lpm", [("3 sin(4t)", 0.2), ("3 sin(4t)", 0.5), ("5 sin(2t)", 0.5), ("8 sin(t)", 0.5), ("8 sin(t)", 1.0)]
+)
+def test_half_of_the_blocks_leak_much(command: str, lpm: float, law: str) -> None:
+    """The blocks with the leak take part, also where little of the pump's flow still moves the piston.
+
+    Leaks of over half the flow were `cannot tell` or a slipping encoder, because position and angle go together by
+    another ratio there; noise of the pressures made the mean flow of an orifice 1 to 7 % too large.
+    """
     throttles = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"}
     experiment = Experiment.of(
-        command="3 sin(4t)", duration=120.0, leak=f"0.2 L/min {law}from 60 s", set=throttles, seed=3
+        command=command, duration=120.0, leak=f"{lpm} L/min {law}from 60 s", set=throttles, seed=3
     )
     result = simulate_with_truth(experiment)
     evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
+    true = result.truth.mean_leak_lpm
     assert evidence.verdict == "leak"
-    assert evidence.leak_lpm == pytest.approx(result.truth.mean_leak_lpm, rel=0.02)
-    assert evidence.onset_s == pytest.approx(60.0, abs=0.3)
+    assert evidence.leak_lpm == pytest.approx(true, rel=0.04)
+    assert evidence.leak_interval_lpm is not None
+    assert evidence.leak_interval_lpm[0] <= true <= evidence.leak_interval_lpm[1]
+    assert evidence.onset_s == pytest.approx(60.0, abs=4.0)

@@ -23,6 +23,8 @@ from sealscope.recordings.recording import Array, Recording
 Y, THETA, FLOW, I_AB, I_ROOT, DP_12, I_12 = range(7)
 #: Length a block should have [s], and the share of a short recording it may take.
 BLOCK_SECONDS = 3.0
+#: The size and the root of dp are taken of means over so long [s], which noise hardly moves and strokes do not notice.
+SMOOTH_SECONDS = 0.016
 _SHARE = 1.0 / 40.0
 _SHORTEST_SECONDS = 1.0
 _FEWEST_SAMPLES = 24
@@ -36,12 +38,12 @@ _ENOUGH = 0.5
 class BalanceBlocks:
     """Sums over n blocks of equal length.
 
-    `t` (n,): middles [s]; `gram` (n, c, c): sums of products of the columns beyond
-    offset, slope and stored oil; `slope` (n, c): slopes of the columns [1/s] beside the stored oil; `stored` (n, c):
-    their coefficients of dp; `abs_dp`, `root_dp` (n,): means of abs(dp), sqrt(abs(dp)); `motion` (n,):
-    mean of dp times the piston's velocity; `walk` (n,): variance of the conductance, over its square, that the noise of
-    dp makes in the integral; `noise`, `noise_12` (n,): variance of the noise of dp, of dp_12; `samples`: samples of a
-    block; `seconds`: its length.
+    `t` (n,): middles [s]; `gram` (n, c, c): sums of products of the columns beyond offset, slope and stored oil;
+    `slope` (n, c): slopes of the columns [1/s] beside the stored oil; `stored` (n, c): their coefficients of dp;
+    `abs_dp`, `root_dp` (n,): means of abs(dp), sqrt(abs(dp)), of dp smoothed; `lift` (n,): the share by which noise
+    lifts that root where dp is not smoothed; `motion` (n,): mean of dp times the piston's velocity; `walk` (n,):
+    variance of the conductance, over its square, that the noise of dp makes in the integral; `noise`, `noise_12` (n,):
+    variance of the noise of dp, of dp_12; `samples`: samples of a block; `seconds`: its length.
     """
 
     t: Array
@@ -50,6 +52,7 @@ class BalanceBlocks:
     stored: Array
     abs_dp: Array
     root_dp: Array
+    lift: Array
     motion: Array
     walk: Array
     noise: Array
@@ -151,6 +154,15 @@ def _beyond(columns: Array, dp: Array, step: float) -> tuple[Array, Array, Array
     return rest, slope - stored * tilt[:, None], stored
 
 
+def _smooth(rows: Array, samples: int) -> Array:
+    """Return the means over `samples` (odd) about each sample of rows (n, L), over fewer at the ends."""
+    half = min(samples, rows.shape[1] - 1) // 2
+    sums = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(rows, axis=1)], axis=1)
+    middles = np.arange(rows.shape[1])
+    first, last = np.maximum(middles - half, 0), np.minimum(middles + half + 1, rows.shape[1])
+    return np.asarray((sums[:, last] - sums[:, first]) / (last - first))
+
+
 def _noise(rows: Array) -> Array:
     """Return the variance (n,) of white noise in rows of slow signals (n, L): that of the second differences over 6."""
     return np.asarray(np.mean(np.diff(rows, 2, axis=1) ** 2, axis=1) / 6.0)
@@ -195,7 +207,10 @@ def cut_blocks(
     spacing = np.diff(times, axis=1) * rate
     usable &= np.all(np.isfinite(times), axis=1) & np.all((spacing > 0.5) & (spacing < 1.5), axis=1)
     times, x, theta, flow, dp = (values[usable] for values in (times, x, theta, flow, dp))
-    columns = [x, theta, flow, _integral(dp, step), _integral(np.sign(dp) * np.sqrt(np.abs(dp)), step)]
+    # the mean of a root is not the root of the mean: noise would pass for a smaller root near zero
+    smooth = _smooth(dp, 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)
+    root = np.sqrt(np.abs(smooth))
+    columns = [x, theta, flow, _integral(dp, step), _integral(np.sign(smooth) * root, step)]
     if pump_dp is not None:
         columns += [pump_dp[usable], _integral(pump_dp[usable], step)]
     rest, slope, stored = _beyond(np.stack(columns, axis=1), dp, step)
@@ -205,8 +220,9 @@ def cut_blocks(
         gram=rest @ rest.transpose(0, 2, 1),
         slope=slope,
         stored=stored,
-        abs_dp=np.abs(dp).mean(axis=1),
-        root_dp=np.sqrt(np.abs(dp)).mean(axis=1),
+        abs_dp=np.abs(smooth).mean(axis=1),
+        root_dp=root.mean(axis=1),
+        lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root.mean(axis=1), np.finfo(float).tiny) - 1.0,
         motion=np.sum(0.5 * (dp[:, 1:] + dp[:, :-1]) * np.diff(x, axis=1), axis=1) / (length * step),
         walk=noise * _walk(rest[:, I_AB], step),
         noise=noise,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,7 +18,8 @@ from sealscope.units import LITRE_PER_MINUTE
 
 #: Displacement over area may differ by this share from the assumed before L/min is not stated.
 GEOMETRY = 0.15
-#: Relative deviation of what every L/min is multiplied by: scale of the position, mean pressure difference.
+#: Relative deviation of what every L/min is multiplied by: scale of the position, mean pressure difference. The mean
+#: root of the difference is uncertain by the share that noise lifts it, too.
 _RELATIVE = 0.003
 #: The motion must be this many times what the balance leaves unexplained.
 _CLEAR = 20.0
@@ -215,9 +217,16 @@ def describe_leak(fit: BalanceFit, step: DriftStep) -> Evidence:
         )
     else:
         flows = [float(np.mean((fit.unit_flow(law) * shape)[open_])) / LITRE_PER_MINUTE for law in laws]
-        half = _t_quantile(step.freedom) * float(np.hypot(size_sd, _RELATIVE * size))
+        lift = float(np.mean(np.abs(fit.blocks.lift[open_])))
+        halves = [
+            _t_quantile(step.freedom) * math.hypot(size_sd, _RELATIVE * size, (law == "orifice") * lift * size)
+            for law in laws
+        ]
         lpm = size * flows[0]
-        interval = (max(0.0, min((size - half) * flow for flow in flows)), (size + half) * max(flows))
+        interval = (
+            max(0.0, min((size - half) * flow for half, flow in zip(halves, flows, strict=True))),
+            max((size + half) * flow for half, flow in zip(halves, flows, strict=True)),
+        )
         course = _course(fit, step, shape, laws[0])
         by = f" by {lpm:.2g} L/min ({interval[0]:.2g} to {interval[1]:.2g})"
     grows = f", over {step.rise:.0f} s" if step.rise > 0 else ""
@@ -261,7 +270,7 @@ def _place(fit: BalanceFit, step: DriftStep, shape: Array, near: dict[str, float
             f"from then on the sides lose oil unevenly, {lost / LITRE_PER_MINUTE:.2g} L/min whichever way the pressure "
             "acts: it leaves to the outside"
         )
-    if near.get("scale", 0.0) > max(_SLIPPED, 2.0 * near.get("pump", 0.0)):
+    if near.get("scale", 0.0) > max(_SLIPPED, 2.0 * near.get("pump", 0.0), 2.0 * near.get("orifice", 0.0)):
         return "sensor fault", (
             "it is no leak but a change of the scale of position, angle or displacement: an encoder slips"
         )

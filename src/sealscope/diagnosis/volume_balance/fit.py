@@ -22,17 +22,21 @@ from sealscope.recordings.recording import Array
 
 #: Laws that a leak may follow: proportional to the pressure difference (a worn seal), or to its root (an orifice).
 Law = Literal["laminar", "orifice"]
-#: A block whose residual is over this many times the usual one does not take part, nor one with less than this share of
-#: the usual information.
+#: A block's residual stands out where it is over this many times the usual one; the block does not balance under any
+#: leak where the residual is over this share of the volume delivered, too.
 _SPOILT = 5.0
-_STILL = 0.02
-#: ... nor one in which the ratio of position and angle differs from the usual one by this share.
-_OTHER_RATIO = 0.1
+_UNBALANCED = 0.05
+#: A block stands where the integral of dp has under this many times the sum of squares that noise makes of it.
+_STILL = 10.0
+#: Share of the blocks whose residuals are below the usual one: well under half, as most blocks may leak.
+_USUAL = 0.25
+#: A block's leak follows the root of dp where that leaves under this share of what a laminar leak leaves.
+_OTHER_LAW = 0.9
+#: Rounds of the fit of the geometry: the first add up norms, which has one minimum; the last weigh by variances.
+_ROUNDS = (12, 8)
 #: Where a leak opens near an end of a block, the block's conductance may lie outside those of its neighbours by this
 #: share of their difference.
 _BENT = 0.25
-#: Where fewer blocks than this share are left, all of them take part, and the residual shows that nothing fits.
-_FEWEST_KEPT = 0.1
 #: The integrals of two pressure differences differ where what sets them apart is over this many times its noise, and
 #: give two conductances where it is over so many times.
 _APART = 1.5
@@ -54,8 +58,8 @@ class BalanceFit:
     where throttles tell it from the piston's, else None, and its deviation `pump_sd`; `g` (n,): conductance of the
     piston, or of both together [m^3/(s Pa)], positive where oil leaks; `sd` (n,): its deviation, from the residual and
     the noise of dp; `shared` (n, m): deviations common to the blocks, from the shared coefficients; `residual` [m^3]:
-    rms; `signal` [m^3]: rms of the motion; `slip` (n,): flow that nothing explains [m^3/s]; `metres`: the position
-    has a unit.
+    rms; `signal` [m^3]: rms of the volume delivered; `slip` (n,): flow that nothing explains [m^3/s]; `metres`: the
+    position has a unit.
     """
 
     blocks: BalanceBlocks
@@ -120,47 +124,66 @@ def _shared_columns(blocks: BalanceBlocks) -> list[int]:
     return [THETA, FLOW, DP_12, I_12] if own_pump else [THETA, FLOW, DP_12]
 
 
-def _noise_of_integrals(blocks: BalanceBlocks) -> float:
-    """Return the sum of squares in a block of the random walk that noise makes of the integral of dp_12.
+def _noise_of_integral(blocks: BalanceBlocks, variance: Array) -> Array:
+    """Return the sum of squares (n,) in a block of the random walk that noise of `variance` (n,) makes of an integral.
 
-    Beyond offset, slope and dp_AB's integral it is sigma^2 step^2 L^2/15 (a Brownian path about its best line has the
-    mean square T/15), sigma^2 that of dp_12 and, by the square of the factor between the two, of dp_AB.
+    Beyond offset and slope it is variance step^2 L^2/15: a Brownian path about its best line has the mean square T/15.
     """
-    factor = np.median(blocks.gram[:, I_12, I_AB] / np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny))
-    variance = float(np.median(blocks.noise_12) + factor**2 * np.median(blocks.noise))
     step = blocks.seconds / blocks.samples
-    return variance * step**2 * blocks.samples**2 / 15.0
+    return np.asarray(variance * step**2 * blocks.samples**2 / 15.0)
 
 
-def _solve(gram: Array, shared: list[int]) -> tuple[Array, Array]:
-    """Return the coefficients (m,) of the shared columns, and their covariance over the residual's variance (m, m)."""
-    total = _beyond(gram, I_AB).sum(axis=0)
+def _noise_of_integrals(blocks: BalanceBlocks) -> float:
+    """Return the usual sum of squares of the noise of the integral of dp_12 beyond that of dp_AB."""
+    factor = np.median(blocks.gram[:, I_12, I_AB] / np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny))
+    variance = np.median(blocks.noise_12) + factor**2 * np.median(blocks.noise)
+    return float(_noise_of_integral(blocks, np.asarray(variance)))
+
+
+def _solve(rest: Array, shared: list[int], weight: Array) -> tuple[Array, Array]:
+    """Return the coefficients (m,) of the shared columns, and their covariance over the residual's variance (m, m).
+
+    `rest` (n, c, c): sums of products beyond the leak of each block; `weight` (n,) of the blocks.
+    """
+    total = np.tensordot(weight, rest, 1)
     size = np.sqrt(np.maximum(np.diag(total)[shared], np.finfo(float).tiny))
     scaled = total[np.ix_(shared, shared)] / np.outer(size, size)
     inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) / np.outer(size, size)
     return inverse @ total[shared, Y], inverse
 
 
-def _left(gram: Array, shared: list[int], beta: Array) -> Array:
+def _left(rest: Array, shared: list[int], beta: Array) -> Array:
     """Return the sum of squares (n,) that the balance with coefficients `beta` leaves in each block."""
-    rest = _beyond(gram, I_AB)
     left = rest[:, Y, Y] - 2.0 * rest[:, Y][:, shared] @ beta
     left += np.einsum("i,nij,j->n", beta, rest[:, shared][:, :, shared], beta)
-    return np.asarray(np.maximum(left, 0.0))
+    # differences of large numbers: what is left is known to rounding only
+    return np.asarray(np.maximum(left, 1e-15 * rest[:, Y, Y]))
 
 
-def _one_motion(gram: Array) -> NDArray[np.bool_]:
-    """Return the blocks (n,) in which position and angle move in the usual ratio, or do beyond what a leak takes.
+def _geometry(gram: Array, shared: list[int]) -> tuple[Array, Array]:
+    """Return the coefficients (m,) that all blocks share, and their covariance over the usual residual's variance.
 
-    A large leak changes the ratio as it stands, but not that beyond the integral of its law (of dp, or of its root);
-    where an integral is nearly the motion itself, noise changes the ratio beyond it, and not the one as it stands.
+    Every block has a leak of its own, of the law that leaves less of it. First the sum of the residuals' norms is
+    least, in which a few blocks with faults do not count by their squares; then each block has the variance of its own
+    residual (iteratively reweighted least squares).
     """
-    usual = np.zeros(len(gram), dtype=bool)
-    for sums in (gram, _beyond(gram, I_AB), _beyond(gram, I_ROOT)):
-        ratio = sums[:, THETA, Y] / np.maximum(sums[:, THETA, THETA], np.finfo(float).tiny)
-        median = float(np.median(ratio))
-        usual |= np.abs(ratio - median) <= _OTHER_RATIO * abs(median)
-    return usual
+    laminar, orifice = _beyond(gram, I_AB), _beyond(gram, I_ROOT)
+    beta, inverse = _solve(laminar, shared, np.ones(len(gram)))
+    rest = laminar
+    for number in range(sum(_ROUNDS)):
+        left = _left(laminar, shared, beta)
+        convex = number < _ROUNDS[0]
+        if not convex:
+            other = _left(orifice, shared, beta)
+            rest = np.where((other < _OTHER_LAW * left)[:, None, None], orifice, laminar)
+            left = np.minimum(left, other)
+        least = max(float(np.quantile(left, _USUAL)), np.finfo(float).tiny)
+        weight = least / np.maximum(left, least)
+        before = beta
+        beta, inverse = _solve(rest, shared, np.sqrt(weight) if convex else weight)
+        if not convex and np.allclose(beta, before, rtol=1e-9, atol=0.0):
+            break
+    return beta, inverse
 
 
 def _between_neighbours(slope: Array, spoilt: NDArray[np.bool_], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -180,39 +203,36 @@ def _between_neighbours(slope: Array, spoilt: NDArray[np.bool_], keep: NDArray[n
     return between
 
 
+def _moving(blocks: BalanceBlocks) -> NDArray[np.bool_]:
+    """Return the blocks (n,) in which the integral of dp is more than noise: elsewhere the machine stands."""
+    return np.asarray(blocks.gram[:, I_AB, I_AB] > _STILL * _noise_of_integral(blocks, blocks.noise))
+
+
 def fit_balance(blocks: BalanceBlocks, *, metres: bool = True) -> BalanceFit:
-    """Fit the balance; blocks in which the machine stands, or the residual stands out, are left out.
+    """Fit the balance; blocks in which the machine stands, or which do not balance under any leak, are left out.
 
     Needs one block or more; `residual` and `signal` show a fit that means nothing (no motion, encoders that do not
     belong together).
     """
-    information = blocks.gram[:, I_AB, I_AB]
-    moving = information > _STILL * float(np.median(information))
-    keep = moving & _one_motion(blocks.gram)
+    keep = _moving(blocks)
+    if not keep.any():
+        keep = np.ones(len(blocks), dtype=bool)
     freedom = max(1, blocks.samples - 4)
-    shared = _shared_columns(blocks)
-    for _ in range(4):
-        if np.mean(keep) < _FEWEST_KEPT:
-            keep = np.ones(len(blocks), dtype=bool)
-            break
-        left = _left(blocks.gram[keep], shared, _solve(blocks.gram[keep], shared)[0])
-        usual = float(np.median(left))
-        spoilt = left > _SPOILT**2 * usual
-        if not spoilt.any() or usual == 0.0:
-            break
-        # the worst one first: what it does to the shared coefficients may make others look bad
-        worst = spoilt & (left >= 0.25 * left.max())
-        keep[np.flatnonzero(keep)[worst]] = False
-    beta, inverse = _solve(blocks.gram[keep], shared)
-    own = np.maximum(information, np.finfo(float).tiny)
+    shared = _shared_columns(blocks.chosen(keep))
+    beta, inverse = _geometry(blocks.gram[keep], shared)
+    own = np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
     leaning = blocks.gram[:, I_AB][:, shared] / own[:, None]
     slope = blocks.gram[:, I_AB, Y] / own - leaning @ beta
-    usual = float(np.median(_left(blocks.gram[keep], shared, beta))) / freedom
-    keep |= _between_neighbours(slope, moving & ~keep, keep)
+    left = _left(_beyond(_beyond(blocks.gram, I_AB), I_ROOT), shared, beta)
+    usual = float(np.quantile(left[keep], _USUAL)) / freedom
+    spoilt = left > _SPOILT**2 * usual * freedom
+    bent = spoilt & _between_neighbours(slope, spoilt, keep & ~spoilt)
+    keep &= ~spoilt | bent | (left <= _UNBALANCED**2 * beta[0] ** 2 * blocks.gram[:, THETA, THETA])
     used, own, leaning, slope = blocks.chosen(keep), own[keep], leaning[keep], slope[keep]
-    left = _left(used.gram, shared, beta)
+    left, astray = left[keep], (spoilt & ~bent)[keep]
     sense = _sense(used, slope, beta)
-    variance = np.maximum(usual, np.where(left > 2.0 * usual * freedom, left / freedom, 0.0))
+    # a residual beyond noise may be all in the direction of the leak
+    variance = np.where(left > 2.0 * usual * freedom, np.where(astray, left, left / freedom), usual)
     # numerically exact data have no residual; a relative rounding error keeps deviations above zero
     variance = np.maximum(variance, 1e-24 * used.gram[:, Y, Y] / used.samples)
     widths, turns = np.linalg.eigh(inverse)
@@ -231,7 +251,7 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True) -> BalanceFit:
         sd=np.sqrt(np.maximum(variance, np.finfo(float).tiny) / own + g**2 * used.walk),
         shared=common,
         residual=float(np.sqrt(usual)),
-        signal=float(np.sqrt(np.median(used.gram[:, Y, Y]) / used.samples)),
+        signal=float(abs(beta[0]) * np.sqrt(np.median(used.gram[:, THETA, THETA]) / used.samples)),
         slip=slip,
         metres=metres,
     )
@@ -284,6 +304,9 @@ def discriminate(fit: BalanceFit, onset: float, rise: float, *, within: float) -
         moved = float(np.mean(b[after]) - np.mean(b[before]))
         freedom = int(before.sum() + after.sum()) - 2
         deviation = np.sqrt(np.var(b[after], ddof=1) / after.sum() + np.var(b[before], ddof=1) / before.sum())
+        if column == THETA:  # where nearly all flow leaks, noise of dp, integrated, is no small part of the motion
+            taken = fit.g**2 * _noise_of_integral(fit.blocks, fit.blocks.noise)
+            deviation = np.hypot(deviation, np.sqrt(np.mean(taken[after]) / np.mean(own[after])))
         z = np.array([moved, moved - whole]) / max(float(deviation), np.finfo(float).tiny)
         here, there = (freedom + 1) * np.log1p(z**2 / freedom)
         evidence[name] = float(here - there)
