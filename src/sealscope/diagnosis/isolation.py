@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.baseline.duty import DutyChange, duty_changes
+from sealscope.diagnosis.baseline.duty import StrokeChange, duty_changes
 from sealscope.diagnosis.changepoint.even_drift import step_near
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence
 from sealscope.recordings.chambers import CHAMBERS
@@ -73,7 +73,7 @@ class Signatures:
     frequency: Array
     noise: Array
     lines: Array
-    motion: tuple[DutyChange, ...]
+    motion: tuple[StrokeChange, ...]
 
 
 def signatures(recording: Recording) -> Signatures | None:

@@ -55,7 +55,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Difference:
+class MotionDifference:
     """What differs between two duties: `text`, and whether a leak cannot be the cause (`certain`)."""
 
     text: str
@@ -63,7 +63,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class DutyChange(Difference):
+class StrokeChange(MotionDifference):
     """Where a duty changes within a recording: also at `t` [s]."""
 
     t: float
@@ -102,7 +102,7 @@ def _logarithms(strokes: Strokes) -> dict[str, Array]:
     return {name: np.log(np.maximum(values, tiny)) for name, values in measured.items() if values is not None}
 
 
-def motion_difference(own: Motion | None, other: Motion | None, least: float) -> Difference | None:
+def motion_difference(own: Motion | None, other: Motion | None, least: float) -> MotionDifference | None:
     """Return how the motion of a recording differs from another one's, None where it does not, or nothing is known.
 
     `least`: the smallest difference of a logarithm that counts; it must also be three standard errors.
@@ -122,7 +122,7 @@ def motion_difference(own: Motion | None, other: Motion | None, least: float) ->
         return None
     here, there = ({name: getattr(side, name)[0] for name in changes} for side in (own, other))
     text = _text(quantity, here, there, (own.unit, own.pump_unit))
-    return Difference(f"another {text[0]} ({text[2]} and {text[1]})", certain)
+    return MotionDifference(f"another {text[0]} ({text[2]} and {text[1]})", certain)
 
 
 def _changed(changes: Mapping[str, float], least: float) -> tuple[Quantity | None, bool]:
@@ -165,7 +165,7 @@ def _text(
     return what, f"{values[0]:.3g}", f"{values[1]:.3g} {unit}"
 
 
-def duty_changes(recording: Recording) -> tuple[DutyChange, ...]:
+def duty_changes(recording: Recording) -> tuple[StrokeChange, ...]:
     """Return where the motion changes within a recording, in the order of time.
 
     The means of strokes before and after each turn are compared by Student's t, for windows of 3 to 48 strokes; strokes
@@ -175,7 +175,7 @@ def duty_changes(recording: Recording) -> tuple[DutyChange, ...]:
     return remembered(recording, "duty changes", _duty_changes)
 
 
-def _duty_changes(recording: Recording) -> tuple[DutyChange, ...]:
+def _duty_changes(recording: Recording) -> tuple[StrokeChange, ...]:
     from scipy.special import stdtrit
 
     strokes = strokes_of(recording)
@@ -213,7 +213,7 @@ def _duty_changes(recording: Recording) -> tuple[DutyChange, ...]:
             if quantity is not None:
                 largest = max(float(t[name][k] / sure) for name in levels if name.endswith(quantity))
                 candidates.append((largest, k + window, window, quantity, certain))
-    changes: list[DutyChange] = []
+    changes: list[StrokeChange] = []
     taken = np.zeros(start.size + 1, dtype=np.bool_)
     units = _units(recording, strokes)
     for _, edge, window, quantity, certain in sorted(candidates, key=lambda own: (_ORDER.index(own[3]), -own[0])):
@@ -227,5 +227,5 @@ def _duty_changes(recording: Recording) -> tuple[DutyChange, ...]:
         ]
         what, before, after = _text(quantity, sides[1], sides[0], units)
         at = float(start[edge])
-        changes.append(DutyChange(f"{what} changed from {before} to {after} at {at:.0f} s", certain, at))
+        changes.append(StrokeChange(f"{what} changed from {before} to {after} at {at:.0f} s", certain, at))
     return tuple(sorted(changes, key=lambda change: change.t))

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.duty import DutyChange, duty_changes
+from sealscope.diagnosis.baseline.duty import StrokeChange, duty_changes
 from sealscope.diagnosis.baseline.mixed_model import FEWEST_FOR_COVARIATE
 from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, operating_point
 from sealscope.diagnosis.baseline.sessions import sessions_of
@@ -87,7 +87,7 @@ class RmsChange:
         return _of_one_duty(within(blocks.settled(), false_alarm_probability), duty_changes(recording))
 
 
-def _of_one_duty(evidence: Evidence, changes: Sequence[DutyChange]) -> Evidence:
+def _of_one_duty(evidence: Evidence, changes: Sequence[StrokeChange]) -> Evidence:
     """Return the evidence within a recording as `cannot tell` where the duty changed."""
     if not changes:
         return evidence
