@@ -59,7 +59,10 @@ def refused(path: Path, **options: object) -> str:
             "a recording must have a channel (u, omega, theta, x, p_1, p_2, p_A, p_B, q_leak) or be given a map such "
             "as p_A=COLUMN, got columns t [s], Druck [bar], note (FILE)",
         ),
-        ("t [s],p_A [Pa],p_A [Pa]\n0,1,2\n1,2,3\n", "channel p_A must be one column, got columns 2 and 3 (FILE)"),
+        (
+            "t [s],p_A [Pa],p_A [Pa]\n0,1,2\n1,2,3\n",
+            "channel p_A must be one column, got columns 2 and 3: map its number, #2 (FILE)",
+        ),
         ("t [s],p_A [Pa]\n0,1\n", "time must increase between some samples (FILE)"),
         ("t [s],p_A [Pa]\n3,1\n2,1\n1,1\n", "time must increase between some samples (FILE)"),
         ("Date,p_A [Pa]\n5/31/24,1\n6/1/24,2\n",

@@ -6,6 +6,7 @@ import bz2
 import datetime as dt
 import gzip
 import lzma
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -71,7 +72,9 @@ def matlab(folder: Path, held: dict[str, Any], version: str) -> Path:
     else:
         from matio import save_to_mat
 
-        save_to_mat(path, held, version=version)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on the resolution of time deltas
+            save_to_mat(path, held, version=version)
     return path
 
 

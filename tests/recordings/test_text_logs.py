@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings import COUNTS, read, split_map_option
+from sealscope.recordings import COUNTS, inspect, read, split_map_option
 
 T = [0.0, 0.002, 0.004, 0.006]
 P = [2.5, 2.25, -2.125, 2e-3]
@@ -220,3 +220,67 @@ def test_split_map_option() -> None:
     ]:
         with pytest.raises(InputError, match=message):
             split_map_option(text)
+
+
+def test_date_and_time_in_two_columns_cross_midnight(tmp_path: Path) -> None:
+    text = "Date,Time,p_A [bar]\n31.05.2024,23:59:59.998,3\n01.06.2024,00:00:00.000,3.5\n01.06.2024,00:00:00.002,3\n"
+    recording = read(saved(tmp_path, text))
+    assert recording.rate == 500.0
+    assert recording.t == pytest.approx([0, 0.002, 0.004], abs=1e-12)
+    assert recording.provenance["start"].startswith("2024-05-31T23:59:59.998")
+    assert "date and time joined from columns Date and Time" in recording.history
+
+
+@pytest.mark.parametrize(
+    ("stamps", "start"),
+    [
+        (("5/31/2024 11:59:59.999 PM", "6/1/2024 12:00:00.001 AM"), "2024-05-31T23:59:59.999"),
+        (("5/31/2024 12:00:00.000 pm", "5/31/2024 12:00:00.002 pm"), "2024-05-31T12:00:00.000"),
+        (("31/05/2024 08:00:00.000", "31/05/2024 08:00:00.002"), "2024-05-31T08:00:00.000"),
+        (("2024/05/31 08:00:00.000", "2024/05/31 08:00:00.002"), "2024-05-31T08:00:00.000"),
+    ],
+)
+def test_dates_with_strokes(tmp_path: Path, stamps: tuple[str, str], start: str) -> None:
+    text = "timestamp,p_A [bar]\n" + "".join(f"{stamp},{3 + i}\n" for i, stamp in enumerate(stamps))
+    recording = read(saved(tmp_path, text))
+    assert recording.t == pytest.approx([0, 0.002], abs=1e-12)
+    assert recording.provenance["start"].startswith(start)
+
+
+@pytest.mark.parametrize(("rate", "step"), [(500.0, 1.0), (333.25, 1.0), (100.0, 0.05)])
+def test_stamps_that_samples_share(tmp_path: Path, rate: float, step: float) -> None:
+    n = 4000
+    t = 0.3 + np.arange(n) / rate
+    coarse = np.floor(t / step + 1e-9) * step
+    rows = "".join(f"{time:.2f},{i % 7}\n" for i, time in enumerate(coarse))
+    recording = read(saved(tmp_path, "t [s],p_A [bar]\n" + rows))
+    assert recording.rate == pytest.approx(rate, rel=1e-3)
+    assert recording.t == pytest.approx(t, abs=2.0 / rate + 5e-4 * t[-1])
+    assert any(f"in steps of {step:g} s" in line for line in recording.history)
+
+
+def test_a_clock_that_stands_still_is_no_coarse_clock(tmp_path: Path) -> None:
+    t = np.concatenate((np.arange(100) / 500, np.full(300, 0.2), 0.2 + np.arange(1, 100) / 500))
+    rows = "".join(f"{time:.3f},{i % 7}\n" for i, time in enumerate(t))
+    recording = read(saved(tmp_path, "t [s],p_A [bar]\n" + rows))
+    assert any(finding.code == "duplicated_time" for finding in inspect(recording))
+
+
+def test_a_few_words_among_many_numbers_are_missing_samples(tmp_path: Path) -> None:
+    rows = [f"{i / 500:.3f},{3 + i % 5}" for i in range(1000)]
+    rows[500] = "1.000,OVERLOAD"
+    rows[600] = "1.200,#VALUE!"
+    recording = read(saved(tmp_path, "t [s],p_A [bar]\n" + "\n".join(rows) + "\n"))
+    assert np.flatnonzero(np.isnan(recording["p_A"])).tolist() == [500, 600]
+    assert any("2 cells without a number read as missing, first 'OVERLOAD' (line 502" in h for h in recording.history)
+    rows[700:720] = [f"{i / 500:.3f},OVERLOAD" for i in range(700, 720)]
+    with pytest.raises(UnreadableFile, match=r"must be a number, got 'OVERLOAD' \(line 502"):
+        read(saved(tmp_path, "t [s],p_A [bar]\n" + "\n".join(rows) + "\n"))
+
+
+def test_columns_by_number(tmp_path: Path) -> None:
+    path = saved(tmp_path, "t [s],P [bar],P [bar]\n0,1,2\n1,2,3\n2,1,3\n")
+    recording = read(path, channel_map={"p_A": "#2", "p_B": "#3"})
+    assert recording["p_B"].tolist() == [2e5, 3e5, 3e5]
+    with pytest.raises(UnreadableFile, match=r"#4, mapped to p_A, must be a column"):
+        read(path, channel_map={"p_A": "#4"})

@@ -15,14 +15,17 @@ from sealscope.units import to_si
 
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d{1,9})?)?"
 _STAMP = re.compile(
-    rf"(?:(?P<date>\d{{4}}-\d{{2}}-\d{{2}})|(?P<day>\d{{1,2}})\.(?P<month>\d{{1,2}})\.(?P<year>\d{{4}}))?"
-    rf"(?:(?:^|[T\s_])\s*(?P<clock>{_CLOCK}))?\s*(?P<zone>Z|UTC|[+-]\d{{2}}:?\d{{2}})?"
+    rf"(?:(?P<date>\d{{4}}[-/]\d{{2}}[-/]\d{{2}})|(?P<day>\d{{1,2}})\.(?P<month>\d{{1,2}})\.(?P<year>\d{{4}})"
+    rf"|(?P<first>\d{{1,2}})/(?P<second>\d{{1,2}})/(?P<year_last>\d{{4}}))?"
+    rf"(?:(?:^|[T\s_])\s*(?P<clock>{_CLOCK})\s?(?P<half>[AaPp][Mm])?)?\s*(?P<zone>Z|UTC|[+-]\d{{2}}:?\d{{2}})?"
 )
 _LONGEST_STAMP = 64
 _SINCE = re.compile(r"(?P<unit>[a-z]{1,20})\s{1,9}since\s{1,9}(?P<start>.{1,64})", re.IGNORECASE)
 _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
 #: Numbers from here on, without a unit, are read as the time since 1970 in this unit.
 _EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
+#: Fewer samples do not tell how many share a stamp.
+_FEWEST_SHARED = 20
 _EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
 
 
@@ -38,7 +41,7 @@ class TimeBase(NamedTuple):
 def _parsed_stamp(text: str) -> re.Match[str] | None:
     text = text.strip()
     match = _STAMP.fullmatch(text) if len(text) <= _LONGEST_STAMP else None
-    return match if match and (match["date"] or match["year"] or match["clock"]) else None
+    return match if match and (match["date"] or match["year"] or match["first"] or match["clock"]) else None
 
 
 def is_stamp(text: str) -> bool:
@@ -47,23 +50,24 @@ def is_stamp(text: str) -> bool:
 
 
 def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
-    """Read date stamps (ISO, or day.month.year) and times of a day as datetime64[ns]; an empty cell is NaT.
+    """Read stamps (ISO, day.month.year, month/day/year) and times of a day as datetime64[ns]; an empty cell is NaT.
 
-    Raises ValueError with the index of the first cell that is no stamp.
+    Dates with strokes begin with the month, but where the first number of any of them is over 12. Raises ValueError
+    with the index of the first cell that is no stamp.
     """
+    matches = [_parsed_stamp(cell) for cell in cells]
+    day_first = any(match is not None and match["first"] and int(match["first"]) > 12 for match in matches)
     plain: list[str] = []
-    for index, cell in enumerate(cells):
-        match = _parsed_stamp(cell)
+    for index, (cell, match) in enumerate(zip(cells, matches, strict=True)):
         if match is None:
             if cell.strip():
                 raise ValueError(index)
             plain.append("NaT")
             continue
-        date = match["date"] or (
-            f"{match['year']}-{match['month']:0>2}-{match['day']:0>2}" if match["year"] else "1970-01-01"
-        )
-        clock = (match["clock"] or "00:00").replace(",", ".")
-        plain.append(f"{date}T{clock:0>5}" if clock[1] != ":" else f"{date}T0{clock}")
+        hour, colon, rest = (match["clock"] or "00:00").replace(",", ".").partition(":")
+        if match["half"]:  # 12 AM is midnight, 12 PM is noon
+            hour = str(int(hour) % 12 + (12 if match["half"].lower() == "pm" else 0)) if 1 <= int(hour) <= 12 else "99"
+        plain.append(f"{_date_of(match, day_first)}T{hour:0>2}{colon}{rest}")
     try:
         return np.array(plain, dtype="datetime64[ns]")
     except ValueError:  # the 30th of February
@@ -73,6 +77,16 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
             except ValueError:
                 raise ValueError(index) from None
         raise
+
+
+def _date_of(match: re.Match[str], day_first: bool) -> str:
+    """Return the date of a stamp as ISO writes it; 1970-01-01 for the time of a day alone."""
+    if match["first"]:
+        month, day = (match["second"], match["first"]) if day_first else (match["first"], match["second"])
+        return f"{match['year_last']}-{month:0>2}-{day:0>2}"
+    if match["year"]:
+        return f"{match['year']}-{match['month']:0>2}-{match['day']:0>2}"
+    return (match["date"] or "1970-01-01").replace("/", "-")
 
 
 def nominal_rate(t: Array) -> float:
@@ -160,4 +174,35 @@ def time_base(values: NDArray[Any], unit: str | None, name: str) -> TimeBase:
         t, start = _from_stamps(values)
     else:
         t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name)
+    resolved = _finer(t)
+    if resolved is not None:
+        resolution, t = resolved
+        notes.append(f"column {name} in steps of {resolution:g} s: samples in between taken as uniform")
     return TimeBase(t, nominal_rate(t), start, tuple(notes))
+
+
+def _finer(t: Array) -> tuple[float, Array] | None:
+    """Return the resolution [s] of times (n,) that several samples each share, and uniform times; None for others.
+
+    Every stamp but the first and the last must stand on as many samples, to one, as its distance asks for.
+    """
+    if t.size < _FEWEST_SHARED or not np.isfinite(t).all():
+        return None
+    steps = np.diff(t)
+    changes = np.flatnonzero(steps)
+    if (steps < 0).any() or changes.size < 3 or 2 * changes.size > steps.size:
+        return None
+    resolution = float(steps[changes].min())
+    counts = np.diff(changes) / np.round(steps[changes][1:] / resolution)
+    usual = float(np.diff(changes).sum() / np.round(steps[changes][1:] / resolution).sum())
+    if usual < 2.0 or np.abs(counts - usual).max() > 1.0:
+        return None
+    rate = usual / resolution
+    for digits in range(1, 16):
+        rounded = float(f"{rate:.{digits}g}")
+        if abs(rounded / rate - 1.0) <= 1.0 / np.diff(changes).sum():
+            rate = rounded
+            break
+    # a stamp says when its first sample was taken, to a sample
+    begin = float(np.median(t[changes + 1] - (changes + 1) / rate))
+    return resolution, begin + np.arange(t.size) / rate

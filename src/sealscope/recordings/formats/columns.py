@@ -34,6 +34,8 @@ _TIME_NAMES = {
     "t_ms": "ms",
     "milliseconds": "ms",
 }
+#: Names of a column of dates beside the time of the day.
+_DATE_NAMES = ("date", "datum", "day", "tag", "fecha", "data")
 
 
 @dataclass(frozen=True)
@@ -104,13 +106,14 @@ def _unit_or_none(text: str | None) -> str | None:
 class ColumnMap:
     """What to load of a table: the number of the time column and its label, name -> (column, unit) of each channel.
 
-    `notes`: lines for the history.
+    `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day.
     """
 
     time: int | None
     time_label: Label | None
     channels: Mapping[str, tuple[int, str]]
     notes: tuple[str, ...] = ()
+    date: int | None = None
 
     @property
     def columns(self) -> list[tuple[int, bool]]:
@@ -159,7 +162,7 @@ def listed(names: Iterable[str], most: int = 12) -> str:
 
 
 def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | None:
-    """Return the one column called `name`: as written, else whatever its case."""
+    """Return the column called `name`: as written, else whatever its case, else by its number as in `#4`, from 1."""
     folded = name.casefold()
     for matches in (
         [i for i, label in enumerate(labels) if label.whole == name],
@@ -168,9 +171,14 @@ def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | No
     ):
         if len(matches) > 1:
             numbers = " and ".join(str(i + 1) for i in matches)
-            raise UnreadableFile(f"{what} must be one column, got columns {numbers} ({place})")
+            raise UnreadableFile(
+                f"{what} must be one column, got columns {numbers}: map its number, #{matches[0] + 1} ({place})"
+            )
         if matches:
             return matches[0]
+    number = name[1:] if name.startswith("#") else ""
+    if number.isascii() and number.isdigit() and 1 <= int(number[:9]) <= len(labels):
+        return int(number) - 1
     return None
 
 
@@ -253,11 +261,13 @@ def choose_columns(
             f"a recording must have a time column such as t [s] or be given a rate, got columns {have} ({place})"
         )
     used = {column for column, _ in channels.values()} | {time}
+    dates = [i for i, label in enumerate(labels) if label.name.casefold() in _DATE_NAMES and i not in used]
+    date = dates[0] if dates and time is not None else None
     if rate is not None and time_label is not None:
         notes.append(f"time column {time_label.whole} not used: the rate was given as {rate:g} Hz")
         time = time_label = None
-    ignored = [label.whole for i, label in enumerate(labels) if i not in used and label.whole]
+    ignored = [label.whole for i, label in enumerate(labels) if i not in used and i != date and label.whole]
     if ignored:
         notes.append(f"columns not used: {listed(ignored, 40)}")
     order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel][0])}
-    return ColumnMap(time, time_label, order, tuple(notes))
+    return ColumnMap(time, time_label, order, tuple(notes), None if time is None else date)

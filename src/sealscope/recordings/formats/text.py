@@ -6,6 +6,7 @@ import csv
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.formats.columns import ColumnMap, counted
 from sealscope.recordings.formats.table import Choose, RawTable, check_size, parse_description
 from sealscope.recordings.formats.text_layout import (
     COMMENTS,
@@ -31,6 +32,8 @@ from sealscope.recordings.timebase import is_stamp, stamps
 _CHUNK = 8 * 1024 * 1024
 _LONGEST_OWN_LINE = 64 * 1024 * 1024
 _ROWS_WRITTEN_AT_ONCE = 8192
+#: Share of a column's cells that may hold a word, as loggers write where the input overflows.
+_MOST_WORDS = 0.01
 _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 
 
@@ -49,9 +52,9 @@ def read_text(path: Path, choose: Choose) -> RawTable:
         layout = layout_of(head, encoding, len(file.read(1)) == 0, place)
         choice = choose(layout.labels)
         file.seek(0)
-        columns = _columns(file, layout, choice.columns, place)
+        columns, notes = _columns(file, layout, choice, place)
     description = None if layout.own is None else parse_description(layout.own, place)
-    return RawTable(layout.kind, choice, columns, description, layout.notes)
+    return RawTable(layout.kind, choice, columns, description, (*layout.notes, *notes))
 
 
 def _own_line(file: BinaryIO, head: bytes) -> bytes:
@@ -121,10 +124,13 @@ def _rows(lines: list[str], numbers: Sequence[int], layout: Layout, cut: bool, p
     return rows[:-1]
 
 
-def _columns(file: BinaryIO, layout: Layout, columns: Sequence[tuple[int, bool]], place: str) -> list[NDArray[Any]]:
-    """Read columns; the one that is the time may hold stamps."""
+def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> tuple[list[NDArray[Any]], list[str]]:
+    """Read the chosen columns, and lines for the history; the time may hold stamps, with the date in another column."""
+    columns = choice.columns
     parts: list[list[NDArray[Any]]] = [[] for _ in columns]
+    words = [_Words(layout.labels[column].whole) for column, _ in columns]
     total = 0
+    dated = False
     stamped: bool | None = None
     least = max(column for column, _ in columns) + 1
     usual = 0
@@ -146,14 +152,29 @@ def _columns(file: BinaryIO, layout: Layout, columns: Sequence[tuple[int, bool]]
         _check_widths(rows, numbers, least, layout, place)
         total += len(rows)
         check_size(total, len(columns), place)
-        for part, (column, time) in zip(parts, columns, strict=True):
+        for part, odd, (column, time) in zip(parts, words, columns, strict=True):
             cells = [row[column] for row in rows]
             if time and stamped is None:
-                first = next((cell for cell in cells if cell.strip().lower() not in MISSING), "")
-                stamped = not is_number(first, layout.decimal) and is_stamp(first)
-            read = _dates if time and stamped else _numbers
-            part.append(read(cells, numbers, column, layout, place))
-    return [np.concatenate(part) if part else np.empty(0) for part in parts]
+                index = next((i for i, cell in enumerate(cells) if cell.strip().lower() not in MISSING), 0)
+                stamped = not is_number(cells[index], layout.decimal) and is_stamp(cells[index])
+                # a time of the day beside a date
+                day = rows[index][choice.date] if choice.date is not None and choice.date < len(rows[index]) else ""
+                dated = stamped and ":" in cells[index][:3] and is_stamp(day) and ":" not in day
+            if not (time and stamped):
+                part.append(_numbers(cells, numbers, column, layout, place, odd))
+                continue
+            if dated and choice.date is not None:
+                cells = [
+                    f"{row[choice.date].strip()} {cell.strip()}" if cell.strip() else ""
+                    for row, cell in zip(rows, cells, strict=True)
+                ]
+            part.append(_dates(cells, numbers, column, layout, place))
+    joined = [np.concatenate(part) if part else np.empty(0) for part in parts]
+    notes = [note for odd in words for note in odd.notes(total)]
+    if dated and choice.date is not None:
+        before, after = layout.labels[choice.date], layout.labels[columns[-1][0]]
+        notes.append(f"date and time joined from columns {before.whole} and {after.whole}")
+    return joined, notes
 
 
 def _check_widths(rows: list[list[str]], numbers: Sequence[int], least: int, layout: Layout, place: str) -> None:
@@ -182,8 +203,27 @@ def _dates(cells: list[str], numbers: Sequence[int], column: int, layout: Layout
         ) from None
 
 
-def _numbers(cells: list[str], numbers: Sequence[int], column: int, layout: Layout, place: str) -> Array:
-    """Read cells as doubles, missing ones as NaN; the first that is no number is named."""
+@dataclass
+class _Words:
+    """Cells of a column that hold a word in place of a number (`OVERLOAD`): how many, the first and its place."""
+
+    name: str
+    count: int = 0
+    first: str = ""
+    where: str = ""
+
+    def notes(self, rows: int) -> list[str]:
+        """Return a line for the history; raise UnreadableFile where they are more than a few among `rows`."""
+        if self.count > _MOST_WORDS * rows:
+            raise UnreadableFile(f"a sample must be a number, got {self.first!r} {self.where}")
+        if not self.count:
+            return []
+        cells = counted(self.count, "cell")
+        return [f"column {self.name}: {cells} without a number read as missing, first {self.first!r} {self.where}"]
+
+
+def _numbers(cells: list[str], numbers: Sequence[int], column: int, layout: Layout, place: str, words: _Words) -> Array:
+    """Read cells as doubles, missing ones as NaN; an infinite one is refused, words are counted and missing."""
     comma = layout.decimal == ","
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if comma else cells
     plain = not any("_" in text for text in texts)  # Python takes 1_000 for a number
@@ -194,9 +234,12 @@ def _numbers(cells: list[str], numbers: Sequence[int], column: int, layout: Layo
     for index in np.flatnonzero(~np.isfinite(values)).tolist():
         shown = cells[index].strip()
         if shown.lower() not in MISSING:
-            rule = "a finite number" if is_number(shown, layout.decimal) else "a number"
             where = _place_of(index, numbers, column, layout, place)
-            raise UnreadableFile(f"a sample must be {rule}, got {shown[:40]!r} {where}")
+            if is_number(shown, layout.decimal):
+                raise UnreadableFile(f"a sample must be a finite number, got {shown[:40]!r} {where}")
+            if not words.count:
+                words.first, words.where = shown[:40], where
+            words.count += 1
     return values
 
 
