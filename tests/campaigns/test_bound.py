@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sealscope.campaigns.prediction.bound import (
+from sealscope.campaigns.cases.bound import (
     UNKNOWN,
     cramer_rao,
     in_lpm,

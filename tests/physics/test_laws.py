@@ -105,8 +105,8 @@ def test_voltage_and_current_hold_at_their_limits_and_come_back():
 
 
 def test_chamber_volumes_are_equal_or_follow_the_piston():
-    assert chamber_volumes(0.1, 234e-6, 633e-6, 600e-6, False) == (234e-6, 234e-6)
-    V_A, V_B = chamber_volumes(0.1, 234e-6, 633e-6, 600e-6, True)
+    assert chamber_volumes(0.1, 234e-6, 235e-6, 633e-6, 600e-6, False) == (234e-6, 235e-6)
+    V_A, V_B = chamber_volumes(0.1, 234e-6, 234e-6, 633e-6, 600e-6, True)
     assert pytest.approx(234e-6 + 63.3e-6) == V_A
     assert pytest.approx(234e-6 - 60.0e-6) == V_B
 

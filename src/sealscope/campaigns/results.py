@@ -88,6 +88,7 @@ def simulated_result(plan: SimulatedPlan, folder: Path) -> CampaignResult:
         onset_s=plan.onset_s,
         hours=plan.duration_s / 3600.0,
         confidence=plan.confidence,
+        false_alarm=plan.false_alarm,
     )
     mode = str(head.get("mode", store.RUN_BY_RUN))
     return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
@@ -135,8 +136,9 @@ def write_result(result: CampaignResult, folder: Path) -> list[Path]:
     """Write tables (and the calibration, where there is one) into the folder; return the files."""
     make_folder(folder)
     unit = result.plan.unit
+    part = result.plan.part if isinstance(result.plan, SimulatedPlan) else ""
     tables = [
-        *tables_of(result.judgement, unit, result.known),
+        *tables_of(result.judgement, unit, result.known, part),
         rows_table(result.rows, detectors_of(result.plan), unit),
         _check_table(result.checks),
     ]

@@ -1,6 +1,7 @@
 """How a parameter is declared: symbol = field name; human name, SI unit and range stand in the model.
 
-A model holds SI numbers and choices only. It has no default: every value comes from a rig's file, with its source.
+A model holds SI numbers and choices only. It has no default: every value comes from a rig's file, with its source. A
+parameter may declare the value at which it is `absent` from the model; a file that does not state it means that one.
 """
 
 from __future__ import annotations
@@ -15,20 +16,32 @@ from pydantic.fields import FieldInfo
 from sealscope.errors import InputError
 
 
-def quantity(name: str, unit: str, **bounds: float) -> Any:
-    """Declare a number: human `name`, SI `unit` ("1" where it has none), bounds `gt`, `ge`, `lt`, `le` in that unit."""
-    return Field(title=name, json_schema_extra={"unit": unit}, **bounds)  # type: ignore[call-overload]
+def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: float) -> Any:
+    """Declare a number: human `name`, SI `unit` ("1" where it has none), bounds `gt`, `ge`, `lt`, `le` in that unit.
+
+    `absent`: the value that leaves what it stands for out of the model.
+    """
+    return Field(title=name, json_schema_extra={"unit": unit, "absent": absent}, **bounds)  # type: ignore[call-overload]
 
 
-def choice(name: str) -> Any:
-    """Declare a choice between readings of the source; the annotation is a Literal of the allowed values."""
-    return Field(title=name, json_schema_extra={"unit": ""})
+def choice(name: str, *, absent: str | None = None) -> Any:
+    """Declare a choice between readings of the source, or between laws; the annotation is a Literal of the values.
+
+    `absent`: the value that leaves all other laws out of the model.
+    """
+    return Field(title=name, json_schema_extra={"unit": "", "absent": absent})
 
 
 def unit_of(field: FieldInfo) -> str:
     """SI unit of a declared parameter ("" for a choice)."""
     extra = field.json_schema_extra
     return str(extra["unit"]) if isinstance(extra, dict) else ""
+
+
+def absent_of(field: FieldInfo) -> float | str | None:
+    """Return the value at which a parameter is absent from the model, None where it never is."""
+    extra = field.json_schema_extra
+    return extra["absent"] if isinstance(extra, dict) else None  # type: ignore[return-value]
 
 
 def choices_of(field: FieldInfo) -> tuple[str, ...]:

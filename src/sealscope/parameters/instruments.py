@@ -23,6 +23,10 @@ class PressureTransducer(Part):
     stuck_rate: Annotated[float, quantity("rate at which the reading gets stuck", "1/s", ge=0, le=1e3)]
     drop_rate: Annotated[float, quantity("rate of lost samples", "1/s", ge=0, le=1e6)]
     delay: Annotated[float, quantity("delay: the reading is the pressure of this time before", "s", ge=0, le=1)]
+    lag: Annotated[float, quantity("time constant of the transducer, first order", "s", absent=0, ge=0, le=10)]
+    hum_harmonics: Annotated[
+        float, quantity("amplitude of each harmonic of the hum over the one before it", "1", absent=0, ge=0, le=1)
+    ]
 
     @model_validator(mode="after")
     def _range_is_a_range(self) -> Self:
@@ -72,6 +76,7 @@ class Daq(Part):
     bits: Annotated[int, quantity("resolution of the conversion", "bit", ge=2, le=32)]
     range: Annotated[float, quantity("input range: plus and minus this voltage", "V", gt=0, le=1e3)]
     sample_rate: Annotated[float, quantity("sampling rate", "Hz", gt=0, le=1e6)]
+    jitter: Annotated[float, quantity("jitter of the clock, standard deviation", "s", absent=0, ge=0, le=1e-3)]
     sensor_volts_lo: Annotated[float, quantity("transducer output at range_lo", "V", ge=-1e3, le=1e3)]
     sensor_volts_hi: Annotated[float, quantity("transducer output at range_hi", "V", ge=-1e3, le=1e3)]
     u_max: Annotated[float, quantity("largest command: plus and minus this voltage", "V", gt=0, le=1e3)]

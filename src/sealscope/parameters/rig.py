@@ -15,7 +15,7 @@ from sealscope.calls import closest
 from sealscope.errors import InputError
 from sealscope.parameters.actuator import Cylinder, Friction
 from sealscope.parameters.drive import Fluid, HydraulicLine, MakeUp, Motor, Pump
-from sealscope.parameters.fields import Part, PartsDisagreeError, choices_of, leaves, unit_of, with_unit
+from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, leaves, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
 from sealscope.parameters.names import resolve
 from sealscope.units import parse_quantity, to_si
@@ -154,6 +154,13 @@ class Rig(Part):
             for name, field in _declared().items()
         ]
 
+    def present(self) -> dict[str, Value]:
+        """Return the values in SI by dotted name, without those at which a parameter is absent from the model.
+
+        Two rigs have the same ones where they are the same machine, whichever parameters Sealscope has learnt since.
+        """
+        return {name: self[name] for name, field in _declared().items() if self[name] != absent_of(field)}
+
     def as_dict(self) -> dict[str, Any]:
         """Return the rig as plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
         tree: dict[str, Any] = {"rig": {"name": self._name, "title": self._title}}
@@ -181,8 +188,9 @@ class Rig(Part):
     def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
         """Return a rig from one entry for each declared parameter, by dotted name.
 
-        `place` is named where one is missing.
+        One that is not stated has the value at which it is absent; `place` is named where it has none such.
         """
+        entries = {**_absent_entries(place), **entries}
         known = declared_names()
         for full in entries:
             if full not in _declared():
@@ -211,6 +219,15 @@ class Rig(Part):
 @cache
 def _declared() -> dict[str, FieldInfo]:
     return dict(leaves(Rig))
+
+
+def _absent_entries(place: str) -> dict[str, ParameterEntry]:
+    """Return an entry for each parameter that need not be stated."""
+    return {
+        full: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
+        for full, field in _declared().items()
+        if (value := absent_of(field)) is not None
+    }
 
 
 @cache

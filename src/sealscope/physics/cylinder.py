@@ -9,14 +9,16 @@ from sealscope.physics.lanes import select
 
 
 @contracted
-def chamber_volumes(x: float, V: float, A_A: float, A_B: float, position_dependent: bool) -> tuple[float, float]:
-    """Return the oil volumes (V_A, V_B) [m^3] at piston position x [m] from mid-stroke.
+def chamber_volumes(
+    x: float, V_A: float, V_B: float, A_A: float, A_B: float, position_dependent: bool
+) -> tuple[float, float]:
+    """Return the oil volumes of both sides [m^3] at piston position x [m] from mid-stroke.
 
-    V on both sides (Table 4.1), or V + A_A x and V - A_B x.
+    V_A and V_B at mid-stroke (Table 4.1: V each, and the hoses), or V_A + A_A x and V_B - A_B x.
     """
     if position_dependent:
-        return V + A_A * x, V - A_B * x
-    return V, V
+        return V_A + A_A * x, V_B - A_B * x
+    return V_A, V_B
 
 
 @contracted

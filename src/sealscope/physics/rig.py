@@ -45,8 +45,12 @@ from sealscope.physics.state import (
 )
 from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
 
-#: Parameters that no law takes under its own symbol: informative ones, and those within the throttles' coefficients.
-_NOT_TAKEN = {"pump.omega_max", "line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "fluid.rho"}
+#: Parameters that no law takes under its own symbol: informative ones, those within the throttles' coefficients or in
+#: the volumes of a side.
+_NOT_TAKEN = {
+    *("pump.omega_max", "line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "fluid.rho"),
+    *("cylinder.V_hose_A", "cylinder.V_hose_B"),
+}
 #: Dotted name of each parameter that the laws take, by its symbol, as the models declare them.
 _PARAMETERS = {
     name.rpartition(".")[2]: name
@@ -61,8 +65,9 @@ _CHOICES = {
     "literal_bracket": ("friction.bracket", "literal"),
     "made_up": ("makeup.check_valves", "present"),
 }
-#: The numbers of `RigNumbers`: parameters, and coefficients of throttle A (from the pump to the cylinder, back) and B.
-NUMBERS = (*_PARAMETERS, "c_A_in", "c_A_out", "c_B_in", "c_B_out")
+#: The numbers of `RigNumbers`: parameters, coefficients of throttle A (from the pump to the cylinder, back) and B, and
+#: the volumes of both sides at mid-stroke.
+NUMBERS = (*_PARAMETERS, "c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B")
 #: The choices: truth values, and two tuples that are empty, so that the compiler leaves the law out, where there is no
 #: air in the oil (`aerated`) and where no oil leaves or enters (`open_circuit`).
 CHOICES = (*_CHOICES, "aerated", "open_circuit")
@@ -115,6 +120,8 @@ def rig_numbers(rig: Rig) -> RigNumbers:
     return RigNumbers(
         *(attrgetter(name)(rig) for name in _PARAMETERS.values()),
         *throttle_coefficients(rig),
+        rig.cylinder.V + rig.cylinder.V_hose_A,
+        rig.cylinder.V + rig.cylinder.V_hose_B,
         **choices,
         aerated=(True,) if rig.fluid.air > 0 else (),
         open_circuit=(True,) if open_circuit else (),
@@ -165,6 +172,12 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 
 @contracted
+def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
+    """Oil volumes [m^3] of both sides, hoses and chambers, at piston position x [m]."""
+    return chamber_volumes(x, p.V_A, p.V_B, p.A_A, p.A_B, p.position_dependent)
+
+
+@contracted
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     """Bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
     if len(p.aerated) == 0:
@@ -175,7 +188,7 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 @contracted
 def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
     """Return what the throttles' flows add to the rates of p_A, p_B, p_1, p_2 [Pa/s], eqs. (4.16)-(4.19)."""
-    V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
+    V_A, V_B = volumes_at(y[POSITION], p)
     return (
         pressure_rate(Q_A, V_A, bulk_modulus(y[P_A], p)),  # eq. (4.18)
         pressure_rate(-Q_B, V_B, bulk_modulus(y[P_B], p)),  # eq. (4.19)
@@ -202,7 +215,7 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 
     Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s].
     """
-    V_A, V_B = chamber_volumes(y[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
+    V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     up_1, up_2 = make_up_flows(y, p)
     out_A, out_B = external_leakage(y[P_A], p.G_ext_A), external_leakage(y[P_B], p.G_ext_B)
@@ -224,10 +237,10 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, p: RigNumber
     current = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
     spin = shaft_acceleration(y[CURRENT], y[OMEGA], pump_torque(dp_pump, p.q_b), p.C_m, p.B_M, p.J_M)
     stop = hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
-    push = piston_acceleration(p_A, p_B, friction_force(y, p), p.F_l, stop, p.A_A, p.A_B, p.M_eq)
+    push = piston_acceleration(p_A, p_B, friction_force(y, p), p.F_l + p.k_load * x, stop, p.A_A, p.A_B, p.M_eq)
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
-    V_A, V_B = chamber_volumes(x, p.V, p.A_A, p.A_B, p.position_dependent)
+    V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
     if p.throttled:
         rate_A = pressure_rate(-p.A_A * v - Q_L, V_A, K_A)

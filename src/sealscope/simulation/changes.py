@@ -31,7 +31,7 @@ _THROTTLES = ("c_A_in", "c_A_out", "c_B_in", "c_B_out")
 #: Parameters that the compiled laws know only within the throttles' coefficients, which go with this power of them.
 _POWERS = {"line.C_d": 1.0, "line.d_line": 2.0, "fluid.rho": -0.5}
 #: What is not a state of the machine that could drift: geometry, choices, the start.
-_FIXED = {"cylinder.L", "fluid.p_charge", "makeup.V_gas"}
+_FIXED = {"cylinder.L", "cylinder.V", "fluid.p_charge", "makeup.V_gas"}
 _OF_INSTRUMENTS = {"noise", "hum", "offset", "gain_error", "scale_error", "common_noise"}
 
 
@@ -260,9 +260,13 @@ class TabulatedDrift:
         return np.interp(t, self.t, self.change)
 
 
+#: Most that a number that drifts in its own unit changes from one block of the solver to the next.
+_STEPS = {"F_l": 0.2}
+
+
 def drifts_absolutely(parameter: str) -> bool:
-    """Whether a parameter drifts in its own unit: an error, which is zero on a perfect instrument."""
-    return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error")
+    """Whether a parameter drifts in its own unit: an error or a load, which may be zero."""
+    return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error", *_STEPS)
 
 
 @dataclass(frozen=True)
@@ -271,7 +275,8 @@ class ParameterDrift:
 
     `parameter`: bare or dotted name of a number of motor, pump, lines, cylinder, friction, oil or make-up, of a
     sensor's noise, hum, offset, gain or scale, or `friction` for the whole level of friction. Offsets, gain and scale
-    errors drift in absolute terms, all others in relative ones. Raises InputError for any other parameter.
+    errors and the load `F_l` drift in absolute terms, all others in relative ones. Raises InputError for any other
+    parameter.
     """
 
     parameter: str
@@ -309,6 +314,8 @@ class ParameterDrift:
         jumps = tuple(map(float, self.shape.t)) if table else ()  # type: ignore[attr-defined]
 
         def effect(field: str, power: float) -> Effect:
+            if self.absolute:
+                return Effect(field, self.shape.at, _STEPS[field], added=True, jumps=jumps)
             return Effect(field, lambda t: (1.0 + self.shape.at(t)) ** power, RESOLUTION, jumps=jumps)
 
         return tuple(effect(field, power) for field, power in fields_of(self.parameter))

@@ -52,6 +52,32 @@ class Sine:
 
 
 @dataclass(frozen=True)
+class Alternating:
+    """Sines in turn, each for a whole number of its periods from its own zero, again and again: (periods, sine)."""
+
+    parts: tuple[tuple[int, Sine], ...]
+
+    def __post_init__(self) -> None:
+        for periods, sine in self.parts:
+            if not (periods >= 1 and sine.omega > 0 and sine.phase == 0 and sine.offset == 0):
+                raise InputError(f"a duty in turn must be of periods >= 1 of sines from zero, got {periods} of {sine}")
+
+    def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
+        lengths = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])
+        ends = np.cumsum(lengths)
+        since = np.mod(t, ends[-1])
+        part = np.minimum(np.searchsorted(ends, since, side="right"), ends.size - 1)
+        amplitude = np.array([sine.amplitude for _, sine in self.parts])
+        omega = np.array([sine.omega for _, sine in self.parts])
+        u = amplitude[part] * np.sin(omega[part] * (since - (ends - lengths)[part]))
+        return np.asarray(np.where(t >= 0, u, 0.0))
+
+    def __str__(self) -> str:
+        return ", ".join(f"{periods} periods of {sine}" for periods, sine in self.parts)
+
+
+@dataclass(frozen=True)
 class Step:
     """u = 0 before `at` [s], `level` [V] from then on."""
 
@@ -229,9 +255,10 @@ def _number(text: str | None, default: float) -> float:
 def parse_command(text: str) -> Command:
     """Read a command from text.
 
-    The forms are ``3 sin(4t)``, ``step 5 at 1 s``, ``ramp 5 from 1 s to 3 s``, ``chirp 3 from 0.1 Hz to 5 Hz over 60
-    s``, ``prbs 2 every 0.5 s seed 1``, and ``file LOG`` (the channel u of a recording). Raises InputError that shows
-    the forms when the text is none of them.
+    The forms are ``3 sin(4t)``, ``6 periods of 5 sin(2t), 10 periods of 3 sin(4t)`` (in turn, again and again),
+    ``step 5 at 1 s``, ``ramp 5 from 1 s to 3 s``, ``chirp 3 from 0.1 Hz to 5 Hz over 60 s``, ``prbs 2 every 0.5 s
+    seed 1``, and ``file LOG`` (the channel u of a recording). Raises InputError that shows the forms when the text is
+    none of them.
     """
     stripped = text.strip()
     if stripped.lower().startswith("file "):
@@ -239,6 +266,12 @@ def parse_command(text: str) -> Command:
 
         path = stripped[5:].strip()
         return recorded_command(read(path), path)
+    if "period" in stripped.lower():
+        form = r"\s*(\d{1,6})\s+periods?\s+of\s+(.*)"
+        parts = [re.fullmatch(form, part, re.IGNORECASE) for part in stripped.split(",")]
+        sines = [(int(part[1]), parse_command(part[2])) for part in parts if part]
+        if len(sines) == len(parts) and all(isinstance(sine, Sine) for _, sine in sines):
+            return Alternating(tuple(sines))  # type: ignore[arg-type]
     for pattern, make in _FORMS:
         match = re.fullmatch(pattern, stripped, re.IGNORECASE)
         if match:

@@ -219,7 +219,7 @@ class Experiment:
 
     def key(self) -> str:
         """Return a short name that is the same for equal experiments only."""
-        values = {row.name: repr(row.value) for row in self.rig.table()}
+        values = {name: repr(value) for name, value in self.rig.present().items()}
         inputs = [exact(self.command), *(exact(leak) for leak in self.leaks)]
         inputs += [exact(change) for change in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]

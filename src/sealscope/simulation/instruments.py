@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 #: Half length of the anti-alias filter, in samples of the recording.
 FILTER_REACH = 16
+#: Highest order of a hum's harmonics.
+HUM_HARMONICS = 5
 _KAISER_BETA = 8.0
 _PASS = 0.9  # cut-off (-6 dB) as a share of the Nyquist frequency
 
@@ -63,6 +65,35 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     return np.asarray(windows[:n] @ taps)
 
 
+def lagging(values: Array, lag: float, rate: float) -> Array:
+    """Return what a transducer of the first order makes of a signal at `rate` [Hz]: lag dy/dt + y = signal.
+
+    Exact for a signal that is linear between its values, at rest before the first one; `lag` [s] of 0 leaves it as it
+    is.
+    """
+    if lag == 0.0:
+        return values
+    from scipy.signal import lfilter
+
+    decay = math.exp(-1.0 / (lag * rate))
+    mean = (1.0 - decay) * lag * rate  # of the exponential over one interval
+    now = 1.0 - mean
+    filtered, _ = lfilter([now, mean - decay], [1.0, -decay], values, zi=[(1.0 - now) * values[0]])
+    return np.asarray(filtered)
+
+
+def at_jittered(sampled: Callable[[Array], Array], values: Array, late: Array | None) -> Array:
+    """Return samples that a clock takes `late` (n,) by so many intervals of `values`, -1 to 1; None: by none.
+
+    `sampled(values)` are the samples of a punctual clock; between the values a parabola is taken.
+    """
+    now = sampled(values)
+    if late is None:
+        return now
+    before, after = sampled(np.r_[values[:1], values[:-1]]), sampled(np.r_[values[1:], values[-1:]])
+    return np.asarray(now + 0.5 * late * (after - before) + 0.5 * late**2 * (after - 2.0 * now + before))
+
+
 def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
     """Return the pressure [Pa] as read back from the converter.
 
@@ -88,13 +119,15 @@ def read_pressure(
 ) -> Array:
     """Return what one pressure channel reads [Pa].
 
-    Gain and offset, own and common noise, drift, hum, saturation, conversion, stuck and lost samples; `of(symbol, own)`
-    is a parameter of the sensor over time.
+    Gain and offset, own and common noise, drift, hum with its harmonics, saturation, conversion, stuck and lost
+    samples; `of(symbol, own)` is a parameter of the sensor over time.
     """
     t = np.arange(true.size) / rate
     walk = np.cumsum(random.standard_normal(true.size)) * sensor.drift / np.sqrt(rate)
     hum = of("hum", sensor.hum) * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
     own = of("noise", sensor.noise) * random.standard_normal(true.size)
+    if sensor.hum_harmonics > 0:
+        hum = hum + of("hum", sensor.hum) * _harmonics(sensor, t, random)
     gain, offset = 1.0 + of("gain_error", sensor.gain_error), of("offset", sensor.offset)
     read = convert(gain * true + offset + walk + hum + own + common, sensor, daq)
     if sensor.stuck_rate > 0:  # a stuck reading holds for a second on average
@@ -102,6 +135,14 @@ def read_pressure(
             read[start : start + 1 + int(random.exponential(rate))] = read[start]
     read[random.random(true.size) < sensor.drop_rate / rate] = np.nan
     return read
+
+
+def _harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
+    """Return the harmonics 2 to `HUM_HARMONICS` of a hum of amplitude 1, each with a phase of its own."""
+    orders = np.arange(2, HUM_HARMONICS + 1)
+    phases = random.random(orders.size)
+    turns = sensor.hum_frequency * np.outer(orders, t) + phases[:, None]
+    return np.asarray(sensor.hum_harmonics ** (orders - 1) @ np.sin(2.0 * np.pi * turns))
 
 
 def _counted(values: Array, resolution: float) -> Array:
@@ -115,12 +156,13 @@ def record(
 
     `trajectory` is sampled `factor` times faster than the recording and runs FILTER_REACH samples longer; `u`: (n,)
     command [V] at the recording's samples. Analog channels (pressures, flow meter) pass the anti-alias filter,
-    encoders are read at the instant. The noise of each channel comes from a stream of its own under `seed`, so that
-    no channel's noise depends on another's settings. `readings`: what changes at the instruments within the run.
+    encoders are read at the instant; the clock of all but the command may jitter. The noise of each channel comes
+    from a stream of its own under `seed`, so that no channel's noise depends on another's settings. `readings`: what
+    changes at the instruments within the run.
     """
     n = u.size
     rate = rig.daq.sample_rate
-    names = ("common", *PRESSURES, "x", "q_leak")
+    names = ("common", *PRESSURES, "x", "q_leak", "clock")
     streams = dict(zip(names, np.random.SeedSequence(seed).spawn(len(names)), strict=True))
     random = {name: np.random.default_rng(stream) for name, stream in streams.items()}
     sensors = rig.sensors
@@ -131,9 +173,19 @@ def record(
     def of(channel: str) -> Callable[[str, float], Array | float]:
         return lambda symbol, own: readings.value(f"sensors.{channel}.{symbol}", own, t)
 
+    late = None
+    if rig.daq.jitter > 0:
+        late = np.clip(rig.daq.jitter * rate * factor * random["clock"].standard_normal(n), -1.0, 1.0)
+
+    def read_at(values: Array) -> Array:
+        return at_jittered(lambda shifted: shifted[instant], values, late)
+
+    def filtered(values: Array, delay: float = 0.0) -> Array:
+        return at_jittered(lambda shifted: decimate(shifted, factor, n, delay), values, late)
+
     count = 2.0 * np.pi / sensors.theta.counts
-    theta = _counted(trajectory["theta"][instant], count)
-    x = (1.0 + of("x")("scale_error", sensors.x.scale_error)) * trajectory["x"][instant] + of("x")("offset", 0.0)
+    theta = _counted(read_at(trajectory["theta"]), count)
+    x = (1.0 + of("x")("scale_error", sensors.x.scale_error)) * read_at(trajectory["x"]) + of("x")("offset", 0.0)
     x = x + of("x")("noise", sensors.x.noise) * random["x"].standard_normal(n)
     common = readings.value("sensors.common_noise", sensors.common_noise, t) * random["common"].standard_normal(n)
     channels: dict[str, Array] = {
@@ -144,10 +196,10 @@ def record(
     }
     for name in PRESSURES:
         sensor = getattr(sensors, name)
-        true = decimate(trajectory[name], factor, n, sensor.delay * rate * factor)
+        true = filtered(lagging(trajectory[name], sensor.lag, rate * factor), sensor.delay * rate * factor)
         channels[name] = read_pressure(true, common, sensor, rig.daq, rate, random[name], of(name))
     flow = sensors.q_leak
-    true = (1.0 + of("q_leak")("gain_error", 0.0)) * decimate(trajectory["q_leak"], factor, n)
+    true = (1.0 + of("q_leak")("gain_error", 0.0)) * filtered(trajectory["q_leak"])
     true = true + of("q_leak")("offset", 0.0)
     read = true + of("q_leak")("noise", flow.noise) * random["q_leak"].standard_normal(n)
     read = np.clip(read, -flow.range_hi, flow.range_hi)

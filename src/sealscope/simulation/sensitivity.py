@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Leak
-from sealscope.simulation.instruments import decimate
+from sealscope.simulation.instruments import decimate, lagging
 from sealscope.simulation.integrate import oversampling, trajectory
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -51,14 +51,19 @@ class Sensitivity:
 def clean_channels(
     experiment: Experiment, leaks: Sequence[Leak] = (), channels: Sequence[str] = CHAMBERS, *, step: float | None = None
 ) -> Array:
-    """Return the channels (c, n) without noise, at the recording's samples and behind its anti-alias filter.
+    """Return the channels (c, n) without noise, at the recording's samples, behind transducers and anti-alias filter.
 
     `leaks` take the place of the experiment's and have coefficients; `step` [s] of the solver, default its own.
     Raises SimulationFailed as `sealscope.simulation.simulate.simulate_with_truth` does.
     """
     n = round(experiment.duration * experiment.rate)
     path = trajectory(experiment, tuple(leaks), step=step)
-    return np.stack([decimate(path[name], oversampling(experiment), n) for name in channels])
+    factor, sensors = oversampling(experiment), experiment.rig.sensors
+    behind = [
+        lagging(path[name], getattr(sensors, name).lag, experiment.rate * factor) if name in PRESSURES else path[name]
+        for name in channels
+    ]
+    return np.stack([decimate(values, factor, n) for values in behind])
 
 
 def _rms(values: Array) -> float:

@@ -14,6 +14,8 @@ import numpy as np
 
 from sealscope.campaigns.plans.model import SimulatedPlan, Use
 
+#: The factor whose levels are families of the plan's profile.
+FAMILY = "family"
 _PACKAGE = Path(__file__).resolve().parents[2]
 #: Parts of the package that no row depends on; the sources of all others are in the code key.
 _NOT_IN_ROWS = (
@@ -63,7 +65,7 @@ def profile_key(name: str) -> str:
 def world(plan: SimulatedPlan) -> dict[str, Any]:
     """Return what all cases of a plan share and a record depends on: rig, bench, length, onset and base seed."""
     return {
-        "rig": digest({row.name: repr(row.value) for row in plan.rig.table()}),
+        "rig": digest({name: repr(value) for name, value in plan.rig.present().items()}),
         "profile": profile_key(plan.profile) if plan.profile else "",
         "duration_s": plan.duration_s,
         "onset_s": plan.onset_s,
@@ -71,10 +73,21 @@ def world(plan: SimulatedPlan) -> dict[str, Any]:
     }
 
 
+def _families(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
+    """Return, for each family of a plan, the digest of what it is: its cases do not depend on another family."""
+    from sealscope.simulation.bench.profile import load_profile
+
+    if FAMILY not in plan.factors:
+        return {}
+    profile = load_profile(plan.profile)
+    return {str(name): {FAMILY: digest(repr(profile.family(str(name))))} for name in plan.factors[FAMILY]}
+
+
 def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
     """Return all cases of a plan: records of each kind go round the cells one by one, the last round may be short."""
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = world(plan)
+    families = _families(plan)
     cases = []
     for group in plan.records:
         for number in range(group.count):
@@ -87,7 +100,7 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
                 "levels": cells[k],
                 "replicate": replicate,
             }
-            name = digest({"world": shared, **content})
+            name = digest({"world": shared, **content, **families.get(str(cells[k].get(FAMILY)), {})})
             machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
             cases.append(CampaignCase(name[:16], int(machine >> np.uint64(1)), int(noise >> np.uint64(1)), **content))
     return cases

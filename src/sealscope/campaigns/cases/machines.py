@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from sealscope.campaigns.cases.case import CampaignCase
+from sealscope.campaigns.cases.case import FAMILY, CampaignCase
 from sealscope.campaigns.plans.duty import closing_values, fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
 
@@ -26,8 +26,9 @@ def leak_of(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 
     if not case.leak_lpm:
         return ()
-    law: Any = case.law
-    return (Leak(law, mean=case.leak_lpm * LITRE_PER_MINUTE, opening=From(plan.onset_s)),)
+    laws: tuple[Any, ...] = ("laminar", "orifice") if case.law == "mixture" else (case.law,)
+    mean = case.leak_lpm * LITRE_PER_MINUTE / len(laws)
+    return tuple(Leak(law, mean=mean, opening=From(plan.onset_s)) for law in laws)
 
 
 def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
@@ -40,7 +41,10 @@ def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = N
     from sealscope.simulation.commands import Sine, parse_command
 
     if plan.profile:
-        machine = draw(profile or plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s)
+        family = str(case.levels.get(FAMILY, ""))
+        machine = draw(
+            profile or plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s, family=family
+        )
     else:
         machine = BenchMachine("none", case.machine_seed, plan.rig, plan.duration_s, {}, (), Sine(3.0, 4.0), 0.0)
     values = dict(machine.overrides)
@@ -49,7 +53,7 @@ def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = N
             machine = replace(machine, command=parse_command(str(level)))
         elif name == "closed":
             values |= {"line.orifices": str(plan.rig["line.orifices"])} | closing_values(level)
-        else:
+        elif name != FAMILY:
             values[name] = level
     machine = replace(machine, overrides=_by_full_name(values))
     fault = fault_of(case.fault, plan.onset_s) if case.fault else None

@@ -98,8 +98,10 @@ class CaseRow:
     """What a campaign stores of a case: its inputs, where the record was made, the scores; or the `error` of it.
 
     `flow_lpm`: mean leak [L/min] while open, as the run really had it; `place`: operating point and length of the
-    record, plain values; `scores` by the plan's name of a detector, `statements` (evidence with the `STATED` figures
-    alone) by `PlanDetector.key`; `seconds`: processor time, which takes no part in the result.
+    record, plain values; `bound_lpm`: standard deviation [L/min] of the best unbiased estimate of the change at the
+    onset, from pressures and command (`bound.change_bound`), None where it was not asked for or there is none;
+    `scores` by the plan's name of a detector, `statements` (evidence with the `STATED` figures alone) by
+    `PlanDetector.key`; `seconds`: processor time, which takes no part in the result.
     """
 
     id: str
@@ -114,6 +116,8 @@ class CaseRow:
     error: str | None = None
     seconds: float = 0.0
     statements: Mapping[str, Evidence] = field(default_factory=dict)
+    law: str = "laminar"
+    bound_lpm: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON values."""
@@ -125,7 +129,9 @@ class CaseRow:
     @classmethod
     def of(cls, case: CampaignCase, **values: Any) -> CaseRow:
         """Return the row of a case, with its results or its `error`."""
-        return cls(case.id, case.use, case.leak_lpm, case.fault, case.levels, case.replicate, **values)
+        return cls(
+            case.id, case.use, case.leak_lpm, case.fault, case.levels, case.replicate, law=case.law, **values
+        )  # fmt: skip
 
     @classmethod
     def from_dict(cls, tree: Mapping[str, Any]) -> CaseRow:

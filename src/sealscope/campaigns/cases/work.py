@@ -6,6 +6,8 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
+
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.row import CaseRow, error_text
@@ -27,13 +29,15 @@ def work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None = None) -> C
 
 
 def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow:
+    from sealscope.campaigns.cases.bound import change_bound
     from sealscope.campaigns.cases.scoring import stated
     from sealscope.diagnosis.baseline.inspection import inspected
     from sealscope.diagnosis.calibration.scorers import Look
     from sealscope.diagnosis.calibration.thresholds import Place
     from sealscope.simulation.simulate import simulate_with_truth
 
-    simulated = simulate_with_truth(experiment_of(plan, case))
+    experiment = experiment_of(plan, case)
+    simulated = simulate_with_truth(experiment)
     if keep is not None:
         from sealscope.recordings import write
 
@@ -43,10 +47,17 @@ def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow
         raise InputError(f"the record cannot be judged: {record.defect}")
     look = Look(record.part, plan.onset_s, plan.false_alarm, plan.assumed or plan.rig)
     scores, statements = stated(look, plan.detectors, plan.views)
+    bound = None
+    if plan.bound and case.leak_lpm:
+        truth = simulated.truth
+        healthy = truth.t < plan.onset_s
+        dp = float(np.mean(np.abs(truth.outputs["p_A"] - truth.outputs["p_B"])[healthy]))
+        bound = change_bound(experiment, plan.onset_s, plan.duration_s - plan.onset_s, dp)
     return CaseRow.of(
         case,
         flow_lpm=simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0,
         place=asdict(Place.of(record.part)),
         scores=scores,
         statements=statements,
+        bound_lpm=bound,
     )

@@ -76,6 +76,8 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     if np.diff(bounds_of(plan)).min() < 1:
         raise no(f"records with details on both sides of the onset, got {plan.duration_s:g} s with {plan.onset_s:g} s")
     for group in plan.records:
+        if group.law == "mixture":
+            raise no("leaks of one law each, got a mixture")
         fault = fault_of(group.fault, plan.onset_s) if group.fault else None
         if fault is not None and (fault.adjustments() or fault.holds()):
             raise no(f"no fault of a sensor, got {group.fault!r}")

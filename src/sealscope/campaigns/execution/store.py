@@ -75,7 +75,7 @@ def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
         "mode": mode,
         "code": code_key(),
         "false_alarm_within": plan.false_alarm if searching else None,
-        "assumed": digest({row.name: repr(row.value) for row in assumed.table()}) if searching else None,
+        "assumed": digest({name: repr(value) for name, value in assumed.present().items()}) if searching else None,
         "plug_ins": _plug_ins(plan),
         "views": {view: list(plan.views.get(view, ())) for view in sorted({detector.view for detector in detectors})},
         "version": _version(),

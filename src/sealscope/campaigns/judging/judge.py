@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, named_cause
+from sealscope.campaigns.judging.families import FamilyFinding, family_findings
 from sealscope.campaigns.plans.detectors import Views, plan_detector
 from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.calibration.scorers import scorer
@@ -120,7 +121,7 @@ class Judgement:
     `table` by size, `overall` with all leaks together; `onsets`, `flows` and `causes`: of detectors that state them;
     `calibration`: None where every detector has a threshold of its own; `calibrated_on`, `judged`: records that had a
     result; `failed`: rows that had none (they are `cannot tell` for every detector); `realised`: size -> mean and
-    standard deviation of the flow the leaks really had [L/min].
+    standard deviation of the flow the leaks really had [L/min]; `families`: what is found in each family of machines.
     """
 
     calibration: Calibration | None
@@ -137,6 +138,7 @@ class Judgement:
     cells: tuple[CellAlarms, ...]
     faults: tuple[FaultAlarms, ...]
     realised: Mapping[float, tuple[float, float]]
+    families: tuple[FamilyFinding, ...] = ()
 
 
 def place_from(tree: Mapping[str, Any]) -> Place:
@@ -207,12 +209,14 @@ def judge(
     onset_s: float | None = None,
     hours: float | None = None,
     confidence: float = 0.95,
+    false_alarm: float = 0.01,
 ) -> Judgement:
     """Return verdicts and figures of all rows to judge.
 
     `thresholds`: the detectors' own, by default those of their scorers; `onset_s` [s]: true onset in leaky records,
-    `hours`: operating time of a record; without them no errors of onsets or alarms per hour are given. Raises
-    InputError where there is no row to judge.
+    `hours`: operating time of a record; without them no errors of onsets or alarms per hour are given.
+    `false_alarm`: the probability at which the bound's best test is taken. Raises InputError where there is no row to
+    judge.
     """
     own = {name: own_threshold(name) for name in detectors} if thresholds is None else thresholds
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
@@ -238,6 +242,7 @@ def judge(
         cells=tuple(_cells(plain, detectors, verdicts, confidence)),
         faults=tuple(_faults(judged, detectors, verdicts, confidence)),
         realised=_realised(plain),
+        families=tuple(family_findings(plain, detectors, verdicts, false_alarm=false_alarm, confidence=confidence)),
     )
 
 

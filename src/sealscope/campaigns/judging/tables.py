@@ -58,9 +58,12 @@ def _size(leak_lpm: float) -> Value:
 
 
 def tables_of(
-    judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None
+    judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None, part: str = ""
 ) -> list[ResultTable]:
-    """Return every table of a judgement; sizes of leaks in `unit`, `known`: what each detector was given."""
+    """Return every table of a judgement.
+
+    Sizes of leaks in `unit`, `known`: what each detector was given, `part`: what the campaign's families are for.
+    """
     by_size = [make(judgement, unit) for make in (_pods, _rocs, _cells, _onsets, _flows)]
     return [
         _main(judgement, unit, known or {}),
@@ -68,6 +71,7 @@ def tables_of(
         _thresholds(judgement),
         _faults(judgement),
         _causes(judgement),
+        _families(judgement, unit, known or {}, part),
     ]
 
 
@@ -89,6 +93,22 @@ def _main(judgement: Judgement, unit: str, known: Mapping[str, PriorKnowledge]) 
             prior = ("yes" if given.onset else "no", " ".join(given.channels), given.rig)
         rows.append((row.detector, _size(row.leak_lpm), *fractions, *hourly, row.informedness, *prior))
     return ResultTable("table", columns, tuple(rows))
+
+
+def _families(judgement: Judgement, unit: str, known: Mapping[str, PriorKnowledge], part: str) -> ResultTable:
+    """Return what each detector finds in each family of machines, beside what the Cramer-Rao bound allows to find."""
+    columns = (
+        "part", "family", "detector", "channels given", "rig assumed", f"leak [{unit}]", "law", *_columns("alarms"),
+        *_columns("cannot tell"), *_columns("interval holds the flow"), *_columns("alarms where the bound allows"),
+        "failed",
+    )  # fmt: skip
+    rows: list[tuple[Value, ...]] = []
+    for row in judgement.families:
+        given = known.get(row.detector)
+        prior = (None, None) if given is None else (" ".join(given.channels), given.rig)
+        shares = (*_of(row.alarms), *_of(row.cannot_tell), *_stated_coverage(row.coverage), *_of(row.allowed))
+        rows.append((part, row.family, row.detector, *prior, row.leak_lpm, row.law, *shares, row.failed))
+    return ResultTable("families", columns, tuple(rows))
 
 
 def _thresholds(judgement: Judgement) -> ResultTable:

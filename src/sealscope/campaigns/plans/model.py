@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 Use = Literal["calibrate", "judge"]
+LeakLaw = Literal["laminar", "orifice", "mixture"]
 Promise = Literal["average", "bound"]
 DataSet = Literal["appendix-c", "hydraulic"]
 LeaveOut = Literal["test", "condition"]
@@ -21,13 +22,14 @@ class RecordGroup:
     """`count` records of one kind, spread evenly over the cells of the factors.
 
     `use`: `calibrate` sets thresholds (leak-free), `judge` is judged by them, on seeds of its own; `leak_lpm`: mean
-    flow [L/min] of a leak of that `law` from the plan's onset on, 0 for none; `fault`: another fault, as text.
+    flow [L/min] of a leak of that `law` (`mixture`: half of each) from the plan's onset on, 0 for none; `fault`:
+    another fault, as text.
     """
 
     use: Use
     count: int
     leak_lpm: float = 0.0
-    law: Literal["laminar", "orifice"] = "laminar"
+    law: LeakLaw = "laminar"
     fault: str = ""
 
 
@@ -57,8 +59,9 @@ class SimulatedPlan(_JudgedPlan):
     """A simulated campaign.
 
     `profile`: the bench whose nuisances each record draws, "" for the rig without drift; `factors`: name -> levels,
-    every combination is a cell; `command` and `closed` are the duty, other names parameters of the rig; `seed`: the
-    base of every case's seed.
+    every combination is a cell; `command` and `closed` are the duty, `family` names families of the profile, other
+    names are parameters of the rig; `seed`: the base of every case's seed; `part`: what the plan is for, such as
+    development or judging; `bound`: whether a leaky record's row says what the Cramer-Rao bound of its machine allows.
     """
 
     rig: Rig
@@ -69,6 +72,8 @@ class SimulatedPlan(_JudgedPlan):
     keep_recordings: bool
     records: tuple[RecordGroup, ...]
     factors: Mapping[str, tuple[str | float, ...]] = field(default_factory=dict)
+    part: str = ""
+    bound: bool = False
 
     @property
     def size(self) -> int:

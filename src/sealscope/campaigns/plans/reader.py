@@ -17,6 +17,7 @@ from sealscope.campaigns.plans.model import (
     Classifier,
     DataSet,
     HeldOutPlan,
+    LeakLaw,
     LeaveOut,
     LogisticClassifier,
     Promise,
@@ -107,17 +108,19 @@ def _simulated(tree: Mapping[str, Any], place: str) -> SimulatedPlan:
     onset = head.number("onset", duration / 2, unit="s")
     if not 0.0 < onset < duration:
         raise head.fail(f"onset must be within the duration, 0 s to {duration:g} s, got {onset:g}")
-    rig = _rig(head)
+    rig, profile = _rig(head), _profile(head)
     plan = SimulatedPlan(
         name=name,
         title=head.text("title", name),
         rig=rig,
-        profile=_profile(head),
+        profile=profile,
         duration_s=duration,
         onset_s=onset,
         seed=head.whole("seed", 0),
         keep_recordings=head.flag("keep_recordings"),
-        factors=_factors(tree.get("factors", {}), rig, place),
+        factors=_factors(tree.get("factors", {}), rig, profile, place),
+        part=head.text("part", ""),
+        bound=head.flag("bound"),
         records=_records(tree.get("records", ()), onset, place),
         **_judged(head, tree, rig),
     )
@@ -165,7 +168,7 @@ def _profile(head: PlanTable) -> str:
     return name
 
 
-def _factors(given: Any, rig: Rig, place: str) -> dict[str, tuple[str | float, ...]]:
+def _factors(given: Any, rig: Rig, profile: str, place: str) -> dict[str, tuple[str | float, ...]]:
     table = PlanTable(given, "factors", place)
     factors: dict[str, tuple[str | float, ...]] = {}
     for name, levels in table.left.items():
@@ -176,15 +179,20 @@ def _factors(given: Any, rig: Rig, place: str) -> dict[str, tuple[str | float, .
         for level in levels:
             if isinstance(level, bool) or not isinstance(level, (str, int, float)):
                 raise table.fail(f"{name} must be texts or numbers, got {level!r}")
-            _in(f"factors.{name}", place, partial(_check_level, name, level, rig))
+            _in(f"factors.{name}", place, partial(_check_level, name, level, rig, profile))
         factors[name] = tuple(levels)
     return factors
 
 
-def _check_level(name: str, level: str | float, rig: Rig) -> None:
+def _check_level(name: str, level: str | float, rig: Rig, profile: str) -> None:
+    from sealscope.simulation.bench.profile import load_profile
     from sealscope.simulation.commands import parse_command
 
-    if name == "command":
+    if name == "family":
+        if not profile:
+            raise InputError(f"a family must be of the plan's profile, got {level!r} and no profile")
+        load_profile(profile).family(str(level))
+    elif name == "command":
         if not isinstance(level, str):
             raise InputError(f"a command must be a text such as '3 sin(4t)', got {level!r}")
         parse_command(level)
@@ -202,7 +210,7 @@ def _records(given: Any, onset: float, place: str) -> tuple[RecordGroup, ...]:
             use=table.choice("use", get_args(Use), "judge"),
             count=table.whole("count", least=1),
             leak_lpm=table.number("leak", 0.0, unit="L/min") if "leak" in table.left else 0.0,
-            law=table.choice("law", ("laminar", "orifice"), "laminar"),
+            law=table.choice("law", get_args(LeakLaw), "laminar"),
             fault=table.text("fault", ""),
         )
         table.end()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.campaigns.prediction.bound import (
+from sealscope.campaigns.cases.bound import (
     UNKNOWN,
     LeakBound,
     in_lpm,

@@ -18,13 +18,13 @@ from typing import TypeVar
 
 import numpy as np
 
+from sealscope.campaigns.cases.bound import in_lpm
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.execution.store import read_rows
 from sealscope.campaigns.plans.duty import closing_values
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.campaigns.prediction.bound import in_lpm
 from sealscope.campaigns.prediction.detection import ChangeDetector, Responses, counted
 from sealscope.diagnosis.calibration.scorers import Look, side_bounds
 from sealscope.diagnosis.rms_change.blocks import QUANTITIES, mean_squares

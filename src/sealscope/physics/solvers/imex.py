@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
-from sealscope.physics.cylinder import chamber_volumes, pressure_rate
+from sealscope.physics.cylinder import pressure_rate
 from sealscope.physics.lanes import anywhere
 from sealscope.physics.restrictors import implicit_orifice_flow
 from sealscope.physics.rig import (
@@ -24,6 +24,7 @@ from sealscope.physics.rig import (
     rates_without_throttles,
     throttle_flows,
     throttle_rates,
+    volumes_at,
     within_limits,
 )
 from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, Pressures, State, moved, pressures_moved, state_of
@@ -75,7 +76,7 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 
     Return the state with the pressures that the throttles' flows leave, and what these flows add to the rates.
     """
-    V_A, V_B = chamber_volumes(z[POSITION], p.V, p.A_A, p.A_B, p.position_dependent)
+    V_A, V_B = volumes_at(z[POSITION], p)
     step = GAMMA * h
     total_A, total_B = z[P_1] - z[P_A], z[P_B] - z[P_2]
     moved = z

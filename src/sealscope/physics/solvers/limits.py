@@ -15,9 +15,9 @@ DECAY_LIMIT = 2.785
 def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
     """Volumes (V_A, V_B) [m^3] with the piston at either end of its stroke, where one of them is smallest."""
     if not p.position_dependent:
-        return ((p.V, p.V),)
+        return ((p.V_A, p.V_B),)
     half = 0.5 * p.L
-    return (p.V - p.A_A * half, p.V + p.A_B * half), (p.V + p.A_A * half, p.V - p.A_B * half)
+    return (p.V_A - p.A_A * half, p.V_B + p.A_B * half), (p.V_A + p.A_A * half, p.V_B - p.A_B * half)
 
 
 def _longest_for_pair(damping: float, stiffness: float) -> float:
@@ -54,7 +54,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
     ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if p.throttled else chambers
     loop = _longest_for_pair(p.R_c / p.L_c + p.B_M / p.J_M, (p.R_c * p.B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M))
-    column = p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) / p.M_eq
+    column = (p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) + p.k_load) / p.M_eq
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
     breakaway = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
     breakaway += 0.0 if p.literal_bracket else p.F_v

@@ -94,9 +94,11 @@ def refuse(experiment: Experiment, place: int) -> None:
         raise no("motor.integrator = state, got euler")
     if any(fault.adjustments() or fault.holds() for fault in experiment.faults):
         raise no(f"no fault of a sensor, got {', '.join(str(fault) for fault in experiment.faults)}")
+    if experiment.rig.daq.jitter != 0:
+        raise no(f"daq.jitter = 0, got {experiment.rig.daq.jitter}")
     for name in CHAMBERS:
         sensor = getattr(experiment.rig.sensors, name)
-        for field in ("stuck_rate", "drop_rate"):
+        for field in ("stuck_rate", "drop_rate", "lag", "hum_harmonics"):
             if getattr(sensor, field) != 0:
                 raise no(f"sensors.{name}.{field} = 0, got {getattr(sensor, field)}")
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.errors import InputError
-from sealscope.simulation.bench.profile import DriftRange, Nuisance, Profile, load_profile
+from sealscope.simulation.bench.profile import DriftRange, Nuisance, NuisanceChoice, Profile, load_profile
 from sealscope.simulation.changes import ParameterDrift, Wander
 from sealscope.simulation.commands import Command, parse_command
 from sealscope.simulation.experiment import Experiment
@@ -111,27 +111,41 @@ def _drawn(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float]
 
 
 def draw(
-    profile: Profile | str = "bench", seed: int = 0, *, rig: Rig | str = "thesis", duration: float = 180.0
+    profile: Profile | str = "bench",
+    seed: int = 0,
+    *,
+    rig: Rig | str = "thesis",
+    duration: float = 180.0,
+    family: str = "",
 ) -> BenchMachine:
     """Return a healthy machine of a rig's kind, drawn from a profile (or its name, or its file).
 
     One seed, one machine.
 
-    `duration` [s] is the record over which the drifts have their sizes. Raises InputError for a seed below 0, and where
-    a drawn value is out of its parameter's range.
+    `duration` [s] is the record over which the drifts have their sizes; `family`: of the profile, "" for a machine that
+    is of none. Raises InputError for a seed below 0, an unknown family, and where a drawn value is out of its
+    parameter's range.
     """
     from sealscope.parameters import load_rig
 
     given = load_profile(profile) if isinstance(profile, str) else profile
+    warms = bool(family) and given.family(family).warms
+    given = given.of_family(family) if family else given
     base = load_rig(rig)
     if seed < 0:
         raise InputError(f"seed must be >= 0, got {seed}")
     if not (math.isfinite(duration) and duration > 0):
         raise InputError(f"duration must be > 0 s and finite, got {duration}")
-    oil = _path(_random(seed, "temperature of the oil"), ("linear", "wander"), duration, warms=True)
+    oil = _path(
+        _random(seed, "temperature of the oil"), ("linear",) if warms else ("linear", "wander"), duration, warms=True
+    )
     overrides: dict[str, float | str] = {}
     drifts: list[ParameterDrift] = []
     for nuisance in given.nuisances:
+        if isinstance(nuisance, NuisanceChoice):
+            value = nuisance.values[int(_random(seed, nuisance.name).integers(len(nuisance.values)))]
+            overrides |= dict.fromkeys(nuisance.parameters, value)
+            continue
         values, drifting = _drawn(nuisance, seed, oil)
         overrides |= {name: float(base[name]) * value for name, value in values.items()} if nuisance.scales else values
         drifts += drifting

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,16 @@ class Nuisance:
 
 
 @dataclass(frozen=True)
+class NuisanceChoice:
+    """One thing that differs between machines: one of `values`, in SI or texts of a choice, for all `parameters`."""
+
+    name: str
+    parameters: tuple[str, ...]
+    values: tuple[float | str, ...]
+    why: str
+
+
+@dataclass(frozen=True)
 class Duty:
     """What the machines are asked for.
 
@@ -61,15 +71,52 @@ class Duty:
     why: str
 
 
+AnyNuisance = Nuisance | NuisanceChoice
+
+
+@dataclass(frozen=True)
+class Family:
+    """Machines that depart from the others of a profile in one way.
+
+    `nuisances` take the place of the profile's for the same parameters, `duty` (None: the profile's) that of its duty;
+    `warms`: the oil warms evenly in all of them.
+    """
+
+    name: str
+    nuisances: tuple[AnyNuisance, ...]
+    duty: Duty | None
+    warms: bool
+    why: str
+
+
 @dataclass(frozen=True)
 class Profile:
-    """All nuisances of a kind of machines, and their duty."""
+    """All nuisances of a kind of machines, and their duty; `families` of machines that depart from it."""
 
     name: str
     title: str
     duty: Duty
-    nuisances: tuple[Nuisance, ...]
+    nuisances: tuple[AnyNuisance, ...]
     place: str
+    families: tuple[Family, ...] = field(default=(), repr=False)
+
+    def family(self, name: str) -> Family:
+        """Return the family of that name; raise InputError where there is none."""
+        for family in self.families:
+            if family.name == name:
+                return family
+        known = ", ".join(family.name for family in self.families) or "none"
+        raise InputError(f"a family of {self.name} must be one of its own ({known}), got {name!r} ({self.place})")
+
+    def of_family(self, name: str) -> Profile:
+        """Return the profile of one family's machines: its nuisances, and the others of this one."""
+        family = self.family(name)
+        own = {parameter for nuisance in family.nuisances for parameter in nuisance.parameters}
+        kept = []
+        for nuisance in self.nuisances:
+            left = tuple(parameter for parameter in nuisance.parameters if parameter not in own)
+            kept += [replace(nuisance, parameters=left)] if left else []
+        return replace(self, duty=family.duty or self.duty, nuisances=(*kept, *family.nuisances), families=())
 
 
 def profile_names() -> tuple[str, ...]:
@@ -92,9 +139,39 @@ def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
 
 def _profile(path: Path, place: str) -> Profile:
     tree = read_toml(path, "a profile", place)
-    _known(tree, ("profile", "duty", "nuisance"), "a profile", place)
+    _known(tree, ("profile", "duty", "nuisance", "family"), "a profile", place)
     head = tree.get("profile", {})
-    _known(head, ("name", "title"), "[profile]", place)
+    _known(head, ("name", "title", "extends"), "[profile]", place)
+    base = None
+    if "extends" in head:
+        if head["extends"] not in profile_names() or tree.get("nuisance"):
+            rule = f"extends must be a packaged profile ({', '.join(profile_names())}), in one without nuisances"
+            raise InputError(f"{rule}, got {head['extends']!r} ({place})")
+        base = load_profile(head["extends"])
+    name, title = (_text(head, key, "[profile]", place) for key in ("name", "title"))
+    duty = base.duty if base is not None and "duty" not in tree else _duty(tree.get("duty"), place)
+    nuisances = _nuisances(tree, place) if base is None else base.nuisances
+    entries = tree.get("family", [])
+    if not isinstance(entries, list):
+        raise InputError(f"families must be [[family]] tables, got {entries!r} ({place})")
+    families = tuple(_family(entry, place) for entry in entries)
+    if len({family.name for family in families}) < len(families):
+        raise InputError(f"families must have names of their own ({place})")
+    return Profile(name, title, duty, nuisances, place, families)
+
+
+def _family(entry: Any, place: str) -> Family:
+    _known(entry, ("name", "why", "warms", "duty", "nuisance"), "a family", place)
+    name = _text(entry, "name", "a family", place)
+    why = _text(entry, "why", name, place)
+    warms = entry.get("warms", False)
+    if not isinstance(warms, bool):
+        raise InputError(f"warms of {name} must be true or false, got {warms!r} ({place})")
+    duty = _duty(entry["duty"], place) if "duty" in entry else None
+    return Family(name, _nuisances(entry, place), duty, warms, why)
+
+
+def _nuisances(tree: dict[str, Any], place: str) -> tuple[AnyNuisance, ...]:
     entries = tree.get("nuisance", [])
     if not isinstance(entries, list):
         raise InputError(f"nuisances must be [[nuisance]] tables, got {entries!r} ({place})")
@@ -108,8 +185,7 @@ def _profile(path: Path, place: str) -> Profile:
                 )
     if len({nuisance.name for nuisance in nuisances}) < len(nuisances):
         raise InputError(f"nuisances must have names of their own ({place})")
-    name, title = (_text(head, key, "[profile]", place) for key in ("name", "title"))
-    return Profile(name, title, _duty(tree.get("duty"), place), nuisances, place)
+    return nuisances
 
 
 def _known(table: Any, keys: tuple[str, ...], what: str, place: str) -> None:
@@ -134,14 +210,16 @@ def _pair(value: Any, what: str, place: str) -> tuple[float, float]:
     return float(value[0]), float(value[1])
 
 
-def _nuisance(entry: Any, place: str) -> Nuisance:
+def _nuisance(entry: Any, place: str) -> AnyNuisance:
     from sealscope.parameters import declared_names
     from sealscope.parameters.fields import choices_of, unit_of
     from sealscope.parameters.names import resolve
     from sealscope.parameters.rig import _declared
     from sealscope.units import to_si
 
-    _known(entry, ("name", "parameters", "range", "unit", "scale", "each", "drift", "why"), "a nuisance", place)
+    _known(
+        entry, ("name", "parameters", "range", "unit", "scale", "values", "each", "drift", "why"), "a nuisance", place
+    )
     name = _text(entry, "name", "a nuisance", place)
     why = _text(entry, "why", name, place)
     given = entry.get("parameters")
@@ -151,6 +229,8 @@ def _nuisance(entry: Any, place: str) -> Nuisance:
         parameters = tuple(resolve(item, declared_names()) for item in given)
     except InputError as error:
         raise InputError(f"{error} ({name}, {place})") from None
+    if "values" in entry:
+        return NuisanceChoice(name, parameters, _values(entry, name, parameters, place), why)
     fields = [_declared()[parameter] for parameter in parameters]
     if choice := next(
         (parameter for parameter, field in zip(parameters, fields, strict=True) if choices_of(field)), None
@@ -176,6 +256,34 @@ def _nuisance(entry: Any, place: str) -> Nuisance:
     return Nuisance(name, parameters, low, high, scales, each, drift, why)
 
 
+def _values(entry: dict[str, Any], name: str, parameters: tuple[str, ...], place: str) -> tuple[float | str, ...]:
+    """Return the values of a `NuisanceChoice`: of a choice as they are, of a number in SI."""
+    from sealscope.parameters.fields import choices_of, unit_of
+    from sealscope.parameters.rig import _declared
+    from sealscope.units import to_si
+
+    _known(entry, ("name", "parameters", "values", "unit", "why"), "a nuisance with values", place)
+    given = entry["values"]
+    fields = [_declared()[parameter] for parameter in parameters]
+    allowed = {choices_of(field) for field in fields}
+    units = {unit_of(field) for field in fields}
+    if len(allowed) > 1 or len(units) > 1:
+        raise InputError(f"parameters of one list of values must be of one kind and unit ({name}, {place})")
+    choices = next(iter(allowed))
+    if not isinstance(given, list) or not given:
+        raise InputError(f"values of {name} must be a list of one or more, got {given!r} ({place})")
+    if choices:
+        for value in given:
+            if value not in choices:
+                raise InputError(f"values of {name} must be among {', '.join(choices)}, got {value!r} ({place})")
+        return tuple(given)
+    for value in given:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"values of {name} must be numbers, got {value!r} ({place})")
+    unit = _text(entry, "unit", name, place)
+    return tuple(to_si(float(value), unit, next(iter(units)), name=name, place=place) for value in given)
+
+
 def _drift(table: Any, name: str, parameters: tuple[str, ...], place: str) -> DriftRange:
     from sealscope.parameters.fields import unit_of
     from sealscope.parameters.rig import _declared
@@ -192,7 +300,8 @@ def _drift(table: Any, name: str, parameters: tuple[str, ...], place: str) -> Dr
         raise InputError(f"{error} ({name}, {place})") from None
     si_unit = unit_of(_declared()[parameters[0]]) if absolute else "1"
     low, high = (to_si(value, unit, si_unit, name=f"drift of {name}", place=place) for value in (low, high))
-    if low < 0 or (not absolute and high >= 1):
+    falls = table.get("oil") != 1.0  # with the oil alone, which warms, it only rises
+    if low < 0 or (not absolute and falls and high >= 1):
         raise InputError(f"size of the drift of {name} must be >= 0 and < 100 %, got {low:g} to {high:g} ({place})")
     if "shapes" in table and "oil" in table:
         raise InputError(f"the drift of {name} must have shapes or oil, got both ({place})")

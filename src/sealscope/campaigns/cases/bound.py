@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.errors import InputError
+from sealscope.errors import InputError, SimulationFailed
 from sealscope.evaluation.checks import share
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
@@ -36,6 +36,8 @@ UNKNOWN = (
     "fluid.K_oil",
     "motor.omega_per_volt",
 )
+#: Length [s] of the run whose bound stands for a record's: four periods of the slowest of the bench's commands.
+BOUND_SECONDS = 25.2
 #: Reciprocal condition of the scaled information below which a parameter cannot be told from the others.
 _SINGULAR = 1e-12
 
@@ -141,6 +143,26 @@ def leak_bound(
         duration=experiment.duration,
         nonlinearity=max(sensitivity.nonlinearity for sensitivity in sensitivities),
     )
+
+
+def change_bound(experiment: Experiment, before: float, after: float, dp: float) -> float | None:
+    """Return the standard deviation [L/min] of the best unbiased estimate of a leak's onset at a known time.
+
+    The leak's change from `before` [s] without to `after` [s] with it, under a mean pressure difference `dp` [Pa], from
+    pressures and command of a machine whose `UNKNOWN` parameters are found from either part alone:
+    ``s sqrt(T/before + T/after)``, s the bound over a run of T = `BOUND_SECONDS` without leak, fault or drift. None
+    where that run has no bound. Drift, hum, skew and an unknown onset can only raise the true limit.
+    """
+    run = replace(
+        experiment, leaks=(), faults=(), drifts=(), duration=min(BOUND_SECONDS, experiment.duration), step=None
+    )
+    try:
+        bound = leak_bound(run, unknown=UNKNOWN).unknown
+    except (InputError, SimulationFailed):
+        return None
+    if bound is None:
+        return None
+    return in_lpm(bound * math.sqrt(run.duration / before + run.duration / after), dp)
 
 
 def smallest_found(deviation: float, false_alarm: float, detection: float = 0.9) -> float:
