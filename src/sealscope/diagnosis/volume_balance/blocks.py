@@ -179,54 +179,75 @@ def _walk(integral: Array, step: float) -> Array:
     return np.asarray(step**2 * np.sum(reach**2, axis=1) / own**2)
 
 
-def cut_blocks(
-    t: Array, samples: Mapping[str, Array], length: int, rate: float, *, area: float, displacement: float, pump: bool
-) -> BalanceBlocks:
+@dataclass(frozen=True)
+class Geometry:
+    """What turns samples into volumes.
+
+    Parameters
+    ----------
+    area : float
+        Area of the piston [m^2].
+    displacement : float
+        Displacement of the pump [m^3/rad].
+    """
+
+    area: float
+    displacement: float
+
+
+def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple[Array, Array, Array]:
+    """Return the columns (n, c, L) of samples `rows` (n, L) of the `balance_channels`, dp, and dp smoothed (n, L)."""
+    step = 1.0 / rate
+    if "theta" in rows:
+        theta = rows["theta"] * geometry.displacement
+        flow = np.gradient(theta, step, axis=1)
+    else:
+        flow = rows["omega"] * geometry.displacement
+        theta = _integral(flow, step)
+    dp = rows["p_A"] - rows["p_B"]
+    # the mean of a root is not the root of the mean: noise would pass for a smaller root near zero
+    smooth = _smooth(dp, 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)
+    root = np.sign(smooth) * np.sqrt(np.abs(smooth))
+    columns = [rows["x"] * geometry.area, theta, flow, _integral(dp, step), _integral(root, step)]
+    if "p_1" in rows:
+        dp_12 = rows["p_1"] - rows["p_2"]
+        columns += [dp_12, _integral(dp_12, step)]
+    return np.stack(columns, axis=1), dp, smooth
+
+
+def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float, geometry: Geometry) -> BalanceBlocks:
     """Cut samples into whole blocks of `length` samples from the first on.
 
     What is left over is not used, nor is a block with a missing value or an uneven time base. `t` (m,) [s]; `samples`:
-    the `balance_channels`, in any unit; `area` [m^2] and `displacement` [m^3/rad] turn x
-    and theta into volumes; `pump`: keep the columns of the pump's ports.
+    the `balance_channels`, in any unit.
     """
     count = t.size // length
 
     def rows(values: Array) -> Array:
         return np.asarray(values[: count * length], dtype=np.float64).reshape(count, length)
 
-    step = 1.0 / rate
-    if "theta" in samples:
-        theta = rows(samples["theta"]) * displacement
-        flow = np.gradient(theta, step, axis=1)
-    else:
-        flow = rows(samples["omega"]) * displacement
-        theta = _integral(flow, step)
-    times, x = rows(t), rows(samples["x"]) * area
-    dp = rows(samples["p_A"]) - rows(samples["p_B"])
-    pump_dp = rows(samples["p_1"]) - rows(samples["p_2"]) if pump else None
-    usable = np.all(np.isfinite(x + theta + dp + (0.0 if pump_dp is None else pump_dp)), axis=1)
+    step, times = 1.0 / rate, rows(t)
+    cut = {name: rows(values) for name, values in samples.items()}
+    usable = np.all(np.isfinite(sum(cut.values())), axis=1)
     spacing = np.diff(times, axis=1) * rate
     usable &= np.all(np.isfinite(times), axis=1) & np.all((spacing > 0.5) & (spacing < 1.5), axis=1)
-    times, x, theta, flow, dp = (values[usable] for values in (times, x, theta, flow, dp))
-    # the mean of a root is not the root of the mean: noise would pass for a smaller root near zero
-    smooth = _smooth(dp, 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)
-    root = np.sqrt(np.abs(smooth))
-    columns = [x, theta, flow, _integral(dp, step), _integral(np.sign(smooth) * root, step)]
-    if pump_dp is not None:
-        columns += [pump_dp[usable], _integral(pump_dp[usable], step)]
-    rest, slope, stored = _beyond(np.stack(columns, axis=1), dp, step)
-    noise = _noise(dp)
+    cut = {name: values[usable] for name, values in cut.items()}
+    columns, dp, smooth = volumes(cut, rate, geometry)
+    rest, slope, stored = _beyond(columns, dp, step)
+    noise, root_dp = _noise(dp), np.sqrt(np.abs(smooth)).mean(axis=1)
+    x = columns[:, Y]
     return BalanceBlocks(
-        t=times.mean(axis=1),
+        t=times[usable].mean(axis=1),
         gram=rest @ rest.transpose(0, 2, 1),
         slope=slope,
         stored=stored,
         abs_dp=np.abs(smooth).mean(axis=1),
-        root_dp=root.mean(axis=1),
-        lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root.mean(axis=1), np.finfo(float).tiny) - 1.0,
+        root_dp=root_dp,
+        lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root_dp, np.finfo(float).tiny) - 1.0,
         motion=np.sum(0.5 * (dp[:, 1:] + dp[:, :-1]) * np.diff(x, axis=1), axis=1) / (length * step),
         walk=noise * _walk(rest[:, I_AB], step),
         noise=noise,
-        noise_12=np.zeros_like(noise) if pump_dp is None else _noise(pump_dp[usable]),
+        noise_12=_noise(columns[:, DP_12]) if "p_1" in cut else np.zeros_like(noise),
         samples=length,
         seconds=length * step,
     )

@@ -19,6 +19,7 @@ from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import (
     BalanceBlocks,
+    Geometry,
     balance_channels,
     block_samples,
     channels_needed,
@@ -26,6 +27,7 @@ from sealscope.diagnosis.volume_balance.blocks import (
 )
 from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trouble
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance
+from sealscope.diagnosis.volume_balance.onset import date_step
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Recording, remembered
@@ -49,8 +51,7 @@ class VolumeBalance:
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
-        self.area = float(0.5 * (rig.cylinder.A_A + rig.cylinder.A_B))
-        self.displacement = float(rig.pump.q_b / (2.0 * np.pi))
+        self.geometry = Geometry(0.5 * (rig.cylinder.A_A + rig.cylinder.A_B), rig.pump.q_b / (2.0 * np.pi))
 
     def usable(self, recording: Recording) -> str | None:
         """Return None where the recording has what the balance needs, else the reason why not."""
@@ -71,7 +72,7 @@ class VolumeBalance:
         if fit is None:
             return Evidence("cannot tell", problem)
         probability = share_of_each(false_alarm_probability, baseline)
-        within = judge(fit, probability)
+        within = judge(fit, probability, dated=lambda own, step: date_step(own, step, recording, self.geometry))
         if not baseline:
             return within
         fits = [remembered(other, (self.name, self.rig), self.fit)[0] for other in baseline]
@@ -87,9 +88,7 @@ class VolumeBalance:
             {name: recording[name] for name in names},
             block_samples(recording) if length is None else length,
             recording.rate,
-            area=self.area,
-            displacement=self.displacement,
-            pump="p_1" in names,
+            self.geometry,
         )
 
     def fit(self, recording: Recording) -> tuple[BalanceFit | None, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -67,11 +67,20 @@ def trouble(fit: BalanceFit) -> str | None:
     return None
 
 
-def judge(fit: BalanceFit, probability: float, *, falls: bool = True) -> Evidence:
-    """Return the evidence of a rise of the conductance within a recording; `falls`: name a fall where nothing rises."""
+def judge(
+    fit: BalanceFit,
+    probability: float,
+    *,
+    falls: bool = True,
+    dated: Callable[[BalanceFit, DriftStep], DriftStep] | None = None,
+) -> Evidence:
+    """Return the evidence of a rise of the conductance within a recording.
+
+    `falls`: name a fall where nothing rises; `dated`: gives the onset from the samples about the step (`onset`).
+    """
     step = search(fit, probability)
     if step.alarm:
-        return describe_leak(fit, step)
+        return describe_leak(fit, step if dated is None else dated(fit, step))
     return no_step(fit, step, search(fit, probability, sign=-1) if falls else None)
 
 

@@ -1,0 +1,47 @@
+"""Power grows with the leak: the score of a larger leak is not below that of a smaller one on the same machine."""
+
+from __future__ import annotations
+
+import pytest
+
+from sealscope.diagnosis.diagnose import Examination
+from sealscope.diagnosis.registry import detectors
+from sealscope.recordings.recording import Recording
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
+
+SIZES = (0.001, 0.0042, 0.02, 0.1, 0.2, 0.4)
+#: A score may be below the highest of all smaller leaks by this share: noise, and the saturation of a likelihood ratio.
+TOLERANCE = 0.2
+#: Largest leak [L/min] that a detector's model follows on this rig; beyond, it says `cannot tell` and that it does not.
+FOLLOWS = {"pressure model": 0.02, "observer": 0.02}
+THROTTLES = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"}
+
+
+def leaking(lpm: float) -> Recording:
+    leak = f"{lpm} L/min from 60 s"
+    experiment = Experiment.of(command="3 sin(4t)", duration=120.0, leak=leak, set=THROTTLES, seed=3)
+    return simulate_with_truth(experiment).recording
+
+
+@pytest.fixture(scope="module")
+def recordings() -> dict[float, Recording]:
+    return {lpm: leaking(lpm) for lpm in SIZES}
+
+
+@pytest.mark.parametrize(
+    "detector",
+    [name if name == "volume balance" else pytest.param(name, marks=pytest.mark.slow) for name in detectors()],
+)
+def test_score_does_not_fall_as_the_leak_grows(detector: str, recordings: dict[float, Recording]) -> None:
+    highest, threshold_passed = 0.0, False
+    for lpm, recording in recordings.items():
+        evidence = Examination(recording, false_alarm_probability=0.01).evidence(detector)
+        if lpm > FOLLOWS.get(detector, max(SIZES)):
+            assert evidence.verdict in ("cannot tell", "leak")
+            break
+        assert evidence.score is not None
+        assert evidence.score >= (1.0 - TOLERANCE) * highest
+        assert evidence.alarmed or not threshold_passed
+        highest, threshold_passed = max(highest, evidence.score), threshold_passed or evidence.alarmed
+    assert threshold_passed
