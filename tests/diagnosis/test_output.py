@@ -123,11 +123,14 @@ def test_numbers_that_json_does_not_know_become_null() -> None:
 
 def test_a_part_analysed_is_told(leaky: Recording) -> None:
     p_A = np.array(leaky["p_A"])
-    p_A[1000] = np.nan
+    p_A[:1001] = np.nan
+    p_A[1100] = np.nan
     found = diagnose(Recording(leaky.t, {**leaky.channels, "p_A": p_A}, leaky.units, leaky.rate))
     codes = {finding.code: finding for finding in found.quality}
     assert codes["part_analysed"].count == 1001
+    assert codes["gaps_bridged"].count == 1
     assert codes["missing"].channel == "p_A"
+    assert "this rests on 98.3 % of the recording" in found.reason
     check(found)
 
 

@@ -51,7 +51,7 @@ def driven(rig: Rig, u: np.ndarray, slope: np.ndarray, h: float, every: int) -> 
 
 
 def followed(rig: Rig, recording: Recording) -> Followed:
-    found = follow(rig, *(recording[n] for n in ("u", "p_A", "p_B")), recording.rate, find_cycle(recording))
+    found = follow(rig, recording, find_cycle(recording))
     assert found is not None
     return found
 

@@ -49,7 +49,7 @@ def with_channels(recording: Recording, **channels: np.ndarray) -> Recording:
 
 
 def followed(rig: Rig, recording: Recording) -> Followed:
-    found = follow(rig, *(recording[n] for n in ("u", "p_A", "p_B")), recording.rate, find_cycle(recording))
+    found = follow(rig, recording, find_cycle(recording))
     assert found is not None
     return found
 

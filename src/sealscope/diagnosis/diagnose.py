@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
 FALSE_ALARM_PROBABILITY = 0.01
 _PROBABILITIES = (1e-4, 0.2)
+#: Least share of a recording that `no leak` rests on.
+WHOLE = 0.95
 #: Detectors that name a cause by the pressures: they do so of nothing that another cause explains, alone either.
 _ISOLATED = ("pressure model", "observer")
 
@@ -40,11 +42,12 @@ def check_probability(probability: float) -> None:
 
 
 class Examination:
-    """One recording without gaps and missing samples, and what detectors are given beside it.
+    """One recording, its gaps bridged, without missing samples, and what detectors are given beside it.
 
     `baseline`: leak-free recordings that can be compared with it (`baseline.inspection`); `no_baseline`: why there is
     none where one was asked for: then a leak within the recording is all that can be stated; `rig`: what detectors may
-    assume of the machine; `distrust`: why the pressures cannot be judged, None where they can: then no detector is run.
+    assume of the machine; `distrust`: why the pressures cannot be judged, None where they can: then no detector is run;
+    `share` of what was to be judged that the recording is: `no leak` needs `WHOLE` of it.
     A recording that is to be its own baseline needs pressures that move throughout (`recordings.motion`).
     """
 
@@ -57,7 +60,9 @@ class Examination:
         rig: Rig | str | os.PathLike[str] = "thesis",
         distrust: str | None = None,
         no_baseline: str | None = None,
+        share: float = 1.0,
     ) -> None:
+        self.share = share
         self.recording, self.baseline, self.rig = recording, tuple(baseline), rig
         self.false_alarm_probability = false_alarm_probability
         self.distrust, self.no_baseline = distrust, no_baseline
@@ -76,6 +81,7 @@ class Examination:
             rig=self.rig,
             distrust=self.distrust,
             no_baseline=self.no_baseline,
+            share=self.share,
         )
         view._detectors, view._evidence = self._detectors, self._evidence
         return view
@@ -122,13 +128,25 @@ class Examination:
         if reason is not None:
             return Evidence("cannot tell", reason, detector=name, usable=False)
         evidence = checked(detector.examine(self.recording, baseline, self.false_alarm_probability))
-        evidence = replace(evidence, detector=name)
+        evidence = self._with_share(replace(evidence, detector=name))
         if self.no_baseline is not None:
             if evidence.verdict == "leak" or evidence.cause is not None or evidence.alarmed:
                 evidence = replace(evidence, reason=f"{evidence.reason}; {self.no_baseline}")
             else:
                 evidence = replace(evidence, verdict="cannot tell", reason=self.no_baseline)
         return self._isolated(evidence) if name in _ISOLATED else evidence
+
+    def _with_share(self, evidence: Evidence) -> Evidence:
+        """Return the evidence with the share of all that was recorded it rests on; `no leak` needs nearly all."""
+        share = self.share * evidence.share
+        evidence = replace(evidence, share=share)
+        if evidence.verdict == "cannot tell" or share >= 1.0:
+            return evidence
+        reason = f"{evidence.reason}; this rests on {100.0 * share:.3g} % of the recording"
+        if evidence.verdict == "no leak" and share < WHOLE:
+            reason += f", and the rest may hide a leak ({WHOLE:.0%} are needed)"
+            return replace(evidence, verdict="cannot tell", reason=reason)
+        return replace(evidence, reason=reason)
 
     def fused(self) -> Evidence:
         """Return one verdict from all registered detectors.
@@ -229,6 +247,7 @@ def diagnose(
         rig=load_rig(rig),
         distrust=judged.distrust,
         no_baseline=compared.refusal,
+        share=judged.share,
     ).fused()
     return Diagnosis(
         **vars(fused),

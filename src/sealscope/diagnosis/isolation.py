@@ -19,6 +19,7 @@ from sealscope.diagnosis.changepoint.even_drift import step_near
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording
 
 #: A block is whole cycles of about so long [s]; where the pressures are looked at as they swing, means are taken over
@@ -103,6 +104,11 @@ def signatures(recording: Recording) -> Signatures | None:
             duty = np.log(np.stack([size, np.diff(u, axis=1).std(axis=1) / size], axis=1))
     power, frequency, noise, lines = _bands(dp, rate)
     t = np.asarray(float(recording.t[0]) + (np.arange(count) + 0.5) * length / rate, dtype=np.float64)
+    whole = ~touched(recording, length * np.arange(count + 1))
+    if np.count_nonzero(whole) < 2 * FEWEST:
+        return None
+    t, mean, swing, power, noise = (values[whole] for values in (t, mean, swing, power, noise))
+    duty = None if duty is None else duty[whole]
     return Signatures(
         t, 0.5 * length / rate, mean, swing, duty, power, frequency, noise, lines, duty_changes(recording)
     )

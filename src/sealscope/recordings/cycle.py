@@ -36,11 +36,12 @@ def cycle_of(signal: Array, rate: float) -> float | None:
     repeated five times or more; refined by a parabola.
     """
     stride = max(1, int(rate / _ANALYSIS_RATE))
-    usable = signal[: signal.size // stride * stride]
-    slow = usable.reshape(-1, stride).mean(axis=1)
+    n = signal.size // stride
+    if n < 32:
+        return None
+    slow = signal[: n * stride].reshape(-1, stride).mean(axis=1)
     slow = slow - slow.mean()
-    n = slow.size
-    if n < 32 or not np.any(slow):
+    if not np.any(slow):
         return None
     spectrum = np.abs(np.fft.rfft(slow, 2 * n)) ** 2
     correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)

@@ -230,12 +230,17 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
     whole = np.isfinite(recording.t)
     for name in recording.channels if channels is None else channels:
         whole = whole & np.isfinite(recording[name])
-    with np.errstate(invalid="ignore"):
-        steps = np.diff(recording.t) * recording.rate
-        joined = whole[1:] & whole[:-1] & (steps > _CROWDED) & (steps < _GAP)
+    joined = whole[1:] & whole[:-1] & even_steps(recording)
     starts = np.flatnonzero(whole & np.r_[True, ~joined][:count])
     stops = np.flatnonzero(whole & np.r_[~joined, True][-count:]) + 1 if count else starts
     return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if b - a >= shortest]
+
+
+def even_steps(recording: Recording) -> NDArray[np.bool_]:
+    """Return which intervals (n - 1,) lie between half and one and a half steps of the recording's rate."""
+    with np.errstate(invalid="ignore"):
+        steps = np.diff(recording.t) * recording.rate
+    return np.asarray((steps > _CROWDED) & (steps < _GAP))
 
 
 class Holes(NamedTuple):

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
@@ -69,6 +70,8 @@ class Recording:
         Where the data come from.
     history : tuple of str, optional
         One line for each processing step.
+    bridged : array_like of bool, shape (n,), optional
+        Rows whose values were missing and are interpolated (`recordings.gaps`); None where there are none.
 
     Raises
     ------
@@ -97,6 +100,7 @@ class Recording:
     rate: float
     provenance: Mapping[str, Any] = field(default_factory=dict)
     history: tuple[str, ...] = ()
+    bridged: NDArray[np.bool_] | None = None
     _results: dict[Hashable, _Result] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
@@ -113,6 +117,12 @@ class Recording:
                 raise InputError(f"channel {name} must have as many samples as t ({t.size}), got shape {values.shape}")
             if name not in self.units:
                 raise InputError(f"channel {name} must have a unit, got none")
+        if self.bridged is not None:
+            bridged = np.array(self.bridged, dtype=bool)
+            if bridged.shape != t.shape:
+                raise InputError(f"bridged must have as many samples as t ({t.size}), got shape {bridged.shape}")
+            bridged.setflags(write=False)
+            object.__setattr__(self, "bridged", bridged if bridged.any() else None)
         if not (np.isfinite(rate) and rate > 0):
             raise InputError(f"rate must be > 0 Hz, got {self.rate}")
         object.__setattr__(self, "t", t)
@@ -169,7 +179,8 @@ class Recording:
 
     def _cut(self, chosen: Any, note: str) -> Recording:
         channels = {name: values[chosen] for name, values in self.channels.items()}
-        return replace(self, t=self.t[chosen], channels=channels, history=(*self.history, note))
+        bridged = None if self.bridged is None else self.bridged[chosen]
+        return replace(self, t=self.t[chosen], channels=channels, history=(*self.history, note), bridged=bridged)
 
     def only(self, names: Iterable[str]) -> Recording:
         """Return the same recording with the named channels alone."""

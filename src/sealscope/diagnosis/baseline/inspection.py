@@ -16,6 +16,9 @@ import numpy as np
 
 from sealscope.diagnosis.baseline.operating_point import OperatingPoint, difference, operating_point
 from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.gaps import MOST_BRIDGED, bridge
+from sealscope.recordings.motion import runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
 from sealscope.recordings.recording import Recording, remembered
 
@@ -32,13 +35,15 @@ _MOST_NAMES = 3
 class Inspection:
     """A recording as detectors see it.
 
-    `part`: its longest uniformly sampled stretch with no chamber pressure and no command missing; `findings` on the
-    whole; `distrust`: why the chamber pressures cannot be trusted, None where they can.
+    `part`: its longest uniformly sampled stretch with no chamber pressure and no command missing, gaps bridged where
+    they can be (`recordings.gaps`); `findings` on the whole; `distrust`: why the chamber pressures cannot be trusted,
+    None where they can; `share` of the whole that the stretch is.
     """
 
     part: Recording
     findings: tuple[Finding, ...]
     distrust: str | None
+    share: float
 
     @property
     def defect(self) -> str | None:
@@ -73,22 +78,31 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     part = recording
     if "u" in part and not np.any(np.isfinite(part["u"])):  # `inspect` reports it; the pressures can do without
         part = part.only(name for name in part.channels if name != "u")
-    stretches = uniform_segments(part, (*chambers, "u") if "u" in part else chambers)
+    needed = (*chambers, "u") if "u" in part else chambers
+    part = bridge(part, needed)
+    if part.bridged is not None:
+        rows = np.flatnonzero(part.bridged)
+        text = (
+            f"{counted(rows.size, 'missing sample')} in {counted(len(runs_of(part.bridged)), 'gap')} bridged; blocks "
+            f"with more than {MOST_BRIDGED:.0%} of them are left out"
+        )
+        findings.append(Finding("gaps_bridged", "note", None, rows.size, float(part.t[rows[0]]), text))
+    stretches, count = uniform_segments(part, needed), len(part)
     if not stretches:
         part = part.between(math.inf, math.inf)
     else:
         longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start)
-        if longest.stop - longest.start < len(part):
+        if longest.stop - longest.start < count:
             part = part.samples(longest)
             text = (
                 f"only the longest whole stretch was analysed: {part.t[0]:.4g} s to {part.t[-1]:.4g} s, {len(part)} of "
-                f"{len(recording)} samples"
+                f"{count} samples"
             )
-            left_out = len(recording) - len(part)
+            left_out = count - len(part)
             findings.append(Finding("part_analysed", "warning", None, left_out, float(part.t[0]), text))
     spoiled = next((own for own in findings if own.channel in chambers and _spoils(own, len(part))), None)
     distrust = None if spoiled is None else f"the pressures cannot be trusted: {spoiled.text}"
-    return Inspection(part, tuple(findings), distrust)
+    return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1))
 
 
 def _spoils(finding: Finding, samples: int) -> bool:

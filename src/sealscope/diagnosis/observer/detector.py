@@ -9,6 +9,7 @@ parameters come from the assumed rig, and the innovations show whether that rig 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,11 +17,13 @@ import numpy as np
 from sealscope.diagnosis.baseline.level import share_of_each
 from sealscope.diagnosis.changepoint.random_walk import FEWEST, WalkStep, find_leak_step
 from sealscope.diagnosis.observer.against_baseline import compare
+from sealscope.diagnosis.observer.estimates import Estimates
 from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, within
 from sealscope.diagnosis.observer.stream import Formulation, ObserverStream, channels_of, formulation_of, whole
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Recording, remembered
 
 if TYPE_CHECKING:
@@ -80,10 +83,12 @@ class Observer:
         stream = ObserverStream(self.rig, channels_of(formulation, recording), recording.rate, block_s)
         estimates = stream.update(recording)
         start = float(recording.t[0]) + stream.block_s * np.arange(estimates.G.size)
-        late = start - float(recording.t[0]) >= WARM_UP
+        gaps = touched(recording, stream.block * np.arange(start.size + 1))
+        late = (start - float(recording.t[0]) >= WARM_UP) & ~gaps
         t = np.asarray(start[late] + 0.5 * stream.block_s, dtype=np.float64)
         G, sd, dp = (values[late] for values in (estimates.G, estimates.sd, estimates.dp))
-        return ConductanceSeries(t, G, sd, dp, stream.block_s, formulation, estimates)
+        own = Estimates(*(values[~gaps] for values in estimates))
+        return ConductanceSeries(t, G, sd, dp, stream.block_s, formulation, own, 1.0 - float(np.mean(gaps)))
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`, within it or against the baseline."""
@@ -100,12 +105,12 @@ class Observer:
         probability = share_of_each(false_alarm_probability, baseline)
         step = self._step(series, probability)
         if not baseline:
-            return within(series, step)
+            return replace(within(series, step), share=series.share)
 
         def follow(other: Recording) -> ConductanceSeries:
             return remembered(other, (self.name, self.rig), self.follow)
 
-        return compare(series, baseline, follow, step, probability, self.rig)
+        return replace(compare(series, baseline, follow, step, probability, self.rig), share=series.share)
 
     @staticmethod
     def _step(series: ConductanceSeries, probability: float) -> WalkStep:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -45,7 +46,8 @@ class ConductanceSeries:
     """The conductance over a recording, without the warm-up.
 
     `t` (k,): middles of the blocks [s]; `G`, `sd` (k,) in `G_UNIT`; `dp` (k,): mean |p_A - p_B| [Pa]; `block_s`: length
-    of a block [s]; `estimates`: those of all blocks, warm-up included.
+    of a block [s]; `estimates`: those of all blocks, warm-up included; blocks with missing samples are left out of
+    both, `share`: that of all blocks which are left.
     """
 
     t: Array
@@ -55,6 +57,13 @@ class ConductanceSeries:
     block_s: float
     formulation: Formulation
     estimates: Estimates
+    share: float = 1.0
+
+    def instants(self, blocks: Sequence[float]) -> Array:
+        """Return where blocks begin [s], by their numbers (k,), which may lie between two."""
+        starts = self.t - 0.5 * self.block_s
+        ends = np.append(starts, starts[-1] + self.block_s)
+        return np.asarray(np.interp(blocks, np.arange(ends.size), ends))
 
 
 def misfit(estimates: Estimates, formulation: Formulation, rig: Rig) -> str | None:
@@ -96,7 +105,7 @@ def within(series: ConductanceSeries, step: WalkStep) -> Evidence:
     """Return the evidence from the step within a recording."""
     from scipy.special import stdtrit
 
-    edges = np.array([step.onset, *step.onset_interval]) * series.block_s + series.t[0] - 0.5 * series.block_s
+    edges = series.instants([step.onset, *step.onset_interval])
     onset, interval = float(edges[0]), (float(edges[1]), float(edges[2]))
     after = series.t > onset
     dp = float(np.mean(series.dp[after])) if np.any(after) else float(np.mean(series.dp))

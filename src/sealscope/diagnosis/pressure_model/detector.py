@@ -10,6 +10,7 @@ here, so that the level of G says nothing of the piston: only its rise does, or 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,12 +80,13 @@ class PressureModel:
             return Evidence("cannot tell", followed)
         probability = share_of_each(false_alarm_probability, baseline)
         within = _within(followed, recording, probability)
+        within = replace(within, share=followed.share)
         if not baseline or within.score is None:
             return within
         if not is_followed(followed):
             return incomparable(within, "the fit has a ring too many or too few in each reversal")
         known = [remembered(other, (self.name, self.rig), self.follow) for other in baseline]
-        return against_baseline(
+        level = against_baseline(
             within,
             followed.level,
             [other.level for other in known if not isinstance(other, str) and _comparable(followed, other)],
@@ -94,13 +96,14 @@ class PressureModel:
             flows=(_mean_drop(recording) / LITRE_PER_MINUTE,),
             cause="piston or pump leak",
         )
+        return replace(level, share=followed.share)
 
     def follow(self, recording: Recording) -> Followed | str:
         """Return the record as the model follows it, or the reason why it does not."""
         from sealscope.diagnosis.pressure_model.follow import follow
 
         cycle = find_cycle(recording)
-        followed = follow(self.rig, recording["u"], recording["p_A"], recording["p_B"], recording.rate, cycle)
+        followed = follow(self.rig, recording, cycle)
         if followed is None:
             return "the model of the rig cannot be fitted to the pressures"
         if followed.explained < EXPLAINED:

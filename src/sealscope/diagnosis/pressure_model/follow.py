@@ -32,7 +32,8 @@ from sealscope.diagnosis.pressure_model.model import (
 )
 from sealscope.diagnosis.pressure_model.track import ConductanceSteps, Track, excess_of, leap, steps_in, track
 from sealscope.parameters import Rig
-from sealscope.recordings.recording import Array
+from sealscope.recordings.gaps import touched
+from sealscope.recordings.recording import Array, Recording
 
 #: Blocks are whole cycles of at least so long [s]; what comes before is left out: the start from rest.
 BLOCK, FIRST = 6.0, 3.0
@@ -54,7 +55,8 @@ class Followed:
 
     `theta` (12,): first fit; `path` (b, 12); `steps` of G; `edges` (b + 1,) [samples]
     from the first sample; `seconds` of a block; `explained`: share of dp's variance; `level` [m^3/(s Pa)]: mean
-    G; `friction_change`, `stiffness_change`: from the first to the last third, as shares.
+    G; `friction_change`, `stiffness_change`: from the first to the last third, as shares; `share` of the blocks that
+    have no missing samples and count.
     """
 
     theta: Array
@@ -68,6 +70,7 @@ class Followed:
     friction_change: float
     stiffness_change: float
     command_rms: float
+    share: float
 
     @property
     def blocks(self) -> int:
@@ -101,11 +104,12 @@ def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple
     return window(long), window(min(short, long))
 
 
-def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float | None) -> Followed | None:
-    """Fit and follow a record of uniformly sampled channels (n,); None where no fit is finite.
+def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | None:
+    """Fit and follow the chamber pressures and the command of a record; None where no fit is finite.
 
     `cycle` [s]: length of the duty's cycle, None where it does not repeat.
     """
+    u, p_A, p_B, rate = recording["u"], recording["p_A"], recording["p_B"], recording.rate
     dp = p_A - p_B
     dp = dp * (1.0 if _same_sense(u, dp) else -1.0)
     centre = nominal(rig)
@@ -124,15 +128,21 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
     edges = np.round(np.arange(FIRST, dp.size / rate, length) * rate).astype(np.int64)
     if edges.size < 4:
         return None
+    seen = ~touched(recording, edges)
+    share = float(np.mean(seen))
+    if np.count_nonzero(seen) < 3:
+        return None
+    first, last = np.flatnonzero(seen)[[0, -1]]
+    edges, seen = edges[first : last + 2], seen[first : last + 1]
     speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(u))
     skip = int(FIRST * rate)
-    followed, steps = _tracked(model, dp, edges, theta, skip, speed)
+    followed, steps = _tracked(model, dp, edges, theta, skip, speed, seen)
     if excess_of(steps) > RESTLESS:
         for first in anew:
             other, dearer = refit(long, first, prior)
             if dearer > cost * (1.0 + _AS_GOOD):
                 continue
-            again = _tracked(model, dp, edges, other, skip, speed)
+            again = _tracked(model, dp, edges, other, skip, speed, seen)
             if excess_of(again[1]) < excess_of(steps) - 0.05:
                 theta, (followed, steps) = other, again
     third = max(1, len(followed.path) // 3)
@@ -150,6 +160,7 @@ def follow(rig: Rig, u: Array, p_A: Array, p_B: Array, rate: float, cycle: float
         friction,
         float(late[K] / early[K] - 1.0),
         float(np.std(u)),
+        share,
     )
 
 
@@ -159,7 +170,13 @@ def _same_sense(u: Array, dp: Array) -> bool:
 
 
 def _tracked(
-    model: DrivenModel, dp: Array, edges: NDArray[np.int64], theta: Array, skip: int, speed: float
+    model: DrivenModel,
+    dp: Array,
+    edges: NDArray[np.int64],
+    theta: Array,
+    skip: int,
+    speed: float,
+    seen: NDArray[np.bool_],
 ) -> tuple[Track, ConductanceSteps]:
     """Follow the record from a first fit, and estimate the steps of G in it.
 
@@ -168,7 +185,7 @@ def _tracked(
     look at what was chosen for being large would raise, is not.
     """
     followed, start = min(
-        ((track(model, dp, edges, theta, start, skip), start) for start in _starts(model, theta)),
+        ((track(model, dp, edges, theta, start, skip, seen=seen), start) for start in _starts(model, theta)),
         key=lambda both: float(both[0].block_variance[:_EARLY].mean()),
     )
     steps = steps_in(followed, theta, speed)
@@ -176,7 +193,7 @@ def _tracked(
     if steps.z[after] < _CLEAR:
         return followed, steps
     jumps = leap(edges.size - 1, after, G)
-    fresh = steps_in(track(model, dp, edges, theta, start, skip, jumps, followed.path), theta, speed)
+    fresh = steps_in(track(model, dp, edges, theta, start, skip, jumps, followed.path, seen=seen), theta, speed)
     if excess_of(fresh) < max(1.0, excess_of(steps)) + 0.05:
         steps = replace(steps, size=fresh.size, deviation=fresh.deviation)
     return followed, steps

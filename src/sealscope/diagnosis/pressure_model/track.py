@@ -139,15 +139,18 @@ def track(
     skip: int,
     jumps: Array | None = None,
     from_path: Array | None = None,
+    *,
+    seen: NDArray[np.bool_] | None = None,
 ) -> Track:
     """Follow the parameters from the first fit `theta` (12,) through blocks between `edges` of the whole record.
 
     `start` (5,): the model's state at the first sample; `jumps` (b - 1, p): how many times farther than usual each
-    parameter may go from a block to the next; `from_path` (b, 12): where to begin, the first fit by default. Blocks are
-    linearised about their own parameters, until these stand still; the trend of the speed's bias within a block is
-    eliminated.
+    parameter may go from a block to the next; `from_path` (b, 12): where to begin, the first fit by default; `seen`
+    (b,): blocks that count (default: all), through the others the parameters wander unseen. Blocks are linearised about
+    their own parameters, until these stand still; the trend of the speed's bias within a block is eliminated.
     """
     blocks = edges.size - 1
+    seen = np.ones(blocks, dtype=bool) if seen is None else seen
     n = dp.size
     segment = np.clip(np.searchsorted(edges, np.arange(n), side="right") - 1, 0, blocks - 1).astype(np.int64)
     h = steps_of(theta)
@@ -164,7 +167,8 @@ def track(
     limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
 
     def misfits(shown: Array) -> Array:
-        return np.array([rest.size * np.var(rest) for rest in (dp[block] - shown[block] for block in limits)])
+        rests = (dp[block] - shown[block] for block in limits)
+        return np.array([rest.size * np.var(rest) for rest in rests]) * seen
 
     def strain(at: Array, walk: Array) -> float:
         steps = np.diff(at, axis=0) / h / walk[:, :-1]
@@ -177,8 +181,8 @@ def track(
         between = np.column_stack([np.interp(at, free, path[free, k]) for k in range(_CONSTANT)])
         tries = np.tile(between, (_BIASES.size, 1, 1))
         tries[:, :, BIAS] += _BIASES[:, None] * _WANDER_BIAS * speed
-        seen = model.run(tries, segment, np.tile(start, (_BIASES.size, 1)))
-        best = np.argmin([misfits(shown) for shown in seen], axis=0)
+        runs = model.run(tries, segment, np.tile(start, (_BIASES.size, 1)))
+        best = np.argmin([misfits(shown) for shown in runs], axis=0)
         return np.where(stuck[:, None], tries[best, at], path)
 
     before: tuple[float, float, Track] | None = None
@@ -190,7 +194,8 @@ def track(
             sets[k + 1, :, k] += h[k]
         shown = model.run(sets, segment, np.tile(start, (_CONSTANT + 1, 1)))
         N, r, squares, counts = _normal(dp, shown, limits, path / h)
-        variance = float(squares.sum() / counts.sum())
+        variance = float(squares[seen].sum() / counts[seen].sum())
+        N, r = N * seen[:, None, None], r * seen[:, None]
         followed = Track(
             edges,
             path,
@@ -198,7 +203,7 @@ def track(
             r / variance,
             units,
             variance,
-            squares / counts,
+            np.where(seen, squares / counts, variance),
             np.concatenate([anchor, centre]),
             seconds,
         )
@@ -208,8 +213,8 @@ def track(
         )
         fresh = _held(solved.reshape(blocks, SIZE)[:, :_CONSTANT] * h, theta)
         tries = path + _SHARES[:, None, None] * (fresh - path)
-        seen = model.run(tries, segment, np.tile(start, (_SHARES.size, 1)))
-        apart = np.array([misfits(each).sum() for each in seen])
+        runs = model.run(tries, segment, np.tile(start, (_SHARES.size, 1)))
+        apart = np.array([misfits(each).sum() for each in runs])
         costs = apart / variance + np.array([strain(at, allowed) for at in tries])
         best = int(np.nanargmin(costs))
         gained = float(misfits(shown[0]).sum()) / variance + strain(path, allowed) - costs[best]

@@ -12,6 +12,7 @@ import numpy as np
 
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.gaps import touched
 from sealscope.recordings.motion import ROUNDING
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import Details, details
@@ -34,9 +35,10 @@ _SETTLING_SECONDS, _SETTLING_CYCLES, _SETTLING_AT_MOST = 10.0, 3.0, 1.0 / 8.0
 class RmsBlocks:
     """Log RMS of every quantity in every block.
 
-    `edges` (n + 1,): boundaries [s]; `log_rms` (n, 5 per chamber): the phase's own level taken out; `chambers`: their
-    names; `phases`: blocks a cycle (1: none); `cycle`: its length [s], None without a cycle; `still`: the first block
-    in which a reading does not move, as text (its log RMS means nothing).
+    `edges` (n + 1,): where each block begins and the last ends [s]; `log_rms` (n, 5 per chamber): the phase's own level
+    taken out; `chambers`: their names; `phases`: blocks a cycle (1: none); `cycle`: its length [s], None without a
+    cycle; `still`: the first block in which a reading does not move, as text (its log RMS means nothing); `left_out`:
+    blocks with missing samples, which are not among these.
     """
 
     edges: Array
@@ -45,6 +47,12 @@ class RmsBlocks:
     phases: int
     cycle: float | None
     still: str | None = None
+    left_out: int = 0
+
+    @property
+    def share(self) -> float:
+        """Share of all blocks that are not left out."""
+        return len(self.log_rms) / max(len(self.log_rms) + self.left_out, 1)
 
     @property
     def names(self) -> list[str]:
@@ -54,6 +62,8 @@ class RmsBlocks:
     @property
     def seconds(self) -> float:
         """Length of a block [s]."""
+        if self.left_out:
+            return float(np.diff(self.edges).min())
         return float(self.edges[-1] - self.edges[0]) / len(self.log_rms)
 
     def columns(self, *quantities: str) -> list[int]:
@@ -108,21 +118,26 @@ def cut(recording: Recording) -> RmsBlocks:
     with np.errstate(divide="ignore", over="ignore"):
         log_rms = 0.5 * np.log(np.concatenate([mean_squares(chamber, bounds) for chamber in transformed], axis=1))
     ends = recording.t[0] + bounds / recording.rate
-    still = _still(recording, chambers, log_rms, ends)
+    kept = ~touched(recording, bounds)
+    still = _still(recording, chambers, log_rms, ends, kept)
     if still is None and phases > 1:
-        level = log_rms.mean(axis=0)
+        level = log_rms[kept].mean(axis=0)
         for phase in range(min(phases, count)):
-            same = log_rms[phase::phases]
-            log_rms[phase::phases] = same - same.mean(axis=0) + level
-    return RmsBlocks(ends, log_rms, chambers, phases, cycle, still)
+            same = np.flatnonzero(kept)[np.flatnonzero(kept) % phases == phase]
+            if same.size:
+                log_rms[same] = log_rms[same] - log_rms[same].mean(axis=0) + level
+    edges = np.append(ends[:-1][kept], ends[1:][kept][-1:] if kept.any() else ends[:1])
+    return RmsBlocks(edges, log_rms[kept], chambers, phases, cycle, still, int(np.count_nonzero(~kept)))
 
 
-def _still(recording: Recording, chambers: tuple[str, ...], log_rms: Array, edges: Array) -> str | None:
-    """Say in which block a chamber's details are rounding, or no number, for the first time; None for never."""
+def _still(
+    recording: Recording, chambers: tuple[str, ...], log_rms: Array, edges: Array, kept: Array | np.ndarray
+) -> str | None:
+    """Say in which of the `kept` blocks a chamber's details are rounding, or no number, first; None for none."""
     for chamber, name in enumerate(chambers):
         levels = log_rms[:, chamber * len(QUANTITIES) : chamber * len(QUANTITIES) + LEVELS]
         floor = np.log(ROUNDING * np.abs(recording[name]).max())
-        still = np.flatnonzero(~np.all(np.isfinite(levels) & (levels > floor), axis=1))
+        still = np.flatnonzero(kept & ~np.all(np.isfinite(levels) & (levels > floor), axis=1))
         if still.size:
             return f"{name} does not move from {edges[still[0]]:.4g} s to {edges[still[0] + 1]:.4g} s"
     return None

@@ -84,7 +84,8 @@ class RmsChange:
             )
         if blocks.still is not None:
             return Evidence("cannot tell", f"the pressures cannot be trusted: {blocks.still}")
-        return _of_one_duty(within(blocks.settled(), false_alarm_probability), duty_changes(recording))
+        evidence = _of_one_duty(within(blocks.settled(), false_alarm_probability), duty_changes(recording))
+        return replace(evidence, share=blocks.share)
 
 
 def _of_one_duty(evidence: Evidence, changes: Sequence[StrokeChange]) -> Evidence:
@@ -218,4 +219,5 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
         f"or more to have the drift between recordings in it){WITHOUT_NOISE if noisy else ''}"
     )
     parts = parts_against(after.names, single, thresholds, changes)
-    return Evidence("leak" if score > threshold else "no leak", reason, score, threshold, parts=parts)
+    verdict: Verdict = "leak" if score > threshold else "no leak"
+    return Evidence(verdict, reason, score, threshold, parts=parts, share=after.share)

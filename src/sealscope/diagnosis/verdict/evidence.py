@@ -63,6 +63,9 @@ class Evidence:
     refuses : frozenset of {"onset_s", "leak_lpm"}
         Figures that the detector has a reason not to state, as opposed to those it cannot compute. No other detector's
         figure takes their place in the fused verdict.
+    share : float
+        Share of the recording, 0 to 1, that the verdict rests on: less than 1 where blocks with missing samples are
+        left out.
     detector : str
         Name of the detector, or of the part; of a fused verdict, the detector that judged, "" where none did.
     usable : bool
@@ -81,6 +84,7 @@ class Evidence:
     cause: Cause | None = None
     course: LeakCourse | None = field(default=None, compare=False, repr=False)
     refuses: frozenset[Figure] = frozenset()
+    share: float = 1.0
     detector: str = ""
     usable: bool = True
 

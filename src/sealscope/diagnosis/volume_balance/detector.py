@@ -10,6 +10,7 @@ turns the result into L/min, and displacement over area shows whether the assume
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +30,7 @@ from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trou
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance
 from sealscope.diagnosis.volume_balance.onset import date_step
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.gaps import touched
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Recording, remembered
 
@@ -72,21 +74,29 @@ class VolumeBalance:
         if fit is None:
             return Evidence("cannot tell", problem)
         probability = share_of_each(false_alarm_probability, baseline)
-        within = judge(fit, probability, dated=lambda own, step: date_step(own, step, recording, self.geometry))
-        if not baseline:
-            return within
-        fits = [remembered(other, (self.name, self.rig), self.fit)[0] for other in baseline]
-        return judge_level(fit, [other for other in fits if other is not None], within, probability)
+        evidence = judge(fit, probability, dated=lambda own, step: date_step(own, step, recording, self.geometry))
+        if baseline:
+            fits = [remembered(other, (self.name, self.rig), self.fit)[0] for other in baseline]
+            evidence = judge_level(fit, [other for other in fits if other is not None], evidence, probability)
+        whole = max(len(recording) // fit.blocks.samples, 1)
+        return replace(evidence, share=(len(fit.blocks) + len(fit.left_out)) / whole)
 
     def blocks(
         self, recording: Recording, length: int | None = None, names: Sequence[str] | None = None
     ) -> BalanceBlocks:
         """Return the blocks of a recording, of `length` samples and `names` of channels, or as its duty suggests."""
         names = balance_channels(recording) if names is None else names
+        length = block_samples(recording) if length is None else length
+        samples = {name: recording[name] for name in names}
+        gaps = touched(recording, np.arange(0, len(recording) + 1, length))
+        if gaps.any():
+            rows = np.flatnonzero(gaps)[:, None] * length + np.arange(length)
+            samples["x"] = samples["x"].copy()
+            samples["x"][rows.ravel()] = np.nan
         return cut_blocks(
             recording.t,
-            {name: recording[name] for name in names},
-            block_samples(recording) if length is None else length,
+            samples,
+            length,
             recording.rate,
             self.geometry,
         )

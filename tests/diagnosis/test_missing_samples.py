@@ -1,0 +1,67 @@
+"""Missing samples hide no leak: blocks on both sides of a gap are judged, and a verdict names the share it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.recordings.recording import Recording
+
+VIEWS = {"all": None, "command": ("u", "p_A", "p_B"), "pressures": ("p_A", "p_B")}
+
+
+def holed(recording: Recording, rows: np.ndarray, *names: str) -> Recording:
+    own = {name: np.where(rows, np.nan, recording[name]) for name in names or recording.channels}
+    return replace(recording, channels={**recording.channels, **own})
+
+
+def seen(recording: Recording, view: str) -> Recording:
+    names = VIEWS[view]
+    return recording if names is None else recording.only(names)
+
+
+@pytest.fixture(scope="module")
+def late_leak(records) -> Recording:  # type: ignore[no-untyped-def]
+    return records(1, leak="0.05 L/min from 61 s", duration=120.0, throttled=True)
+
+
+GAPS: dict[str, Callable[[Recording], Recording]] = {
+    "one sample before the onset": lambda r: holed(r, np.arange(len(r)) == 30_250, "p_A"),
+    "samples here and there after the onset": lambda r: holed(
+        r, (np.random.default_rng(0).random(len(r)) < 0.005) & (r.t > 61.0), "p_A"
+    ),
+    "2 s of all channels": lambda r: holed(r, (r.t > 58.0) & (r.t < 60.0)),
+    "rows lost": lambda r: replace(
+        r, t=np.delete(r.t, slice(29_500, 30_400)),
+        channels={name: np.delete(values, slice(29_500, 30_400)) for name, values in r.channels.items()},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("gap", "view"), [*((gap, view) for gap in GAPS for view in ("all", "pressures")), (next(iter(GAPS)), "command")]
+)
+def test_a_leak_after_a_gap_is_found(gap: str, view: str, late_leak: Recording) -> None:
+    diagnosis = diagnose(seen(GAPS[gap](late_leak), view))
+    assert diagnosis.verdict == "leak", diagnosis.reason
+    assert diagnosis.onset_s == pytest.approx(61.0, abs=5.0)  # within the blocks that the gap takes
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_few_missing_samples_change_no_verdict_of_a_sound_machine(view: str, sound: Recording) -> None:
+    diagnosis = diagnose(seen(GAPS["2 s of all channels"](sound), view))
+    assert diagnosis.verdict == "no leak"
+    assert f"this rests on {100 * diagnosis.share:.3g} % of the recording" in diagnosis.reason
+    assert 0.95 <= diagnosis.share < 1.0
+
+
+@pytest.mark.parametrize("view", ["all", "pressures"])
+def test_no_leak_needs_nearly_all_of_the_recording(view: str, sound: Recording) -> None:
+    """A tenth of a second in every four after half: hardly a sample is missing, and few blocks are left."""
+    diagnosis = diagnose(seen(holed(sound, (sound.t % 4.0 < 0.1) & (sound.t > 60.0)), view))
+    assert diagnosis.verdict == "cannot tell"
+    assert "the rest may hide a leak" in diagnosis.reason
