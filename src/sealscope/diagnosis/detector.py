@@ -20,9 +20,9 @@ class Detector(Protocol):
     """A detector: states evidence at a false-alarm probability, and says `cannot tell` rather than guess.
 
     The recordings it is given are uniformly sampled, and their chamber pressures and command have no missing sample
-    (what was missing is bridged, and marked in `Recording.bridged`); any other channel may be absent or hold NaN. A class attribute `reads` may name the channels that it looks at where
-    no baseline is given: then a campaign that shows a record through several sets of channels runs it once for all that
-    agree in these.
+    (what was missing is bridged, and marked in `Recording.bridged`); any other channel may be absent or hold NaN. A
+    class attribute `reads` may name the channels that it looks at where no baseline is given: then a campaign that
+    shows a record through several sets of channels runs it once for all that agree in these.
     """
 
     name: str
