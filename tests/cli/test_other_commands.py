@@ -143,3 +143,20 @@ def test_the_shell_s_script_calls_the_command_back(shell):
     done = shell("sealscope", _SEALSCOPE_COMPLETE="source_bash")
     assert "complete_bash" in done.out
     assert re.search(r"^complete .* sealscope$", done.out, re.MULTILINE)
+
+
+def test_inspect_shows_what_a_foreign_file_holds_and_what_is_wrong(call, tmp_path):
+    rows = "".join(f"{k / 500:.3f};{20 + k % 9};5;{k % 7}\n" for k in range(600))
+    (tmp_path / "log.csv").write_text("Zeit [s];Druck A [bar];PB_bar;Weg_mm\n" + rows)
+    done = call("inspect", tmp_path / "log.csv", tmp_path / "none.csv")
+    assert done.status == 1
+    assert "must exist" in done.err
+    lines = done.out.splitlines()
+    assert lines[0].endswith("600 samples at 500 Hz, 1.2 s")
+    assert lines[1].split()[:1] == ["p_A"]
+    assert "20 to 28 bar" in lines[1]
+    assert "note: column Weg_mm read as x in mm" in done.out
+    assert "warning: p_B: is constant at 500000 Pa" in done.out
+    again = call("inspect", tmp_path / "log.csv", "--map", "auto", "--map", "p_A=#2")
+    assert (again.status, again.err.count("\n")) == (2, 1)
+    assert "--map auto must stand without other maps, got p_A=#2" in again.err

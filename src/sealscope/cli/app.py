@@ -32,6 +32,7 @@ for command in (
     recordings.report,
     simulation.parameters,
     prediction.predict,
+    recordings.inspect,
     recordings.convert,
     reproduction.reproduce,
     campaign.calibrate,

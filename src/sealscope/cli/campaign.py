@@ -308,7 +308,7 @@ def calibrate(
         confidence=confidence,
         made_from={
             "recordings": files,
-            "channel_map": dict(channel_map),
+            "channel_map": channel_map if isinstance(channel_map, str) else dict(channel_map),
             "version": str(__version__),
             "assumed_rig": rig or "thesis",
         },

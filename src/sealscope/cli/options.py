@@ -13,6 +13,7 @@ from sealscope.errors import InputError
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+    from sealscope.recordings.formats.columns import ChannelMap
     from sealscope.simulation.simulate import Progress
 
 
@@ -54,7 +55,10 @@ SetOption = Annotated[
 MapOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--map", metavar="CHANNEL=COLUMN", help="Take a channel from a foreign column, e.g. p_A=PG_1[psi]; repeat."
+        "--map",
+        metavar="CHANNEL=COLUMN",
+        help="Take a channel from a foreign column, with its unit if the file has none: p_A=PG_1[psi], x=#4[mm]; "
+        "repeat. `auto`: what the columns' names tell.",
     ),
 ]
 RateOption = Annotated[float | None, typer.Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
@@ -109,10 +113,14 @@ def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
     return rig.with_overrides(parse_overrides(overrides), source="set by --set") if overrides else rig
 
 
-def channel_map_of(options: Sequence[str] | None) -> dict[str, str]:
-    """Channel -> column of the `--map` options; raises InputError where a channel is given twice."""
+def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
+    """Channel -> column of the `--map` options, or `auto`; raises InputError where a channel is given twice."""
     from sealscope.recordings import split_map_option
 
+    if options and "auto" in options:
+        if len(options) > 1:
+            raise InputError(f"--map auto must stand without other maps, got {options[options[0] == 'auto']}")
+        return "auto"
     columns: dict[str, str] = {}
     for option in options or ():
         channel, column = split_map_option(option)

@@ -1,4 +1,4 @@
-"""The commands that look at recordings: diagnose, report, convert."""
+"""The commands that look at recordings: diagnose, report, inspect, convert."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
+    from sealscope.recordings.formats.columns import ChannelMap
 
 
 class TextFormat(StrEnum):
@@ -38,7 +39,7 @@ class TextFormat(StrEnum):
 
 
 def _read_all(
-    files: Sequence[Path], channel_map: dict[str, str], rate: float | None
+    files: Sequence[Path], channel_map: ChannelMap, rate: float | None
 ) -> Iterator[tuple[Path, Recording | None]]:
     """Yield each file and its recording; None, with one line on standard error, where it cannot be read."""
     from sealscope.recordings import read
@@ -94,7 +95,7 @@ def _diagnoses(
 def _calibrated(
     files: Sequence[Path],
     baseline: Sequence[Path],
-    channel_map: dict[str, str],
+    channel_map: ChannelMap,
     rate: float | None,
     calibration: Path,
     rig: Rig | None,
@@ -180,6 +181,25 @@ def report(
         page = output / f"{Path(diagnosis.file).stem}.html" if several else output
         write_page(page, recording, diagnosis, rig=assumed)
         typer.echo(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
+    if not complete:
+        raise typer.Exit(1)
+
+
+def inspect(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings, of any format that is read.")],
+    maps: MapOption = None,
+    rate: RateOption = None,
+) -> None:
+    """Show what a file holds and what is wrong with it; columns without a map are taken by their names."""
+    from sealscope.recordings import inspect as inspected
+    from sealscope.reporting import overview_text
+
+    complete = True
+    for file, recording in _read_all(files, channel_map_of(maps) or "auto", rate):
+        if recording is None:
+            complete = False
+        else:
+            typer.echo(overview_text(str(file), recording, inspected(recording)))
     if not complete:
         raise typer.Exit(1)
 

@@ -15,7 +15,7 @@ from sealscope.calls import checked_call
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
 from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.recordings.formats.columns import check_call, choose_columns
+from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
 from sealscope.recordings.formats.lvm import is_lvm
 from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.table import Choose, RawTable
@@ -118,7 +118,7 @@ def _writer(kind: str) -> Writer:
 def read(
     path: str | os.PathLike[str],
     *,
-    channel_map: Mapping[str, str] | None = None,
+    channel_map: ChannelMap | None = None,
     rate: float | None = None,
     format: str | None = None,
 ) -> Recording:
@@ -132,9 +132,10 @@ def read(
     ----------
     path : str or path
         The file. Its content tells the format.
-    channel_map : mapping of str to str, optional
-        Channel (or ``t``) -> name of the file's column, or name and unit, as in ``{"p_A": "PG_1[psi]"}``. A column
-        without any unit is raw counts.
+    channel_map : mapping of str to str or "auto", optional
+        Channel (or ``t``) -> name of the file's column, or name and unit, as in ``{"p_A": "PG_1[psi]"}``, or number,
+        as in ``{"p_A": "#2"}``. A column without any unit is raw counts. ``"auto"``: what the columns' names and units
+        tell, in several languages; the history says what was taken.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
     format : {"text", "netcdf", "parquet", "matlab", "tdms", "mdf", "lvm", "spreadsheet"}, optional
@@ -189,7 +190,7 @@ def read(
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read(file: Path, name: str, channel_map: Mapping[str, str], rate: float | None, format: str | None) -> Recording:
+def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None, format: str | None) -> Recording:
     """Read a file that is no archive; `name`: what the recording's provenance calls it."""
     kind = _format_of(file)
     if format not in (None, kind):

@@ -6,11 +6,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sealscope.reporting.charts import Mark
     from sealscope.reporting.messages import diagnosis_text
+    from sealscope.reporting.overview import overview_text
     from sealscope.reporting.page import render_page, write_page
 
-__all__ = ["Mark", "diagnosis_text", "render_page", "write_page"]
+__all__ = ["Mark", "diagnosis_text", "overview_text", "render_page", "write_page"]
 
-_HOMES = {"Mark": "charts", "diagnosis_text": "messages", "render_page": "page", "write_page": "page"}
+_HOMES = {
+    "Mark": "charts",
+    "diagnosis_text": "messages",
+    "overview_text": "overview",
+    "render_page": "page",
+    "write_page": "page",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -6,10 +6,13 @@ import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
+from typing import Literal
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.units import parse_unit, same_dimension, to_si
+from sealscope.recordings.formats.labels import Label, square_brackets
+from sealscope.recordings.formats.proposal import map_options, proposed_map
+from sealscope.units import same_dimension, to_si
 
 #: Names of a time column, most telling first, and the unit that the name itself tells.
 _TIME_NAMES = {
@@ -38,68 +41,8 @@ _TIME_NAMES = {
 _DATE_NAMES = ("date", "datum", "day", "tag", "fecha", "data")
 
 
-@dataclass(frozen=True)
-class Label:
-    """A column's heading: `whole` as written, `name` without the unit, `unit` where one is given."""
-
-    whole: str
-    name: str
-    unit: str | None = None
-
-    @classmethod
-    def parse(cls, text: str, unit: str | None = None) -> Label:
-        """Parse `p_A [psi]`, `p_A (psi)` or `p_A / psi`; a unit given elsewhere (a row or an attribute) is `unit`."""
-        whole = text.strip()
-        name, bracketed = _square_brackets(whole)
-        if bracketed is not None:
-            return cls(whole, name, bracketed if unit is None else unit)
-        name, remark = _round_brackets_or_stroke(whole)
-        return cls(whole, name, _unit_or_none(remark) if unit is None else unit)
-
-
-def _square_brackets(text: str) -> tuple[str, str | None]:
-    """Split `name [unit]`, without blanks around; (text, None) for any other text."""
-    begin = text.rfind("[")
-    if begin < 0 or not text.endswith("]") or "]" in text[begin:-1]:
-        return text, None
-    return text[:begin].rstrip(), text[begin + 1 : -1].strip()
-
-
-def _round_brackets_or_stroke(text: str) -> tuple[str, str | None]:
-    """Split `name (unit)`, the unit with one pair of brackets at most, or `name / unit`, where this is possible first.
-
-    Returns (text, None) for any other text.
-    """
-    ends: list[tuple[int, int]] = []  # where the name ends, and the unit begins
-    parts = text.split("/")
-    for count in (2, 1):  # `name / m/s`, `name / s`
-        unit = "/".join(parts[-count:])
-        end = len(text) - len(unit) - 1
-        if end > 1 and text[end - 1].isspace() and unit[:1].isspace() and all(unit[1:].split("/")):
-            ends.append((end - 1, end + 1))
-    depth = opened = 0
-    for at in range(len(text) - 1, -1, -1) if text.endswith(")") else ():
-        depth += {")": 1, "(": -1}.get(text[at], 0)
-        opened += text[at] == "("
-        if depth == 0:
-            if opened <= 2:
-                ends.append((len(text[:at].rstrip()), at))
-            break
-    end, begin = min(ends, default=(0, 0))
-    if not end:
-        return text, None
-    return text[:end].rstrip(), (text[begin + 1 : -1] if text[begin] == "(" else text[begin:]).strip()
-
-
-def _unit_or_none(text: str | None) -> str | None:
-    """Return None for the remark that round brackets may hold as well (`pressure (port A)`)."""
-    if not text:
-        return None
-    try:
-        parse_unit(text)
-    except InputError:
-        return None
-    return text
+#: Channel (or `t`) -> column, as a caller gives it; or the word for what the columns' names tell.
+ChannelMap = Mapping[str, str] | Literal["auto"]
 
 
 @dataclass(frozen=True)
@@ -140,10 +83,14 @@ def check_channel(channel: str) -> None:
         raise InputError(f"a mapped channel must be one of {', '.join(known)}, got {channel}{hint}")
 
 
-def check_call(channel_map: Mapping[str, str], rate: float | None) -> None:
+def check_call(channel_map: ChannelMap, rate: float | None) -> None:
     """Raise InputError for a map of what is no channel, and for a rate that is not positive."""
-    for channel in channel_map:
-        check_channel(channel)
+    if isinstance(channel_map, str):
+        if channel_map != "auto":
+            raise InputError(f"channel_map must be a mapping or the word auto, got {channel_map!r}")
+    else:
+        for channel in channel_map:
+            check_channel(channel)
     if rate is not None and not (isfinite(rate) and rate > 0):
         raise InputError(f"rate must be > 0 Hz, got {rate}")
 
@@ -187,7 +134,7 @@ def _mapped(labels: Sequence[Label], channel: str, foreign: str, place: str) -> 
     column = _find(labels, foreign, what, place)
     if column is not None:
         return column, labels[column].unit
-    name, unit = _square_brackets(foreign)
+    name, unit = square_brackets(foreign)
     column = None if unit is None else _find(labels, name, what, place)
     if column is None:
         have = listed(label.whole for label in labels)
@@ -217,17 +164,17 @@ def _find_time(labels: Sequence[Label], place: str) -> int | None:
     return None
 
 
-def choose_columns(
-    labels: Sequence[Label], channel_map: Mapping[str, str], rate: float | None, place: str
-) -> ColumnMap:
+def choose_columns(labels: Sequence[Label], channel_map: ChannelMap, rate: float | None, place: str) -> ColumnMap:
     """Decide which columns are read, and as what.
 
-    A mapped channel comes before a column that bears the channel's own name. Raises UnreadableFile where a mapped
-    column is missing, where no column is a channel, and where there is neither time nor rate; InputError for a unit of
-    another dimension.
+    A map `auto` is what `proposed_map` makes of the labels. A mapped channel comes before a column that bears the
+    channel's own name. Raises UnreadableFile where a mapped column is missing, where no column is a channel, and where
+    there is neither time nor rate; InputError for a unit of another dimension.
     """
     notes: list[str] = []
     channels: dict[str, tuple[int, str]] = {}
+    if isinstance(channel_map, str):
+        channel_map = proposed_map(labels)
     time: int | None = None
     time_label: Label | None = None
     for channel, foreign in channel_map.items():
@@ -252,9 +199,10 @@ def choose_columns(
             time_label = Label(label.whole, label.name, label.unit or _TIME_NAMES.get(label.name.casefold()))
     have = listed(label.whole for label in labels)
     if not channels:
+        guess = map_options(proposed_map(labels))
         raise UnreadableFile(
             f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
-            f"got columns {have} ({place})"
+            f"got columns {have} ({place})" + (f"; --map auto would read {guess}" if guess else "")
         )
     if rate is None and time is None:
         raise UnreadableFile(

@@ -13,7 +13,7 @@ import numpy as np
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import Label
+from sealscope.recordings.formats.labels import Label
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import Choose, RawTable, check_size
 from sealscope.recordings.formats.text_layout import MISSING, SNIFF, encoding_of

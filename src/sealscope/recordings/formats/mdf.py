@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import MissingExtra
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import Label
+from sealscope.recordings.formats.labels import Label
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import Choose, RawTable
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, Array
-from sealscope.recordings.formats.columns import ColumnMap, Label
+from sealscope.recordings.formats.columns import ColumnMap
+from sealscope.recordings.formats.labels import Label
 from sealscope.recordings.formats.table import Choose, RawTable, check_size, from_text
 from sealscope.recordings.timebase import nominal_rate
 

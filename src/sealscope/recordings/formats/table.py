@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
-from sealscope.recordings.formats.columns import ColumnMap, Label
+from sealscope.recordings.formats.columns import ColumnMap
+from sealscope.recordings.formats.labels import Label
 from sealscope.recordings.timebase import stamps, time_base
 from sealscope.units import to_si
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import MissingExtra
-from sealscope.recordings.formats.columns import Label
+from sealscope.recordings.formats.labels import Label
 from sealscope.recordings.formats.series import Clock, Series, table_of, uniform
 from sealscope.recordings.formats.table import Choose, RawTable
 

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.formats.columns import Label, counted
+from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.formats.labels import Label
 from sealscope.recordings.timebase import is_stamp
 from sealscope.units import parse_unit
 

@@ -1,0 +1,158 @@
+"""Which channel a foreign column probably is, by the words of its name in several languages and by its unit."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import unicodedata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sealscope.errors import InputError
+from sealscope.recordings.channels import CHANNEL_UNITS
+from sealscope.recordings.formats.labels import Label
+from sealscope.units import parse_unit, same_dimension
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+#: What a column may measure -> words of its name: English, German, French, Spanish, Italian, Chinese.
+_WORDS: Mapping[str, frozenset[str]] = {
+    "pressure": _words(
+        "p pr pres press pressure druck kammerdruck zylinderdruck pression presion pressione pg pt 压力 压强"
+    ),
+    "position": _words(
+        "x pos position weg hub stroke displ displacement travel kolbenweg kolbenposition lvdt deplacement course "
+        "posicion carrera posizione corsa 位移 行程 位置"
+    ),
+    "command": _words(
+        "u cmd command soll sollwert setpoint ref reference demand spannung voltage stellgroesse ansteuerung consigne "
+        "tension comando mando tensione 指令 电压"
+    ),
+    "speed": _words("omega n speed rpm drehzahl motordrehzahl vitesse velocidad velocita giri 转速"),
+    "angle": _words("theta phi angle winkel motorwinkel encoder drehwinkel angulo angolo 角度 转角"),
+    "leak": _words("leak leakage leck leckage leckstrom fuite fuga trafilamento 泄漏"),
+    "time": _words("t time zeit temps tiempo tempo 时间"),
+}
+_A = _words("a cap bore blind piston kolben kolbenseite kolbenseitig bodenseite boden fond fondo 无杆腔")
+_B = _words("b rod ring annulus annular stange stangenseite stangenseitig ringseite tige vastago stelo 有杆腔")
+_PUMP = _words("pump pumpe port pompe bomba pompa 泵")
+_OTHERS = _words(
+    "tank supply versorgung system charge speisedruck speise accumulator speicher oil oel temp temperature temperatur "
+    "force kraft current strom soll sollwert setpoint ist flow"
+)
+#: Words of a script that writes no blanks between words.
+_UNSPACED = frozenset(word for words in (*_WORDS.values(), _A, _B, _PUMP) for word in words if ord(word[0]) > 0x2E7F)
+#: How loggers write revolutions a minute, which as a unit of its own is a frequency.
+_TURNS = ("1/min", "min-1", "min^-1", "U/min")
+_UNITS = {"position": "m", "command": "V", "speed": "rad/s", "angle": "rad", "leak": "m^3/s", "time": "s"}
+_CHANNELS = {"position": "x", "command": "u", "speed": "omega", "angle": "theta", "leak": "q_leak", "time": "t"}
+_TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
+_LONGEST_NAME = 80
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """`kind`: what a column measures; `side`: "A", "B", "pump" or a number as text; `unit`: of its name's ending."""
+
+    kind: str
+    side: str
+    unit: str | None
+
+
+def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
+    """Return channel (or ``t``) -> column, as a map gives them, for the columns whose meaning their names tell.
+
+    A column that bears a channel's own name is left out, and a channel that several columns could be. A unit at the end
+    of a name (``PA_bar``) becomes the column's unit.
+    """
+    own = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
+    guesses = [None if label.name.casefold() in own else _guess(label) for label in labels]
+    candidates: dict[str, list[int]] = {}
+    for column, guess in enumerate(guesses):
+        for channel in () if guess is None else _channels(guess):
+            candidates.setdefault(channel, []).append(column)
+    if "p_A" not in candidates and "p_B" not in candidates and not {"p_a", "p_b"} & own:
+        for channel, pumped in (("p_A", "p_1"), ("p_B", "p_2")):  # pressures 1 and 2 alone are those of the chambers
+            if pumped in candidates:
+                candidates[channel] = candidates.pop(pumped)
+    result = {}
+    for channel in (*CHANNEL_UNITS, "t"):
+        columns = candidates.get(channel, [])
+        if len(columns) == 1 and channel.casefold() not in own:
+            guess, label = guesses[columns[0]], labels[columns[0]]
+            assert guess is not None
+            ending = f"[{guess.unit}]" if guess.unit not in (None, label.unit) else ""
+            result[channel] = label.whole + ending
+    return {} if set(result) <= {"t"} else result
+
+
+def map_options(channel_map: Mapping[str, str]) -> str:
+    """Return the `--map` options of a map, ready for a shell."""
+    return " ".join(f"--map {shlex.quote(f'{channel}={column}')}" for channel, column in channel_map.items())
+
+
+def _plain(text: str) -> str:
+    """Return a name without accents, the umlauts as two letters."""
+    for umlaut, letters in zip("äöüßÄÖÜ", ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue"), strict=True):
+        text = text.replace(umlaut, letters)
+    return "".join(sign for sign in unicodedata.normalize("NFKD", text) if not unicodedata.combining(sign))
+
+
+def _guess(label: Label) -> _Guess | None:
+    if len(label.name) > _LONGEST_NAME:
+        return None
+    tokens = [token.casefold() for token in _TOKEN.findall(_plain(label.name))]
+    name, unit = _split_unit(label.name)
+    if label.unit is None and unit is not None:
+        tokens = [token.casefold() for token in _TOKEN.findall(_plain(name))]
+    words = {part for token in tokens for part in _parts(token)} | {word for word in _UNSPACED if word in label.name}
+    unit = label.unit if label.unit is not None else unit
+    side = _side(words)
+    if unit is not None and same_dimension(unit, "Pa"):
+        return None if words & _OTHERS else _Guess("pressure", side, unit)
+    if words & _OTHERS - {"soll", "sollwert", "setpoint"}:
+        return None
+    if unit in _TURNS and words & _WORDS["speed"]:
+        return _Guess("speed", side, "rpm")
+    for kind, known in _WORDS.items():
+        fits = unit is None or (kind in _UNITS and same_dimension(unit, _UNITS[kind]))
+        if words & known and fits:
+            return _Guess(kind, side, unit)
+    return None
+
+
+def _parts(token: str) -> set[str]:
+    """Return a token and what is left of it after a leading p: `pa`, `pb`, `p1` are the pressure of a side."""
+    return {token, "p", token[1:]} if token in ("pa", "pb") else {token}
+
+
+def _side(words: set[str]) -> str:
+    if words & _PUMP:
+        return next((f"pump {digit}" for digit in ("1", "2") if digit in words), "pump")
+    cap, rod = bool(words & _A), bool(words & _B)
+    if cap != rod:
+        return "A" if cap else "B"
+    return next((digit for digit in ("1", "2") if digit in words), "") if not cap else ""
+
+
+def _channels(guess: _Guess) -> tuple[str, ...]:
+    if guess.kind == "pressure":
+        names = {"A": "p_A", "B": "p_B", "1": "p_1", "2": "p_2", "pump 1": "p_1", "pump 2": "p_2"}
+        return (names[guess.side],) if guess.side in names else ()
+    return (_CHANNELS[guess.kind],)
+
+
+def _split_unit(name: str) -> tuple[str, str | None]:
+    """Split `PA_bar` into name and unit; (name, None) where the last word is no unit of what a channel measures."""
+    before, _, last = name.replace(" ", "_").rpartition("_")
+    if not before or not last or last in ("A", "B", "s", "m"):
+        return name, None
+    try:
+        parse_unit(last)
+    except InputError:
+        return name, None
+    si_units = {*CHANNEL_UNITS.values(), "s"}
+    return (before, last) if any(same_dimension(last, unit) for unit in si_units) else (name, None)

@@ -1,0 +1,61 @@
+"""A recording in a few lines of a terminal: where it comes from, its channels as small curves, and what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from sealscope.recordings.channels import LONG_NAMES, Array
+from sealscope.recordings.quality import Finding
+from sealscope.recordings.recording import Recording
+
+_BARS = "▁▂▃▄▅▆▇█"
+#: Width of a curve in characters.
+CURVE = 32
+#: Range of values -> the unit they are shown in, and its size.
+_SHOWN = {
+    "Pa": ("bar", 1e5),
+    "m": ("mm", 1e-3),
+    "m^3/s": ("L/min", 1e-3 / 60.0),
+}
+
+
+def curve(values: Array, width: int = CURVE) -> str:
+    """Return values (n,) as `width` bars between their least and largest; a blank where all samples are missing."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return " " * width
+    low, high = float(known.min()), float(known.max())
+    edges = np.linspace(0, values.size, min(width, values.size) + 1).astype(int)
+    bars = []
+    for begin, end in pairwise(edges):
+        part = values[begin:end]
+        part = part[np.isfinite(part)]
+        if not part.size:
+            bars.append(" ")
+            continue
+        # a middle sample, not a mean: a mean over many strokes would show a line
+        share = (float(part[part.size // 2]) - low) / (high - low) if high > low else 0.0
+        bars.append(_BARS[min(int(share * len(_BARS)), len(_BARS) - 1)])
+    return "".join(bars)
+
+
+def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) -> str:
+    """Return what a person checks before a verdict: clock, channels with range and curve, notes, findings."""
+    provenance = recording.provenance
+    start = f", from {provenance['start']}" if "start" in provenance else ""
+    kind = f"{provenance['format']}; " if "format" in provenance else ""
+    seconds = len(recording) / recording.rate
+    lines = [f"{name}: {kind}{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}"]
+    for channel, values in recording.channels.items():
+        unit, size = _SHOWN.get(recording.units[channel], (recording.units[channel], 1.0))
+        known = values[np.isfinite(values)] / size
+        ends = f"{known.min():.4g} to {known.max():.4g} {unit}" if known.size else "no values"
+        lines.append(f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<30}{curve(values)}")
+    lines += [f"  note: {line}" for line in recording.history]
+    lines += [f"  {finding.severity}: {finding.text}" for finding in findings]
+    if not findings:
+        lines.append("  nothing wrong was seen")
+    return "\n".join(lines)

@@ -1,0 +1,78 @@
+"""Maps proposed from the names of foreign columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings import read
+from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.proposal import proposed_map
+
+
+@pytest.mark.parametrize(
+    ("heads", "expected"),
+    [
+        (
+            "Zeit [s];Druck A [bar];Druck B [bar];Weg_mm;Drehzahl [1/min];Öldruck [bar]",
+            {
+                "t": "Zeit [s]",
+                "p_A": "Druck A [bar]",
+                "p_B": "Druck B [bar]",
+                "x": "Weg_mm[mm]",
+                "omega": "Drehzahl [1/min][rpm]",
+            },
+        ),
+        ("Time;PA_bar;PB_bar;Cmd_V", {"t": "Time", "p_A": "PA_bar[bar]", "p_B": "PB_bar[bar]", "u": "Cmd_V[V]"}),
+        ("time;Cyl_P_Cap;Cyl_P_Rod", {"t": "time", "p_A": "Cyl_P_Cap", "p_B": "Cyl_P_Rod"}),
+        (
+            "Temps [s];Pression tige [bar];Pression fond [bar];Course [mm]",
+            {"t": "Temps [s]", "p_A": "Pression fond [bar]", "p_B": "Pression tige [bar]", "x": "Course [mm]"},
+        ),
+        (
+            "时间 [s];无杆腔压力 [MPa];有杆腔压力 [MPa]",
+            {"t": "时间 [s]", "p_A": "无杆腔压力 [MPa]", "p_B": "有杆腔压力 [MPa]"},
+        ),
+        ("t;PG_1;PG_2;PG_tank", {"p_A": "PG_1", "p_B": "PG_2", "t": "t"}),
+        (
+            "s;pump pressure 1 [psi];pump pressure 2 [psi];Pressure A (psi);Pressure B (psi)",
+            {
+                "p_1": "pump pressure 1 [psi]",
+                "p_2": "pump pressure 2 [psi]",
+                "p_A": "Pressure A (psi)",
+                "p_B": "Pressure B (psi)",
+            },
+        ),
+        ("t [s];p_A [bar];p_B [bar];Kolbenweg [mm]", {"x": "Kolbenweg [mm]", "t": "t [s]"}),
+    ],
+)
+def test_names_of_loggers(heads: str, expected: dict[str, str]) -> None:
+    assert proposed_map([Label.parse(head) for head in heads.split(";")]) == expected
+
+
+def test_what_two_columns_could_be_is_not_guessed() -> None:
+    labels = [Label.parse(head) for head in ("t [s]", "Druck A vorn [bar]", "Druck A hinten [bar]", "Druck B [bar]")]
+    assert "p_A" not in proposed_map(labels)
+
+
+def test_the_error_prints_the_map_and_auto_takes_it(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("Zeit [s];Druck A [bar];PB_bar\n0;1;2\n0,002;2;3\n0,004;1;2\n")
+    with pytest.raises(UnreadableFile, match=r"--map auto would read --map 'p_A=Druck A \[bar\]' --map 'p_B=PB_bar\["):
+        read(path)
+    recording = read(path, channel_map="auto")
+    assert recording["p_B"].tolist() == [2e5, 3e5, 2e5]
+    assert "column PB_bar read as p_B in bar" in recording.history
+    with pytest.raises(InputError, match="channel_map must be a mapping or the word auto, got 'guess'"):
+        read(path, channel_map="guess")  # type: ignore[arg-type]
+
+
+@given(st.lists(st.text(max_size=100), max_size=8))
+def test_any_names_give_a_map_of_these_columns(names: list[str]) -> None:
+    labels = [Label.parse(name) for name in names]
+    for column in proposed_map(labels).values():
+        assert any(column.startswith(label.whole) for label in labels)
