@@ -81,7 +81,8 @@ def test_the_last_window_is_judged_as_a_recording_would_be() -> None:
     batch = detector.examine(WORN, [], 0.01)
     assert final.evidence.score == pytest.approx(batch.score, rel=1e-9)
     assert final.evidence.leak_lpm == pytest.approx(batch.leak_lpm, rel=1e-9)
-    assert final.evidence.onset_s == pytest.approx(batch.onset_s, abs=1e-6)
+    # the samples about the onset, which a recording has, date it within the block
+    assert final.evidence.onset_s == pytest.approx(batch.onset_s, abs=0.1)
 
 
 def test_alarm_soon_after_the_onset_and_stays() -> None:

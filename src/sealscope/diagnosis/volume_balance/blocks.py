@@ -13,14 +13,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sealscope.diagnosis.volume_balance.rests import in_motion
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
-#: Columns of every block: displaced volume, angle, flow of the pump (d theta/dt), integrals of dp and of its root, and
-#: pressure difference at the pump's ports with its integral; the last two only where the pump's ports are recorded.
-Y, THETA, FLOW, I_AB, I_ROOT, DP_12, I_12 = range(7)
+#: Columns of every block: displaced volume, angle, flow of the pump (d theta/dt), integrals of dp and of its root;
+#: displaced volume counted by the pump's direction, and by the side of the higher pressure; and pressure difference at
+#: the pump's ports with its integral, these two only where the pump's ports are recorded.
+Y, THETA, FLOW, I_AB, I_ROOT, Y_PUMP, Y_SIDE, DP_12, I_12 = range(9)
 #: Length a block should have [s], and the share of a short recording it may take.
 BLOCK_SECONDS = 3.0
 #: The size and the root of dp are taken of means over so long [s], which noise hardly moves and strokes do not notice.
@@ -186,13 +189,16 @@ class Geometry:
     Parameters
     ----------
     area : float
-        Area of the piston [m^2].
+        Area of the piston, the mean of both sides [m^2].
     displacement : float
         Displacement of the pump [m^3/rad].
+    unequal : bool
+        Whether the areas of the two sides differ.
     """
 
     area: float
     displacement: float
+    unequal: bool = False
 
 
 def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple[Array, Array, Array]:
@@ -206,21 +212,61 @@ def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple
         theta = _integral(flow, step)
     dp = rows["p_A"] - rows["p_B"]
     # the mean of a root is not the root of the mean: noise would pass for a smaller root near zero
-    smooth = _smooth(dp, 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)
+    width = 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1
+    smooth = _smooth(dp, width)
     root = np.sign(smooth) * np.sqrt(np.abs(smooth))
-    columns = [rows["x"] * geometry.area, theta, flow, _integral(dp, step), _integral(root, step)]
+    y = rows["x"] * geometry.area
+    moved = np.diff(y, axis=1, prepend=y[:, :1])
+    by_pump, by_side = (np.cumsum(np.sign(of) * moved, axis=1) for of in (_smooth(flow, width), smooth))
+    columns = [y, theta, flow, _integral(dp, step), _integral(root, step), by_pump, by_side]
     if "p_1" in rows:
         dp_12 = rows["p_1"] - rows["p_2"]
         columns += [dp_12, _integral(dp_12, step)]
     return np.stack(columns, axis=1), dp, smooth
 
 
+def _passed_over(
+    t: Array, samples: Mapping[str, Array], moving: NDArray[np.bool_], stopped: NDArray[np.bool_], rate: float
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Return times, times without what is passed over, and samples, of those in motion alone.
+
+    What the pump delivers against a stop does not count.
+    """
+    kept = np.flatnonzero(moving)
+    steps = np.diff(t[kept], prepend=t[kept[:1]])
+    steps[1:][np.diff(kept) > 1] = 1.0 / rate
+    rest = {name: np.asarray(values, dtype=np.float64) for name, values in samples.items()}
+    if "theta" in rest:
+        turns = np.diff(rest["theta"], prepend=rest["theta"][0])
+        rest["theta"] = np.cumsum(np.where(stopped, 0.0, turns))
+    return t[kept], np.cumsum(steps), {name: values[kept] for name, values in rest.items()}
+
+
+def _over_rests(
+    samples: Mapping[str, Array], moving: NDArray[np.bool_], stopped: NDArray[np.bool_], length: int, rate: float
+) -> Array:
+    """Return means (2, n) of abs(dp) and its root from the start of each block to that of the next, rests included."""
+    dp = np.asarray(samples["p_A"] - samples["p_B"], dtype=np.float64)[None]
+    size = np.where(stopped, 0.0, np.abs(_smooth(dp, 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)[0]))
+    sums = np.cumsum(np.stack([size, np.sqrt(size), 1.0 - stopped]), axis=1)
+    ends = np.append(np.flatnonzero(moving)[::length], size.size - 1)
+    over = np.diff(sums[:, ends], axis=1)
+    return np.asarray(over[:2] / np.maximum(over[2], 1.0))
+
+
 def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float, geometry: Geometry) -> BalanceBlocks:
     """Cut samples into whole blocks of `length` samples from the first on.
 
     What is left over is not used, nor is a block with a missing value or an uneven time base. `t` (m,) [s]; `samples`:
-    the `balance_channels`, in any unit.
+    the `balance_channels`, in any unit. Where the machine rests or is at an end stop for long, blocks are of the
+    samples in motion, and shorter by what is passed over.
     """
+    elapsed, everything = t, samples
+    motion = in_motion(samples, rate) if t.size > length else None
+    if motion is not None:
+        moving, stopped = motion
+        length = max(_FEWEST_SAMPLES, round(length * float(np.mean(moving))))
+        t, elapsed, samples = _passed_over(t, samples, moving, stopped, rate)
     count = t.size // length
 
     def rows(values: Array) -> Array:
@@ -229,21 +275,24 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
     step, times = 1.0 / rate, rows(t)
     cut = {name: rows(values) for name, values in samples.items()}
     usable = np.all(np.isfinite(sum(cut.values())), axis=1)
-    spacing = np.diff(times, axis=1) * rate
+    spacing = np.diff(rows(elapsed), axis=1) * rate
     usable &= np.all(np.isfinite(times), axis=1) & np.all((spacing > 0.5) & (spacing < 1.5), axis=1)
     cut = {name: values[usable] for name, values in cut.items()}
     columns, dp, smooth = volumes(cut, rate, geometry)
     rest, slope, stored = _beyond(columns, dp, step)
-    noise, root_dp = _noise(dp), np.sqrt(np.abs(smooth)).mean(axis=1)
+    noise, root = _noise(dp), np.sqrt(np.abs(smooth)).mean(axis=1)
+    abs_dp, root_dp = np.abs(smooth).mean(axis=1), root
+    if motion is not None:
+        abs_dp, root_dp = _over_rests(everything, *motion, length, rate)[:, :count][:, usable]
     x = columns[:, Y]
     return BalanceBlocks(
         t=times[usable].mean(axis=1),
         gram=rest @ rest.transpose(0, 2, 1),
         slope=slope,
         stored=stored,
-        abs_dp=np.abs(smooth).mean(axis=1),
+        abs_dp=abs_dp,
         root_dp=root_dp,
-        lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root_dp, np.finfo(float).tiny) - 1.0,
+        lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root, np.finfo(float).tiny) - 1.0,
         motion=np.sum(0.5 * (dp[:, 1:] + dp[:, :-1]) * np.diff(x, axis=1), axis=1) / (length * step),
         walk=noise * _walk(rest[:, I_AB], step),
         noise=noise,

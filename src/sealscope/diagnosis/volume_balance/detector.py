@@ -37,6 +37,8 @@ from sealscope.recordings.recording import Recording, remembered
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: Share of the recording for which the machine may stand at a time.
+_UNSEEN = 0.3
 #: Share of the samples that a pressure may be cut off.
 _CLIPPED = 0.005
 
@@ -53,7 +55,8 @@ class VolumeBalance:
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
-        self.geometry = Geometry(0.5 * (rig.cylinder.A_A + rig.cylinder.A_B), rig.pump.q_b / (2.0 * np.pi))
+        areas = rig.cylinder.A_A, rig.cylinder.A_B
+        self.geometry = Geometry(0.5 * sum(areas), rig.pump.q_b / (2.0 * np.pi), areas[0] != areas[1])
 
     def usable(self, recording: Recording) -> str | None:
         """Return None where the recording has what the balance needs, else the reason why not."""
@@ -113,9 +116,19 @@ class VolumeBalance:
             )
         if not np.all(np.isfinite(blocks.gram)):
             return None, "the balance cannot be computed: values are beyond floating point"
-        fit = fit_balance(blocks, metres=recording.units["x"] == "m")
-        problem = trouble(fit)
+        fit = fit_balance(blocks, metres=recording.units["x"] == "m", unequal=self.geometry.unequal)
+        problem = trouble(fit) or _unseen(recording, fit)
         return (fit, "") if problem is None else (None, problem)
+
+
+def _unseen(recording: Recording, fit: BalanceFit) -> str | None:
+    """Return for how long nothing can be balanced where that is too long to miss a leak in, in one line, or None."""
+    times = np.concatenate([recording.t[:1], fit.blocks.t, recording.t[-1:]])
+    longest = int(np.argmax(np.diff(times)))
+    first, last = float(times[longest]), float(times[longest + 1])
+    if last - first <= _UNSEEN * recording.duration + fit.blocks.seconds:
+        return None
+    return f"the machine stands, or samples are missing, from {first:.4g} to {last:.4g} s: a leak there would not show"
 
 
 def _at_the_rail(recording: Recording) -> str | None:

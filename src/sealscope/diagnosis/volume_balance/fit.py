@@ -17,7 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import DriftStep, find_step
-from sealscope.diagnosis.volume_balance.blocks import DP_12, FLOW, I_12, I_AB, I_ROOT, THETA, BalanceBlocks, Y
+from sealscope.diagnosis.volume_balance.blocks import (
+    DP_12,
+    FLOW,
+    I_12,
+    I_AB,
+    I_ROOT,
+    THETA,
+    Y_PUMP,
+    Y_SIDE,
+    BalanceBlocks,
+    Y,
+)
 from sealscope.recordings.recording import Array
 
 #: Laws that a leak may follow: proportional to the pressure difference (a worn seal), or to its root (an orifice).
@@ -28,6 +39,8 @@ _SPOILT = 5.0
 _UNBALANCED = 0.05
 #: A block stands where the integral of dp has under this many times the sum of squares that noise makes of it.
 _STILL = 10.0
+#: The sides' areas differ where counting them apart leaves under this share of the usual sum of squares.
+_UNEQUAL = 0.5
 #: Share of the blocks whose residuals are below the usual one: well under half, as most blocks may leak.
 _USUAL = 0.25
 #: A block's leak follows the root of dp where that leaves under this share of what a laminar leak leaves.
@@ -59,7 +72,7 @@ class BalanceFit:
     piston, or of both together [m^3/(s Pa)], positive where oil leaks; `sd` (n,): its deviation, from the residual and
     the noise of dp; `shared` (n, m): deviations common to the blocks, from the shared coefficients; `residual` [m^3]:
     rms; `signal` [m^3]: rms of the volume delivered; `slip` (n,): flow that nothing explains [m^3/s]; `metres`: the
-    position has a unit.
+    position has a unit; `unequal`: the sides' areas differ.
     """
 
     blocks: BalanceBlocks
@@ -76,6 +89,7 @@ class BalanceFit:
     signal: float
     slip: Array
     metres: bool
+    unequal: bool
 
     @property
     def scale(self) -> float:
@@ -91,13 +105,15 @@ class BalanceFit:
         """Return the mean flow (n,) [m^3/s] over each block of a leak that shows as one unit of conductance there.
 
         A laminar leak has the flow g abs(dp). A leak C sign(dp) sqrt(abs(dp)) through an orifice shows as ``g = C
-        <I_AB, I_root>/<I_AB, I_AB>`` and has the mean flow C sqrt(abs(dp)).
+        <I_AB, I_root>/<I_AB, I_AB>`` and has the mean flow C sqrt(abs(dp)). Volumes are the piston's; where its sides'
+        areas differ, and it depends on the load which of them counts, they are the pump's.
         """
+        volume = 1.0 / abs(self.scale) if self.unequal else 1.0
         if law == "laminar":
-            return self.blocks.abs_dp
+            return volume * self.blocks.abs_dp
         gram = self.blocks.gram
         shown = gram[:, I_ROOT, I_AB] / np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny)
-        return np.asarray(self.blocks.root_dp / shown)
+        return np.asarray(volume * self.blocks.root_dp / shown)
 
     @property
     def share_left_out(self) -> float:
@@ -160,6 +176,11 @@ def _left(rest: Array, shared: list[int], beta: Array) -> Array:
     return np.asarray(np.maximum(left, 1e-15 * rest[:, Y, Y]))
 
 
+def _least(gram: Array, shared: list[int], beta: Array) -> float:
+    """Return the usual sum of squares that the balance leaves in a block."""
+    return float(np.quantile(_left(_beyond(gram, I_AB), shared, beta), _USUAL))
+
+
 def _geometry(gram: Array, shared: list[int]) -> tuple[Array, Array]:
     """Return the coefficients (m,) that all blocks share, and their covariance over the usual residual's variance.
 
@@ -208,18 +229,36 @@ def _moving(blocks: BalanceBlocks) -> NDArray[np.bool_]:
     return np.asarray(blocks.gram[:, I_AB, I_AB] > _STILL * _noise_of_integral(blocks, blocks.noise))
 
 
-def fit_balance(blocks: BalanceBlocks, *, metres: bool = True) -> BalanceFit:
+def _by_lesser_side(blocks: BalanceBlocks) -> BalanceBlocks:
+    """Return the blocks with the volume displaced under pressure from the side that has it less, in place of `Y_SIDE`.
+
+    It is nothing where one side carries the load throughout; twice it and the volume displaced differ by a sign only.
+    """
+    turn = np.eye(blocks.gram.shape[1])
+    turn[Y_SIDE, Y_SIDE] = -0.5 if float(np.sum(blocks.gram[:, Y, Y_SIDE])) >= 0 else 0.5
+    turn[Y_SIDE, Y] = 0.5
+    return replace(blocks, gram=turn @ blocks.gram @ turn.T, slope=blocks.slope @ turn.T, stored=blocks.stored @ turn.T)
+
+
+def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, unequal: bool = False) -> BalanceFit:
     """Fit the balance; blocks in which the machine stands, or which do not balance under any leak, are left out.
 
-    Needs one block or more; `residual` and `signal` show a fit that means nothing (no motion, encoders that do not
-    belong together).
+    `unequal`: the areas of the piston's sides are known to differ. Needs one block or more; `residual` and `signal`
+    show a fit that means nothing (no motion, encoders that do not belong together).
     """
+    blocks = _by_lesser_side(blocks)
     keep = _moving(blocks)
     if not keep.any():
         keep = np.ones(len(blocks), dtype=bool)
     freedom = max(1, blocks.samples - 4)
     shared = _shared_columns(blocks.chosen(keep))
     beta, inverse = _geometry(blocks.gram[keep], shared)
+    plain = _UNEQUAL * _least(blocks.gram[keep], shared, beta)
+    for column in (Y_PUMP, Y_SIDE):
+        apart = [*shared[:2], column, *[other for other in shared[2:] if other not in (Y_PUMP, Y_SIDE)]]
+        counted = _geometry(blocks.gram[keep], apart)
+        if (least := _least(blocks.gram[keep], apart, counted[0])) < plain:
+            plain, shared, (beta, inverse) = least, apart, counted
     own = np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
     leaning = blocks.gram[:, I_AB][:, shared] / own[:, None]
     slope = blocks.gram[:, I_AB, Y] / own - leaning @ beta
@@ -254,6 +293,7 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True) -> BalanceFit:
         signal=float(abs(beta[0]) * np.sqrt(np.median(used.gram[:, THETA, THETA]) / used.samples)),
         slip=slip,
         metres=metres,
+        unequal=unequal or bool({Y_PUMP, Y_SIDE} & set(shared)),
     )
 
 

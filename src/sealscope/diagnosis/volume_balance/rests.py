@@ -1,0 +1,41 @@
+"""Rests and end stops, which the balance passes over: nothing moves, or the pump turns on against a relief valve."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.recordings.recording import Array
+
+#: Nothing moves where the mean speed over `_STILL_SECONDS` [s] is under this share of the usual speed in motion.
+_STILL, _STILL_SECONDS = 0.005, 0.2
+#: The piston is at a stop where it stands within this share of its range of an end while the pump turns on, under a
+#: pressure difference of over so many times the usual one in motion.
+_AT_END, _PRESSED = 0.01, 1.5
+#: Samples are passed over where they are more than this share of all.
+_WORTH = 0.02
+
+
+def in_motion(samples: Mapping[str, Array], rate: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+    """Return which samples (m,) are neither rest nor end stop, and which are end stops; None where nearly all move."""
+    x = np.asarray(samples["x"], dtype=np.float64)
+    dp = np.abs(samples["p_A"] - samples["p_B"])
+    turns = np.gradient(samples["theta"]) if "theta" in samples else np.asarray(samples["omega"], dtype=np.float64)
+    if not all(np.isfinite(values).all() for values in (x, dp, turns)):
+        return None
+    width = max(1, round(_STILL_SECONDS * rate))
+    piston_rests, pump_rests = _rests(np.gradient(x), width), _rests(turns, width)
+    near = _AT_END * np.ptp(x)
+    at_end = (x < x.min() + near) | (x > x.max() - near)
+    usual = float(np.median(dp[~piston_rests])) if not piston_rests.all() else np.inf
+    stopped = piston_rests & ~pump_rests & at_end & (dp > _PRESSED * usual)
+    passed = (piston_rests & pump_rests) | stopped
+    return (~passed, stopped) if np.mean(passed) > _WORTH else None
+
+
+def _rests(speed: Array, width: int) -> NDArray[np.bool_]:
+    """Return where the mean of abs(speed) over `width` samples is next to nothing."""
+    mean = np.convolve(np.abs(np.convolve(speed, np.ones(width) / width, "same")), np.ones(width) / width, "same")
+    return np.asarray(mean < _STILL * float(np.quantile(mean, 0.9)))
