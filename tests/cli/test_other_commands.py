@@ -160,3 +160,20 @@ def test_inspect_shows_what_a_foreign_file_holds_and_what_is_wrong(call, tmp_pat
     again = call("inspect", tmp_path / "log.csv", "--map", "auto", "--map", "p_A=#2")
     assert (again.status, again.err.count("\n")) == (2, 1)
     assert "--map auto must stand without other maps, got p_A=#2" in again.err
+
+
+def test_parts_of_a_run_are_joined(call, recordings, tmp_path):
+    whole = sealscope.read(recordings / "healthy_1.nc")
+    half = len(whole) // 2
+    sealscope.write(whole.samples(slice(0, half)), tmp_path / "part_1.csv")
+    sealscope.write(whole.samples(slice(half, None)), tmp_path / "part_2.csv")
+    done = call("inspect", "--join", tmp_path / "part_2.csv", tmp_path / "part_1.csv")
+    assert (done.status, done.err) == (0, "")
+    assert "20000 samples at 500 Hz, 40 s" in done.out
+    assert "joined from 2 files: part_1.csv, part_2.csv" in done.out
+    alone = call("diagnose", recordings / "healthy_1.nc", "--format", "jsonl").objects[0]
+    joined = call("diagnose", "--join", tmp_path / "part_1.csv", tmp_path / "part_2.csv", "--format", "jsonl")
+    assert [result["score"] for result in joined.objects] == [alone["score"]]
+    done = call("diagnose", "--join", tmp_path / "part_1.csv", tmp_path / "part_1.csv")
+    assert (done.status, done.err.count("\n")) == (2, 1)
+    assert "must go on from file to file" in done.err

@@ -62,6 +62,9 @@ MapOption = Annotated[
     ),
 ]
 RateOption = Annotated[float | None, typer.Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
+JoinOption = Annotated[
+    bool, typer.Option("--join", help="The files are parts of a single run: join them by their clocks.")
+]
 BaselineOption = Annotated[
     list[Path] | None, typer.Option("--baseline", metavar="FILE...", help="Leak-free recordings of the same machine.")
 ]

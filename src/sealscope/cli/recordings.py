@@ -15,6 +15,7 @@ from sealscope.cli.options import (
     BaselineOption,
     CalibrationOption,
     FalseAlarmOption,
+    JoinOption,
     MapOption,
     RateOption,
     assumed_rig,
@@ -52,8 +53,23 @@ def _read_all(
             yield file, None
 
 
+def _read_parts(
+    files: Sequence[Path], channel_map: ChannelMap, rate: float | None, join_them: bool
+) -> Iterator[tuple[Path, Recording | None]]:
+    """Yield what `_read_all` does; or the first file and the recording of all files joined, None where one is bad."""
+    if not join_them:
+        yield from _read_all(files, channel_map, rate)
+        return
+    from sealscope.recordings import join
+
+    parts = [recording for _, recording in _read_all(files, channel_map, rate)]
+    whole = [part for part in parts if part is not None]
+    yield files[0], join(whole, names=[file.name for file in files]) if len(whole) == len(files) else None
+
+
 def _diagnoses(
     files: Sequence[Path],
+    join_them: bool,
     baseline: Sequence[Path],
     maps: Sequence[str] | None,
     rate: float | None,
@@ -67,7 +83,7 @@ def _diagnoses(
     check_probability(false_alarm)
     channel_map = channel_map_of(maps)
     if calibration is not None:
-        yield from _calibrated(files, baseline, channel_map, rate, calibration, rig)
+        yield from _calibrated(files, join_them, baseline, channel_map, rate, calibration, rig)
         return
     for file in files if baseline else ():
         if all(path.resolve() == file.resolve() for path in baseline):
@@ -77,7 +93,7 @@ def _diagnoses(
         yield None
         if not known:
             raise UnreadableFile("no baseline could be read, so nothing is diagnosed")
-    for file, recording in _read_all(files, channel_map, rate):
+    for file, recording in _read_parts(files, channel_map, rate, join_them):
         if recording is None:
             yield None
             continue
@@ -94,6 +110,7 @@ def _diagnoses(
 
 def _calibrated(
     files: Sequence[Path],
+    join_them: bool,
     baseline: Sequence[Path],
     channel_map: ChannelMap,
     rate: float | None,
@@ -107,7 +124,7 @@ def _calibrated(
     if baseline:
         raise InputError("--calibration must stand without --baseline: its leak-free recordings are in it")
     known = load(calibration)
-    for file, recording in _read_all(files, channel_map, rate):
+    for file, recording in _read_parts(files, channel_map, rate, join_them):
         yield (
             None
             if recording is None
@@ -123,6 +140,7 @@ def diagnose(
     output: Annotated[TextFormat, typer.Option("--format", help="Text, or one JSON object a line.")] = TextFormat.text,
     maps: MapOption = None,
     rate: RateOption = None,
+    join: JoinOption = False,
     false_alarm: FalseAlarmOption = 0.01,
     calibration: CalibrationOption = None,
     rig: AssumeOption = None,
@@ -131,7 +149,7 @@ def diagnose(
     from sealscope.reporting import diagnosis_text
 
     complete = True
-    for result in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed_rig(rig)):
+    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, calibration, assumed_rig(rig)):
         if result is None:
             complete = False
         elif output is TextFormat.jsonl:
@@ -148,6 +166,7 @@ def report(
     baseline: BaselineOption = None,
     maps: MapOption = None,
     rate: RateOption = None,
+    join: JoinOption = False,
     false_alarm: FalseAlarmOption = 0.01,
     calibration: CalibrationOption = None,
     rig: AssumeOption = None,
@@ -157,10 +176,10 @@ def report(
     from sealscope.reporting.template import check_page
     from sealscope.storage.folders import make_folder
 
-    several = len(files) > 1 or output.is_dir()
+    several = (len(files) > 1 and not join) or output.is_dir()
     read_too = {path.resolve() for path in (*files, *(baseline or ()))}
     pages: dict[Path, Path] = {}
-    for file in files:
+    for file in files[:1] if join else files:
         page = output / f"{file.stem}.html" if several else output
         if page.resolve() in read_too:
             raise InputError(f"a page must not replace a recording, got {page}")
@@ -173,7 +192,7 @@ def report(
         check_folder(check_page(output))
     complete = True
     assumed = assumed_rig(rig)
-    for result in _diagnoses(files, baseline or [], maps, rate, false_alarm, calibration, assumed):
+    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, calibration, assumed):
         if result is None:
             complete = False
             continue
@@ -189,13 +208,14 @@ def inspect(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings, of any format that is read.")],
     maps: MapOption = None,
     rate: RateOption = None,
+    join: JoinOption = False,
 ) -> None:
     """Show what a file holds and what is wrong with it; columns without a map are taken by their names."""
     from sealscope.recordings import inspect as inspected
     from sealscope.reporting import overview_text
 
     complete = True
-    for file, recording in _read_all(files, channel_map_of(maps) or "auto", rate):
+    for file, recording in _read_parts(files, channel_map_of(maps) or "auto", rate, join):
         if recording is None:
             complete = False
         else:

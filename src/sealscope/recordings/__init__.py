@@ -10,10 +10,12 @@ from sealscope.recordings.recording import Recording
 if TYPE_CHECKING:
     from sealscope.recordings.files import read, write
     from sealscope.recordings.formats.columns import split_map_option
+    from sealscope.recordings.joining import join
     from sealscope.recordings.quality import Finding, inspect, uniform_segments
 
 _HOMES = {
     "split_map_option": "formats.columns",
+    "join": "joining",
     "read": "files",
     "write": "files",
     "Finding": "quality",
@@ -27,6 +29,7 @@ __all__ = [
     "Finding",
     "Recording",
     "inspect",
+    "join",
     "read",
     "split_map_option",
     "uniform_segments",

@@ -1,0 +1,112 @@
+"""Recordings of one run, as loggers cut them into files, joined in the order of their clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from sealscope.calls import checked_call
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Recording
+
+#: Files of the same start [s] have a clock that goes on from file to file.
+_SAME_START = 1e-6
+
+
+def _start(recording: Recording) -> float | None:
+    """Return the moment t = 0 in seconds of some clock of the day; None where it is not known."""
+    provenance = recording.provenance
+    if "start_epoch_s" in provenance:
+        return float(provenance["start_epoch_s"])
+    try:
+        return float(np.datetime64(str(provenance["start"]), "ns").astype(np.int64)) / 1e9
+    except (KeyError, ValueError):
+        return None
+
+
+@checked_call
+def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None) -> Recording:
+    """Join recordings of one run to one.
+
+    The clocks must fit: each recording begins after the one before has ended, by the moments of their files or, where
+    none is known, by times that go on. What was not recorded in between stays a gap of the time, which `inspect` names.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Two or more, in any order, with the same channels, units and sampling rate.
+    names : sequence of str, optional
+        What messages and the history call them; by default the files of their provenance.
+
+    Returns
+    -------
+    Recording
+        Its time begins with that of the first; its provenance is that of the first, with the names of all files.
+
+    Raises
+    ------
+    InputError
+        If channels, units or rates differ, or the clocks do not fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sealscope as ss
+    >>> from sealscope.recordings import join
+    >>> t = np.arange(2000) / 500
+    >>> whole = ss.Recording(t, {"p_A": 3e5 + t}, {"p_A": "Pa"}, rate=500.0)
+    >>> join([whole.between(2.0, 4.0), whole.between(0.0, 2.0)])
+    Recording(p_A [Pa]; 2000 samples, 500 Hz, 4 s)
+    """
+    if len(recordings) < 2:
+        raise InputError(f"recordings to join must be two or more, got {len(recordings)}")
+    first = recordings[0]
+    names = names or [
+        str(recording.provenance.get("file", f"recording {number}")) for number, recording in enumerate(recordings, 1)
+    ]
+    for number, other in enumerate(recordings):
+        if len(other) == 0:
+            raise InputError(f"a recording to join must have samples, got none ({names[number]})")
+        if dict(other.units) != dict(first.units):
+            raise InputError(
+                f"recordings to join must have the same channels and units, got {', '.join(first.units)} and "
+                f"{', '.join(other.units)} ({names[number]})"
+            )
+        if other.rate != first.rate:
+            raise InputError(
+                f"recordings to join must have the same rate, got {first.rate:g} and {other.rate:g} Hz "
+                f"({names[number]})"
+            )
+    starts = [_start(recording) for recording in recordings]
+    known = [start for start in starts if start is not None]
+    if len(known) == len(starts) and max(known) - min(known) > _SAME_START:
+        offsets = [start - min(known) for start in known]
+    else:
+        offsets = [0.0] * len(recordings)
+    times = [recording.t + offset for recording, offset in zip(recordings, offsets, strict=True)]
+    order = sorted(range(len(recordings)), key=lambda number: float(np.nanmin(times[number])))
+    for before, after in pairwise(order):
+        begin, end = float(np.nanmin(times[after])), float(np.nanmax(times[before]))
+        if begin <= end:
+            clocks = "the moments of the files" if any(offsets) else "their times, as no moment of the files is known"
+            raise InputError(
+                f"the clocks of recordings to join must go on from file to file, got {end:g} s at the end of "
+                f"{names[before]} and {begin:g} s at the beginning of "
+                f"{names[after]}, by {clocks}"
+            )
+    parts = [recordings[number] for number in order]
+    files = [names[number] for number in order]
+    channels = {name: np.concatenate([part[name] for part in parts]) for name in parts[0].channels}
+    bridged = [np.zeros(len(part), dtype=bool) if part.bridged is None else part.bridged for part in parts]
+    history = tuple(dict.fromkeys(line for part in parts for line in part.history))
+    return Recording(
+        np.concatenate([times[number] for number in order]),
+        channels,
+        parts[0].units,
+        first.rate,
+        {**parts[0].provenance, "files": files},
+        (*history, f"joined from {len(parts)} files: {', '.join(files)}"),
+        np.concatenate(bridged),
+    )
