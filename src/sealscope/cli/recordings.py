@@ -162,7 +162,9 @@ def diagnose(
 
 def report(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings to report on.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The page, or a folder when there are several files.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The page (.html, .pdf), or a folder where there are several files.")
+    ],
     baseline: BaselineOption = None,
     maps: MapOption = None,
     rate: RateOption = None,

@@ -51,7 +51,8 @@ def write_page(
     Parameters
     ----------
     path : str or path-like
-        The page, ending in .html or .htm. It is complete under its name or not there at all.
+        The page, ending in .html, .htm or .pdf. It is complete under its name or not there at all. A PDF is printed by
+        a browser of Chromium's family or by WeasyPrint, whichever is on the machine.
     recording : Recording
         The recording that was judged.
     diagnosis : Diagnosis
@@ -75,7 +76,9 @@ def write_page(
     Raises
     ------
     InputError
-        The recording is empty, the path is no .html file or cannot be written, or a unit or rig is not known.
+        The recording is empty, the path is no page's or cannot be written, or a unit or rig is not known.
+    MissingExtra
+        A PDF is asked for, and nothing on the machine prints it.
 
     Examples
     --------

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sealscope.errors import InputError
+from sealscope.reporting.printing import print_page
 from sealscope.storage.atomic import atomic_write
 
 if TYPE_CHECKING:
     import jinja2
     from markupsafe import Markup
 
-_SUFFIXES = (".html", ".htm")
+_SUFFIXES = (".html", ".htm", ".pdf")
 
 
 @cache
@@ -55,12 +56,18 @@ def script_hash(code: str) -> Markup:
 def check_page(path: str | os.PathLike[str]) -> Path:
     """Return the path of a page to write; raises InputError for another kind of file."""
     if Path(path).suffix.lower() not in _SUFFIXES:
-        raise InputError(f"a page must be a file {' or '.join(_SUFFIXES)}, got {os.fspath(path)}")
+        raise InputError(f"a page must be a file {', '.join(_SUFFIXES)}, got {os.fspath(path)}")
     return Path(path)
 
 
 def write(path: str | os.PathLike[str], page: str) -> Path:
-    """Write a page as UTF-8, whole or not at all; raises InputError where it cannot be written."""
+    """Write a page as UTF-8, or as a PDF where the name ends so, whole or not at all.
+
+    Raises InputError where it cannot be written, MissingExtra where nothing on the machine prints a PDF.
+    """
+    if Path(path).suffix.lower() == ".pdf":
+        print_page(page, path)
+        return Path(path)
     with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8", newline="\n")
     return Path(path)
