@@ -125,4 +125,5 @@ def of_linear_model(
     for b in range(blocks):
         values, vectors = np.linalg.eigh(like.N[b])
         r[b] = like.N[b] @ path[b] + vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(size))
-    return replace(like, r=r)
+    rise = replace(like.rises[G], right=r[:, G])
+    return replace(like, r=r, rises={**like.rises, G: rise})

@@ -39,7 +39,7 @@ def thesis() -> Rig:
 
 
 def truth_of(rig: Rig) -> np.ndarray:
-    """The parameters (12,) of the machine of `recorded`, where nothing else is said."""
+    """The parameters (13,) of the machine of `recorded`, where nothing else is said."""
     theta = nominal(rig.with_overrides({"fluid.p_charge": P_CHARGE}))
     theta[G] = G_PUMP
     return theta
@@ -52,7 +52,7 @@ def driven(rig: Rig, u: np.ndarray, slope: np.ndarray, h: float, every: int) -> 
 
 def followed(rig: Rig, recording: Recording) -> Followed:
     found = follow(rig, recording, find_cycle(recording))
-    assert found is not None
+    assert isinstance(found, Followed)
     return found
 
 
@@ -77,7 +77,7 @@ def test_the_reduced_rig_shows_what_the_whole_rig_shows(command: str, thesis: Ri
 
 def test_stiffness_follows_the_volumes_of_both_chambers() -> None:
     """K (1/V_A + 1/V_B) over 2 K / V, with V_A = V + A x and V_B = V - A x; none of it where the share is nought."""
-    theta = [0.0] * 12
+    theta = [0.0] * 13
     theta[OFFSET] = 0.1
     for place in (-0.6, -0.3, 0.0, 0.25, 0.5):
         theta[STROKE] = 0.0
@@ -104,7 +104,7 @@ def test_long_strokes_show_what_the_whole_rig_shows(thesis: Rig) -> None:
     centred = place - np.polynomial.Polynomial.fit(np.arange(x.size), place, 1)(np.arange(x.size))
     assert np.sqrt(np.mean((model.travel[:-1:4] - centred) ** 2)) < 0.01 * np.std(place)
     theta[OFFSET] = float(np.mean(place - model.travel[:-1:4]))
-    sets = np.array([theta, theta * (np.arange(12) != STROKE), theta * (np.arange(12) != F_CFR)])
+    sets = np.array([theta, theta * (np.arange(13) != STROKE), theta * (np.arange(13) != F_CFR)])
     misfits = np.sqrt(np.mean((model.run(sets) - p_A + p_B)[:, 500:] ** 2, axis=1))
     assert misfits[0] < 700.0
     assert misfits[1] > 1.8 * misfits[0]
@@ -135,7 +135,7 @@ def test_lanes_are_runs_of_their_own(thesis: Rig) -> None:
     u, _ = true_difference()
     model = DrivenModel.of(u[:3000], 500.0, assumed_numbers(thesis))
     random = np.random.default_rng(4)
-    sets = truth_of(thesis) * random.uniform(0.8, 1.2, (RUNS + 3, 12))
+    sets = truth_of(thesis) * random.uniform(0.8, 1.2, (RUNS + 3, 13))
     together = model.run(sets)
     for one, theta in zip(together, sets, strict=True):
         np.testing.assert_array_equal(one, model.run(theta[None])[0])

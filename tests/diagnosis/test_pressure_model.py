@@ -50,12 +50,12 @@ def with_channels(recording: Recording, **channels: np.ndarray) -> Recording:
 
 def followed(rig: Rig, recording: Recording) -> Followed:
     found = follow(rig, recording, find_cycle(recording))
-    assert found is not None
+    assert isinstance(found, Followed)
     return found
 
 
 def truth_of(rig: Rig) -> np.ndarray:
-    """The parameters (12,) of the machine of `recorded`, where nothing else is said."""
+    """The parameters (13,) of the machine of `recorded`, where nothing else is said."""
     theta = nominal(rig.with_overrides({"fluid.p_charge": P_CHARGE}))
     theta[G] = G_PUMP
     return theta

@@ -25,6 +25,7 @@ from sealscope.diagnosis.pressure_model.model import (
     OFFSET,
     PARAMETERS,
     SLOW_WIDTH,
+    SOUND,
     STATES,
     STROKE,
     DrivenModel,
@@ -63,7 +64,7 @@ _NEAR, _SAME = 50.0, 0.01
 
 
 def steps_of(theta: Array) -> Array:
-    """Return the steps (12,) of the forward differences, small against the data's errors and large against rounding."""
+    """Return the steps (13,) of the forward differences, small against the data's errors and large against rounding."""
     return np.array(
         [
             1e-3 * theta[GAIN],
@@ -78,6 +79,7 @@ def steps_of(theta: Array) -> Array:
             2e-8,
             2e-3,
             1e-3,
+            5e-12,
         ]
     )
 
@@ -110,7 +112,7 @@ class Window:
         return np.asarray(dp - dp.mean(axis=-1, keepdims=True))
 
     def runs(self, thetas: Array) -> Array:
-        """Return what the model shows in the window for parameter sets (runs, 12), as `slow` leaves it."""
+        """Return what the model shows in the window for parameter sets (runs, 13), as `slow` leaves it."""
         start = np.zeros((len(thetas), STATES))
         start[:, 4] = self.integral * thetas[:, GAIN]
         start[:, 2] = 0.9 * self.model.u[0] * thetas[:, GAIN]
@@ -125,7 +127,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A normal prior: centre and standard deviation (12,) of each parameter."""
+    """A normal prior: centre and standard deviation (13,) of each parameter."""
 
     centre: Array
     deviation: Array
@@ -148,7 +150,7 @@ def prior_of(centre: Array) -> Prior:
 def _fit(
     window: Window, thetas: Array, prior: Prior, free: Sequence[int], most: int, enough: float
 ) -> tuple[Array, Array]:
-    """Minimise the cost over the free parameters by Levenberg-Marquardt from several starts (m, 12) side by side.
+    """Minimise the cost over the free parameters by Levenberg-Marquardt from several starts (m, 13) side by side.
 
     Returns the sets that are reached, cheapest first, and their costs (m,); `enough`: gain of cost to continue for.
     """
@@ -200,7 +202,7 @@ def _fit(
 
 
 def first_guess(short: Window, prior: Prior) -> Array:
-    """Return parameters (12,) of which gain, lead, bias and friction fit the slow part of the pressure.
+    """Return parameters (13,) of which gain, lead, bias and friction fit the slow part of the pressure.
 
     The others are the prior's.
     """
@@ -216,7 +218,7 @@ def first_guess(short: Window, prior: Prior) -> Array:
 
 
 def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Array, float, list[Array]]:
-    """Return the parameters (12,) of the best fit, its cost per sample, and other starts.
+    """Return the parameters (13,) of the best fit, its cost per sample, and other starts.
 
     The other starts are for a record that the model does not follow from the first; `short`: part of the window, for
     the many starts about the first `guess`.
@@ -235,7 +237,7 @@ def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Arra
         )
         starts = starts[likely.reshape(-1)]
     starts, costs = _fit(short, starts, prior, (GAIN, LEAD, K, G, F_V, *((OFFSET,) if long else ())), 3, 3.0)
-    everything = range(len(PARAMETERS))
+    everything = range(SOUND)
     tried, _ = _fit(short, starts[costs <= costs[0] + _NEAR], prior, everything, 8, 1.0)
     other = next((k for k in range(1, len(tried)) if abs(tried[k, K] / tried[0, K] - 1.0) > _SAME), None)
     finalists, _ = _fit(window, tried[[0] if other is None else [0, other]], prior, everything, 4, 1.0)
@@ -249,5 +251,5 @@ def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Arra
 def refit(window: Window, start: Array, prior: Prior) -> tuple[Array, float]:
     """Return the best fit that is reached from another start, and its cost per sample."""
     fitted, _ = _fit(window, start[None], prior, (GAIN, K), 6, 1.0)
-    fitted, costs = _fit(window, fitted, prior, range(len(PARAMETERS)), 20, 0.1)
+    fitted, costs = _fit(window, fitted, prior, range(SOUND), 20, 0.1)
     return fitted[0], float(costs[0]) / window.dp.size

@@ -21,7 +21,7 @@ from sealscope.parameters import Rig
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
 from sealscope.physics.lanes import WIDTH, load, spread, store
-from sealscope.physics.leakage import laminar_leakage
+from sealscope.physics.leakage import piston_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
 from sealscope.physics.rig import RigNumbers, rig_numbers
@@ -30,14 +30,17 @@ from sealscope.recordings.recording import Array
 #: What is estimated: speed per volt of the command [rad/(s V)], lead of the command [s], what the speed has beyond it
 #: [rad/s], stiffness of the oil [Pa], conductance past the piston and the pump [m^3/(s Pa)], Coulomb friction [N],
 #: viscous friction [N s/m], breakaway over Coulomb friction [1], decay of the breakaway [s/m]; Coulomb friction per
-#: pressure [N/Pa]; share of the stiffness that follows the stroke [1], mid-stroke's offset as a share of V [1].
-PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c", "F_cfr", "stroke", "offset")
-GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C, F_CFR, STROKE, OFFSET = range(len(PARAMETERS))
+#: pressure [N/Pa]; share of the stiffness that follows the stroke [1], mid-stroke's offset as a share of V [1];
+#: coefficient of an orifice past the piston [m^3/(s Pa^0.5)], which a sound machine does not have.
+PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c", "F_cfr", "stroke", "offset", "orifice")
+GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C, F_CFR, STROKE, OFFSET, ORIFICE = range(len(PARAMETERS))
+#: The parameters that a machine without an orifice past the piston has.
+SOUND = ORIFICE
 #: Runs that one call makes side by side.
 RUNS = WIDTH
 STATES = 5
 State = tuple[float, float, float, float, float]
-Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
 #: Largest share of V that a stroke takes away, squared.
 _LARGEST_SHARE = 0.75
 #: Longest step of the solver [s]: a tenth of a radian at the ringing of the thesis's rig would be 2e-4 s; RK4 at 1e-3 s
@@ -58,7 +61,7 @@ def assumed_numbers(rig: Rig) -> RigNumbers:
 
 
 def nominal(rig: Rig) -> Array:
-    """Return the parameters (12,) that a rig has about its charge pressure with no leak past the piston."""
+    """Return the parameters (13,) that a rig has about its charge pressure with no leak past the piston."""
     friction = rig.friction
     coulomb = coulomb_friction(
         rig.fluid.p_charge,
@@ -80,6 +83,7 @@ def nominal(rig: Rig) -> Array:
             friction.C_c,
             friction.F_cfr,
             0.5,
+            0.0,
             0.0,
         ]
     )
@@ -105,7 +109,7 @@ def reduced_rates(y: State, u: float, stiffness: float, coulomb: float, theta: P
     error = theta[GAIN] * u + theta[BIAS] - omega
     voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
     friction = stribeck_friction(v, coulomb, theta[K_BRK], theta[C_C], theta[F_V], m.v_th, False)
-    flow = pump_flow(omega, dp, m.q_b, 0.0) - m.A_A * v - laminar_leakage(dp, theta[G])
+    flow = pump_flow(omega, dp, m.q_b, 0.0) - m.A_A * v - piston_leakage(dp, theta[G], theta[ORIFICE], m.dp_0)
     return (
         2.0 * pressure_rate(flow, m.V, stiffness),
         piston_acceleration(0.5 * dp, -0.5 * dp, friction, 0.0, 0.0, m.A_A, m.A_A, m.M_eq),
@@ -135,13 +139,13 @@ def pressure_differences(
     """Write dp [Pa], or v [m/s] if `speeds`, of RUNS runs at each sample into `out` (n, RUNS).
 
     The method is RK4 in steps of h [s], `every` to a sample. `inputs`: (2 every n + 1, 4) at every half step: command
-    [V], its derivative [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa]; `theta`: (segments, 12,
+    [V], its derivative [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa]; `theta`: (segments, 13,
     RUNS) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, RUNS) at the first sample, in place.
     """
     y = (load(state, 0), load(state, 1), load(state, 2), load(state, 3), load(state, 4))
     for sample in range(segment.size):
         store(out, sample, y[1] if speeds else y[0])
-        row = 12 * segment[sample]
+        row = 13 * segment[sample]
         lead = load(theta, row + LEAD)
         now = (
             load(theta, row + GAIN),
@@ -156,6 +160,7 @@ def pressure_differences(
             load(theta, row + F_CFR),
             load(theta, row + STROKE),
             load(theta, row + OFFSET),
+            load(theta, row + ORIFICE),
         )
         for step in range(every):
             at = 2 * (sample * every + step)
@@ -203,7 +208,7 @@ class DrivenModel:
         return DrivenModel(inputs, h, every, numbers)
 
     def with_travel(self, theta: Array) -> DrivenModel:
-        """Return the model with the piston's place that it shows itself for parameters `theta` (12,).
+        """Return the model with the piston's place that it shows itself for parameters `theta` (13,).
 
         Mean and trend of the place are removed: mid-stroke is not known, and a piston that stays in its cylinder has no
         trend for long.
@@ -254,7 +259,7 @@ class DrivenModel:
     ) -> Array:
         """Return dp [Pa], or v [m/s] if `speeds`, (runs, n) of parameter sets `thetas`.
 
-        `thetas` (runs, 12), or (runs, segments, 12) with `segment` (n,), which of them holds at a sample; `start`
+        `thetas` (runs, 13), or (runs, segments, 13) with `segment` (n,), which of them holds at a sample; `start`
         (runs, 5): the state at the first sample, at rest by default, which becomes the last.
         """
         sets = thetas[:, None, :] if thetas.ndim == 2 else thetas

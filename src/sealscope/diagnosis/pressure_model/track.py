@@ -5,7 +5,8 @@ from the slopes of dp. The parameters theta_b wander from block to block (a rand
 machines have), so that the whole record is one normal model with precision matrix Lambda (block tridiagonal). A step d
 of G after block k adds N_b e_G d to the right sides of all later blocks; with everything else eliminated its estimate
 is s_k / I_k with variance 1 / I_k, and z_k = s_k / sqrt(I_k) is standard normal where nothing steps, with a known
-correlation between any two instants.
+correlation between any two instants. A step of an orifice's coefficient, which sound blocks do not have, is estimated
+in the same way from the slopes of dp for it.
 
 Sources: A. C. Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, ch. 4; P. de Jong, J.
 Penzer, Diagnosing shocks in time series, JASA 93 (1998) 796-806.
@@ -13,7 +14,7 @@ Penzer, Diagnosing shocks in time series, JASA 93 (1998) 796-806.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,8 @@ from sealscope.diagnosis.pressure_model.model import (
     K_BRK,
     LEAD,
     OFFSET,
-    PARAMETERS,
+    ORIFICE,
+    SOUND,
     STROKE,
     DrivenModel,
     G,
@@ -52,8 +54,6 @@ _PASSES = 10
 #: the stiffness leaps by so many deviations of its walk: they are set between their neighbours, at one of these biases
 #: of the speed, in units of the bias's own wandering, and followed once more.
 _STUCK, _LEAPS, _BIASES = 3.0, 1.7, np.array([0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, 2.0])
-#: A jump: so many times the wandering from block to block.
-_LEAP = 50.0
 #: Shares of a Gauss-Newton step that are tried side by side, and the fall of the cost to go on for.
 _SHARES = np.array([1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 1.4])
 _ENOUGH = 1.0
@@ -62,32 +62,51 @@ _ENOUGH = 1.0
 _LEASHES = (0.1, 0.3, 1.0)
 #: Wandering that is tried, times the usual one: the likelihood chooses.
 SCALES = (1.0, 2.0, 4.0)
-_CONSTANT = len(PARAMETERS)
-SIZE = _CONSTANT + 1
+#: What wanders: the parameters of a sound machine and a constant of dp. What a leak makes rise, by its law.
+SIZE = SOUND + 1
+RISES = (G, ORIFICE)
+
+
+@dataclass(frozen=True, eq=False)
+class Rise:
+    """What a rise of one parameter in a block does, in the model that is linear there.
+
+    `cross` (b, p): information shared with what wanders; `own` (b,), `right` (b,): its own information and right side;
+    `unit`: that of the parameter.
+    """
+
+    cross: Array
+    own: Array
+    right: Array
+    unit: float
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """Parameters of a record, followed.
 
-    Blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 12) about which the model is
-    linear; `N` (b, p, p), `r` (b, p) information in units of `units` (p,), the last a constant of dp; `variance`
-    [Pa^2] of the residual and of each block's (b,).
+    Blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 13) about which the model is
+    linear; `N` (b, p, p), `r` (b, p) information in units of `units` (p,), the last a constant of dp; `rises` by
+    parameter; `variance` [Pa^2] of the residual and of each block's (b,); `misfit` [Pa^2]: sum of squares of what is
+    left of dp; `strain`: chi square of the wandering.
     """
 
     edges: NDArray[np.int64]
     path: Array
     N: Array
     r: Array
+    rises: Mapping[int, Rise]
     units: Array
     variance: float
     block_variance: Array
     anchor: Array
     seconds: float
+    misfit: float
+    strain: float
 
 
 def _deviations(theta: Array, shares: dict[int, float], rest: dict[int, float]) -> Array:
-    return np.array([shares.get(k, 0.0) * abs(theta[k]) + rest.get(k, 0.0) for k in range(len(PARAMETERS))])
+    return np.array([shares.get(k, 0.0) * abs(theta[k]) + rest.get(k, 0.0) for k in range(SOUND)])
 
 
 def wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
@@ -103,7 +122,7 @@ def _anchor(theta: Array, units: Array) -> Array:
     deviation = _deviations(theta, ANCHOR, ANCHOR_REST)
     weight = np.zeros(SIZE)
     known = deviation > 0
-    weight[:_CONSTANT][known] = (units[:_CONSTANT][known] / deviation[known]) ** 2
+    weight[:SOUND][known] = (units[:SOUND][known] / deviation[known]) ** 2
     return weight
 
 
@@ -112,7 +131,7 @@ def precision(N: Array, walk: Array, anchor: Array) -> Array:
     blocks, p, _ = N.shape
     matrix = np.zeros((blocks, p, blocks, p))
     for b in range(blocks):
-        matrix[b, :, b] += N[b]
+        matrix[b, :, b] += N[b] + 1e-10 * np.diag(np.diagonal(N[b]))
         if b:
             steps = np.diag(1.0 / walk[b - 1] ** 2)
             matrix[b, :, b] += steps
@@ -121,7 +140,6 @@ def precision(N: Array, walk: Array, anchor: Array) -> Array:
             matrix[b, :, b - 1] -= steps
     for k in np.flatnonzero(anchor > 0):
         matrix[:, k, :, k] += anchor[k] / blocks**2
-    matrix[0, range(p), 0, range(p)] += 1e-10 * np.diagonal(N[0])
     return matrix.reshape(blocks * p, blocks * p)
 
 
@@ -137,51 +155,55 @@ def track(
     theta: Array,
     start: Array,
     skip: int,
-    jumps: Array | None = None,
+    rise: tuple[int, int] | None = None,
     from_path: Array | None = None,
     *,
     seen: NDArray[np.bool_] | None = None,
 ) -> Track:
-    """Follow the parameters from the first fit `theta` (12,) through blocks between `edges` of the whole record.
+    """Follow the parameters from the first fit `theta` (13,) through blocks between `edges` of the whole record.
 
-    `start` (5,): the model's state at the first sample; `jumps` (b - 1, p): how many times farther than usual each
-    parameter may go from a block to the next; `from_path` (b, 12): where to begin, the first fit by default; `seen`
-    (b,): blocks that count (default: all), through the others the parameters wander unseen. Blocks are linearised about
-    their own parameters, until these stand still; the trend of the speed's bias within a block is eliminated.
+    `start` (5,): the model's state at the first sample; `rise`: a parameter that rises by as much as suits, and after
+    which block; `from_path` (b, 13): where to begin, the first fit by default; `seen` (b,): blocks that count (default:
+    all), through the others the parameters wander unseen. Blocks are linearised about their own parameters, until these
+    stand still; the trend of the speed's bias within a block is eliminated.
     """
     blocks = edges.size - 1
     seen = np.ones(blocks, dtype=bool) if seen is None else seen
     n = dp.size
     segment = np.clip(np.searchsorted(edges, np.arange(n), side="right") - 1, 0, blocks - 1).astype(np.int64)
     h = steps_of(theta)
-    units = np.append(h, 1.0)
+    units = np.append(h[:SOUND], 1.0)
     seconds = float(np.median(np.diff(edges))) / model.rate
     speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(model.u))
     walk = np.tile(wander(theta, units, seconds, speed), (blocks - 1, 1))
-    if jumps is not None:
-        walk *= jumps
     anchor = _anchor(theta, units)
     leashes = _LEASHES if from_path is None else _LEASHES[-1:]
-    centre = np.append(theta / h, 0.0)
+    centre = np.append(theta[:SOUND] / h[:SOUND], 0.0)
     path = np.tile(theta, (blocks, 1)) if from_path is None else from_path
     limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
+    # where the rising parameter has risen, in its unit
+    risen = np.zeros(path.shape)
+    if rise is not None:
+        risen[rise[1] + 1 :, rise[0]] = h[rise[0]]
+    size = 0.0
 
     def misfits(shown: Array) -> Array:
         rests = (dp[block] - shown[block] for block in limits)
         return np.array([rest.size * np.var(rest) for rest in rests]) * seen
 
     def strain(at: Array, walk: Array) -> float:
-        steps = np.diff(at, axis=0) / h / walk[:, :-1]
-        off = at.mean(axis=0) / h - centre[:-1]
+        at = at[:, :SOUND] / h[:SOUND]
+        steps = np.diff(at, axis=0) / walk[:, :-1]
+        off = at.mean(axis=0) - centre[:-1]
         return float(np.sum(steps**2)) + float(anchor[:-1] @ off**2)
 
     def freed(path: Array, stuck: NDArray[np.bool_]) -> Array:
         """Return the path with stuck blocks set between their neighbours, at the speed's bias that suits each best."""
         at, free = np.arange(blocks), np.flatnonzero(np.logical_not(stuck))
-        between = np.column_stack([np.interp(at, free, path[free, k]) for k in range(_CONSTANT)])
+        between = np.column_stack([np.interp(at, free, path[free, k]) for k in range(path.shape[1])])
         tries = np.tile(between, (_BIASES.size, 1, 1))
         tries[:, :, BIAS] += _BIASES[:, None] * _WANDER_BIAS * speed
-        runs = model.run(tries, segment, np.tile(start, (_BIASES.size, 1)))
+        runs = model.run(tries + size * risen, segment, np.tile(start, (_BIASES.size, 1)))
         best = np.argmin([misfits(shown) for shown in runs], axis=0)
         return np.where(stuck[:, None], tries[best, at], path)
 
@@ -189,43 +211,56 @@ def track(
     last = _PASSES
     number = 0
     while True:
-        sets = np.tile(path, (_CONSTANT + 1, 1, 1))
-        for k in range(_CONSTANT):
+        at = path + size * risen
+        sets = np.tile(at, (h.size + 1, 1, 1))
+        for k in range(h.size):
             sets[k + 1, :, k] += h[k]
-        shown = model.run(sets, segment, np.tile(start, (_CONSTANT + 1, 1)))
-        N, r, squares, counts = _normal(dp, shown, limits, path / h)
+        shown = model.run(sets, segment, np.tile(start, (h.size + 1, 1)))
+        N, r, squares, counts = _normal(dp, shown, limits, at / h)
         variance = float(squares[seen].sum() / counts[seen].sum())
         N, r = N * seen[:, None, None], r * seen[:, None]
+        allowed = leashes[min(number, len(leashes) - 1)] * walk
+        misfit = float(misfits(shown[0]).sum())
         followed = Track(
             edges,
-            path,
-            N / variance,
-            r / variance,
+            at,
+            N[:, _WANDERING[:, None], _WANDERING] / variance,
+            r[:, _WANDERING] / variance,
+            {
+                k: Rise(N[:, _WANDERING, k] / variance, N[:, k, k] / variance, r[:, k] / variance, float(h[k]))
+                for k in RISES
+            },
             units,
             variance,
             np.where(seen, squares / counts, variance),
             np.concatenate([anchor, centre]),
             seconds,
+            misfit,
+            strain(path, allowed),
         )
-        allowed = leashes[min(number, len(leashes) - 1)] * walk
-        solved = np.linalg.solve(
-            precision(followed.N, allowed, anchor), right_sides(followed.r, anchor, centre).reshape(-1)
+        matrix, right = precision(followed.N, allowed, anchor), right_sides(followed.r, anchor, centre).reshape(-1)
+        if rise is not None:
+            matrix, right = _with_rise(matrix, right, followed.rises[rise[0]], rise[1] + 1)
+        solved = np.linalg.solve(matrix, right)
+        fresh = np.column_stack(
+            [_held(solved[: blocks * SIZE].reshape(blocks, SIZE)[:, :SOUND] * h[:SOUND], theta), path[:, SOUND:]]
         )
-        fresh = _held(solved.reshape(blocks, SIZE)[:, :_CONSTANT] * h, theta)
+        further = (max(0.0, solved[-1]) if rise is not None else 0.0) - size
         tries = path + _SHARES[:, None, None] * (fresh - path)
-        runs = model.run(tries, segment, np.tile(start, (_SHARES.size, 1)))
+        sizes = size + _SHARES * further
+        runs = model.run(tries + sizes[:, None, None] * risen, segment, np.tile(start, (_SHARES.size, 1)))
         apart = np.array([misfits(each).sum() for each in runs])
-        costs = apart / variance + np.array([strain(at, allowed) for at in tries])
+        costs = apart / variance + np.array([strain(each, allowed) for each in tries])
         best = int(np.nanargmin(costs))
-        gained = float(misfits(shown[0]).sum()) / variance + strain(path, allowed) - costs[best]
+        gained = misfit / variance + followed.strain - costs[best]
         if gained > 0.0:
-            path = tries[best]
+            path, size = tries[best], float(sizes[best])
         number += 1
         if number < len(leashes) or (gained > _ENOUGH and number < last):
             continue
         if before is not None:
             return before[2] if before[0] / variance + before[1] < costs[best] else followed
-        stuck = _stuck(followed, counts, walk if jumps is None else None)
+        stuck = _stuck(followed, counts, walk if rise is None else None)
         if not np.any(stuck) or np.all(stuck):
             return followed
         before = float(apart[best]), strain(tries[best], allowed), followed
@@ -233,15 +268,28 @@ def track(
         last = number + _PASSES
 
 
+#: Rows of the normal equations of what wanders: all but the orifice.
+_WANDERING = np.delete(np.arange(SIZE + 1), ORIFICE)
+
+
+def _with_rise(matrix: Array, right: Array, rise: Rise, first: int) -> tuple[Array, Array]:
+    """Return the normal equations with a rise in all blocks from the `first` on as the last unknown."""
+    cross = rise.cross.copy()
+    cross[:first] = 0.0
+    border = cross.reshape(-1)
+    own, side = float(rise.own[first:].sum()), float(rise.right[first:].sum())
+    return np.block([[matrix, border[:, None]], [border[None, :], np.array([[own]])]]), np.append(right, side)
+
+
 def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Array, Array, Array]:
     """Return the normal equations of each block between `limits`.
 
-    They are N (b, p, p) and r (b, p) of the model that is linear about `at` (b, 12) [units], the sum of squares (b,)
-    that no parameters explain, and its degrees of freedom (b,). `shown` (13, n): the model there, and a unit more of
-    each parameter. The trend of the speed's bias is eliminated.
+    They are N (b, 14, 14) and r (b, 14) of the model that is linear about `at` (b, 13) [units], the last a constant
+    of dp, the sum of squares (b,) that nothing which wanders explains, and its degrees of freedom (b,). `shown`
+    (14, n): the model there, and a unit more of each parameter. The trend of the speed's bias is eliminated.
     """
-    blocks = len(limits)
-    N, r = np.empty((blocks, SIZE, SIZE)), np.empty((blocks, SIZE))
+    blocks, size = len(limits), len(shown)
+    N, r = np.empty((blocks, size, size)), np.empty((blocks, size))
     squares, counts = np.empty(blocks), np.empty(blocks)
     for b, here in enumerate(limits):
         slopes = shown[1:, here] - shown[0, here]
@@ -252,7 +300,9 @@ def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tupl
         H, g = X @ X.T, X @ rest
         lost = H[:-1, -1] / H[-1, -1]
         H, g, gone = H[:-1, :-1] - np.outer(lost, H[:-1, -1]), g[:-1] - lost * g[-1], g[-1] ** 2 / H[-1, -1]
-        squares[b] = float(rest @ rest - gone - g @ np.linalg.lstsq(H, g, rcond=1e-12)[0])
+        own = g[_WANDERING]
+        explained = own @ np.linalg.lstsq(H[_WANDERING[:, None], _WANDERING], own, rcond=1e-12)[0]
+        squares[b] = float(rest @ rest - gone - explained)
         counts[b] = count - SIZE - 1
         N[b], r[b] = H, g + H @ np.append(at[b], 0.0)
     return N, r, squares, counts
@@ -274,13 +324,6 @@ def _stuck(followed: Track, counts: Array, walk: Array | None) -> NDArray[np.boo
     return np.asarray(stuck)
 
 
-def leap(blocks: int, after: int, *parameters: int) -> Array:
-    """Return factors (b - 1, p) on the walk that let some parameters jump after a block."""
-    factors = np.ones((blocks - 1, SIZE))
-    factors[after, list(parameters)] = _LEAP
-    return factors
-
-
 def _held(path: Array, theta: Array) -> Array:
     """Hold the path within what the laws can be evaluated for."""
     for k in (GAIN, K, F_C, C_C):
@@ -291,9 +334,9 @@ def _held(path: Array, theta: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ConductanceSteps:
-    """A step of G after each block.
+    """A step of what a leak makes rise, after each block.
 
-    `size`, `deviation` (b - 1,) [m^3/(s Pa)], `z` and their `correlation`; `level`
+    `size`, `deviation` (b - 1,) [m^3/(s Pa)], of an orifice [m^3/(s Pa^0.5)]; `z` and their `correlation`; `level`
     (b,) the wandering G with no step, and its `level_deviation`; `scale` of the wandering that was chosen; `excess`:
     chi square of the blocks against the wandering, and its degrees of freedom.
     """
@@ -314,8 +357,13 @@ def excess_of(steps: ConductanceSteps) -> float:
     return float((chi_square - np.max(np.abs(steps.z)) ** 2) / freedom)
 
 
-def steps_in(followed: Track, theta: Array, speed: float, scales: Sequence[float] = SCALES) -> ConductanceSteps:
-    """Estimate a step of G after each block, everything else free to wander as far as the likelihood chooses."""
+def steps_in(
+    followed: Track, theta: Array, speed: float, scales: Sequence[float] = SCALES, rising: int = G
+) -> ConductanceSteps:
+    """Estimate a step of the `rising` parameter after each block.
+
+    Everything else is free to wander as far as the likelihood chooses.
+    """
     anchor, centre = np.split(followed.anchor, 2)
     walk = np.tile(wander(theta, followed.units, followed.seconds, speed), (len(followed.N) - 1, 1))
     right = right_sides(followed.r, anchor, centre).reshape(-1)
@@ -336,24 +384,25 @@ def steps_in(followed: Track, theta: Array, speed: float, scales: Sequence[float
         solution, _, rank, _ = np.linalg.lstsq(N, r, rcond=1e-12)
         free += float(r @ solution)
         ranks += int(rank)
+    rise = followed.rises[rising]
     later_blocks = np.zeros((blocks, SIZE, blocks - 1))
     for k in range(1, blocks):
-        later_blocks[k:, :, k - 1] = followed.N[k:, :, G]
+        later_blocks[k:, :, k - 1] = rise.cross[k:]
     inner = later_blocks.reshape(blocks * SIZE, blocks - 1)
     level_rows = np.zeros((blocks * SIZE, blocks))
     level_rows[np.arange(blocks) * SIZE + G, np.arange(blocks)] = 1.0
     solved = np.linalg.solve(L, np.column_stack([inner, right, level_rows]))
     steps, half, levels = solved[:, : blocks - 1], solved[:, blocks - 1], solved[:, blocks:]
-    later = np.cumsum(followed.N[::-1, G, G])[::-1]
+    later = np.cumsum(rise.own[::-1])[::-1]
     at = np.arange(1, blocks)
     information = later[np.maximum(at[:, None], at[None, :])] - steps.T @ steps
-    right_sum = np.cumsum(followed.r[::-1, G])[::-1][1:]
+    right_sum = np.cumsum(rise.right[::-1])[::-1][1:]
     score = right_sum - steps.T @ half
     own = np.sqrt(np.diagonal(information))
     unit = followed.units[G]
     return ConductanceSteps(
-        score / own**2 * unit,
-        unit / own,
+        score / own**2 * rise.unit,
+        rise.unit / own,
         score / own,
         information / np.outer(own, own),
         levels.T @ half * unit,
