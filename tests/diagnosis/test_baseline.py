@@ -113,10 +113,10 @@ def test_a_baseline_given_twice_counts_once(records, sound_ones: list[Recording]
 def test_baselines_that_do_not_scatter_tell_nothing() -> None:
     """Recordings that differ by a shift of their zero alone, as from a simulator without noise."""
     random = np.random.default_rng(0)
-    x = random.standard_normal(5000)
+    x = 1e3 * np.cumsum(random.standard_normal(5000))
     units = {"p_A": "Pa"}
     ones = [Recording(np.arange(5000) / 500, {"p_A": x + offset}, units, 500.0) for offset in (0.0, 1.0, 2.0, 3.0)]
-    other = Recording(np.arange(5000) / 500, {"p_A": random.standard_normal(5000)}, units, 500.0)
+    other = Recording(np.arange(5000) / 500, {"p_A": x[::-1]}, units, 500.0)
     found = diagnose(other, ones)
     assert found.verdict == "cannot tell"
     assert "do not scatter" in found.reason

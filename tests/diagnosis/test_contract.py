@@ -53,7 +53,6 @@ GOOD: dict[str, Change] = {
     "counts": counts,
     "one gap near the end": lambda r: with_channels(r, p_A=np.where(np.arange(len(r)) == 50000, np.nan, r["p_A"])),
     "command without a value": lambda r: with_channels(r, u=np.full(len(r), np.nan)),
-    "very slow sampling": lambda r: replace(r, t=np.arange(len(r)) * 10.0, rate=0.1),
 }
 #: ... and recordings on which it must say `cannot tell`, with what its reason has to name.
 HOPELESS: dict[str, tuple[Change, str]] = {
@@ -64,6 +63,11 @@ HOPELESS: dict[str, tuple[Change, str]] = {
     "constant pressure": (lambda r: with_channels(r, p_A=np.full(len(r), 3e5)), "p_A is constant"),
     "no value at all": (lambda r: with_channels(r, p_A=np.full(len(r), np.nan)), "226 samples"),
     "every second value missing": (every_second_missing, "226 samples"),
+    "time in ms labelled s": (lambda r: replace(r, t=np.arange(len(r)) * 2.0, rate=0.5), "the unit of the time"),
+    "pressures at 0.5 Hz": (
+        lambda r: replace(r, t=np.arange(len(r)) * 2.0, rate=0.5).only(["p_A", "p_B"]),
+        "needs 8 Hz or more to see the ringing",
+    ),
     "time runs backwards": (lambda r: replace(r, t=r.t[::-1]), "226 samples"),
     "10 s at the rail": (lambda r: holding(r, 5000, 10000, float(r["p_A"].min())), "p_A does not move"),
     "10 s at zero": (lambda r: holding(r, 5000, 10000, 0.0), "p_A"),

@@ -18,7 +18,8 @@ from sealscope.diagnosis.baseline.operating_point import OperatingPoint, differe
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.gaps import MOST_BRIDGED, bridge
-from sealscope.recordings.motion import runs_of
+from sealscope.recordings.hydraulics import no_machine
+from sealscope.recordings.motion import does_not_move, runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
 from sealscope.recordings.recording import Recording, remembered
 
@@ -102,6 +103,9 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
             findings.append(Finding("part_analysed", "warning", None, left_out, float(part.t[0]), text))
     spoiled = next((own for own in findings if own.channel in chambers and _spoils(own, len(part))), None)
     distrust = None if spoiled is None else f"the pressures cannot be trusted: {spoiled.text}"
+    if distrust is None and len(part) >= SHORTEST and does_not_move(part) is None and (reason := no_machine(part)):
+        distrust = f"this is no recording of a hydraulic machine: {reason}"
+        findings.append(Finding("no_machine", "warning", None, len(part), float(part.t[0]), reason))
     return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1))
 
 

@@ -43,6 +43,8 @@ from sealscope.signals.details import shortest
 #: Fewest blocks in which a change can be looked for (the covariance of six columns needs them), and fewest of each side
 #: where blocks of several recordings are compared.
 FEWEST_BLOCKS, FEWEST_BLOCKS_A_SIDE = 24, 12
+#: Lowest rate [Hz]: the ringing of a hydraulic line of some metres lies over 4 Hz.
+SLOWEST_RATE = 8.0
 #: Fewest baseline recordings of a repeated duty from which the scatter between recordings is estimated.
 FEWEST_RECORDINGS = 3
 #: How far outside the baseline's range of levels a recording may lie, as a share of the range.
@@ -72,6 +74,11 @@ class RmsChange:
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`, within it or against the baseline."""
+        if recording.rate < SLOWEST_RATE:
+            return Evidence(
+                "cannot tell",
+                f"needs {SLOWEST_RATE:g} Hz or more to see the ringing that a leak damps, got {recording.rate:g} Hz",
+            )
         if baseline:
             return against(recording, baseline, false_alarm_probability)
         blocks = cut(recording)

@@ -1,0 +1,109 @@
+"""Readings of every hydraulic machine pass, leaking or not; noise, copies, wrong units and strangers are named."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.recordings import CHANNEL_UNITS, Recording, read
+from sealscope.recordings.hydraulics import no_machine
+
+REAL = Path("/work/shared/data/real")
+RATE, N = 500.0, 60_000
+RANDOM = np.random.default_rng(0)
+
+
+def machine(seed: int = 0, period: float = 1.6, noise: float = 8e3) -> Recording:
+    """A duty against friction, with noise; `period` [s] of its strokes."""
+    random, t = np.random.default_rng(seed), np.arange(N) / RATE
+    angle = 2 * np.pi * t / period
+    swing = 5e4 * np.tanh(6 * np.cos(angle))
+    channels = {
+        "u": 3 * np.cos(angle),
+        "p_A": 3e5 + swing + noise * random.standard_normal(N),
+        "p_B": 3e5 - swing + noise * random.standard_normal(N),
+        "theta": 20 * np.sin(angle),
+        "omega": 20 * 2 * np.pi / period * np.cos(angle),
+        "x": 0.02 * np.sin(angle),
+    }
+    return Recording(t, channels, CHANNEL_UNITS, RATE)
+
+
+def put(recording: Recording, **channels: np.ndarray) -> Recording:
+    return replace(recording, channels={**recording.channels, **channels})
+
+
+def slower(recording: Recording, factor: float) -> Recording:
+    return replace(recording, t=recording.t * factor, rate=recording.rate / factor)
+
+
+@pytest.mark.parametrize("names", [("u", "p_A", "p_B"), ("p_A", "p_B"), ("p_A",), None])
+@pytest.mark.parametrize(
+    "recording",
+    [
+        machine(),
+        machine(period=12.0),
+        machine(noise=1e2),
+        machine(noise=3e4),
+        slower(machine(period=12.0), 25.0).only(["u", "x", "p_A", "p_B"]),
+        put(machine(), x=np.full(N, 0.1)),
+        put(machine(), u=np.zeros(N)),
+        machine().samples(slice(0, 500)),
+    ],
+    ids=["machine", "slow", "quiet", "noisy", "at 20 Hz", "no position", "no command", "1 s"],
+)
+def test_a_machine_passes(recording: Recording, names: tuple[str, ...] | None) -> None:
+    assert no_machine(recording if names is None else recording.only(names)) is None
+
+
+GARBAGE: dict[str, tuple[Callable[[Recording], Recording], str]] = {
+    "noise": (lambda r: put(r, p_A=3e5 + 5e4 * RANDOM.standard_normal(N)), "p_A is noise"),
+    "noisy copy": (lambda r: put(r, p_B=r["p_A"] + 4e3 * RANDOM.standard_normal(N)), "p_A - p_B is noise"),
+    "copy": (lambda r: put(r, p_B=r["p_A"]), "p_B is a copy of p_A"),
+    "bar labelled Pa": (lambda r: put(r, p_A=r["p_A"] / 1e5, p_B=r["p_B"] / 1e5), "is its unit right"),
+    "Pa labelled bar": (lambda r: put(r, p_A=r["p_A"] * 1e5, p_B=r["p_B"] * 1e5), "is its unit right"),
+    "walks": (
+        lambda r: put(r, **{name: 3e5 + np.cumsum(1e3 * RANDOM.standard_normal(N)) for name in ("p_A", "p_B")}),
+        "nothing to do with each other",
+    ),
+    "another machine's command": (
+        lambda r: put(r.only(["u", "p_A", "p_B"]), u=np.cumsum(RANDOM.standard_normal(N))),
+        "does not follow u",
+    ),
+    "ms labelled s": (lambda r: slower(r, 1e3), "the speed is 1e+03 times that at which the angle turns"),
+}
+
+
+@pytest.mark.parametrize("kind", GARBAGE)
+def test_what_is_no_machine_is_named(kind: str) -> None:
+    make, reason = GARBAGE[kind]
+    assert reason in (no_machine(make(machine())) or "")
+
+
+def test_real_rotary_strokes_pass() -> None:
+    files = sorted((REAL / "vtnsi_actuator").glob("act_*/*.txt"))
+    if not files:
+        pytest.skip("the real recordings are not here")
+    for path in files:
+        assert no_machine(read(path, channel_map={"p_A": "PG_1", "p_B": "PG_2"}, rate=1000)) is None
+
+
+def test_pressures_of_one_circuit_of_a_real_test_rig_pass() -> None:
+    """PS1 to PS3 lie in the rig's working circuit; 10 cycles of 60 s at 100 Hz."""
+    path = REAL / "zema_hydraulic" / "fullrate_10cycles" / "testing_sample.csv"
+    if not path.is_file():
+        pytest.skip("the real recordings are not here")
+    with path.open(encoding="utf-8") as file:
+        head, *cycles = csv.reader(file)
+    columns = {name: [k for k, own in enumerate(head) if own.startswith(f"{name}_")] for name in ("PS1", "PS2", "PS3")}
+    for cycle in cycles:
+        bar = {name: np.array([float(cycle[k]) for k in own]) for name, own in columns.items()}
+        for p_A, p_B in (("PS1", "PS2"), ("PS2", "PS3"), ("PS3", "PS1")):
+            channels = {"p_A": 1e5 * bar[p_A], "p_B": 1e5 * bar[p_B]}
+            recording = Recording(np.arange(6000) / 100.0, channels, CHANNEL_UNITS, 100.0)
+            assert no_machine(recording) is None
