@@ -16,6 +16,9 @@ class Cylinder(Part):
     M_eq: Annotated[float, quantity("moving mass", "kg", gt=0, le=1e6)]
     V: Annotated[float, quantity("volume of each side at mid-stroke", "m^3", gt=0, le=100)]
     volumes: Annotated[Literal["fixed", "position"], choice("chamber volumes: constant V, or V + A_A x and V - A_B x")]
+    balance: Annotated[
+        Literal["mass", "volume"], choice("what chambers balance where volumes move with the piston", absent="mass")
+    ]
     k_stop: Annotated[float, quantity("stiffness of the end stop", "N/m", gt=0, le=1e12)]
     d_stop: Annotated[float, quantity("damping of the end stop", "N s/m", ge=0, le=1e9)]
     V_hose_A: Annotated[float, quantity("hose on side A: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)]
@@ -27,7 +30,7 @@ class Cylinder(Part):
 
 
 class Friction(Part):
-    """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22)."""
+    """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22), or another law with the same forces."""
 
     F_pr: Annotated[float, quantity("preload force of the seals", "N", ge=0, le=1e7)]
     F_cfr: Annotated[float, quantity("Coulomb friction per pressure", "N/Pa", ge=0, le=1)]
@@ -36,4 +39,12 @@ class Friction(Part):
     F_v: Annotated[float, quantity("viscous friction coefficient", "N s/m", ge=0, le=1e8)]
     v_th: Annotated[float, quantity("velocity below which friction is linear", "m/s", gt=0, le=10)]
     coulomb_pressure: Annotated[Literal["sum", "difference"], choice("pressure in the Coulomb force, eq. (4.20)")]
+    law: Annotated[
+        Literal["stribeck", "karnopp", "lugre"], choice("law of friction near standstill", absent="stribeck")
+    ]
+    sigma_0: Annotated[float, quantity("stiffness of the contact, LuGre", "N/m", absent=1e6, gt=0, le=1e12)]
+    sigma_1: Annotated[float, quantity("damping of the contact, LuGre", "N s/m", absent=1e3, ge=0, le=1e9)]
+    backward: Annotated[
+        float, quantity("friction of motion towards -x over that towards +x", "1", absent=1, gt=0, le=100)
+    ]
     bracket: Annotated[Literal["continuous", "literal"], choice("bracketing of the linear part, eq. (4.22)")]

@@ -76,6 +76,12 @@ class Rig(Part):
             if swept >= c.V:
                 rule = f'must be > {symbol} L/2 = {with_unit(swept, "m^3")} when volumes = "position"'
                 raise ValueError(f"cylinder.V {rule}, got {c.V}")
+        f = self.friction
+        if f.law != "stribeck" and (f.coulomb_pressure != "sum" or f.F_pr <= 0):
+            raise ValueError(
+                f'friction.law = "{f.law}" must have coulomb_pressure = "sum" and F_pr > 0, for its force must be > 0, '
+                f"got {f.coulomb_pressure} and {with_unit(f.F_pr, 'N')}"
+            )
         return self
 
     def __eq__(self, other: object) -> bool:

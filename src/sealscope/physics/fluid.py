@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from sealscope.compiled import contracted
-from sealscope.physics.lanes import anywhere
+from sealscope.physics.lanes import anywhere, exponential
 
 #: Atmospheric pressure [Pa]; every pressure of the rig is counted from it.
 P_ATM = 101325.0
@@ -26,5 +26,32 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
     if not anywhere(air > 0.0):
         return K_oil + 0.0 * p
     p_abs = max(p + P_ATM, _LEAST)
-    r = air * math.pow(P_ATM / p_abs, 1.0 / n_air)
+    r = air_share(p, air, n_air)
     return K_oil * (1.0 + r) / (1.0 + r * K_oil / (n_air * p_abs))
+
+
+@contracted
+def oil_density_ratio(dp: float, K_oil: float) -> float:
+    """Return rho(p + dp)/rho(p) = exp(dp/K_oil) of oil without air: the density whose bulk modulus is constant.
+
+    From K = rho dp/d rho (Merritt, Hydraulic Control Systems, 1967, the definition of the bulk modulus).
+    """
+    return exponential(dp / K_oil)  # type: ignore[no-any-return]
+
+
+@contracted
+def air_share(p: float, air: float, n_air: float) -> float:
+    """Volume of air over volume of oil at `p` [Pa gauge]: air (p_atm/p_abs)^(1/n)."""
+    return air * math.pow(P_ATM / max(p + P_ATM, _LEAST), 1.0 / n_air)
+
+
+@contracted
+def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air: float) -> float:
+    """Return rho(p)/rho(p_0) of oil with free air, whose modulus is `effective_bulk_modulus`.
+
+    ln of it is the integral of dp/K: ln((1 + r_0)/(1 + r)) of the air exactly, and that of dp/(K_oil (1 + r)) by
+    Simpson's rule, whose error is far below r dp/K_oil.
+    """
+    r, r_0, r_m = air_share(p, air, n_air), air_share(p_0, air, n_air), air_share(0.5 * (p + p_0), air, n_air)
+    mean = (1.0 / (1.0 + r) + 4.0 / (1.0 + r_m) + 1.0 / (1.0 + r_0)) / 6.0
+    return (1.0 + r_0) / (1.0 + r) * exponential((p - p_0) * mean / K_oil)  # type: ignore[no-any-return]

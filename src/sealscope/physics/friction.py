@@ -1,4 +1,8 @@
-"""Friction of piston and rod: Coulomb, Stribeck and viscous, linear near standstill (eqs. 4.20-4.22)."""
+"""Friction of piston and rod: Coulomb, Stribeck and viscous, linear near standstill (eqs. 4.20-4.22).
+
+Two other laws stand beside it, for machines that are not the thesis's: Karnopp's, in which the piston sticks, and
+LuGre, in which the contact gives way before it slides.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,63 @@ def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, of_diffe
 
 
 @contracted
+def stribeck_level(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
+    """Friction force [N] of steady sliding at `speed` >= 0 [m/s] without its viscous part, eq. (4.21).
+
+    F_C (1 + (K_brk - 1) exp(-C_c speed)): the breakaway force K_brk F_C at rest, F_C at speed.
+    """
+    return F_C * (1.0 + (K_brk - 1.0) * exponential(-C_c * speed))  # type: ignore[no-any-return]
+
+
+@contracted
+def karnopp_friction(
+    v: float, applied: float, breakaway: float, F_C: float, K_brk: float, C_c: float, F_v: float, v_th: float
+) -> float:
+    """Friction force [N] of a piston that sticks where |v| < v_th, and slides by eq. (4.21) above.
+
+    Stuck, it balances the `applied` force [N] up to the `breakaway` force [N]; `stuck_velocity` says how it moves.
+
+    Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
+    Dynamic Systems, Measurement and Control 107 (1985) 100-103.
+    """
+    speed = abs(v)
+    sliding = math.copysign(stribeck_level(speed, F_C, K_brk, C_c), v) + F_v * v
+    stuck = min(max(applied, -breakaway), breakaway)
+    return select(speed < v_th, stuck, sliding)  # type: ignore[no-any-return]
+
+
+@contracted
+def stuck_velocity(v: float, v_th: float) -> float:
+    """Velocity [m/s] at which a piston of Karnopp's law moves: none where |v| < v_th (source: `karnopp_friction`)."""
+    return select(abs(v) < v_th, 0.0 * v, v)  # type: ignore[no-any-return]
+
+
+@contracted
+def bristle_rate(v: float, z: float, level: float, sigma_0: float) -> float:
+    """Return dz/dt = v - sigma_0 |v|/g z [m/s] of the mean deflection z [m] of the contact, g = `level` > 0 [N].
+
+    At a steady v it settles at sigma_0 z = g sign(v), |z| never exceeds g/sigma_0 once below it.
+
+    Source: C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with friction,
+    IEEE Transactions on Automatic Control 40 (1995) 419-425, eq. (2), with g of eq. (4.21) in place of its Gaussian.
+    """
+    return v - sigma_0 * abs(v) / level * z
+
+
+@contracted
+def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float, F_v: float, v_th: float) -> float:
+    """Friction force [N] of a contact with deflection z [m] that changes by dz [m/s], against the velocity v [m/s].
+
+    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v. The damping of the contact dies out as it slides, without which
+    the force could drive the motion.
+
+    Source: as `bristle_rate`, eq. (3); the decay: H. Olsson, Control Systems with Friction, Lund 1996, section 5.
+    """
+    share = v / v_th
+    return sigma_0 * z + sigma_1 * exponential(-share * share) * dz + F_v * v  # type: ignore[no-any-return]
+
+
+@contracted
 def stribeck_friction(
     v: float, F_C: float, K_brk: float, C_c: float, F_v: float, v_th: float, literal_bracket: bool
 ) -> float:
@@ -34,5 +95,4 @@ def stribeck_friction(
         stribeck = 1.0 + (K_brk - 1.0) * exponential(-C_c * speed)
         slow = v * F_C * (stribeck + F_v * v_th) / v_th
         return select(speed > v_th, math.copysign(F_C * stribeck, v) + F_v * v, slow)  # type: ignore[no-any-return]
-    stribeck = 1.0 + (K_brk - 1.0) * exponential(-C_c * max(speed, v_th))
-    return F_C * stribeck * min(max(v / v_th, -1.0), 1.0) + F_v * v  # type: ignore[no-any-return]
+    return stribeck_level(max(speed, v_th), F_C, K_brk, C_c) * min(max(v / v_th, -1.0), 1.0) + F_v * v

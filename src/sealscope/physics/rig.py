@@ -2,9 +2,10 @@
 
 State y, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega [rad/s] and
 angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa], oil V_up [m^3] that
-the make-up has fed. Without throttles the pump is connected to the chambers directly: there are no line volumes, p_1 =
-p_A and p_2 = p_B. With throttles the stiffness of the equations is in their two flows alone (microseconds, against
-milliseconds for all else), so the right-hand side comes in two parts: everything but the throttles, and the throttles.
+the make-up has fed, deflection z [m] of the bristles of LuGre's friction. Without throttles the pump is connected to
+the chambers directly: there are no line volumes, p_1 = p_A and p_2 = p_B. With throttles the stiffness of the equations
+is in their two flows alone (microseconds, against milliseconds for all else), so the right-hand side comes in two
+parts: everything but the throttles, and the throttles.
 """
 
 from __future__ import annotations
@@ -21,13 +22,23 @@ from sealscope.parameters import Rig
 from sealscope.parameters.fields import leaves, unit_of
 from sealscope.physics.cylinder import chamber_volumes, hard_stop_force, piston_acceleration, pressure_rate
 from sealscope.physics.external import accumulator_pressure, check_valve_flow, external_leakage
-from sealscope.physics.fluid import effective_bulk_modulus
-from sealscope.physics.friction import coulomb_friction, stribeck_friction
+from sealscope.physics.fluid import effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
+from sealscope.physics.friction import (
+    bristle_rate,
+    coulomb_friction,
+    karnopp_friction,
+    lugre_friction,
+    stribeck_friction,
+    stribeck_level,
+    stuck_velocity,
+)
+from sealscope.physics.lanes import select
 from sealscope.physics.leakage import piston_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
 from sealscope.physics.restrictors import one_way_coefficient, orifice_coefficient, orifice_flow
 from sealscope.physics.state import (
+    BRISTLE,
     CURRENT,
     INTEGRAL,
     MADE_UP,
@@ -68,9 +79,12 @@ _CHOICES = {
 #: The numbers of `RigNumbers`: parameters, coefficients of throttle A (from the pump to the cylinder, back) and B, and
 #: the volumes of both sides at mid-stroke.
 NUMBERS = (*_PARAMETERS, "c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B")
-#: The choices: truth values, and two tuples that are empty, so that the compiler leaves the law out, where there is no
-#: air in the oil (`aerated`) and where no oil leaves or enters (`open_circuit`).
-CHOICES = (*_CHOICES, "aerated", "open_circuit")
+#: Laws that most rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out. Air
+#: in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has bristles, that differs
+#: between the directions.
+LAWS = ("aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided")
+#: The choices: truth values, and the laws.
+CHOICES = (*_CHOICES, *LAWS)
 
 if TYPE_CHECKING:
 
@@ -85,6 +99,10 @@ if TYPE_CHECKING:
         made_up: bool
         aerated: tuple[bool, ...]
         open_circuit: tuple[bool, ...]
+        conserving: tuple[bool, ...]
+        sticking: tuple[bool, ...]
+        bristled: tuple[bool, ...]
+        one_sided: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> float: ...
@@ -116,15 +134,21 @@ def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
 def rig_numbers(rig: Rig) -> RigNumbers:
     """Return the rig's parameters as the compiled laws take them."""
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
-    open_circuit = choices["made_up"] or rig.cylinder.G_ext_A > 0 or rig.cylinder.G_ext_B > 0
+    laws = {
+        "aerated": rig.fluid.air > 0,
+        "open_circuit": choices["made_up"] or rig.cylinder.G_ext_A > 0 or rig.cylinder.G_ext_B > 0,
+        "conserving": rig.cylinder.volumes == "position" and rig.cylinder.balance == "mass",
+        "sticking": rig.friction.law == "karnopp",
+        "bristled": rig.friction.law == "lugre",
+        "one_sided": rig.friction.backward != 1.0,
+    }
     return RigNumbers(
         *(attrgetter(name)(rig) for name in _PARAMETERS.values()),
         *throttle_coefficients(rig),
         rig.cylinder.V + rig.cylinder.V_hose_A,
         rig.cylinder.V + rig.cylinder.V_hose_B,
         **choices,
-        aerated=(True,) if rig.fluid.air > 0 else (),
-        open_circuit=(True,) if open_circuit else (),
+        **{name: (True,) if there else () for name, there in laws.items()},
     )
 
 
@@ -144,7 +168,7 @@ def within_limits(y: State, p: RigNumbers) -> State:
     """
     current = min(max(y[CURRENT], -p.i_max), p.i_max)
     p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
-    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, y[10]
+    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, y[10], y[11]
 
 
 @contracted
@@ -154,10 +178,24 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 
 
 @contracted
-def friction_force(y: State, p: RigNumbers) -> float:
-    """Friction [N] on the piston, eqs. (4.20)-(4.22)."""
+def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
+    """Friction [N] on the piston by the law that is in force, and the rate [m/s] of its bristles' deflection.
+
+    `applied` [N]: all other forces on the piston. Eqs. (4.20)-(4.22), unless the rig has another law.
+    """
+    v = y[VELOCITY]
     F_C = coulomb_friction(y[P_A], y[P_B], p.F_pr, p.F_cfr, p.coulomb_of_difference)
-    return stribeck_friction(y[VELOCITY], F_C, p.K_brk, p.C_c, p.F_v, p.v_th, p.literal_bracket)
+    F_v, breakaway = p.F_v, p.K_brk * F_C
+    if len(p.one_sided) > 0:
+        breakaway = select(applied < 0.0, p.backward * breakaway, breakaway)
+        side = select(v < 0.0, p.backward, 1.0)
+        F_C, F_v = side * F_C, side * F_v
+    if len(p.sticking) > 0:
+        return karnopp_friction(v, applied, breakaway, F_C, p.K_brk, p.C_c, F_v, p.v_th), 0.0 * v
+    if len(p.bristled) > 0:
+        dz = bristle_rate(v, y[BRISTLE], stribeck_level(abs(v), F_C, p.K_brk, p.C_c), p.sigma_0)
+        return lugre_friction(v, y[BRISTLE], dz, p.sigma_0, p.sigma_1, F_v, p.v_th), dz
+    return stribeck_friction(v, F_C, p.K_brk, p.C_c, F_v, p.v_th, p.literal_bracket), 0.0 * v
 
 
 @contracted
@@ -186,15 +224,45 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 
 
 @contracted
+def density_ratio(pressure: float, other: float, p: RigNumbers) -> float:
+    """Density of the oil at `pressure` over that at the `other` pressure [Pa]."""
+    if len(p.aerated) == 0:
+        return oil_density_ratio(pressure - other, p.K_oil)
+    return mixture_density_ratio(pressure, other, p.K_oil, p.air, p.n_air)
+
+
+@contracted
+def volumes_exchanged(Q: float, source: float, sink: float, p: RigNumbers) -> tuple[float, float]:
+    """Volumes [m^3/s] that leave one volume and enter another, each at its own pressure (`source`, `sink` [Pa]).
+
+    `Q` > 0 leaves the first, and is counted at the pressure it comes from: mass is conserved, rho_in Q_in = rho_out
+    Q_out. Where the rig balances volumes, both are Q.
+    """
+    if len(p.conserving) == 0:
+        return Q, Q
+    forward = Q > 0.0
+    ratio = density_ratio(select(forward, source, sink), select(forward, sink, source), p)
+    return select(forward, Q, Q * ratio), select(forward, Q * ratio, Q)
+
+
+@contracted
 def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
     """Return what the throttles' flows add to the rates of p_A, p_B, p_1, p_2 [Pa/s], eqs. (4.16)-(4.19)."""
     V_A, V_B = volumes_at(y[POSITION], p)
+    from_1, to_A = volumes_exchanged(Q_A, y[P_1], y[P_A], p)
+    from_B, to_2 = volumes_exchanged(Q_B, y[P_B], y[P_2], p)
     return (
-        pressure_rate(Q_A, V_A, bulk_modulus(y[P_A], p)),  # eq. (4.18)
-        pressure_rate(-Q_B, V_B, bulk_modulus(y[P_B], p)),  # eq. (4.19)
-        pressure_rate(-Q_A, p.V_1, bulk_modulus(y[P_1], p)),  # eq. (4.16)
-        pressure_rate(Q_B, p.V_2, bulk_modulus(y[P_2], p)),  # eq. (4.17)
+        pressure_rate(to_A, V_A, bulk_modulus(y[P_A], p)),  # eq. (4.18)
+        pressure_rate(-from_B, V_B, bulk_modulus(y[P_B], p)),  # eq. (4.19)
+        pressure_rate(-from_1, p.V_1, bulk_modulus(y[P_1], p)),  # eq. (4.16)
+        pressure_rate(to_2, p.V_2, bulk_modulus(y[P_2], p)),  # eq. (4.17)
     )
+
+
+@contracted
+def supply_pressure(y: State, p: RigNumbers) -> float:
+    """Pressure [Pa] of the make-up's accumulator."""
+    return accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
 
 @contracted
@@ -203,7 +271,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
     At the pump's ports, or at the chambers without lines.
     """
-    supply = accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
+    supply = supply_pressure(y, p)
     p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
     G_check = p.G_check if p.made_up else 0.0 * p.G_check
     return check_valve_flow(supply - p_1, p.p_crack, G_check), check_valve_flow(supply - p_2, p.p_crack, G_check)
@@ -219,43 +287,53 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     up_1, up_2 = make_up_flows(y, p)
     out_A, out_B = external_leakage(y[P_A], p.G_ext_A), external_leakage(y[P_B], p.G_ext_B)
+    fed, supply = up_1 + up_2, supply_pressure(y, p)
+    up_1 = volumes_exchanged(up_1, supply, y[P_1] if p.throttled else y[P_A], p)[1]
+    up_2 = volumes_exchanged(up_2, supply, y[P_2] if p.throttled else y[P_B], p)[1]
     if p.throttled:
         rate_1 = pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
-        return (-pressure_rate(out_A, V_A, K_A), -pressure_rate(out_B, V_B, K_B), rate_1, rate_2), up_1 + up_2
+        return (-pressure_rate(out_A, V_A, K_A), -pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
     rate_1, rate_2 = pressure_rate(up_1 - out_A, V_A, K_A), pressure_rate(up_2 - out_B, V_B, K_B)
-    return (rate_1, rate_2, rate_1, rate_2), up_1 + up_2
+    return (rate_1, rate_2, rate_1, rate_2), fed
 
 
 @contracted
 def rates_without_throttles(y: State, u: float, G: float, C: float, p: RigNumbers) -> State:
     """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients."""
     p_A, p_B, x, v = y[P_A], y[P_B], y[POSITION], y[VELOCITY]
+    if len(p.sticking) > 0:
+        v = stuck_velocity(v, p.v_th)
     dp_pump = (y[P_1] - y[P_2]) if p.throttled else (p_A - p_B)
     error = speed_error(y, u, p)  # eq. (4.2) as a state
     voltage = controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
     current = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
     spin = shaft_acceleration(y[CURRENT], y[OMEGA], pump_torque(dp_pump, p.q_b), p.C_m, p.B_M, p.J_M)
     stop = hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
-    push = piston_acceleration(p_A, p_B, friction_force(y, p), p.F_l + p.k_load * x, stop, p.A_A, p.A_B, p.M_eq)
+    load = p.F_l + p.k_load * x
+    friction, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
+    push = piston_acceleration(p_A, p_B, friction, load, stop, p.A_A, p.A_B, p.M_eq)
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
     V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
+    from_A, to_B = volumes_exchanged(Q_L, p_A, p_B, p)
     if p.throttled:
-        rate_A = pressure_rate(-p.A_A * v - Q_L, V_A, K_A)
-        rate_B = pressure_rate(p.A_B * v + Q_L, V_B, K_B)
-        rate_1 = pressure_rate(Q_1, p.V_1, bulk_modulus(y[P_1], p))
-        rate_2 = pressure_rate(-Q_1, p.V_2, bulk_modulus(y[P_2], p))
+        from_2, to_1 = volumes_exchanged(Q_1, y[P_2], y[P_1], p)
+        rate_A = pressure_rate(-p.A_A * v - from_A, V_A, K_A)
+        rate_B = pressure_rate(p.A_B * v + to_B, V_B, K_B)
+        rate_1 = pressure_rate(to_1, p.V_1, bulk_modulus(y[P_1], p))
+        rate_2 = pressure_rate(-from_2, p.V_2, bulk_modulus(y[P_2], p))
     else:
-        rate_A = pressure_rate(Q_1 - p.A_A * v - Q_L, V_A, K_A)
-        rate_B = pressure_rate(-Q_1 + p.A_B * v + Q_L, V_B, K_B)
+        from_2, to_1 = volumes_exchanged(Q_1, p_B, p_A, p)
+        rate_A = pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
+        rate_B = pressure_rate(-from_2 + p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = rate_A, rate_B
-    dy = (error, current, spin, y[OMEGA], v, push, rate_A, rate_B, rate_1, rate_2, 0.0 * v)  # eq. (4.13)
+    dy = (error, current, spin, y[OMEGA], v, push, rate_A, rate_B, rate_1, rate_2, 0.0 * v, dz)  # eq. (4.13)
     if len(p.open_circuit) > 0:
         outer, fed = outer_rates(y, p)
         dy = pressures_moved(dy, 1.0, outer)
-        return dy[0], dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], fed
+        return dy[0], dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], fed, dy[11]
     return dy
 
 

@@ -52,7 +52,7 @@ _OVERSAMPLING = 4
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Result of an integration: (n,) times [s] and (n, 18) outputs in the order of `sealscope.physics.state.OUTPUTS`.
+    """Result of an integration: (n,) times [s] and (n, 19) outputs in the order of `sealscope.physics.state.OUTPUTS`.
 
     `error`: the estimated rms error [Pa] of the pressures, NaN where it was not checked.
     """

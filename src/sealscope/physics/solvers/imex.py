@@ -33,8 +33,9 @@ from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, Pressures, Sta
 IMEX_NODES = (0.0, 1 / 2, 83 / 250, 31 / 50, 17 / 20, 1.0)
 GAMMA = 1 / 4
 Nodes = tuple[float, float, float, float, float, float]
-#: With air in the oil an implicit stage is solved anew with the bulk moduli of the pressures that it found, until these
-#: move by less than this [Pa], or this many times (each brings them nearer by about a factor of ten).
+#: With air in the oil, or a balance of mass, an implicit stage is solved anew with the bulk moduli and densities of the
+#: pressures that it found, until these move by less than this [Pa], or this many times (each brings them nearer by
+#: about a factor of ten).
 AIR_SETTLED = 1e-2
 AIR_TURNS = 12
 
@@ -81,7 +82,8 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     total_A, total_B = z[P_1] - z[P_A], z[P_B] - z[P_2]
     moved = z
     s = (z[P_A], z[P_B], z[P_1], z[P_2])
-    for _ in range(1 if len(p.aerated) == 0 else AIR_TURNS):
+    turns = AIR_TURNS if len(p.aerated) + len(p.conserving) > 0 else 1
+    for _ in range(turns):
         K_A, K_B = bulk_modulus(moved[P_A], p), bulk_modulus(moved[P_B], p)
         K_1, K_2 = bulk_modulus(moved[P_1], p), bulk_modulus(moved[P_2], p)
         g_A = step * (pressure_rate(1.0, V_A, K_A) + pressure_rate(1.0, p.V_1, K_1))
@@ -91,7 +93,7 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
         s = throttle_rates(moved, Q_A, Q_B, p)
         before = moved
         moved = pressures_moved(z, step, s)
-        if len(p.aerated) > 0:
+        if turns > 1:
             settled_A = max(abs(moved[P_A] - before[P_A]), abs(moved[P_1] - before[P_1]))
             settled_B = max(abs(moved[P_B] - before[P_B]), abs(moved[P_2] - before[P_2]))
             if not anywhere(max(settled_A, settled_B) >= AIR_SETTLED):
@@ -137,9 +139,9 @@ def advance_imex(
     every: int,
     rows: np.ndarray,
 ) -> None:
-    """Advance `y` (11,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
+    """Advance `y` (12,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
-    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 18).
+    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 19).
     """
     z = state_of(y)
     for step in range(u.shape[0]):

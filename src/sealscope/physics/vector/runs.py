@@ -13,7 +13,7 @@ import numpy as np
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.lanes import load, store
 from sealscope.physics.leakage import piston_leakage
-from sealscope.physics.rig import CHOICES, NUMBERS, RigNumbers
+from sealscope.physics.rig import CHOICES, LAWS, NUMBERS, RigNumbers
 from sealscope.physics.solvers.imex import imex_step
 from sealscope.physics.solvers.rk4 import rk4_step
 from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, State
@@ -40,8 +40,8 @@ def _lane_numbers() -> Any:
     made from the lists of fields.
     """
     fields = [f"{name}=taken(p.{name}, table, at + {row})" for row, name in enumerate(NUMBERS)]
-    fields += [f"{name}=settled(p.{name})" for name in CHOICES if name not in ("aerated", "open_circuit")]
-    fields += ["aerated=p.aerated", "open_circuit=p.open_circuit"]
+    fields += [f"{name}=settled(p.{name})" for name in CHOICES if name not in LAWS]
+    fields += [f"{name}=p.{name}" for name in LAWS]
     scope = {"RigNumbers": RigNumbers, "taken": taken, "settled": settled}
     exec(f"def lane_numbers(table, at, p):\n    return RigNumbers({', '.join(fields)})", scope)
     return contracted(scope["lane_numbers"])  # type: ignore[type-var]
@@ -52,7 +52,7 @@ lane_numbers = _lane_numbers()
 
 @contracted
 def lane_state(y: np.ndarray, at: int) -> State:
-    """Return the state of a group from rows at .. at + 10."""
+    """Return the state of a group from rows at .. at + 11."""
     return (
         load(y, at),
         load(y, at + 1),
@@ -65,6 +65,7 @@ def lane_state(y: np.ndarray, at: int) -> State:
         load(y, at + 8),
         load(y, at + 9),
         load(y, at + 10),
+        load(y, at + 11),
     )
 
 
@@ -119,7 +120,7 @@ def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> A
     if q.throttled:
         least = min(least, z[P_1])
         least = min(least, z[P_2])
-    total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10]
+    total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11]
     return flow, opened + share, max(abs(z[POSITION]), reach), least, diverged + 0.0 * total
 
 
@@ -146,7 +147,7 @@ def advance(
 
     By the implicit-explicit method where `implicit`, else by RK4; for lanes, or on a GPU for a thread's one number.
 
-    `y`: (groups, 11, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
+    `y`: (groups, 12, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
     WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields, WIDTH) with
     `bounds` (cells + 1,) the step at which each cell begins; `pressures`: (groups, outputs, CHANNELS, WIDTH), written
     from output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).
