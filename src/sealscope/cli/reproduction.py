@@ -112,11 +112,14 @@ def _progress() -> Iterator[Progress]:
     )
 
     console = Console(stderr=True)
+    if not console.is_terminal:  # a disabled bar prints an empty line in some versions of the library
+        yield lambda ended, total, in_work: None
+        return
     columns = (
         BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )  # fmt: skip
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=None)
 
         def update(ended: int, total: int, in_work: Sequence[str]) -> None:
