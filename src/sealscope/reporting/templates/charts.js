@@ -59,10 +59,10 @@
   function build() {
     const style = getComputedStyle(document.documentElement);
     const color = (name) => style.getPropertyValue(name).trim();
-    for (const p of plots.splice(0)) p.destroy();
     for (const c of data.charts) {
       const box = document.querySelector('[data-chart="' + c.key + '"]');
-      if (!box) continue;
+      if (!box || !box.clientWidth || box.classList.contains("live")) continue; // folded, or drawn already
+      const series = c.band ? [c.series[1], c.series[2], c.series[0]] : c.series; // the estimate above its interval
       const pen = (s) => ({
         label: s.label, stroke: color("--" + s.style), width: widths[s.style] || 1.1, dash: dashes[s.style],
         points: {show: c.axis !== "samples" && axes[c.axis].length < 60}, value: (u, v) => shown(v, c.unit),
@@ -72,18 +72,26 @@
         width: box.clientWidth, height: c.height,
         scales: {x: {time: false}, y: {range: (u, min, max) => min == null ? [0, 1] : uPlot.rangeNum(min, max, 0.06, true)}},
         axes: [Object.assign({size: 30, values: (u, list) => list.map((v) => v + " s")}, axis), Object.assign({size: 66, space: 22, values: (u, list) => list.map((v) => (v == null ? "" : (Math.abs(v) >= 1e5 ? v.toExponential().replace("e+", "e") : String(+v.toPrecision(6))).replace("-", "−")))}, axis)],
-        series: [{label: "t", value: (u, v) => (v == null ? "–" : v.toFixed(2) + " s")}].concat(c.series.map(pen)),
-        bands: c.band ? [{series: [3, 2], fill: color("--fill-a")}] : [],
-        legend: {markers: {width: 1, fill: (u, i) => u.series[i]._stroke || color("--" + c.series[i - 1].style)}},
+        series: [{label: "t", value: (u, v) => (v == null ? "–" : v.toFixed(2) + " s")}].concat(series.map((s, i) => c.band && i < 2 ? Object.assign(pen(s), {width: 0, points: {show: false}}) : pen(s))),
+        bands: c.band ? [{series: [2, 1], fill: color("--fill-a")}] : [],
+        legend: {markers: {width: 1, fill: (u, i) => u.series[i]._stroke || color("--" + series[i - 1].style)}},
         cursor: {sync: {key: "t", scales: ["x", null]}, drag: {x: true, y: false}},
         hooks: {draw: [(u) => marksOver(u, color)], setScale: [(u, key) => {if (key === "x" && u.status) link(u, u.scales.x.min, u.scales.x.max);}]},
-      }, [stretched(c.axis, axes[c.axis], first, last)].concat(c.series.map((s) => stretched(c.axis, values(s), null, null))), box);
+      }, [stretched(c.axis, axes[c.axis], first, last)].concat(series.map((s) => stretched(c.axis, values(s), null, null))), box);
       box.classList.add("live");
       plot.drawnHeight = c.height;
       plots.push(plot);
     }
   }
   build();
+  document.addEventListener("toggle", build, true);
+  function rebuild() {
+    for (const p of plots.splice(0)) {
+      p.root.parentNode.classList.remove("live");
+      p.destroy();
+    }
+    build();
+  }
 
   const tools = document.getElementById("chart-tools");
   if (tools) {
@@ -105,5 +113,5 @@
       if (width && width !== p.width) p.setSize({width, height: p.drawnHeight});
     }), 60);
   }).observe(document.querySelector("main"));
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", build);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", rebuild);
 })();
