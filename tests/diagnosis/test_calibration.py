@@ -128,16 +128,44 @@ def test_a_bound_is_kept_by_nineteen_calibrations_in_twenty():
 
 
 def test_too_few_recordings_say_how_many_it_takes(sound_ones):
-    with pytest.raises(
-        InputError, match=r"must be at least 99 at an operating point for a false-alarm rate of 0\.01, got at most 12"
-    ):
-        calibrate_on(sound_ones, DETECTORS, false_alarm_probability=0.01)
+    few = dict(list(sound_ones.items())[:4])
+    with pytest.raises(InputError, match=r"must be at least 5 at an operating point, .* got at most 4"):
+        calibrate_on(few, DETECTORS, false_alarm_probability=0.01)
+
+
+def test_few_recordings_extrapolate_the_tail(sound_ones, records):
+    """Twelve for 1 %: every detector has a threshold, over all their scores, with the interval of the true rate."""
+    found = calibrate_on(sound_ones, DETECTORS, false_alarm_probability=0.01)
+    assert set(found.groups[0].thresholds) == set(DETECTORS)
+    for name, threshold in found.groups[0].thresholds.items():
+        scores = [scorer(name).score(Look(recording)).value for recording in sound_ones.values()]
+        assert threshold.value > max(scores)
+        assert threshold.low < 0.01 < threshold.high
+        assert (threshold.rank, threshold.n) == (0, 12)
+    leaky = records(98, duration=20.0, leak="0.1 L/min from 10 s", throttled=True)
+    verdict = diagnose_calibrated(leaky, found)
+    assert verdict.verdict == "leak"
+    assert "by an extrapolated tail" in verdict.reason
+    fresh = [diagnose_calibrated(records(seed, duration=20.0, throttled=True), found).verdict for seed in range(60, 66)]
+    assert fresh.count("leak") <= 1
 
 
 def test_a_point_with_too_few_has_no_threshold():
     places = [place()] * 12 + [place(command_rms=5.0)] * 3
     found = calibrate(places, {"d3 of p_A fell": [float(k) for k in range(15)]}, false_alarm_probability=0.1)
     assert [bool(group.thresholds) for group in found.groups] == [True, False]
+
+
+def test_the_first_detector_that_judges_makes_the_verdict(sound_ones):
+    """20 s are too short for a scan of their own, so that `rms change` has no score to calibrate with."""
+    short = {name: recording.between(0.0, 8.0) for name, recording in sound_ones.items()}
+    found = calibrate_on(short, ("rms change", *DETECTORS), false_alarm_probability=0.1)
+    assert "rms change" not in found.groups[0].thresholds
+    verdict = diagnose_calibrated(next(iter(short.values())), found)
+    assert verdict.verdict in ("leak", "no leak")
+    assert verdict.methods[0].detector == DETECTORS[0]
+    last = next(method for method in verdict.methods if method.detector == "rms change")
+    assert "too short to be its own baseline" in last.reason
 
 
 def test_a_record_that_could_not_be_told_counts_as_no_alarm():

@@ -9,7 +9,8 @@ import pytest
 from scipy.special import ndtri, stdtrit
 
 from sealscope.diagnosis.baseline.mixed_model import BaselineModel, Prior, Spread
-from sealscope.diagnosis.baseline.sessions import sessions_of, start_seconds
+from sealscope.diagnosis.baseline.sessions import Times, start_seconds
+from sealscope.diagnosis.baseline.sessions import sessions_of as sessions_of_times
 from sealscope.diagnosis.rms_change.by_recordings import PRIOR
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -23,6 +24,10 @@ STRENGTH = np.array(
     [2158.70, 1678.15, 2316.00, 2061.30, 2207.50, 1708.30, 1784.70, 2575.00, 2357.90, 2256.70,
      2165.20, 2399.55, 1779.80, 2336.75, 1765.30, 2053.50, 2414.40, 2200.50, 2654.20, 1753.70]
 )  # fmt: skip
+
+
+def sessions_of(recording, baseline, *, single_strokes):
+    return sessions_of_times(start_seconds(recording), Times.of(baseline), single_strokes=single_strokes)
 
 
 def flat(scale: float) -> Prior:

@@ -285,6 +285,7 @@ def calibrate(
     from sealscope import __version__
     from sealscope.diagnosis.calibration.calibrated import DEFAULT_DETECTORS, calibrate_on
     from sealscope.diagnosis.calibration.thresholds import save
+    from sealscope.evaluation.thresholds import FEWEST
     from sealscope.recordings import read
 
     check_folder(output)
@@ -322,10 +323,14 @@ def calibrate(
         typer.echo(", ".join(parts))
         for name in calibration.detectors:
             limit = group.thresholds.get(name)
-            typer.echo(
-                f"  {name}: too few recordings"
-                if limit is None
-                else f"  {name}: threshold {limit.value:.4g}, false alarms {100 * limit.expected:.3g} % expected "
-                f"({100 * limit.low:.2g} % to {100 * limit.high:.2g} %)"
-            )
+            if limit is None and group.judges(name):
+                typer.echo(f"  {name}: each stroke against these {group.records}")
+            elif limit is None:
+                typer.echo(f"  {name}: fewer than {FEWEST} of them have a score, and no verdict comes from it")
+            else:
+                tail = "" if limit.rank else ", by an extrapolated tail"
+                typer.echo(
+                    f"  {name}: threshold {limit.value:.4g}, false alarms {100 * limit.expected:.3g} % expected "
+                    f"({100 * limit.low:.2g} % to {100 * limit.high:.2g} %){tail}"
+                )
     typer.echo(f"calibration: {output}")

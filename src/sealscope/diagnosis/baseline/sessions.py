@@ -80,19 +80,30 @@ class Sessions:
     exchangeable: bool
 
 
-def sessions_of(recording: Recording, baseline: Sequence[Recording], *, single_strokes: bool) -> Sessions:
-    """Return the sessions of the baseline recordings and of the one that is judged.
+@dataclass(frozen=True)
+class Times:
+    """When n recordings were made: `starts` (n,) [s since 1970], None where not known, and `lengths` (n,) [s]."""
+
+    starts: tuple[float | None, ...]
+    lengths: tuple[float, ...]
+
+    @classmethod
+    def of(cls, recordings: Sequence[Recording]) -> Times:
+        """Return the times of recordings."""
+        return cls(tuple(map(start_seconds, recordings)), tuple(recording.duration for recording in recordings))
+
+
+def sessions_of(own: float | None, baseline: Times, *, single_strokes: bool) -> Sessions:
+    """Return the sessions of the baseline recordings and of the one that is judged, which started at `own` [s].
 
     `single_strokes`: whether they go one way only, as opposed to a repeated duty.
     """
-    starts = [start_seconds(known) for known in baseline]
-    known = [start for start in starts if start is not None]
-    if len(known) < len(baseline):
+    known = [start for start in baseline.starts if start is not None]
+    if len(known) < len(baseline.starts):
         if not single_strokes:
             return Sessions(None, None, None, None, True)
-        lengths = np.array([leak_free.duration for leak_free in baseline])
-        return Sessions(np.cumsum(lengths) - lengths, np.zeros(len(baseline), dtype=np.int64), None, None, False)
-    own = start_seconds(recording)
+        lengths = np.array(baseline.lengths)
+        return Sessions(np.cumsum(lengths) - lengths, np.zeros(lengths.size, dtype=np.int64), None, None, False)
     together = np.array(known if own is None else [*known, own])
     order = np.argsort(together, kind="stable")
     numbers = np.empty(len(together), dtype=np.int64)

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.calibration.scorers import Look, Score, scorer, split_view
-from sealscope.diagnosis.calibration.thresholds import Calibration, Group, Place, calibrate
+from sealscope.diagnosis.calibration.thresholds import BY_STROKES, Calibration, Group, Place, calibrate
+from sealscope.diagnosis.rms_change.by_recordings import by_recordings
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.errors import InputError
+from sealscope.evaluation.thresholds import FEWEST
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -46,17 +48,24 @@ def calibrate_on(
         raise InputError(f"the split must be a share of the length between 0 and 1, got {split_share}")
     scorers = [scorer(name) for name in detectors]
     places: list[Place] = []
+    parts: list[Recording] = []
     scores: dict[str, list[float | None]] = {chosen.name: [] for chosen in scorers}
     for name, recording in recordings.items():
         own = inspected(recording)
         if own.defect is not None:
             raise InputError(f"a leak-free recording must be in good order, got: {own.defect} ({name})")
         places.append(Place.of(own.part))
+        parts.append(own.part)
         look = look_at(own.part, split_share, false_alarm_probability, rig)
         for chosen in scorers:
             scores[chosen.name].append(chosen.score(look).value)
     return calibrate(
-        places, scores, false_alarm_probability=false_alarm_probability, split_share=split_share, **options
+        places,
+        scores,
+        false_alarm_probability=false_alarm_probability,
+        split_share=split_share,
+        recordings=parts,
+        **options,
     )
 
 
@@ -65,9 +74,10 @@ def diagnose_calibrated(
 ) -> Diagnosis:
     """Say whether oil bypasses the piston, by the thresholds of a calibration.
 
-    The first of the calibration's detectors makes the verdict, at its false-alarm probability; the others are stated as
-    methods. A recording outside the calibrated operating points, or one the data of which cannot be trusted, is
-    `cannot tell`, with the reason. `rig`: what detectors may assume of the machine, the same as for the calibration.
+    The first of the calibration's detectors that judges at the recording's operating point makes the verdict, at its
+    false-alarm probability; the others are stated as methods. A recording outside the calibrated operating points, or
+    one the data of which cannot be trusted, is `cannot tell`, with the reason. `rig`: what detectors may assume of the
+    machine, the same as for the calibration.
     """
     judged = inspected(recording)
     group = judged.defect or calibration.find(Place.of(judged.part))
@@ -77,8 +87,12 @@ def diagnose_calibrated(
         methods = [Evidence("cannot tell", group, detector=name) for name in calibration.detectors]
     else:
         look = look_at(judged.part, calibration.split_share, probability, rig)
-        for name in calibration.detectors:
+        for name in sorted(calibration.detectors, key=lambda name: not group.judges(name)):
             detector, view = split_view(name)
+            if name == BY_STROKES and group.leak_free is not None:
+                own = by_recordings(judged.part, group.leak_free, probability)
+                methods.append(replace(own, parts=(), detector=name))
+                continue
             score = scorer(detector).score(look.through(calibration.views[view]) if view else look)
             methods.append(_evidence(name, score, group, probability))
     return Diagnosis(
@@ -93,18 +107,19 @@ def _evidence(name: str, score: Score, group: Group, probability: float) -> Evid
     threshold = group.thresholds.get(name)
     if threshold is None:
         reason = (
-            f"calibrated with {group.records} leak-free recordings at this operating point, too few for a false-alarm "
-            f"rate of {probability:g}"
+            f"fewer than {FEWEST} of the {group.records} leak-free recordings at this operating point have a score to "
+            f"calibrate with{': ' + score.reason if score.value is None and score.reason else ''}"
         )
         return Evidence("cannot tell", reason, score.value, detector=name)
     if score.value is None or not math.isfinite(score.value):
         return Evidence("cannot tell", score.reason or "no score", None, threshold.value, detector=name)
     verdict: Verdict = "leak" if score.value > threshold.value else "no leak"
     sign = "over" if verdict == "leak" else "not over"
+    tail = "" if threshold.rank else "by an extrapolated tail, "
     reason = (
         f"{name}: score {score.value:.4g} {sign} the threshold {threshold.value:.4g}, set from {threshold.n} leak-free "
-        f"recordings for a false-alarm rate of {probability:g} (truly {threshold.low:.2g} to {threshold.high:.2g} "
-        f"at {100 * threshold.confidence:g} % confidence)"
+        f"recordings for a false-alarm rate of {probability:g} ({tail}truly {threshold.low:.2g} to "
+        f"{threshold.high:.2g} at {100 * threshold.confidence:g} % confidence)"
     )
     onset = score.onset_s if verdict == "leak" else None
     return Evidence(verdict, reason, score.value, threshold.value, onset, detector=name)

@@ -139,7 +139,7 @@ class Scorer:
 
     `timing`: whether it compares the two sides of the split, judges the whole, or searches for the onset; `threshold`:
     its own, None where leak-free recordings must set one; `of_sides`: the score from the RMS on both sides alone, None
-    where it needs the whole recording.
+    where it needs the whole recording; `power`: the power of a score that cannot be negative which is nearly normal.
     """
 
     name: str
@@ -148,6 +148,12 @@ class Scorer:
     score: Callable[[Look], Score]
     threshold: float | None = None
     of_sides: Callable[[Sides], Score] | None = None
+    power: float = 1.0
+
+
+#: Powers of scores that are nearly normal: of the size of a normal deviate and of a sum of squares (E. B. Wilson, M. M.
+#: Hilferty, Proc. Natl. Acad. Sci. 17 (1931) 684-688), and of a detector's own score, which may be either.
+_OF_SIZES, _OF_SQUARES, _OF_ANY = 2.0 / 3.0, 1.0 / 3.0, 1.0 / 2.0
 
 
 def _on_sides(
@@ -156,8 +162,9 @@ def _on_sides(
     about: str,
     of_sides: Callable[[Sides], Score],
     threshold: float | None = None,
+    power: float = 1.0,
 ) -> Scorer:
-    return Scorer(name, timing, about, lambda look: of_sides(look.sides), threshold, of_sides)
+    return Scorer(name, timing, about, lambda look: of_sides(look.sides), threshold, of_sides, power)
 
 
 def _of_detail(chamber: str, quantity: str, what: Literal["change", "level"], sign: float) -> Callable[[Sides], Score]:
@@ -188,7 +195,8 @@ def _of_details() -> Iterator[Scorer]:
             yield _on_sides(f"{name} {word}", "split", about, moved)
             yield _on_sides(f"sign rule: {name} {word}", "split", f"{about}; any change at all", moved, 0.0)
         about = f"the RMS of {name} changed either way over the split, as size of the change of its logarithm"
-        yield _on_sides(f"{name} changed", "split", about, _of_detail(chamber, quantity, "change", 0.0))
+        size = _of_detail(chamber, quantity, "change", 0.0)
+        yield _on_sides(f"{name} changed", "split", about, size, power=_OF_SIZES)
         for word, sign in (("low", -1.0), ("high", 1.0)):
             about = f"the RMS of {name} over the whole recording is {word}, as its logarithm"
             yield _on_sides(f"{name} {word}", "whole", about, _of_detail(chamber, quantity, "level", sign))
@@ -219,7 +227,7 @@ def _all() -> Iterator[Scorer]:
     yield _on_sides(both, "split", about, _both_products)
     yield _on_sides(f"sign rule: {both}", "split", f"{about}; any change at all", _both_products, 0.0)
     about = "the largest T2 of a step of d2..d4 of both chambers at any instant"
-    yield Scorer("rms change", "search", about, _scan)
+    yield Scorer("rms change", "search", about, _scan, power=_OF_SQUARES)
     about = "T2 less the threshold that random orders of the recording's own blocks with a healthy machine's drift give"
     yield Scorer("rms change, own threshold", "search", about, _own_scan, 0.0)
 
@@ -242,7 +250,7 @@ def _calibrated(detector: str) -> Scorer:
         return Score(evidence.score, evidence.onset_s, evidence.reason)
 
     about = f"the score of the detector {detector!r}, against a threshold from leak-free recordings"
-    return Scorer(f"{detector}{CALIBRATED}", "search", about, score)
+    return Scorer(f"{detector}{CALIBRATED}", "search", about, score, power=_OF_ANY)
 
 
 #: Every scorer by name, but for the calibrated form of the registered detectors.

@@ -10,10 +10,22 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingPoint, difference, operating_point
+from sealscope.diagnosis.baseline.sessions import Times, sessions_of
 from sealscope.diagnosis.calibration.scorers import scorer, split_view
+from sealscope.diagnosis.rms_change.by_recordings import LeakFree
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
+from sealscope.evaluation.thresholds import (
+    FEWEST,
+    Promise,
+    Threshold,
+    Wander,
+    predictive_threshold,
+    quantile_threshold,
+    records_needed,
+)
 from sealscope.recordings.recording import Recording
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular
@@ -24,6 +36,10 @@ LEVEL_MARGIN = 0.25
 #: How far the length of a recording may differ from those calibrated with, as a ratio: scores of short recordings
 #: scatter more.
 DURATION_RATIO = 1.1
+#: The detector that judges single strokes by the leak-free ones themselves.
+BY_STROKES = "rms change"
+#: How far the mean of a score moves after the recordings of a session, in deviations of its scatter.
+WANDER = Wander(scale=3.0, freedom=4.0)
 _LARGEST_FILE = 50_000_000
 
 
@@ -44,8 +60,9 @@ class Place:
 class Group:
     """One calibrated operating point.
 
-    The `point` of its first recording, the ranges of all `records`, and the threshold of each detector (none where the
-    records are too few for the probability).
+    The `point` of its first recording, the ranges of all `records`, and the threshold of each detector (none where too
+    few of them have a score). `leak_free`: of single strokes, what `rms change` compares a stroke with, by a threshold
+    of its own; they are too short to hold a change.
     """
 
     point: OperatingPoint
@@ -53,6 +70,11 @@ class Group:
     levels: tuple[float, float]
     durations_s: tuple[float, float]
     thresholds: Mapping[str, Threshold]
+    leak_free: LeakFree | None = None
+
+    def judges(self, name: str) -> bool:
+        """Return whether a detector has a verdict at this operating point."""
+        return name in self.thresholds or (name == BY_STROKES and self.leak_free is not None)
 
     def refuses(self, place: Place) -> str | None:
         """Return why a recording is outside of this operating point, None where it is inside."""
@@ -124,6 +146,14 @@ def grouped(places: Sequence[Place]) -> list[list[int]]:
     return groups
 
 
+def _wander(recordings: Sequence[Recording], point: OperatingPoint) -> Wander | None:
+    """Return how far the mean score may move: of recordings of few sessions, which drift and are of one day."""
+    if not recordings:
+        return None
+    sessions = sessions_of(None, Times.of(recordings), single_strokes=point.direction != 0)
+    return None if sessions.exchangeable else WANDER
+
+
 def calibrate(
     places: Sequence[Place],
     scores: Mapping[str, Sequence[float | None]],
@@ -134,12 +164,15 @@ def calibrate(
     split_share: float = 0.5,
     made_from: Mapping[str, Any] | None = None,
     views: Mapping[str, Sequence[str]] | None = None,
+    recordings: Sequence[Recording] | None = None,
 ) -> Calibration:
     """Set thresholds by the scores of leak-free recordings.
 
     `places` (n,): where each was made; `scores`: detector -> (n,) scores, None where it could not tell (such a record
-    raises no alarm and counts as the lowest score). Each operating point gets, for each detector, the order statistic
-    that keeps the `promise` (`evaluation.thresholds`); one with too few records gets none. Raises InputError where no
+    raises no alarm and counts as the lowest score); `recordings` (n,): the recordings themselves, where they are at
+    hand. Each operating point gets, for each detector, the order statistic that keeps the `promise`
+    (`evaluation.thresholds`), or, from fewer records and where they are of few sessions, a tail that is extrapolated
+    from `FEWEST` scores or more, with `WANDER` of their mean where they are of few sessions. Raises InputError where no
     operating point has enough records, saying how many it takes.
     """
     if not places:
@@ -153,38 +186,45 @@ def calibrate(
             raise InputError(
                 f"scores of {name!r} must be as many as the recordings, got {len(values)} for {len(places)}"
             )
-    needed = records_needed(false_alarm_probability, confidence if promise == "bound" else None)
+    exact = records_needed(false_alarm_probability, confidence if promise == "bound" else None)
+    limits = (false_alarm_probability, confidence, promise)
     groups = []
     for members in grouped(places):
+        point = places[members[0]].point
+        own = [] if recordings is None else [recordings[k] for k in members]
+        wander = _wander(own, point)
         thresholds: dict[str, Threshold] = {}
         for name, values in scores.items():
-            own = scorer(split_view(name)[0]).threshold
-            if own is not None:
+            chosen = scorer(split_view(name)[0])
+            if chosen.threshold is not None:
                 raise InputError(f"{name!r} has a threshold of its own and cannot be calibrated")
             known = [values[k] for k in members]
             finite = [value for value in known if value is not None]
-            if len(members) < needed or not finite:
-                continue
-            floor = min(finite)
-            thresholds[name] = quantile_threshold(
-                [floor if value is None else value for value in known], false_alarm_probability, confidence, promise
-            )
+            if wander is None and finite and len(members) >= exact:
+                floor = min(finite)
+                thresholds[name] = quantile_threshold([floor if value is None else value for value in known], *limits)
+            elif len(finite) >= FEWEST and np.ptp(finite) > 0:
+                thresholds[name] = predictive_threshold(finite, *limits, power=chosen.power, wander=wander)
+        strokes = None
+        if own and point.direction != 0 and len(own) >= FEWEST and BY_STROKES in scores:
+            strokes = LeakFree.of(own)
         levels = [places[k].point.level for k in members]
         lengths = [places[k].duration_s for k in members]
         groups.append(
             Group(
-                places[members[0]].point,
+                point,
                 len(members),
                 (min(levels), max(levels)),
                 (min(lengths), max(lengths)),
                 thresholds,
+                strokes if strokes is not None and np.all(np.isfinite(strokes.log_rms)) else None,
             )
         )
-    if not any(group.thresholds for group in groups):
+    if not any(group.judges(name) for group in groups for name in scores):
         most = max(group.records for group in groups)
         raise InputError(
-            f"leak-free recordings must be at least {needed} at an operating point for a false-alarm rate of "
-            f"{false_alarm_probability:g}, got at most {most}"
+            f"leak-free recordings must be at least {FEWEST} at an operating point, with scores that differ, got at "
+            f"most {most}"
         )
     used = {view: seen[view] for name in scores if (view := split_view(name)[1])}
     return Calibration(
@@ -216,6 +256,7 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
             "levels": list(group.levels),
             "durations_s": list(group.durations_s),
             "thresholds": {name: asdict(threshold) for name, threshold in group.thresholds.items()},
+            **({} if group.leak_free is None else {"leak_free": group.leak_free.as_dict()}),
         }
         for group in calibration.groups
     ]
@@ -281,7 +322,8 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
         low, high = (float(value) for value in group["levels"])
         short, long = (float(value) for value in group["durations_s"])
         point = OperatingPoint.of_dict(group["point"])
-        groups.append(Group(point, int(group["records"]), (low, high), (short, long), thresholds))
+        strokes = None if group.get("leak_free") is None else LeakFree.of_dict(group["leak_free"])
+        groups.append(Group(point, int(group["records"]), (low, high), (short, long), thresholds, strokes))
     views = {str(name): tuple(map(str, channels)) for name, channels in tree.get("views", {}).items()}
     for name in detectors:
         _check(name, views)

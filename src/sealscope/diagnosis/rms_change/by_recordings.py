@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.mixed_model import BaselineModel, Prediction, Prior, Spread
-from sealscope.diagnosis.baseline.sessions import Sessions
+from sealscope.diagnosis.baseline.mixed_model import FEWEST_FOR_COVARIATE, BaselineModel, Prediction, Prior, Spread
+from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, OperatingPoint, operating_point
+from sealscope.diagnosis.baseline.sessions import Sessions, Times, sessions_of, start_seconds
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole_log_rms
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
+from sealscope.errors import InputError
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.filters import IntArray
@@ -26,10 +29,35 @@ PRIOR = Prior(
 #: A change of log RMS that has to be found before `no leak` is said: the mean change of d3 of p_A in the thesis's
 #: Appendix C, by 19 %.
 WORTH_FINDING = 0.2
+#: Recordings of a session that show how it drifts after them; where there are fewer, a later recording that differs may
+#: as well be of another session.
+FEWEST_OF_SESSION = 10
+#: How far outside the baseline's range of levels a recording may lie, as a share of the range.
+LEVEL_MARGIN = 0.25
 #: Scatter of the log RMS between recordings below which they are copies of one another.
 _LEAST_SCATTER = 1e-9
 #: What a reason adds where d1 changed.
 WITHOUT_NOISE = "; the noise (d1) changed too, and was taken out of the other details"
+
+
+def outside_levels(point: OperatingPoint, levels: Array) -> str | None:
+    """Return why the pressure level of a recording lies outside those (n,) of leak-free ones, None where it does not.
+
+    From `FEWEST_FOR_COVARIATE` recordings on it may lie a share of their range outside, as they tell how the details
+    follow the level.
+    """
+    margin = float(np.log(LEVEL_RATIO))
+    if len(levels) < FEWEST_FOR_COVARIATE:
+        outside = bool(np.all(np.abs(levels - point.level) > margin))
+    else:
+        margin = max(LEVEL_MARGIN * float(np.ptp(levels)), margin)
+        outside = not levels.min() - margin <= point.level <= levels.max() + margin
+    if not outside:
+        return None
+    return (
+        f"the pressure level, {np.exp(point.level):.4g} {point.units[0]} rms, lies outside that of the "
+        f"{len(levels)} comparable baseline recordings, {np.exp(levels.min()):.4g} to {np.exp(levels.max()):.4g}"
+    )
 
 
 def normal_threshold(probability: float) -> float:
@@ -61,45 +89,83 @@ class _Judged:
         return float(np.min((prediction.half_width(threshold) * self.inflation)[self.columns])) / self.unit
 
 
-def by_recordings(
-    recording: Recording,
-    baseline: Sequence[Recording],
-    level: float,
-    levels: Array,
-    sessions: Sessions,
-    probability: float,
-) -> Evidence:
+@dataclass(frozen=True, eq=False)
+class LeakFree:
+    """What is compared of n leak-free recordings: all that a calibration has to keep of them.
+
+    `log_rms` (n, 5 per chamber); `levels` (n,): log pressure levels; `times`: when they were made.
+    """
+
+    log_rms: Array
+    levels: Array
+    times: Times
+
+    @classmethod
+    def of(cls, recordings: Sequence[Recording]) -> LeakFree:
+        """Return it of recordings of one operating point."""
+        return cls(
+            np.stack([whole_log_rms(leak_free) for leak_free in recordings]),
+            np.array([operating_point(leak_free).level for leak_free in recordings]),
+            Times.of(recordings),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain JSON values."""
+        return {
+            "log_rms": self.log_rms.tolist(),
+            "levels": self.levels.tolist(),
+            "starts": list(self.times.starts),
+            "lengths": list(self.times.lengths),
+        }
+
+    @classmethod
+    def of_dict(cls, tree: Mapping[str, Any]) -> LeakFree:
+        """Return it of what `as_dict` gave."""
+        times = Times(tuple(tree["starts"]), tuple(map(float, tree["lengths"])))
+        own = cls(np.array(tree["log_rms"], dtype=float), np.array(tree["levels"], dtype=float), times)
+        if own.log_rms.ndim != 2 or {len(own.log_rms), len(times.starts)} != {len(own.levels), len(times.lengths)}:
+            raise InputError("leak-free recordings must have a level, a start and a length each")
+        return own
+
+
+def by_recordings(recording: Recording, leak_free: LeakFree, probability: float) -> Evidence:
     """Evidence from the distribution of one more recording, given leak-free ones of its operating point.
 
-    `level`, `levels` (n,): log pressure levels of the recording and of the baseline. `leak`: the recording is not of
+    `leak`: the recording is not of
     that distribution, whichever session it may belong to. `no leak`: it is, and a change `WORTH_FINDING` would have
     been found, or it is of a session of the baseline and differs no more than a repetition would. Else `cannot tell`:
     it differs as drift, another session or another machine would, too.
     """
-    known, measured = np.stack([whole_log_rms(leak_free) for leak_free in baseline]), whole_log_rms(recording)
+    known, measured = leak_free.log_rms, whole_log_rms(recording)
+    point, levels = operating_point(recording), leak_free.levels
+    level = point.level
+    if (refusal := outside_levels(point, levels)) is not None:
+        return Evidence("cannot tell", refusal)
+    sessions = sessions_of(start_seconds(recording), leak_free.times, single_strokes=point.direction != 0)
     copies = len(known) > 1 and np.any(np.ptp(known, axis=0) < _LEAST_SCATTER)
     if copies or not np.all(np.isfinite(measured)) or not np.all(np.isfinite(known)):
         return Evidence(
             "cannot tell",
-            f"the {len(baseline)} comparable baseline recordings do not scatter, or a pressure does not move: "
+            f"the {len(known)} comparable baseline recordings do not scatter, or a pressure does not move: "
             "nothing to judge a change by",
         )
     names = [f"{quantity} of {chamber}" for chamber in chambers_of(recording) for quantity in QUANTITIES]
     columns = np.array([k for k, name in enumerate(names) if name.split()[0] in JUDGED])
     own, threshold = normal_threshold(probability), normal_threshold(probability / len(columns))
     model = BaselineModel(known, levels, PRIOR, times=sessions.times, sessions=sessions.labels)
-    expected = model.predict(level, sessions.time, sessions.label)
+    shown = _shown(sessions)
+    expected = model.predict(level, sessions.time, shown)
     changes, single = measured - expected.mean, expected.z(measured)
     parts = parts_against(names, single, np.full(len(names), own), changes)
     judged = _Judged(model, columns, measured, np.ones(len(names)), 1.0)
     noisy = any(single[k] > own for k, name in enumerate(names) if name.startswith("d1 "))
     if noisy:
         judged = _beyond_noise(known, measured, model, level, columns)
-        expected = judged.model.predict(level, sessions.time, sessions.label)
+        expected = judged.model.predict(level, sessions.time, shown)
     z = judged.z(expected)
     score = float(np.max(z))
     chosen = [names[k] for k in columns]
-    against = f"against {len(baseline)} comparable leak-free recording{'s' if len(baseline) > 1 else ''}"
+    against = f"against {len(known)} comparable leak-free recording{'s' if len(known) > 1 else ''}"
     figures = f"largest deviation {score:.1f}, threshold {threshold:.1f}"
     note = WITHOUT_NOISE if noisy else ""
     if score > threshold:
@@ -127,6 +193,15 @@ def by_recordings(
     changed = largest_changes(chosen, near[nearest], changes[columns], np.full(len(z), threshold))
     reason = f"{changed} {against}: {_possible(sessions)} ({figures}; only {sensitivity}){note}"
     return Evidence("cannot tell", reason, score, threshold, parts=parts)
+
+
+def _shown(sessions: Sessions) -> int | None:
+    """Return the recording's session where the baseline shows its drift: by enough of it, or before and after."""
+    if sessions.labels is None or sessions.times is None or sessions.label is None or sessions.time is None:
+        return None
+    times = sessions.times[sessions.labels == sessions.label]
+    between = times.min() <= sessions.time <= times.max()
+    return sessions.label if between or times.size >= FEWEST_OF_SESSION else None
 
 
 def _repetitions(sessions: Sessions) -> list[tuple[float, int]]:

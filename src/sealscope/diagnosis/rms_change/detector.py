@@ -19,17 +19,17 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.baseline.duty import StrokeChange, duty_changes
-from sealscope.diagnosis.baseline.mixed_model import FEWEST_FOR_COVARIATE
-from sealscope.diagnosis.baseline.operating_point import LEVEL_RATIO, operating_point
-from sealscope.diagnosis.baseline.sessions import sessions_of
+from sealscope.diagnosis.baseline.operating_point import operating_point
 from sealscope.diagnosis.changepoint.scatter import HealthyDrift, StepScan
 from sealscope.diagnosis.changepoint.tails import near_best
 from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, cut, excess
 from sealscope.diagnosis.rms_change.by_recordings import (
     WITHOUT_NOISE,
+    LeakFree,
     by_recordings,
     change_text,
     largest_changes,
+    outside_levels,
     part,
     parts_against,
 )
@@ -47,8 +47,6 @@ FEWEST_BLOCKS, FEWEST_BLOCKS_A_SIDE = 24, 12
 SLOWEST_RATE = 8.0
 #: Fewest baseline recordings of a repeated duty from which the scatter between recordings is estimated.
 FEWEST_RECORDINGS = 3
-#: How far outside the baseline's range of levels a recording may lie, as a share of the range.
-LEVEL_MARGIN = 0.25
 
 
 class RmsChange:
@@ -172,22 +170,11 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
 def against(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
     """Return the evidence from the comparison with leak-free recordings of the same operating point."""
     point = operating_point(recording)
-    levels = np.array([operating_point(other).level for other in baseline])
-    margin = float(np.log(LEVEL_RATIO))
-    if len(levels) < FEWEST_FOR_COVARIATE:
-        outside = bool(np.all(np.abs(levels - point.level) > margin))
-    else:
-        margin = max(LEVEL_MARGIN * float(np.ptp(levels)), margin)
-        outside = not levels.min() - margin <= point.level <= levels.max() + margin
-    if outside:
-        return Evidence(
-            "cannot tell",
-            f"the pressure level, {np.exp(point.level):.4g} {point.units[0]} rms, lies outside that of the "
-            f"{len(baseline)} comparable baseline recordings, {np.exp(levels.min()):.4g} to {np.exp(levels.max()):.4g}",
-        )
     if len(baseline) >= FEWEST_RECORDINGS or point.direction != 0:
-        sessions = sessions_of(recording, baseline, single_strokes=point.direction != 0)
-        return by_recordings(recording, baseline, point.level, levels, sessions, probability)
+        return by_recordings(recording, LeakFree.of(baseline), probability)
+    levels = np.array([operating_point(other).level for other in baseline])
+    if (refusal := outside_levels(point, levels)) is not None:
+        return Evidence("cannot tell", refusal)
     return _by_blocks(recording, baseline, probability)
 
 
