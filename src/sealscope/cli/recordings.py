@@ -173,8 +173,8 @@ def report(
     calibration: CalibrationOption = None,
     rig: AssumeOption = None,
 ) -> None:
-    """Diagnose each file and write a self-contained HTML page of it."""
-    from sealscope.reporting import write_page
+    """Diagnose each file and write a self-contained page of it; a folder gets an index, the most severe first."""
+    from sealscope.reporting import write_index, write_page
     from sealscope.reporting.template import check_page
     from sealscope.storage.folders import make_folder
 
@@ -187,12 +187,15 @@ def report(
             raise InputError(f"a page must not replace a recording, got {page}")
         if page in pages:
             raise InputError(f"pages must have names of their own, got {page} for {pages[page]} and {file}")
+        if several and file.stem == "index":
+            raise InputError(f"a page must not replace the index of its folder, got {page} for {file}")
         pages[page] = file
     if several:
         make_folder(output)
     else:
         check_folder(check_page(output))
     complete = True
+    written: list[tuple[Path, Diagnosis]] = []
     assumed = assumed_rig(rig)
     for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, calibration, assumed):
         if result is None:
@@ -201,7 +204,10 @@ def report(
         recording, diagnosis = result
         page = output / f"{Path(diagnosis.file).stem}.html" if several else output
         write_page(page, recording, diagnosis, rig=assumed)
+        written.append((page, diagnosis))
         typer.echo(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
+    if several and written:
+        write_index(output / "index.html", written)
     if not complete:
         raise typer.Exit(1)
 

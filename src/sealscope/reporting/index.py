@@ -1,0 +1,41 @@
+"""The index of a folder of pages: one line a recording, the most severe first."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.reporting import messages, template
+
+#: Verdicts as an index orders them.
+_ORDER = ("leak", "cannot tell", "no leak")
+
+
+def severity(diagnosis: Diagnosis) -> tuple[int, float, str]:
+    """Return what pages are ordered by: leaks by their flow, then what cannot be told, then what holds."""
+    return (_ORDER.index(diagnosis.verdict), -(diagnosis.leak_lpm or 0.0), diagnosis.file)
+
+
+def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
+    """Write the index of `pages`, each a page's path in the folder of `path` and its diagnosis."""
+    ordered = sorted(pages, key=lambda page: severity(page[1]))
+    counts = {verdict: sum(diagnosis.verdict == verdict for _, diagnosis in pages) for verdict in _ORDER}
+    summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    rows = [
+        {
+            "href": quote(page.name),
+            "file": Path(diagnosis.file).name,
+            "verdict": diagnosis.verdict,
+            "since": messages.since(diagnosis),
+            "how_much": messages.how_much(diagnosis),
+            "cause": messages.cause(diagnosis),
+            "reason": diagnosis.reason,
+        }
+        for page, diagnosis in ordered
+    ]
+    return template.write(
+        path, template.render("index.html.j2", title=f"{len(pages)} recordings: {summary}", rows=rows)
+    )
