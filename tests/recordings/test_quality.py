@@ -286,3 +286,18 @@ def test_no_number_is_too_large_or_too_small_to_inspect(scale: float) -> None:
     t = np.sort(rng.normal(size=3000)) * scale
     t[-1] = np.finfo(float).max
     assert inspect(replace(recording({"p_A": values, "x": -values}, t), rate=1e300))
+
+
+def test_pressures_that_creep_as_in_no_sealed_circuit_are_remarked():
+    """Volumes balanced in place of mass pump a circuit up; mass balanced, a warm-up or a jump are no such thing."""
+    t = np.arange(9000) / 100.0
+    stroke = 1e5 * np.sin(4 * t)
+
+    def codes(mean):
+        channels = {"p_A": 3e5 + mean + stroke, "p_B": 3e5 + mean - stroke}
+        found = inspect(Recording(t, channels, dict.fromkeys(channels, "Pa"), rate=100.0))
+        return [(f.code, f.severity) for f in found if f.code == "creeping_pressures"]
+
+    assert codes(6e3 * t) == codes(-6e3 * t) == [("creeping_pressures", "note")]
+    assert codes(0.0 * t) == codes(500.0 * t) == codes(np.where(t > 45, 6e5, 0.0)) == []
+    assert codes(3e5 * (1 - np.exp(-t / 10))) == []

@@ -34,6 +34,10 @@ _LOUD_HUM = 0.1
 _UNCONNECTED = 0.5
 _FEWEST_AT_RAIL = 5
 _LONG_RUN = 20
+#: Mean pressure [Pa/s] of both chambers that creeps faster than oil warms in an actuator with an accumulator, and how
+#: long [s] a recording must be to tell it from a stroke.
+_CREEP_RATE = 2e3
+_CREEP_SECONDS = 60.0
 _HUM_BAND = 5.0
 _HUM_POWER_FROM = 20.0
 _HUM_OVER_REST = 4.0
@@ -64,7 +68,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 
     Codes of the time: ``too_short``, ``missing_time``, ``reversed_time``, ``duplicated_time``, ``gap``,
     ``rate_mismatch``, ``irregular_sampling``; of a channel: ``missing``, ``mixed_rate``, ``infinite``, ``constant``,
-    ``clipped``, ``stuck``, ``mains_hum``.
+    ``clipped``, ``stuck``, ``mains_hum``; of both chambers: ``creeping_pressures``.
 
     Parameters
     ----------
@@ -96,6 +100,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
         findings = _time_findings(recording)
         for name, values in recording.channels.items():
             findings += _channel_findings(recording, name, values)
+        findings += _creep_findings(recording)
     return tuple(findings)
 
 
@@ -159,6 +164,25 @@ def _lost(samples: float) -> str:
 
 def _times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
+
+
+def _creep_findings(recording: Recording) -> list[Finding]:
+    """Return the finding on chambers whose mean pressure creeps evenly all the while, as no sealed circuit's does."""
+    duration = len(recording) / recording.rate
+    if duration < _CREEP_SECONDS or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
+        return []
+    mean = 0.5 * (recording["p_A"] + recording["p_B"])
+    levels = np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in np.array_split(mean, 8)])
+    steps = np.diff(levels)
+    rate = float(np.median(steps)) * 8.0 / duration
+    even = np.all((steps / np.median(steps) > 0.5) & (steps / np.median(steps) < 2.0))
+    if not (even and abs(rate) >= _CREEP_RATE):
+        return []
+    text = (
+        f"p_A, p_B: their mean creeps evenly by {rate / 1e3:+.2g} kPa/s: oil is fed or lost, or a simulator balanced "
+        "volumes in place of mass"
+    )
+    return [Finding("creeping_pressures", "note", None, len(recording), _moment(recording, 0), text)]
 
 
 def _channel_findings(recording: Recording, name: str, values: Array) -> list[Finding]:
