@@ -46,7 +46,7 @@ FEWEST = 5
 
 
 @dataclass(frozen=True)
-class Wander:
+class LevelWander:
     """What is assumed of how far the mean score moves after the calibration, in deviations of its scatter.
 
     The shift is normal; its deviation has a scaled inverse chi-square prior of `scale` and degrees of `freedom`.
@@ -130,7 +130,7 @@ def predictive_threshold(
     promise: Promise = "average",
     *,
     power: float = 1.0,
-    wander: Wander | None = None,
+    wander: LevelWander | None = None,
 ) -> Threshold:
     """Return a threshold from few leak-free scores, by a normal law of `score^power`.
 
@@ -172,7 +172,7 @@ def predictive_threshold(
 
 
 @cache
-def _posterior(n: int, wander: Wander | None) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _posterior(n: int, wander: LevelWander | None) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return mean and deviation behind the next record at the points of a Sobol sequence, as (y - m)/s."""
     from scipy.special import chdtri, ndtri
     from scipy.stats.qmc import Sobol

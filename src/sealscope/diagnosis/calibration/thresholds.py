@@ -19,9 +19,9 @@ from sealscope.diagnosis.rms_change.by_recordings import LeakFree
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.evaluation.thresholds import (
     FEWEST,
+    LevelWander,
     Promise,
     Threshold,
-    Wander,
     predictive_threshold,
     quantile_threshold,
     records_needed,
@@ -39,7 +39,7 @@ DURATION_RATIO = 1.1
 #: The detector that judges single strokes by the leak-free ones themselves.
 BY_STROKES = "rms change"
 #: How far the mean of a score moves after the recordings of a session, in deviations of its scatter.
-WANDER = Wander(scale=3.0, freedom=4.0)
+WANDER = LevelWander(scale=3.0, freedom=4.0)
 _LARGEST_FILE = 50_000_000
 
 
@@ -146,7 +146,7 @@ def grouped(places: Sequence[Place]) -> list[list[int]]:
     return groups
 
 
-def _wander(recordings: Sequence[Recording], point: OperatingPoint) -> Wander | None:
+def _wander(recordings: Sequence[Recording], point: OperatingPoint) -> LevelWander | None:
     """Return how far the mean score may move: of recordings of few sessions, which drift and are of one day."""
     if not recordings:
         return None
