@@ -24,6 +24,7 @@ KEYS = {
     "quality": list,
     "cause": str | None,
     "next_check": str,
+    "passage": dict | None,
 }
 VERDICTS = {"leak", "no leak", "cannot tell"}
 FOREIGN = ("--map", "p_A=PG_1", "--map", "p_B=PG_2", "--rate", "1000")

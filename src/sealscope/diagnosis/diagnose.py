@@ -254,6 +254,7 @@ def diagnose(
         file=os.fspath(file) if file else str(recording.provenance.get("file", "recording")),
         false_alarm_probability=false_alarm_probability,
         quality=(*judged.findings, *compared.findings),
+        baselines=len(compared.parts),
     )
 
 

@@ -29,6 +29,16 @@ class Pump(Part):
 
     q_b: Annotated[float, quantity("displacement", "m^3/rev", gt=0, le=0.1)]
     G_pump: Annotated[float, quantity("internal leakage conductance of the pump", "m^3/(s Pa)", ge=0, le=1e-6)]
+    G_healthy: Annotated[
+        float,
+        quantity(
+            "most that pump and piston of a healthy machine pass together, as a conductance (0: not known)",
+            "m^3/(s Pa)",
+            absent=0,
+            ge=0,
+            le=1e-6,
+        ),
+    ]
     omega_max: Annotated[float, quantity("speed limit (informative)", "rad/s", gt=0, le=1e4)]
 
 

@@ -87,6 +87,23 @@ def how_much(diagnosis: Diagnosis) -> str | None:
     return text
 
 
+def passes(diagnosis: Diagnosis) -> str | None:
+    """Return what pump and piston together pass, and what of it would have shown; None where it is not known."""
+    own = diagnosis.passage
+    if own is None:
+        return None
+    low, high = own.interval_lpm
+    text = (
+        f"pump and piston together {number(own.lpm, 2)} L/min, between {number(low, 2)} and {number(high, 2)}, at "
+        f"{number(own.pressure / 1e6, 2)} MPa"
+    )
+    if own.healthy_lpm is not None:
+        text += f"; a healthy machine at most {number(own.healthy_lpm, 2)} L/min"
+    if own.findable_lpm is not None:
+        text += f"; the smallest step that would have been found is {number(own.findable_lpm, 2)} L/min"
+    return text
+
+
 def how_sure(diagnosis: Diagnosis) -> str:
     """Return the score against its threshold, and what the threshold means."""
     if diagnosis.score is None or diagnosis.threshold is None:
@@ -137,7 +154,7 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
             steps.insert(0, f"Rule out a fault of the data first: {faults}.")
     elif diagnosis.verdict == "no leak":
         steps = [
-            "Keep this recording as the baseline for later ones of this actuator with the same command.",
+            diagnosis.next_check,
             "A leak too small to lift the score over its threshold stays unseen; a longer recording sees smaller ones.",
         ]
         if trouble:
@@ -167,6 +184,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     rows = [
         ("since", since(diagnosis)),
         ("how much", how_much(diagnosis)),
+        ("passes", passes(diagnosis)),
         ("cause", cause(diagnosis)),
         ("how sure", how_sure(diagnosis)),
         ("reason", diagnosis.reason or None),

@@ -49,6 +49,8 @@ STRENGTHS = tuple((walk, 0.0) for walk in _WALKS) + tuple(
 _FRACTIONS = 3
 #: Interventions whose score is within this of the best take part in the height of the step.
 _NEAR = 20.0
+#: Where the smallest step that would have been seen is looked for, as shares of the series.
+_ADDED_AT = (0.3, 0.5, 0.7)
 #: Power of the likelihood that weighs drifts, onsets and rises for the height: under 1, because no real drift is of the
 #: family (a power posterior: Holmes & Walker, Biometrika 104 (2017) 497-503).
 _TRUST = 0.5
@@ -296,6 +298,31 @@ def find_step(
         level=family.level(y, beside, best) * unit,
         noise=float(np.sqrt(post.scale[beside, here])),
     )
+
+
+def findable_step(
+    t: Array, g: Array, sd: Array, false_alarm_probability: float, noise: float, *, shared: Array | None = None
+) -> float:
+    """Return the smallest step that would have been an alarm in a series in which none was.
+
+    Steps of growing height are added at three places of the middle of the series, to its own noise and drift; the
+    height is that over which all three, and every higher one, exceed the threshold of any drift; infinite where none
+    does. `noise`: scale of the noise over the stated one.
+    """
+    u = (t - t[0]) / float(np.median(np.diff(t)))
+    unit = float(np.median(sd))
+    family = _family(u, sd / unit, None if shared is None else shared / unit)
+    heights = noise * np.geomspace(0.2, 200.0, 36)
+    shapes = rises(u, u[0] + np.array(_ADDED_AT) * (u[-1] - u[0]))
+    series = (g / unit)[:, None] + (shapes.T[:, :, None] * heights).reshape(u.size, -1)
+    threshold = max(
+        null_threshold("smooth_drift", false_alarm_probability, family.n, number) for number in range(len(STRENGTHS))
+    )
+    seen = np.max(family.scores(series, 1)[0], axis=0).reshape(len(_ADDED_AT), -1).min(axis=0) > threshold
+    if not seen[-1]:
+        return float("inf")
+    unseen = np.flatnonzero(~seen)
+    return float(heights[unseen[-1] + 1 if unseen.size else 0] * unit)
 
 
 def _height(post: Posterior) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Verdict
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Passage, Verdict
 from sealscope.recordings.quality import Finding
 
 _CHECKS: Mapping[Cause, str] = {
@@ -46,8 +46,11 @@ _CHECKS: Mapping[Cause, str] = {
 }
 
 
-def next_check(verdict: Verdict, cause: Cause | None) -> str:
-    """Return what to check next on the machine, in one or two sentences."""
+def next_check(verdict: Verdict, cause: Cause | None, *, healthy: bool = False) -> str:
+    """Return what to check next on the machine, in one or two sentences.
+
+    `healthy`: with `no leak`, whether the level of the leakage is known to be that of a healthy machine.
+    """
     if cause is not None:
         return _CHECKS[cause]
     if verdict == "leak":
@@ -55,8 +58,13 @@ def next_check(verdict: Verdict, cause: Cause | None) -> str:
             "Repeat the recording with the same command and oil temperature, with the bypass valve shut: a worn seal "
             "shows again. What was recorded does not tell the seal from an open bypass, and maybe not from a worn pump."
         )
-    if verdict == "no leak":
+    if verdict == "no leak" and healthy:
         return "Nothing needs a check; keep this recording as a baseline for later ones with the same command."
+    if verdict == "no leak":
+        return (
+            "Nothing changed within this recording, which does not show that the machine is healthy: compare it with "
+            "leak-free recordings, or with what a new machine loses, before it is kept as a baseline."
+        )
     return "Remove the cause that the reason names and record again; a verdict was not forced out of these data."
 
 
@@ -74,11 +82,14 @@ class Diagnosis(Evidence):
         Probability of `leak` on a leak-free recording for which `threshold` was set.
     quality : tuple of Finding
         Findings on the data.
+    baselines : int
+        Leak-free recordings that it was compared with.
     """
 
     file: str = "recording"
     false_alarm_probability: float
     quality: tuple[Finding, ...] = ()
+    baselines: int = 0
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
@@ -88,7 +99,13 @@ class Diagnosis(Evidence):
     @property
     def next_check(self) -> str:
         """What to check next on the machine, in one or two sentences."""
-        return next_check(self.verdict, self.cause)
+        return next_check(self.verdict, self.cause, healthy=self.known_healthy)
+
+    @property
+    def known_healthy(self) -> bool:
+        """Whether the level is known to be that of a healthy machine: by leak-free recordings, or by the rig."""
+        by_rig = self.passage is not None and self.passage.healthy
+        return self.verdict == "no leak" and (self.baselines > 0 or by_rig)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values, keys in the order of the output contract.
@@ -129,6 +146,7 @@ class Diagnosis(Evidence):
             ],
             "cause": self.cause,
             "next_check": self.next_check,
+            "passage": None if self.passage is None else _plain_passage(self.passage),
         }
 
     def __str__(self) -> str:
@@ -161,6 +179,16 @@ class Diagnosis(Evidence):
 
 def _plain(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _plain_passage(passage: Passage) -> dict[str, Any]:
+    return {
+        "lpm": _plain(passage.lpm),
+        "interval_lpm": _pair(passage.interval_lpm),
+        "pressure_Pa": _plain(passage.pressure),
+        "findable_lpm": _plain(passage.findable_lpm),
+        "healthy_lpm": _plain(passage.healthy_lpm),
+    }
 
 
 def _pair(pair: tuple[float, float] | None) -> list[float | None] | None:

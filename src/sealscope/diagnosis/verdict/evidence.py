@@ -39,6 +39,34 @@ class LeakCourse:
 
 
 @dataclass(frozen=True)
+class Passage:
+    """What pump and piston together pass over a whole recording, a leak included that was there from the start.
+
+    Parameters
+    ----------
+    lpm, interval_lpm : float and pair of floats
+        Mean flow, and its 95 % interval [L/min].
+    pressure : float
+        Mean size of the pressure difference at which it flows [Pa].
+    findable_lpm : float, optional
+        Smallest step of that flow that would have been found [L/min]; None where a step was found.
+    healthy_lpm : float, optional
+        The most that a healthy machine passes at that pressure [L/min], by the rig; None where the rig does not say.
+    """
+
+    lpm: float
+    interval_lpm: tuple[float, float]
+    pressure: float
+    findable_lpm: float | None = None
+    healthy_lpm: float | None = None
+
+    @property
+    def healthy(self) -> bool:
+        """Whether it is surely no more than a healthy machine passes."""
+        return self.healthy_lpm is not None and self.interval_lpm[1] <= self.healthy_lpm
+
+
+@dataclass(frozen=True)
 class Evidence:
     """Verdict on one recording and the figures it rests on.
 
@@ -63,6 +91,8 @@ class Evidence:
     refuses : frozenset of {"onset_s", "leak_lpm"}
         Figures that the detector has a reason not to state, as opposed to those it cannot compute. No other detector's
         figure takes their place in the fused verdict.
+    passage : Passage, optional
+        What pump and piston pass together, where the detector measures it.
     share : float
         Share of the recording, 0 to 1, that the verdict rests on: less than 1 where blocks with missing samples are
         left out.
@@ -84,6 +114,7 @@ class Evidence:
     cause: Cause | None = None
     course: LeakCourse | None = field(default=None, compare=False, repr=False)
     refuses: frozenset[Figure] = frozenset()
+    passage: Passage | None = None
     share: float = 1.0
     detector: str = ""
     usable: bool = True

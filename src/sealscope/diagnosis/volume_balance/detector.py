@@ -77,12 +77,17 @@ class VolumeBalance:
         if fit is None:
             return Evidence("cannot tell", problem)
         probability = share_of_each(false_alarm_probability, baseline)
-        evidence = judge(fit, probability, dated=lambda own, step: date_step(own, step, recording, self.geometry))
+        evidence = judge(
+            fit,
+            probability,
+            dated=lambda own, step: date_step(own, step, recording, self.geometry),
+            healthy=self.rig.pump.G_healthy or None,
+        )
         if baseline:
             fits = [remembered(other, (self.name, self.rig), self.fit)[0] for other in baseline]
             evidence = judge_level(fit, [other for other in fits if other is not None], evidence, probability)
-        whole = max(len(recording) // fit.blocks.samples, 1)
-        return replace(evidence, share=(len(fit.blocks) + len(fit.left_out)) / whole)
+        blocks = np.arange(0, len(recording) + 1, block_samples(recording))
+        return replace(evidence, share=1.0 - float(np.mean(touched(recording, blocks))))
 
     def blocks(
         self, recording: Recording, length: int | None = None, names: Sequence[str] | None = None

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.changepoint.smooth_drift import DriftStep, find_step
+from sealscope.diagnosis.changepoint.smooth_drift import DriftStep, find_step, findable_step
 from sealscope.diagnosis.volume_balance.blocks import (
     DP_12,
     FLOW,
@@ -186,25 +186,33 @@ def _geometry(gram: Array, shared: list[int]) -> tuple[Array, Array]:
 
     Every block has a leak of its own, of the law that leaves less of it. First the sum of the residuals' norms is
     least, in which a few blocks with faults do not count by their squares; then each block has the variance of its own
-    residual (iteratively reweighted least squares).
+    residual (iteratively reweighted least squares). Both laws are begun with, as most blocks may leak by either, and
+    the fit of the higher likelihood is taken.
     """
-    laminar, orifice = _beyond(gram, I_AB), _beyond(gram, I_ROOT)
-    beta, inverse = _solve(laminar, shared, np.ones(len(gram)))
-    rest = laminar
+    laws = _beyond(gram, I_AB), _beyond(gram, I_ROOT)
+    fits = [_reweighted(laws, first, shared) for first in laws]
+    likeliest = min(fits, key=lambda fit: fit[2])
+    return likeliest[:2]
+
+
+def _reweighted(laws: tuple[Array, Array], first: Array, shared: list[int]) -> tuple[Array, Array, float]:
+    """Return coefficients, covariance, and the sum of the logarithms of what is left, from the law `first`."""
+    beta, inverse = _solve(first, shared, np.ones(len(first)))
+    rest, logs = first, float("inf")
     for number in range(sum(_ROUNDS)):
-        left = _left(laminar, shared, beta)
+        left = _left(rest, shared, beta)
         convex = number < _ROUNDS[0]
         if not convex:
-            other = _left(orifice, shared, beta)
-            rest = np.where((other < _OTHER_LAW * left)[:, None, None], orifice, laminar)
+            left, other = (_left(law, shared, beta) for law in laws)
+            rest = np.where((other < _OTHER_LAW * left)[:, None, None], laws[1], laws[0])
             left = np.minimum(left, other)
         least = max(float(np.quantile(left, _USUAL)), np.finfo(float).tiny)
         weight = least / np.maximum(left, least)
-        before = beta
+        before, logs = beta, float(np.log(np.maximum(left, np.finfo(float).tiny)).sum())
         beta, inverse = _solve(rest, shared, np.sqrt(weight) if convex else weight)
-        if not convex and np.allclose(beta, before, rtol=1e-9, atol=0.0):
+        if np.allclose(beta, before, rtol=1e-9, atol=0.0) and not convex:
             break
-    return beta, inverse
+    return beta, inverse, logs
 
 
 def _between_neighbours(slope: Array, spoilt: NDArray[np.bool_], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -372,6 +380,19 @@ def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> DriftStep:
     if not (fine.alarm and fine.rise == 0 and low <= fine.onset <= high):
         return coarse
     return replace(coarse, onset=fine.onset, onset_interval=fine.onset_interval, index=first + fine.index)
+
+
+def findable(fit: BalanceFit, probability: float, noise: float) -> float:
+    """Return the smallest step of the conductance that would have been an alarm where `search` raised none.
+
+    `noise`: scale of the noise that it saw over the stated one.
+    """
+    shared = _shared_errors(fit)
+    every = -(-len(fit.blocks) // MOST_BLOCKS)
+    if every == 1:
+        return findable_step(fit.blocks.t, fit.g, fit.sd, probability, noise, shared=shared)
+    t, g, sd, common = _merged(fit, shared, every)
+    return findable_step(t, g, sd, probability, noise, shared=common)
 
 
 def _merged(fit: BalanceFit, shared: Array | None, every: int) -> tuple[Array, Array, Array, Array | None]:

@@ -19,19 +19,26 @@ _WORTH = 0.02
 
 
 def in_motion(samples: Mapping[str, Array], rate: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
-    """Return which samples (m,) are neither rest nor end stop, and which are end stops; None where nearly all move."""
+    """Return which samples (m,) are neither rest nor end stop, and which are end stops; None where nearly all move.
+
+    What is missing is taken for motion: its block is left out.
+    """
     x = np.asarray(samples["x"], dtype=np.float64)
     dp = np.abs(samples["p_A"] - samples["p_B"])
     turns = np.gradient(samples["theta"]) if "theta" in samples else np.asarray(samples["omega"], dtype=np.float64)
-    if not all(np.isfinite(values).all() for values in (x, dp, turns)):
+    known = np.isfinite(x + dp + turns)
+    if np.count_nonzero(known) < 2:
         return None
+    at = np.arange(x.size)
+    x, dp, turns = (np.interp(at, at[known], values[known]) for values in (x, dp, turns))
     width = max(1, round(_STILL_SECONDS * rate))
     piston_rests, pump_rests = _rests(np.gradient(x), width), _rests(turns, width)
     near = _AT_END * np.ptp(x)
     at_end = (x < x.min() + near) | (x > x.max() - near)
     usual = float(np.median(dp[~piston_rests])) if not piston_rests.all() else np.inf
     stopped = piston_rests & ~pump_rests & at_end & (dp > _PRESSED * usual)
-    passed = (piston_rests & pump_rests) | stopped
+    stopped &= known
+    passed = ((piston_rests & pump_rests) | stopped) & known
     return (~passed, stopped) if np.mean(passed) > _WORTH else None
 
 

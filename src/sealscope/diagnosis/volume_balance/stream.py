@@ -219,4 +219,4 @@ class SequentialBalance:
         problem = trouble(fit)
         if problem is not None:
             return Evidence("cannot tell", problem), None
-        return judge(fit, self.alarms_per_hour * blocks.seconds / 3600.0, falls=False), total_lpm(fit)
+        return judge(fit, self.alarms_per_hour * blocks.seconds / 3600.0, window=True), total_lpm(fit)

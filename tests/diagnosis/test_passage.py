@@ -1,0 +1,92 @@
+"""What pump and piston pass without a baseline: a leak from the first sample, and what `no leak` rests on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.recording import Recording
+from sealscope.reporting.messages import diagnosis_text, passes
+
+from .balance_machine import machine, step
+
+P = 0.01
+LPM = 6.0e4
+#: Leaks from the start [m^3/(s Pa)] beside those of the pump of 2.4e-13.
+PUMP, WORN = 2.4e-13, 1.0e-12
+
+
+def rig(G_healthy: float | None) -> Rig:
+    own = load_rig("thesis")
+    return own if G_healthy is None else own.with_overrides({"pump.G_healthy": f"{G_healthy} m^3/(s Pa)"})
+
+
+def flow(recording: Recording, G: float) -> float:
+    return G * float(np.mean(np.abs(recording["p_A"] - recording["p_B"]))) * LPM
+
+
+@pytest.mark.parametrize("law", ["laminar", "orifice"])
+def test_a_leak_from_the_first_sample_is_stated(law: str) -> None:
+    """It read "no leak; keep this recording as the baseline"."""
+    worn, lost = machine(1, G=WORN), WORN
+    if law == "orifice":
+        C = WORN * float(np.sqrt(1.1e5))
+        worn = machine(1, C=C)
+        dp = np.abs(worn["p_A"] - worn["p_B"])
+        lost = C * float(np.mean(np.sqrt(dp)) / np.mean(dp))
+    evidence = VolumeBalance(rig(None)).examine(worn, [], P)
+    assert evidence.verdict == "no leak"
+    assert "no change within this recording" in evidence.reason
+    passage = evidence.passage
+    assert passage is not None
+    low, high = passage.interval_lpm
+    assert low <= flow(worn, PUMP + lost) <= high
+    assert high - low < 0.2 * passage.lpm
+    assert passage.pressure == pytest.approx(np.mean(np.abs(worn["p_A"] - worn["p_B"])), rel=0.02)
+    assert passage.healthy_lpm is None
+    assert not passage.healthy
+
+
+def test_the_smallest_step_is_found_and_half_of_it_is_not() -> None:
+    detector = VolumeBalance(rig(None))
+    for seed in (1, 2, 3):
+        smallest = detector.examine(machine(seed), [], P).passage
+        assert smallest is not None
+        assert smallest.findable_lpm is not None
+        G = smallest.findable_lpm / LPM / smallest.pressure
+        assert detector.examine(machine(seed, G=step(0.0, 1.2 * G)), [], P).verdict == "leak"
+        assert detector.examine(machine(seed, G=step(0.0, 0.4 * G)), [], P).verdict == "no leak"
+
+
+def test_against_what_a_healthy_machine_passes() -> None:
+    sound, worn = machine(1), machine(1, G=WORN)
+    known = VolumeBalance(rig(2.0 * PUMP))
+    evidence = known.examine(worn, [], P)
+    assert evidence.verdict == "leak"
+    assert evidence.onset_s is None
+    assert evidence.leak_lpm == pytest.approx(flow(worn, WORN - PUMP), rel=0.1)
+    assert known.examine(sound, [], P).verdict == "no leak"
+
+
+def test_only_what_is_known_to_be_healthy_becomes_a_baseline() -> None:
+    sound, worn = machine(1), machine(1, G=WORN)
+    advice = "keep this recording as a baseline"
+    unknown, known = diagnose(worn), diagnose(sound, rig=rig(2.0 * PUMP))
+    assert advice not in unknown.next_check
+    assert advice in known.next_check
+    assert advice in diagnose(sound, [machine(2), machine(3)]).next_check
+    for diagnosis in (unknown, known):
+        told = diagnosis.as_dict()["passage"]
+        assert set(told) == {"lpm", "interval_lpm", "pressure_Pa", "findable_lpm", "healthy_lpm"}
+        assert passes(diagnosis) is not None
+        assert "pump and piston together" in diagnosis_text(diagnosis)
+
+
+def test_no_leak_only_where_one_worth_finding_would_have_shown() -> None:
+    """Pressures so noisy that a fiftieth of the pump's flow would not show."""
+    noisy = machine(4, p_noise=2.0e6, x_step=2.0e-3)
+    evidence = VolumeBalance(rig(None)).examine(noisy, [], P)
+    assert evidence.verdict == "cannot tell"
