@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.special import ndtr
 
 from sealscope.errors import InputError
-from sealscope.evaluation.thresholds import Wander, predictive_threshold, quantile_threshold, records_needed
+from sealscope.evaluation.thresholds import LevelWander, predictive_threshold, quantile_threshold, records_needed
 
 distinct = st.lists(st.integers(-10_000, 10_000), min_size=25, max_size=120, unique=True)
 
@@ -155,7 +155,7 @@ def test_a_power_of_the_score_keeps_the_rate_of_sizes_and_squares():
 
 def test_a_mean_that_wanders_raises_the_threshold_and_keeps_the_rate():
     rng = np.random.default_rng(4)
-    wander = Wander(3.0, 4.0)
+    wander = LevelWander(3.0, 4.0)
     alarms = []
     for _ in range(3000):
         row = rng.standard_normal(11)
