@@ -196,12 +196,13 @@ def by_recordings(recording: Recording, leak_free: LeakFree, probability: float)
 
 
 def _shown(sessions: Sessions) -> int | None:
-    """Return the recording's session where the baseline shows its drift: by enough of it, or before and after."""
+    """Return the recording's session where the baseline shows its drift: by enough of it, or all around."""
     if sessions.labels is None or sessions.times is None or sessions.label is None or sessions.time is None:
         return None
     times = sessions.times[sessions.labels == sessions.label]
-    between = times.min() <= sessions.time <= times.max()
-    return sessions.label if between or times.size >= FEWEST_OF_SESSION else None
+    margin = 0.1 * float(np.ptp(times))
+    around = times.min() - margin <= sessions.time <= times.max() + margin
+    return sessions.label if around or times.size >= FEWEST_OF_SESSION else None
 
 
 def _repetitions(sessions: Sessions) -> list[tuple[float, int]]:
