@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from sealscope.diagnosis.observer.detector import Observer
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.parameters import load_rig
@@ -72,5 +73,17 @@ def test_mean_flow_from_pressures_and_command(law: str) -> None:
     assert evidence.verdict == "leak"
     assert ("orifice" if law == "orifice" else "worn seal") in evidence.reason
     assert evidence.leak_lpm == pytest.approx(result.truth.mean_leak_lpm, rel=0.15)
+    assert evidence.leak_interval_lpm is not None
+    assert evidence.leak_interval_lpm[0] <= result.truth.mean_leak_lpm <= evidence.leak_interval_lpm[1]
+
+
+@pytest.mark.parametrize("law", ["laminar", "orifice"])
+def test_mean_flow_of_the_observer(law: str) -> None:
+    """Its interval holds either law, and what it states lies between: it was the laminar flow, 1 to 4 % low."""
+    leak = f"0.1 L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
+    result = simulate_with_truth(Experiment.of(command="5 sin(2t)", duration=125.0, leak=leak, seed=7))
+    evidence = Observer(load_rig("thesis")).examine(result.recording, [], 0.01)
+    assert evidence.verdict == "leak"
+    assert evidence.leak_lpm == pytest.approx(result.truth.mean_leak_lpm, rel=0.015)
     assert evidence.leak_interval_lpm is not None
     assert evidence.leak_interval_lpm[0] <= result.truth.mean_leak_lpm <= evidence.leak_interval_lpm[1]

@@ -18,7 +18,7 @@ from sealscope.diagnosis.baseline.level import share_of_each
 from sealscope.diagnosis.changepoint.random_walk import FEWEST, WalkStep, find_leak_step
 from sealscope.diagnosis.observer.against_baseline import compare
 from sealscope.diagnosis.observer.estimates import Estimates
-from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, within
+from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, orifice_over_laminar, within
 from sealscope.diagnosis.observer.stream import Formulation, ObserverStream, channels_of, formulation_of, whole
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
@@ -88,7 +88,8 @@ class Observer:
         t = np.asarray(start[late] + 0.5 * stream.block_s, dtype=np.float64)
         G, sd, dp = (values[late] for values in (estimates.G, estimates.sd, estimates.dp))
         own = Estimates(*(values[~gaps] for values in estimates))
-        return ConductanceSeries(t, G, sd, dp, stream.block_s, formulation, own, 1.0 - float(np.mean(gaps)))
+        orifice = orifice_over_laminar(recording["p_A"] - recording["p_B"], formulation)
+        return ConductanceSeries(t, G, sd, dp, stream.block_s, formulation, own, orifice, 1.0 - float(np.mean(gaps)))
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`, within it or against the baseline."""

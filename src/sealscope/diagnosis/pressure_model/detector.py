@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
 #: Shortest record [s], lowest rate [Hz] that shows the ringing, and fewest blocks on either side of a step.
 SHORTEST, SLOWEST_RATE, LEAST = 40.0, 250.0, 3
-#: Scatter of the blocks beyond the wandering, as chi square over its degrees of freedom: three deviations above 1.
-UNRULY = 1.2
+#: Scatter of the blocks beyond the wandering, as chi square over its degrees of freedom: three deviations above 1, to
+#: which the level of a record can be compared, and the most for which a wider error makes up.
+STEADY, UNRULY = 1.2, 1.5
 #: A change of a parameter from the first to the last third that no healthy machine shows within a record, as a share.
 _OTHER_CAUSE = {"friction": 0.18, "stiffness": 0.15}
 #: From day to day the level of G moves by this much [m^3/(s Pa)], known as from five recordings: fits differ with the
@@ -120,7 +121,7 @@ def is_followed(followed: Followed) -> bool:
     from sealscope.diagnosis.pressure_model.model import LEAD
 
     lead = float(np.mean(followed.path[:, LEAD]))
-    return followed.excess <= UNRULY and abs(lead) <= _LARGEST_LEAD
+    return followed.excess <= STEADY and abs(lead) <= _LARGEST_LEAD
 
 
 def _mean_drop(recording: Recording, since: float = -np.inf, power: float = 1.0) -> float:
@@ -134,8 +135,8 @@ def _flow(
 ) -> tuple[float, tuple[float, float], str]:
     """Return the mean flow [L/min] of a rise after a block, its 95 % interval, and the law in words where it is known.
 
-    Where both laws explain the record, the interval holds what either says. `scatter` of the blocks over their stated
-    deviation.
+    Where both laws explain the record, the flow is the mean of theirs and the interval holds what either says.
+    `scatter` of the blocks over their stated deviation.
     """
     from sealscope.diagnosis.pressure_model.follow import PossibleLeak
     from sealscope.diagnosis.pressure_model.model import G
@@ -152,7 +153,11 @@ def _flow(
     law = ""
     if len(likely) < len(leaks):
         law = ", as of a worn seal" if likely[0].rising == G else ", as of an orifice"
-    return stated[0][0], (min(low for _, low, _ in stated), max(high for *_, high in stated)), law
+    return (
+        float(np.mean([lpm for lpm, *_ in stated])),
+        (min(low for _, low, _ in stated), max(high for *_, high in stated)),
+        law,
+    )
 
 
 def _within(followed: Followed, recording: Recording, probability: float) -> Evidence:

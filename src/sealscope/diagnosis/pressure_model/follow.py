@@ -46,7 +46,7 @@ _WINDOW_AT = 0.55
 _INTEGRAL = 4
 _EARLY = 4
 #: A rise of G worth another look.
-_CLEAR = 2.0
+_CLEAR = 2.7
 #: A record that the model follows so badly is tried again from other first fits.
 RESTLESS = 1.15
 #: ... of which one is as good whose cost is higher by no more than this share.

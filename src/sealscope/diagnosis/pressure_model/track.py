@@ -56,7 +56,7 @@ _PASSES = 10
 _STUCK, _LEAPS, _BIASES = 3.0, 1.7, np.array([0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, 2.0])
 #: Shares of a Gauss-Newton step that are tried side by side, and the fall of the cost to go on for.
 _SHARES = np.array([1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 1.4])
-_ENOUGH = 1.0
+_ENOUGH = 4.0
 #: How far the parameters may wander in the first passes, times the usual: the record's mean comes first, so that what
 #: is left in a block is small and the model is linear over it.
 _LEASHES = (0.1, 0.3, 1.0)
