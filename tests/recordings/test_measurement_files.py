@@ -347,3 +347,14 @@ def test_a_matlab_file_that_reads_from_another_file_is_refused(tmp_path: Path) -
         data.attrs["MATLAB_class"] = np.bytes_("double")
     with pytest.raises(UnreadableFile, match=r"u must have its samples in the file itself"):
         read(path)
+
+
+def test_what_a_file_says_of_its_recording(tmp_path: Path) -> None:
+    from nptdms import ChannelObject, RootObject, TdmsWriter
+
+    with TdmsWriter(tmp_path / "log.tdms") as writer:
+        root = RootObject({"Operator": "N. N.", "Oil temperature": 41.5})
+        writer.write_segment([root, ChannelObject("Log", "p_A", P_A, {"unit_string": "bar", "wf_increment": 1 / RATE})])
+    assert read(tmp_path / "log.tdms").provenance["about"]["Oil temperature"] == "41.5"
+    assert read(lvm(tmp_path)).provenance["about"] == {"operator": "N. N."}
+    assert read(xlsx(tmp_path)).provenance.get("about") is None

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings import read
-from sealscope.recordings.formats.labels import Label
-from sealscope.recordings.formats.proposal import proposed_map
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.proposal import proposed_map
 
 
 @pytest.mark.parametrize(

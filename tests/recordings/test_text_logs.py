@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings import COUNTS, inspect, read, split_map_option
+from sealscope.recordings.formats.headings.preamble import of_lines
 
 T = [0.0, 0.002, 0.004, 0.006]
 P = [2.5, 2.25, -2.125, 2e-3]
@@ -284,3 +285,24 @@ def test_columns_by_number(tmp_path: Path) -> None:
     assert recording["p_B"].tolist() == [2e5, 3e5, 3e5]
     with pytest.raises(UnreadableFile, match=r"#4, mapped to p_A, must be a column"):
         read(path, channel_map={"p_A": "#4"})
+
+
+def test_what_stands_above_the_header_is_kept(tmp_path: Path) -> None:
+    text = "Test bench 4\nOperator: N. N.\nOil temperature = 41 degC\nMachine;EHA 7;;\n# Remark: seal new\n"
+    recording = read(saved(tmp_path, text + "t [s];p_A [bar]\n" + body(";")))
+    assert recording.provenance["about"] == {
+        "Operator": "N. N.",
+        "Oil temperature": "41 degC",
+        "Machine": "EHA 7",
+        "Remark": "seal new",
+    }
+    assert "1 line before the header not used" in recording.history
+
+
+@given(st.lists(st.text(max_size=600), max_size=60), st.sampled_from([",", ";", "\t", " ", "|"]))
+def test_any_lines_above_the_header_give_short_printable_entries(lines: list[str], delimiter: str) -> None:
+    about = of_lines(lines, delimiter)
+    assert len(about) <= 40
+    for name, value in about.items():
+        assert 0 < len(name) <= 60 and 0 < len(value) <= 200
+        assert (name + value).isprintable()

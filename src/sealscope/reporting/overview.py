@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from sealscope.recordings.channels import LONG_NAMES, Array
+from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
@@ -54,6 +55,7 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
         known = values[np.isfinite(values)] / size
         ends = f"{known.min():.4g} to {known.max():.4g} {unit}" if known.size else "no values"
         lines.append(f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<30}{curve(values)}")
+    lines += [f"  {name}: {value}" for name, value in remarks_of(provenance).items()]
     lines += [f"  note: {line}" for line in recording.history]
     lines += [f"  {finding.severity}: {finding.text}" for finding in findings]
     if not findings:

@@ -14,6 +14,7 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.reporting import charts, features, messages, template
 from sealscope.reporting.charts import Mark
@@ -21,6 +22,8 @@ from sealscope.reporting.charts import Mark
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: What a file says of its recording stands under the title, so many entries of it.
+_MOST_REMARKS = 6
 #: Parameters of the rig that label the schematic: symbol, unit shown, SI per unit.
 _VALUES = {
     "cylinder.A_A": ("A_A", "mm²", 1e-6),
@@ -140,6 +143,7 @@ def render_page(
         messages=messages,
         title=title or Path(diagnosis.file).name,
         subtitle=f"{diagnosis.file} · {facts}",
+        about=list(remarks_of(recording.provenance).items())[:_MOST_REMARKS],
         known=_known(diagnosis, truth_onset_s, truth_leak_lpm),
         marks=all_marks,
         charts=shown,

@@ -10,8 +10,8 @@ from typing import Literal
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.recordings.formats.labels import Label, square_brackets
-from sealscope.recordings.formats.proposal import map_options, proposed_map
+from sealscope.recordings.formats.headings.labels import Label, square_brackets
+from sealscope.recordings.formats.headings.proposal import map_options, proposed_map
 from sealscope.units import same_dimension, to_si
 
 #: Names of a time column, most telling first, and the unit that the name itself tells.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.channels import LONG_NAMES, Array
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.netcdf import attributes
 from sealscope.recordings.formats.table import FORMAT_VERSION, Choose, RawTable, from_text, parse_description
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import entries
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import Choose, RawTable, check_size
 from sealscope.recordings.formats.text_layout import MISSING, SNIFF, encoding_of
@@ -54,7 +55,8 @@ def read_lvm(path: Path, choose: Choose) -> RawTable:
     given = header.get("x_columns", "one").casefold() != "no"
     channels = _channels(packets, multiple, given, comma, place)
     check_size(sum(len(packet.rows) for packet in packets), len(channels), place)
-    return table_of(channels, choose, "LabVIEW measurement", place)
+    about = entries((name, header[name]) for name in ("operator", "project", "description") if name in header)
+    return table_of(channels, choose, "LabVIEW measurement", place, about)
 
 
 def _file_header(lines: Iterator[str]) -> tuple[str, dict[str, str], int]:

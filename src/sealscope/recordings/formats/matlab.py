@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import MissingExtra, UnreadableFile
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable

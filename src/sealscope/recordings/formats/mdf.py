@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from sealscope.errors import MissingExtra
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import entries
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import Choose, RawTable
 
@@ -40,7 +41,9 @@ def read_mdf(path: Path, choose: Choose) -> RawTable:
                 if index != master:
                     label = Label.parse(channel.name, file.get_channel_unit(group=number, index=index) or None)
                     series.append(Series(name, label, count, partial(_values, file, number, index), clock))
-        return table_of(series, choose, f"MDF {file.version}", str(path))
+        header = ("author", "department", "project", "subject", "comment")
+        about = entries((name, getattr(file.header, name, "")) for name in header)
+        return table_of(series, choose, f"MDF {file.version}", str(path), about)
 
 
 def _opened(MDF: Any, path: Path) -> Any:

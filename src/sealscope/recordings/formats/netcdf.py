@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.channels import LONG_NAMES, Array
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.table import (
     FORMAT_VERSION,
     Choose,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import MissingExtra, UnreadableFile
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.table import Choose, RawTable, check_size, from_text, parse_description
 
 _OWN = b"sealscope"

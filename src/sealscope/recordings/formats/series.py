@@ -9,7 +9,7 @@ put into a gap of a series or before its first and after its last sample.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, Array
 from sealscope.recordings.formats.columns import ColumnMap
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.table import Choose, RawTable, check_size, from_text
 from sealscope.recordings.timebase import nominal_rate
 
@@ -74,7 +74,9 @@ def _uniform(count: int, step: float, first: float) -> Array:
     return first + step * np.arange(count, dtype=np.float64)
 
 
-def table_of(series: Sequence[Series], choose: Choose, kind: str, place: str) -> RawTable:
+def table_of(
+    series: Sequence[Series], choose: Choose, kind: str, place: str, about: Mapping[str, str] | None = None
+) -> RawTable:
     """Return the table of the series that `choose` picks; raise UnreadableFile where they cannot be brought together.
 
     Parameters
@@ -87,6 +89,8 @@ def table_of(series: Sequence[Series], choose: Choose, kind: str, place: str) ->
         The file's format, in words.
     place : str
         The file, for messages.
+    about : mapping of str to str, optional
+        What the file says of the recording.
     """
     series, notes = _distinct(series)
     labels = [member.label for member in series]
@@ -96,7 +100,7 @@ def table_of(series: Sequence[Series], choose: Choose, kind: str, place: str) ->
     check_size(max(member.count for member in chosen.values()), len(choice.columns), place)
     if choice.time == len(series):
         columns, more = _on_one_clock(choice, chosen, place)
-        return RawTable(kind, choice, columns, notes=(*notes, *more))
+        return RawTable(kind, choice, columns, notes=(*notes, *more), about=about or {})
     if choice.time is not None:
         chosen[choice.time] = series[choice.time]
     last = next(reversed(chosen.values()))
@@ -106,7 +110,7 @@ def table_of(series: Sequence[Series], choose: Choose, kind: str, place: str) ->
                 f"{member.path} must have as many samples as {last.path} ({last.count}), got {member.count} ({place})"
             )
     columns = [_samples(chosen[column], time, place) for column, time in choice.columns]
-    return RawTable(kind, choice, columns, notes=notes)
+    return RawTable(kind, choice, columns, notes=notes, about=about or {})
 
 
 def _distinct(series: Sequence[Series]) -> tuple[list[Series], tuple[str, ...]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
 from sealscope.recordings.formats.columns import ColumnMap
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.timebase import stamps, time_base
 from sealscope.units import to_si
 
@@ -40,7 +40,8 @@ class RawTable:
     """The chosen columns of a table, in the units of the table.
 
     `kind`: the format, in words; `columns`: the columns of `choice.columns`, each (n,) doubles, the time doubles or
-    datetime64; `description`: what Sealscope itself wrote beside the numbers, or None; `notes`: lines for the history.
+    datetime64; `description`: what Sealscope itself wrote beside the numbers, or None; `notes`: lines for the history;
+    `about`: what the file says of the recording beside the samples.
     """
 
     kind: str
@@ -48,6 +49,7 @@ class RawTable:
     columns: Sequence[NDArray[Any]]
     description: Mapping[str, Any] | None = None
     notes: tuple[str, ...] = ()
+    about: Mapping[str, str] = field(default_factory=dict)
 
     def samples(self, source: Mapping[str, Any], *, rate: float | None, infer_rate: bool) -> RecordingFields:
         """Convert to SI. `source`: begins the provenance of a foreign table; `rate` [Hz]: where there is no time.
@@ -76,7 +78,8 @@ class RawTable:
             notes += more
         if own is not None:
             return RecordingFields(t, channels, units, rate, own["provenance"], (*own["history"], *notes))
-        return RecordingFields(t, channels, units, rate, {**source, "format": self.kind, **start}, notes)
+        about = {"about": dict(self.about)} if self.about else {}
+        return RecordingFields(t, channels, units, rate, {**source, "format": self.kind, **start, **about}, notes)
 
 
 def check_size(rows: int, columns: int, place: str) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import MissingExtra
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import entries
 from sealscope.recordings.formats.series import Clock, Series, table_of, uniform
 from sealscope.recordings.formats.table import Choose, RawTable
 
@@ -39,7 +40,10 @@ def read_tdms(path: Path, choose: Choose) -> RawTable:
             for group in file.groups()
             for channel in group.channels()
         ]
-        return table_of(series, choose, "TDMS", str(path))
+        about = entries(
+            (name, value) for name, value in file.properties.items() if isinstance(value, str | int | float)
+        )
+        return table_of(series, choose, "TDMS", str(path), about)
 
 
 def _values(channel: Any) -> NDArray[Any]:

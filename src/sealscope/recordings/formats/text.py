@@ -54,7 +54,7 @@ def read_text(path: Path, choose: Choose) -> RawTable:
         file.seek(0)
         columns, notes = _columns(file, layout, choice, place)
     description = None if layout.own is None else parse_description(layout.own, place)
-    return RawTable(layout.kind, choice, columns, description, (*layout.notes, *notes))
+    return RawTable(layout.kind, choice, columns, description, (*layout.notes, *notes), layout.about)
 
 
 def _own_line(file: BinaryIO, head: bytes) -> bytes:

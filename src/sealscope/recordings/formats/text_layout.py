@@ -5,12 +5,13 @@ from __future__ import annotations
 import codecs
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.formats.columns import counted
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import of_lines
 from sealscope.recordings.timebase import is_stamp
 from sealscope.units import parse_unit
 
@@ -43,6 +44,7 @@ class Layout:
     first_row: int
     own: str | None = None
     notes: tuple[str, ...] = ()
+    about: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
@@ -233,10 +235,14 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
     if not labels:
         labels = [Label(str(i + 1), str(i + 1)) for i in range(width)]
         notes.append("no header: columns are called by their number, from 1")
-    above = [line for line in lines[:first] if line.strip() and not line.startswith(COMMENTS)]
-    if len(above) > taken:
-        notes.append(f"{counted(len(above) - taken, 'line')} before the header not used")
-    return Layout(encoding, delimiter, decimal, tuple(labels), first, None, tuple(notes))
+    above = [line for line in lines[:first] if line.strip()]
+    remarks = above[: len(above) - taken]
+    about = of_lines(remarks, delimiter)
+    plain = [line for line in remarks if not line.startswith(COMMENTS)]
+    unused = len(plain) - len(of_lines(plain, delimiter))
+    if unused > 0:
+        notes.append(f"{counted(unused, 'line')} before the header not used")
+    return Layout(encoding, delimiter, decimal, tuple(labels), first, None, tuple(notes), about)
 
 
 def _likely(line: str) -> str:

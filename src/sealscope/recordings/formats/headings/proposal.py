@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
-from sealscope.recordings.formats.labels import Label
+from sealscope.recordings.formats.headings.labels import Label
 from sealscope.units import parse_unit, same_dimension
 
 
