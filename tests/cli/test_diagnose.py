@@ -25,6 +25,8 @@ KEYS = {
     "cause": str | None,
     "next_check": str,
     "passage": dict | None,
+    "chance": float | None,
+    "odds": str | None,
 }
 VERDICTS = {"leak", "no leak", "cannot tell"}
 FOREIGN = ("--map", "p_A=PG_1", "--map", "p_B=PG_2", "--rate", "1000")

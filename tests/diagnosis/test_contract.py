@@ -224,3 +224,49 @@ def test_methods_state_their_own_evidence(detector, leaky: Recording) -> None:  
         assert (method.verdict == "no leak") == (method.score <= method.threshold)
         if method.detector.startswith("RMS of d1 "):
             assert method.verdict != "leak"  # noise alone never is a leak
+
+
+@pytest.mark.parametrize("case", ["leaky", "sound"])
+@pytest.mark.parametrize("with_baseline", [False, True])
+def test_the_chance_agrees_with_score_and_threshold(
+    detector,  # type: ignore[no-untyped-def]
+    case: str,
+    with_baseline: bool,
+    request: pytest.FixtureRequest,
+) -> None:
+    """At each probability asked for: the score is over the threshold where the chance is below it, and only there."""
+    recording = request.getfixturevalue(case)
+    baseline = [request.getfixturevalue("records")(9, duration=120.0, throttled=True)] if with_baseline else []
+    for probability in (0.1, 0.01):
+        own = detector.examine(recording, baseline, probability)
+        if detector.name == "ringing energy":  # a plug-in need not state it
+            assert (own.chance, own.odds) == (None, None)
+            continue
+        if own.score is None:
+            assert own.chance is None
+            continue
+        assert 0.0 < own.chance <= 1.0
+        assert (own.chance <= probability * (1.0 + 1e-9)) == (own.score > own.threshold)
+
+
+def test_odds_in_words() -> None:
+    said = {
+        chance: Evidence("no leak", "", chance=chance).odds for chance in (None, 1e-9, 1e-4, 0.00312, 0.05, 0.5, 1.0)
+    }
+    assert said[None] is None
+    assert said[1e-9] == said[1e-4] == "fewer than 1 in 10 000 healthy recordings looks like this"
+    assert said[0.00312] == "1 in 320 healthy recordings looks like this"
+    assert said[0.05] == "1 in 20 healthy recordings looks like this"
+    assert said[0.5] == said[1.0] == "more than 1 in 5 healthy recordings look like this"
+
+
+def test_odds_are_in_every_output(leaky: Recording) -> None:
+    from sealscope.reporting import diagnosis_text
+
+    found = diagnose(leaky)
+    assert found.verdict == "leak"
+    assert found.odds in diagnosis_text(found)
+    assert found.as_dict()["odds"] == found.odds
+    assert found.as_dict()["chance"] <= 0.01
+    stated = [method["odds"] for method in found.as_dict()["methods"]]
+    assert any(stated)

@@ -21,7 +21,7 @@ from sealscope.recordings.recording import Recording
 KEYS = [
     "file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm",
     "false_alarm_probability", "score", "threshold", "methods", "quality", "cause", "next_check",
-    "passage",
+    "passage", "chance", "odds",
 ]  # fmt: skip
 VERDICTS = ("leak", "no leak", "cannot tell")
 CAUSES = get_args(Cause)
@@ -55,7 +55,7 @@ def check(found: Diagnosis) -> None:
     assert type(told["false_alarm_probability"]) is float
     assert told["methods"]
     for method in told["methods"]:
-        assert list(method) == ["name", "score", "threshold", "verdict", "reason"]
+        assert list(method) == ["name", "score", "threshold", "verdict", "reason", "chance", "odds"]
         assert type(method["name"]) is str
         assert type(method["reason"]) is str
         assert method["verdict"] in VERDICTS

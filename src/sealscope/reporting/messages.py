@@ -105,14 +105,15 @@ def passes(diagnosis: Diagnosis) -> str | None:
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """Return the score against its threshold, and what the threshold means."""
+    """Return how many healthy recordings look like this, the score against its threshold, and what that means."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return "no score was formed"
+    odds = "" if diagnosis.odds is None else f"{diagnosis.odds}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     text = f"score {number(diagnosis.score)}, {relation} the threshold of {number(diagnosis.threshold)}"
     judge = diagnosis.methods[0].detector if diagnosis.methods else ""
     by = f" of {judge}" if judge else ""
-    return f"{text}{by}; {false_alarms(diagnosis)}"
+    return f"{odds}{text}{by}; {false_alarms(diagnosis)}"
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:
@@ -192,6 +193,10 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     lines += [_row(label, text, width) for label, text in rows if text]
     for method in diagnosis.methods:
         figures = f"{method.verdict} (score {number(method.score)}, threshold {number(method.threshold)})"
+        if method.odds is not None:
+            figures = (
+                f"{method.verdict} ({method.odds}; score {number(method.score)}, threshold {number(method.threshold)})"
+            )
         if method.score is None and method.reason:
             figures = f"{method.verdict} ({method.reason})"
         lines.append(_row("method", f"{method.detector}: {figures}", width))

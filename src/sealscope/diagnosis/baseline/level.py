@@ -54,13 +54,15 @@ class Rise:
     """Level of a recording beyond that of the baseline.
 
     `size` and its 95 % interval, in the unit of the levels; `score`: the standard normal deviate of the probability
-    that a leak-free recording exceeds this level; `threshold`: that of the false-alarm probability.
+    that a leak-free recording exceeds this level; `threshold`: that of the false-alarm probability; `chance`: that
+    probability itself.
     """
 
     size: float
     interval: tuple[float, float]
     score: float
     threshold: float
+    chance: float
 
 
 def share_of_each(false_alarm_probability: float, baseline: Sequence[object]) -> float:
@@ -90,6 +92,7 @@ def rise_of(own: Level, baseline: Sequence[Level], prior: DayToDay, false_alarm_
         interval=(limit(0.025), limit(0.975)),
         score=-float(ndtri_exp(log_exceeds)),
         threshold=-float(ndtri(false_alarm_probability)),
+        chance=float(np.exp(log_exceeds)),
     )
 
 
@@ -143,7 +146,7 @@ def against_baseline(
     if within.verdict == "leak" or within.cause is not None or not alarm:
         order = "higher than" if alarm else "not above"
         reason = f"{within.reason}; over the whole recording the leakage conductance is {order} the baseline's"
-        return replace(within, reason=f"{reason} ({figures})", parts=parts)
+        return replace(within, reason=f"{reason} ({figures})", parts=parts, chance=_of_both(within.chance))
     lpm, interval, by = None, None, ""
     if flows:
         lpm = rise.size * flows[0]
@@ -162,10 +165,17 @@ def against_baseline(
         cause=cause,
         course=course,
         refuses=refuses,
+        chance=_of_both(rise.chance),
     )
 
 
 def incomparable(within: Evidence, reason: str) -> Evidence:
     """Return the evidence where a baseline was given and no recording of it can be compared."""
     verdict = within.verdict if within.verdict == "leak" or within.cause is not None else "cannot tell"
-    return replace(within, verdict=verdict, reason=f"{within.reason}; no baseline recording can be compared: {reason}")
+    reason = f"{within.reason}; no baseline recording can be compared: {reason}"
+    return replace(within, verdict=verdict, reason=reason, chance=_of_both(within.chance))
+
+
+def _of_both(chance: float | None) -> float | None:
+    """Return the probability that either of two tests shows as much."""
+    return None if chance is None else min(1.0, 2.0 * chance)

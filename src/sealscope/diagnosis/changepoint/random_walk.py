@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.shapes import rises, warm_ups
-from sealscope.diagnosis.changepoint.tails import ONSET_CUT, null_threshold
+from sealscope.diagnosis.changepoint.tails import ONSET_CUT, null_chance, null_threshold
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -44,13 +44,15 @@ _TINY = float(np.finfo(float).tiny)
 class WalkStep:
     """The best step of a series.
 
-    `onset`, `onset_interval` (95 %): in blocks from the beginning of the first; `size`, `size_sd`: in the unit of the
-    series; `freedom`: degrees of freedom of `size_sd`; `scale`: of the noise over the stated deviations; `warms_up`: an
-    exponential approach from the beginning on is likelier than the step.
+    `chance`: probability of a score as high without a step; `onset`, `onset_interval` (95 %): in blocks from the
+    beginning of the first; `size`, `size_sd`: in the unit of the series; `freedom`: degrees of freedom of `size_sd`;
+    `scale`: of the noise over the stated deviations; `warms_up`: an exponential approach from the beginning on is
+    likelier than the step.
     """
 
     score: float
     threshold: float
+    chance: float
     onset: float
     onset_interval: tuple[float, float]
     size: float
@@ -166,10 +168,8 @@ def find_leak_step(
     t, number = (column[:, 0] for column in scan.scores(y))
     best = int(np.argmax(t))
     walk = scan.walks[number[best]]
-    threshold = max(
-        null_threshold("random_walk", false_alarm_probability, n, row, expected_walk)
-        for row in (int(number[best]), *([scan.without_step(y)] if wary else []))
-    )
+    rows = (int(number[best]), *([scan.without_step(y)] if wary else []))
+    threshold = max(null_threshold("random_walk", false_alarm_probability, n, row, expected_walk) for row in rows)
 
     fine: Array = np.clip(scan.onsets[best] + np.arange(-0.75, 0.75 + 1e-9, _FINE), 1.0, n - 1.0)
     sharp = scan.freedom * np.log(walk.fit(y, rises(scan.middles, fine))[1][:, 0])
@@ -188,6 +188,7 @@ def find_leak_step(
     return WalkStep(
         score=float(t[best]),
         threshold=threshold,
+        chance=max(null_chance("random_walk", float(t[best]), n, row, expected_walk) for row in rows),
         onset=onset,
         onset_interval=(float(near.min()) - _RESOLUTION, float(near.max()) + _RESOLUTION),
         size=float(moved[0, 0] / lengths[0]) * unit,

@@ -176,8 +176,14 @@ class StepScan:
         From so many random orders that at least 20 exceed the threshold: a relative error of its tail under 25 %.
         """
         orders = max(999, int(np.ceil(20.0 / probability)) - 1)
-        t2, single, trend = (upper_quantile(null, probability) for null in self.null(orders, after=after))
+        nulls = self.null(orders, after=after)
+        self._joint = nulls[0]
+        t2, single, trend = (upper_quantile(null, probability) for null in nulls)
         return float(t2), single, float(trend)
+
+    def chance(self, score: float) -> float:
+        """Return the probability of a T2 of `score` or more without a step, by the random orders of `thresholds`."""
+        return float((1 + np.count_nonzero(self._joint >= score)) / (1 + self._joint.size))
 
 
 def _cosines(x: Array) -> Array:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.shapes import least_blocks, rises, warm_ups
-from sealscope.diagnosis.changepoint.tails import near_best, null_threshold
+from sealscope.diagnosis.changepoint.tails import near_best, null_chance, null_threshold
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -61,7 +61,8 @@ _TINY = float(np.finfo(float).tiny)
 class DriftStep:
     """The best step of a series.
 
-    `score`, `threshold`: the score exceeds the threshold with the stated probability where nothing steps; `index`:
+    `score`, `threshold`: the score exceeds the threshold with the stated probability where nothing steps, and
+    itself with that of `chance`; `index`:
     first block after the onset; `onset`, `onset_interval` (95 %): in the unit of t; `rise`: duration of the rise;
     `size`, `size_sd`: height of the step, averaged over the likely onsets, rises and drifts; `freedom`: degrees of
     freedom of `size_sd`; `level` (n,): the smooth drift fitted beside the step; `noise`: scale of the noise over the
@@ -70,6 +71,7 @@ class DriftStep:
 
     score: float
     threshold: float
+    chance: float
     index: int
     onset: float
     onset_interval: tuple[float, float]
@@ -280,14 +282,14 @@ def find_step(
     post = family.posterior(y, sign, near)
     here = int(np.flatnonzero(near == best)[0])
     beside = int(np.argmax(post.log_l[:, here]))
-    threshold = max(
-        null_threshold("smooth_drift", false_alarm_probability, family.n, number) for number in (int(plain[0]), beside)
-    )
+    drifts = (int(plain[0]), beside)
+    threshold = max(null_threshold("smooth_drift", false_alarm_probability, family.n, number) for number in drifts)
     size, size_sd = _height(post)
     onset, first, last = _onset(u, y, family, sign, beside, course)
     return DriftStep(
         score=float(course[best]),
         threshold=threshold,
+        chance=max(null_chance("smooth_drift", float(course[best]), family.n, number) for number in drifts),
         index=int(np.searchsorted(u, onset)),
         onset=float(t[0] + spacing * onset),
         onset_interval=(float(t[0] + spacing * first), float(t[0] + spacing * last)),

@@ -86,15 +86,19 @@ def weighted_quantile(values: Array, weights: Array, probability: float) -> floa
     return float(values[order[min(int(np.searchsorted(tail, probability)), values.size - 1)]])
 
 
-def largest_normal(correlation: Array, probability: float, seed: int) -> float:
+def largest_normal(correlation: Array, probability: float, seed: int, score: float = np.inf) -> tuple[float, float]:
     """Return what the largest of standard normals with this correlation (k, k) exceeds with `probability`.
 
-    By 2000 `rare_draws`: the probability is right within 4 % (one standard deviation), however small it is.
+    And the probability that it exceeds `score`, by the same draws, so that the two agree: 2000 `rare_draws`, by which
+    the first probability is right within 4 % (one standard deviation), however small it is; the second one
+    is at least a hundredth of it, as far out as they are drawn.
     """
     root = np.asarray(np.linalg.cholesky(correlation + 1e-9 * np.eye(len(correlation))), dtype=np.float64)
     levels = np.asarray(np.minimum(probability * _LEVELS, _LARGEST_LEVEL), dtype=np.float64)
     z, weights = rare_draws(root, levels, 2000, seed)
-    return weighted_quantile((root @ z).max(axis=0), weights, probability)
+    largest = (root @ z).max(axis=0)
+    chance = float(np.sum(weights[largest >= score])) / largest.size
+    return weighted_quantile(largest, weights, probability), float(np.clip(chance, levels.min(), 1.0))
 
 
 @cache
@@ -108,6 +112,19 @@ def _null_table(scan: str) -> tuple[tuple[Array, ...], Array]:
     values = rows[:, places:].reshape([axis.size for axis in axes])
     axes[-1], values = axes[-1][::-1], values[..., ::-1]
     return tuple(np.log(axis) if axis[0] > 0 else axis for axis in axes), values
+
+
+def null_chance(scan: str, score: float, *place: float) -> float:
+    """Return the probability that the largest score of a scan exceeds `score` in series without a step.
+
+    The inverse of `null_threshold` over its table's probabilities; 1 for scores that are exceeded more often than the
+    largest of them, and the smallest for all beyond it.
+    """
+    axis = _null_table(scan)[0][-1]
+    values = np.array([null_threshold(scan, float(np.exp(at)), *place) for at in axis])
+    if score <= values[-1]:
+        return 1.0
+    return float(np.exp(np.interp(-score, -values, axis)))
 
 
 def null_threshold(scan: str, probability: float, *place: float) -> float:

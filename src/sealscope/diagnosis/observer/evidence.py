@@ -146,14 +146,19 @@ def within(series: ConductanceSeries, step: WalkStep) -> Evidence:
             (max(0.0, laminar - half) * min(1.0, series.orifice), (laminar + half) * max(1.0, series.orifice)),
             cause="piston or pump leak",
             course=course(series, step, float(np.mean(series.G[before])) if np.any(before) else 0.0),
+            chance=step.chance,
         )
     if step.score > step.threshold:
         reason = f"what passes between the chambers rose evenly from the beginning on, as in a warm-up ({figures})"
-        return Evidence("cannot tell", reason, step.score, step.threshold, course=course(series, step, None))
+        return Evidence(
+            "cannot tell", reason, step.score, step.threshold, course=course(series, step, None), chance=step.chance
+        )
     reason = f"what passes between the chambers did not rise within the recording ({figures})"
     if series.formulation == "volume":
         reason += f"; pump and piston together let {float(np.median(series.G)) * unit:.4f} L/min pass"
-    return Evidence("no leak", reason, step.score, step.threshold, course=course(series, step, None))
+    return Evidence(
+        "no leak", reason, step.score, step.threshold, course=course(series, step, None), chance=step.chance
+    )
 
 
 def course(series: ConductanceSeries, step: WalkStep, level: float | None) -> LeakCourse:

@@ -165,9 +165,11 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     steps, begin = followed.steps, float(recording.t[0])
     inner = slice(LEAST - 1, followed.blocks - LEAST)
     z = steps.z[inner]
-    threshold = largest_normal(steps.correlation[inner, inner], probability, seed_of(z))
     best = int(np.argmax(z))
     excess = followed.excess
+    scatter = float(np.sqrt(max(1.0, excess)))
+    score = float(z[best]) / scatter
+    threshold, chance = largest_normal(steps.correlation[inner, inner], probability, seed_of(z), score)
     cause = _other_cause(followed)
     if excess > UNRULY:
         seen = {
@@ -181,8 +183,6 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
             f"those of a healthy machine may, {UNRULY:g} are allowed{seen}",
             cause=cause,
         )
-    scatter = float(np.sqrt(max(1.0, excess)))
-    score = float(z[best]) / scatter
     edges = begin + followed.edges / recording.rate
     onset = float(edges[inner.start + 1 + best])
     figures = f"z {score:.2f}, threshold {threshold:.2f}"
@@ -195,7 +195,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
             "friction change": f"the friction changed, the leakage conductance did not ({figures})",
             "air in the oil": f"the oil became softer, the leakage conductance did not change ({figures})",
         }[cause]
-        return Evidence("no leak", reason, score, threshold, parts=(part,), cause=cause)
+        return Evidence("no leak", reason, score, threshold, parts=(part,), cause=cause, chance=chance)
     near = near_best(z * np.abs(z), scatter**2)
     interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
     lpm, limits, law = _flow(followed, recording, inner.start + best, onset, scatter)
@@ -213,6 +213,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
             threshold,
             parts=(part,),
             cause=cause,
+            chance=chance,
         )
     return Evidence(
         "leak",
@@ -226,6 +227,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
         parts=(part,),
         cause="piston or pump leak",
         course=course,
+        chance=chance,
     )
 
 

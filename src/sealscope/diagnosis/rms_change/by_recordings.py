@@ -136,6 +136,8 @@ def by_recordings(recording: Recording, leak_free: LeakFree, probability: float)
     been found, or it is of a session of the baseline and differs no more than a repetition would. Else `cannot tell`:
     it differs as drift, another session or another machine would, too.
     """
+    from scipy.special import ndtr
+
     known, measured = leak_free.log_rms, whole_log_rms(recording)
     point, levels = operating_point(recording), leak_free.levels
     level = point.level
@@ -164,35 +166,36 @@ def by_recordings(recording: Recording, leak_free: LeakFree, probability: float)
         expected = judged.model.predict(level, sessions.time, shown)
     z = judged.z(expected)
     score = float(np.max(z))
+    chance = min(1.0, 2.0 * len(columns) * float(ndtr(-score)))
     chosen = [names[k] for k in columns]
     against = f"against {len(known)} comparable leak-free recording{'s' if len(known) > 1 else ''}"
     figures = f"largest deviation {score:.1f}, threshold {threshold:.1f}"
     note = WITHOUT_NOISE if noisy else ""
     if score > threshold:
         changed = largest_changes(chosen, z, changes[columns], np.full(len(z), threshold))
-        return Evidence("leak", f"{changed} {against} ({figures}){note}", score, threshold, parts=parts)
+        return Evidence("leak", f"{changed} {against} ({figures}){note}", score, threshold, parts=parts, chance=chance)
     smallest = judged.smallest_found(expected, threshold)
     percent = float(100.0 * np.expm1(smallest))
     sensitivity = f"a change of {percent:.{0 if percent >= 10 else 1}f} % would have been found"
     if smallest <= WORTH_FINDING:
         reason = f"no change of the details' RMS {against} ({figures}; {sensitivity}){note}"
-        return Evidence("no leak", reason, score, threshold, parts=parts)
+        return Evidence("no leak", reason, score, threshold, parts=parts, chance=chance)
     repetitions = _repetitions(sessions)
     if not repetitions:
         reason = f"no change of the details' RMS {against}, but only {sensitivity} ({figures}){note}"
-        return Evidence("cannot tell", reason, score, threshold, parts=parts)
+        return Evidence("cannot tell", reason, score, threshold, parts=parts, chance=chance)
     near = [judged.z(judged.model.predict(level, time, label)) for time, label in repetitions]
     nearest = int(np.argmin([np.max(own_z) for own_z in near]))
     if np.max(near[nearest]) <= threshold:
         reason = f"no change of the details' RMS {against} beyond that of a repetition ({figures}){note}"
         if sessions.label is not None:
-            return Evidence("no leak", reason, score, threshold, parts=parts)
+            return Evidence("no leak", reason, score, threshold, parts=parts, chance=chance)
         reason += f"; but it may be of another session or of another machine, and then only {sensitivity}"
-        return Evidence("cannot tell", reason, score, threshold, parts=parts)
+        return Evidence("cannot tell", reason, score, threshold, parts=parts, chance=chance)
     changes = measured - model.predict(level, *repetitions[nearest]).mean
     changed = largest_changes(chosen, near[nearest], changes[columns], np.full(len(z), threshold))
     reason = f"{changed} {against}: {_possible(sessions)} ({figures}; only {sensitivity}){note}"
-    return Evidence("cannot tell", reason, score, threshold, parts=parts)
+    return Evidence("cannot tell", reason, score, threshold, parts=parts, chance=chance)
 
 
 def _shown(sessions: Sessions) -> int | None:

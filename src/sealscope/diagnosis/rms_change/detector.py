@@ -139,6 +139,7 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
         even = noise if noise.trend > noise.joint.max() else result
         changed += ", beyond a change of the noise"
     score = float(result.joint[step])
+    chance = scan.chance(score)
     onset, interval = None, None
     verdict: Verdict = "cannot tell"
     if noisy and even is result and score <= threshold:
@@ -164,7 +165,7 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
         near = blocks.edges[near_best(result.joint) + 1]
         onset, interval = float(blocks.edges[step + 1]), (float(near[0]), float(near[-1]))
         reason = f"{changed} at {onset:.1f} s (T2 {score:.1f}, threshold {threshold:.1f})"
-    return Evidence(verdict, reason, score, threshold, onset, interval, parts=tuple(parts))
+    return Evidence(verdict, reason, score, threshold, onset, interval, parts=tuple(parts), chance=chance)
 
 
 def against(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
@@ -214,4 +215,4 @@ def _by_blocks(recording: Recording, baseline: Sequence[Recording], probability:
     )
     parts = parts_against(after.names, single, thresholds, changes)
     verdict: Verdict = "leak" if score > threshold else "no leak"
-    return Evidence(verdict, reason, score, threshold, parts=parts, share=after.share)
+    return Evidence(verdict, reason, score, threshold, parts=parts, share=after.share, chance=scan.chance(score))

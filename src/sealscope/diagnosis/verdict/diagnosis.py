@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Passage, Verdict
+from sealscope.diagnosis.verdict.evidence import RAREST, Cause, Evidence, Passage, Verdict
 from sealscope.recordings.quality import Finding
 
 _CHECKS: Mapping[Cause, str] = {
@@ -130,6 +130,8 @@ class Diagnosis(Evidence):
                     "threshold": _plain(method.threshold),
                     "verdict": method.verdict,
                     "reason": method.reason,
+                    "chance": _chance(method),
+                    "odds": method.odds,
                 }
                 for method in self.methods
             ],
@@ -147,6 +149,8 @@ class Diagnosis(Evidence):
             "cause": self.cause,
             "next_check": self.next_check,
             "passage": None if self.passage is None else _plain_passage(self.passage),
+            "chance": _chance(self),
+            "odds": self.odds,
         }
 
     def __str__(self) -> str:
@@ -167,6 +171,7 @@ class Diagnosis(Evidence):
             ("cause", self.cause),
             ("score", _shown(self.score)),
             ("threshold", _shown(self.threshold)),
+            ("odds", self.odds),
             ("false-alarm probability", f"{self.false_alarm_probability:g}"),
             *((finding.severity, finding.text) for finding in self.quality),
             ("next check", self.next_check),
@@ -175,6 +180,10 @@ class Diagnosis(Evidence):
             f"<tr><th>{escape(label)}</th><td>{escape(text)}</td></tr>" for label, text in rows if text is not None
         )
         return f"<table><caption>{escape(self.file)}: {escape(self.verdict)}</caption>{body}</table>"
+
+
+def _chance(evidence: Evidence) -> float | None:
+    return None if evidence.chance is None else max(RAREST, float(evidence.chance))
 
 
 def _plain(value: float | None) -> float | None:

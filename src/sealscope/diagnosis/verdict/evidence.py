@@ -25,6 +25,12 @@ Figure = Literal["onset_s", "leak_lpm"]
 LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak")
 
 
+#: Smallest chance that is stated: no null distribution is known further out.
+RAREST = 1e-4
+#: Chance from which on a recording looks like any healthy one.
+OFTEN = 0.2
+
+
 @dataclass(frozen=True, eq=False)
 class LeakCourse:
     """Leak over a recording.
@@ -100,6 +106,10 @@ class Evidence:
         Name of the detector, or of the part; of a fused verdict, the detector that judged, "" where none did.
     usable : bool
         Whether the recording had what the detector needs.
+    chance : float, optional
+        Probability that a leak-free recording scores as high, by the detector's own null distribution; at most the
+        false-alarm probability where the score is over the threshold. None where the detector does not state it. Less
+        than `RAREST` is not told apart from it.
     """
 
     verdict: Verdict
@@ -118,6 +128,7 @@ class Evidence:
     share: float = 1.0
     detector: str = ""
     usable: bool = True
+    chance: float | None = None
 
     @property
     def alarmed(self) -> bool:
@@ -128,3 +139,20 @@ class Evidence:
     def abstains(self) -> bool:
         """Whether the next detector judges: `cannot tell`, and no change was seen."""
         return self.verdict == "cannot tell" and self.cause is None and not self.alarmed
+
+    @property
+    def odds(self) -> str | None:
+        """How many healthy recordings look like this one, in words; None where that is not stated."""
+        if self.chance is None:
+            return None
+        if self.chance <= RAREST:
+            return f"fewer than 1 in {grouped(1.0 / RAREST)} healthy recordings looks like this"
+        if self.chance >= OFTEN:
+            return f"more than 1 in {1.0 / OFTEN:.0f} healthy recordings look like this"
+        return f"1 in {grouped(1.0 / self.chance)} healthy recordings looks like this"
+
+
+def grouped(value: float) -> str:
+    """Return a number of two digits, its thousands apart."""
+    rounded = float(f"{value:.2g}")
+    return f"{rounded:,.0f}".replace(",", " ")

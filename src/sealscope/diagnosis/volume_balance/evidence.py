@@ -127,6 +127,13 @@ def _normal_quantile(probability: float) -> float:
     return -float(ndtri(probability))
 
 
+def _normal_tail(score: float) -> float:
+    """Return the probability that a standard normal number exceeds a score."""
+    from scipy.special import ndtr
+
+    return float(ndtr(-score))
+
+
 def _t_quantile(freedom: float) -> float:
     """Return the factor of a deviation that gives a 95 % interval."""
     from scipy.special import stdtrit
@@ -232,6 +239,7 @@ def _from_the_start(evidence: Evidence, fit: BalanceFit, probability: float) -> 
         ),
         score=score,
         threshold=threshold,
+        chance=_normal_tail(score),
         leak_lpm=passes.lpm - passes.healthy_lpm,
         leak_interval_lpm=(max(low - passes.healthy_lpm, 0.0), high),
         cause="piston or pump leak",
@@ -292,7 +300,9 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
             )
         if smallest > 0.0:
             reason += f"; the smallest step that would have shown is {_flow_text(smallest, fit)}"
-    return Evidence(verdict, reason + _left_out_text(fit), step.score, step.threshold, parts=(_part(step),))
+    return Evidence(
+        verdict, reason + _left_out_text(fit), step.score, step.threshold, parts=(_part(step),), chance=step.chance
+    )
 
 
 def _shape(fit: BalanceFit, step: DriftStep) -> Array:
@@ -349,6 +359,7 @@ def describe_leak(fit: BalanceFit, step: DriftStep) -> Evidence:
         cause,
         course,
         _refused(fit),
+        chance=step.chance,
     )
     if evidence.verdict == "leak":
         return evidence
