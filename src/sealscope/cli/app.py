@@ -42,7 +42,18 @@ app.add_typer(campaign.campaign)
 
 
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Log on standard error what errors come from; anywhere in a call.")
+    ] = False,
+) -> None:
+    if verbose:
+        import logging
+
+        log = logging.getLogger("sealscope")
+        log.addHandler(logging.StreamHandler())
+        log.setLevel(logging.DEBUG)
     if version:
         from sealscope import __version__
 
@@ -91,6 +102,14 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
     return [arguments[0], *options, *left, *plain]
 
 
+def arguments_of(words: Sequence[str]) -> list[str]:
+    """Return the words of a call as the commands take them: `-v` first, an option for each baseline."""
+    end = list(words).index("--") if "--" in words else len(words)
+    verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
+    plain = [word for word in words[:end] if word not in ("-v", "--verbose")]
+    return [*verbose[:1], *spread_baselines([*plain, *words[end:]])]
+
+
 def main() -> None:
     """Run the command line.
 
@@ -102,7 +121,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # a terminal without the character shows its code instead
             stream.reconfigure(errors="backslashreplace")
     try:
-        status = app(spread_baselines(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
+        status = app(arguments_of(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
         sys.stdout.flush()
     except typer.Exit as error:
         status = error.exit_code

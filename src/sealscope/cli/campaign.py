@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from sealscope.cli.options import (
     MapOption,
     RateOption,
     assumed_rig,
+    attempt,
     channel_map_of,
     check_folder,
     complain,
@@ -297,7 +299,13 @@ def calibrate(
         raise InputError(f"--promise must be average or bound, got {promise}")
     assumed = assumed_rig(rig)
     channel_map = channel_map_of(maps)
-    recordings = {str(path): read(path, channel_map=channel_map or None, rate=rate) for path in baseline}
+    recordings = {}
+    for path in baseline:
+        recording = attempt(path, partial(read, path, channel_map=channel_map or None, rate=rate))
+        if recording is not None:
+            recordings[str(path)] = recording
+    if len(recordings) < len(baseline):
+        raise typer.Exit(1)
     files = [{"file": path.name, "sha256": sha256(path.read_bytes()).hexdigest()} for path in baseline]
     calibration = calibrate_on(
         recordings,

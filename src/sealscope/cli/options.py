@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import logging
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from sealscope.errors import InputError
+from sealscope.errors import InputError, SealscopeError
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.recordings.formats.columns import ChannelMap
     from sealscope.simulation.simulate import Progress
+
+
+T = TypeVar("T")
+_log = logging.getLogger(__name__)
 
 
 def complete_rigs(incomplete: str) -> list[str]:
@@ -136,10 +141,31 @@ def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
     return columns
 
 
+def printable(text: str, kept: str = "") -> str:
+    """Return a text without what a terminal would obey, whatever a file's name or header brought; `kept` stays."""
+    return "".join(c if c.isprintable() or c in kept else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def say(text: str) -> None:
+    """Print lines on standard output."""
+    typer.echo(printable(text, "\n"))
+
+
 def complain(message: object) -> None:
-    """One line on standard error, whatever characters a file's name or header brought."""
-    printable = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(message))
-    typer.echo(f"sealscope: {printable}", err=True)
+    """Print one line on standard error."""
+    typer.echo(f"sealscope: {printable(str(message))}", err=True)
+
+
+def attempt(file: Path, work: Callable[[], T]) -> T | None:
+    """Return `work()`; None, with one line on standard error, where it fails with this file: the others go on."""
+    try:
+        return work()
+    except SealscopeError as error:
+        complain(error if str(file) in str(error) else f"{error} ({file})")
+    except Exception as error:  # a defect of the program; the other files have their results yet
+        _log.debug("cannot handle %s", file, exc_info=True)
+        complain(f"cannot handle {file}, got {type(error).__name__}: {error} (-v says where)")
+    return None
 
 
 def check_folder(file: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,11 +20,13 @@ from sealscope.cli.options import (
     MapOption,
     RateOption,
     assumed_rig,
+    attempt,
     channel_map_of,
     check_folder,
     complain,
+    say,
 )
-from sealscope.errors import InputError, MissingExtra, UnreadableFile
+from sealscope.errors import InputError, UnreadableFile
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -46,11 +49,7 @@ def _read_all(
     from sealscope.recordings import read
 
     for file in files:
-        try:
-            yield file, read(file, channel_map=channel_map or None, rate=rate)
-        except (UnreadableFile, MissingExtra) as error:
-            complain(error)
-            yield file, None
+        yield file, attempt(file, partial(read, file, channel_map=channel_map or None, rate=rate))
 
 
 def _read_parts(
@@ -64,7 +63,8 @@ def _read_parts(
 
     parts = [recording for _, recording in _read_all(files, channel_map, rate)]
     whole = [part for part in parts if part is not None]
-    yield files[0], join(whole, names=[file.name for file in files]) if len(whole) == len(files) else None
+    joined = partial(join, whole, names=[file.name for file in files])
+    yield files[0], attempt(files[0], joined) if len(whole) == len(files) else None
 
 
 def _diagnoses(
@@ -102,10 +102,9 @@ def _diagnoses(
             complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
             continue
-        yield (
-            recording,
-            diagnose(recording, others, false_alarm_probability=false_alarm, file=file, rig=rig or "thesis"),
-        )
+        work = partial(diagnose, recording, others, false_alarm_probability=false_alarm, file=file, rig=rig or "thesis")
+        diagnosis = attempt(file, work)
+        yield None if diagnosis is None else (recording, diagnosis)
 
 
 def _calibrated(
@@ -125,11 +124,11 @@ def _calibrated(
         raise InputError("--calibration must stand without --baseline: its leak-free recordings are in it")
     known = load(calibration)
     for file, recording in _read_parts(files, channel_map, rate, join_them):
-        yield (
-            None
-            if recording is None
-            else (recording, diagnose_calibrated(recording, known, file=str(file), rig=rig or "thesis"))
-        )
+        diagnosis = None
+        if recording is not None:
+            work = partial(diagnose_calibrated, recording, known, file=str(file), rig=rig or "thesis")
+            diagnosis = attempt(file, work)
+        yield None if recording is None or diagnosis is None else (recording, diagnosis)
 
 
 def diagnose(
@@ -155,7 +154,7 @@ def diagnose(
         elif output is TextFormat.jsonl:
             typer.echo(json.dumps(result[1].as_dict(), allow_nan=False))
         else:
-            typer.echo(diagnosis_text(result[1]))
+            say(diagnosis_text(result[1]))
     if not complete:
         raise typer.Exit(1)
 
@@ -203,9 +202,11 @@ def report(
             continue
         recording, diagnosis = result
         page = output / f"{Path(diagnosis.file).stem}.html" if several else output
-        write_page(page, recording, diagnosis, rig=assumed)
+        if attempt(page, partial(write_page, page, recording, diagnosis, rig=assumed)) is None:
+            complete = False
+            continue
         written.append((page, diagnosis))
-        typer.echo(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
+        say(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
     if several and written:
         write_index(output / "index.html", written)
     if not complete:
@@ -227,7 +228,7 @@ def inspect(
         if recording is None:
             complete = False
         else:
-            typer.echo(overview_text(str(file), recording, inspected(recording)))
+            say(overview_text(str(file), recording, inspected(recording)))
     if not complete:
         raise typer.Exit(1)
 
@@ -246,6 +247,6 @@ def convert(
     check_folder(target)
     recording = read(source, channel_map=channel_map_of(maps) or None, rate=rate)
     write(recording, target)
-    typer.echo(f"{target}: {len(recording)} samples at {recording.rate:g} Hz, channels {', '.join(recording.channels)}")
+    say(f"{target}: {len(recording)} samples at {recording.rate:g} Hz, channels {', '.join(recording.channels)}")
     for finding in inspect(recording):
-        typer.echo(f"{finding.severity}: {finding.text}")
+        say(f"{finding.severity}: {finding.text}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import cast
 
 from sealscope.calls import checked_call
-from sealscope.errors import InputError, MissingExtra, UnreadableFile
+from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
@@ -22,11 +21,10 @@ from sealscope.recordings.formats.table import Choose, RawTable
 from sealscope.recordings.formats.text_layout import SNIFF
 from sealscope.recordings.recording import Recording
 from sealscope.storage.atomic import atomic_write
-from sealscope.storage.opening import open_regular
+from sealscope.storage.opening import open_regular, whole
 
 Reader = Callable[[Path, Choose], RawTable]
 Writer = Callable[..., None]
-_log = logging.getLogger(__name__)
 #: Suffix -> format of a file to write.
 SUFFIXES: Mapping[str, str] = {
     ".nc": "netcdf",
@@ -196,21 +194,11 @@ def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None, fo
     if format not in (None, kind):
         raise UnreadableFile(f"a file read as {format} must be {format}, got {kind} ({file})")
     choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(file))
-    try:
+    with whole(f"{_NAMES[kind]} file", file):
         table = _reader(kind)(file, choose)
         if format is None and {**SUFFIXES, **_READ_ONLY}.get(file.suffix.lower(), kind) != kind:
             table = replace(table, notes=(f"name ends in {file.suffix}, content is {table.kind}", *table.notes))
         return Recording(*table.samples({"file": name}, rate=rate, infer_rate=bool(channel_map)))
-    except (MissingExtra, UnreadableFile):
-        raise
-    except InputError as error:
-        raise UnreadableFile(str(error) if str(file) in str(error) else f"{error} ({file})") from None
-    except MemoryError as error:
-        raise UnreadableFile(f"a recording must be readable, got: too little memory ({file})") from error
-    except Exception as error:  # format libraries raise whatever a damaged file makes them
-        _log.debug("cannot read %s", file, exc_info=True)
-        text = " ".join(str(error).split())[:160] or type(error).__name__
-        raise UnreadableFile(f"{_NAMES[kind]} file must be whole, got: {text} ({file})") from error
 
 
 def check_target(path: str | os.PathLike[str]) -> str:

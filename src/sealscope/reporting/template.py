@@ -69,7 +69,7 @@ def write(path: str | os.PathLike[str], page: str) -> Path:
         print_page(page, path)
         return Path(path)
     with atomic_write(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", newline="\n")
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace", newline="\n")  # a file's name
     return Path(path)
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Literal
 
-from sealscope.errors import InputError
+from sealscope.errors import InputError, MissingExtra, UnreadableFile
 
+_log = logging.getLogger(__name__)
 _NO_WAITING = getattr(os, "O_NONBLOCK", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 #: How messages call what is no regular file.
@@ -60,3 +64,23 @@ def _opened(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"],
         os.close(number)
         raise InputError(f"{what} must be a file, got {kind} ({path})")
     return os.fdopen(number, mode)
+
+
+@contextmanager
+def whole(what: str, place: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn whatever a damaged file raises in the block into an UnreadableFile of one line; the log has the original.
+
+    `what` it is ("a calibration") and its `place` stand in the message. MissingExtra and UnreadableFile pass.
+    """
+    try:
+        yield
+    except (MissingExtra, UnreadableFile):
+        raise
+    except InputError as error:
+        raise UnreadableFile(str(error) if str(place) in str(error) else f"{error} ({place})") from None
+    except MemoryError as error:
+        raise UnreadableFile(f"{what} must be readable, got: too little memory ({place})") from error
+    except Exception as error:  # the libraries of formats raise whatever a damaged file makes them
+        _log.debug("cannot read %s", place, exc_info=True)
+        text = " ".join(str(error).split())[:160] or type(error).__name__
+        raise UnreadableFile(f"{what} must be whole, got: {text} ({place})") from error

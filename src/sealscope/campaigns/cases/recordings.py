@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import logging
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.row import CaseRow, error_text
 from sealscope.campaigns.cases.scoring import stated
 from sealscope.campaigns.plans.model import RecordedPlan, RecordingSet
 from sealscope.errors import InputError, SealscopeError
 
+_log = logging.getLogger(__name__)
 #: Called with how many records have their row, how many there are, and how many of those failed.
 ProgressCallback = Callable[[int, int, int], None]
 
@@ -54,7 +57,7 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
 
     row = partial(
         CaseRow,
-        id=hashlib.sha256(name.encode()).hexdigest()[:16],
+        id=hashlib.sha256(os.fsencode(name)).hexdigest()[:16],
         use=recordings.use,
         leak_lpm=recordings.size,
         fault="",
@@ -69,5 +72,7 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
         look = look_at(record.part, 0.5, plan.false_alarm, plan.assumed or "thesis")
         scores, statements = stated(look, plan.detectors, plan.views)
         return row(place=asdict(Place.of(record.part)), scores=scores, statements=statements)
-    except SealscopeError as error:
-        return row(error=str(error))
+    except Exception as error:  # one recording must not end the others; the table says it
+        if not isinstance(error, SealscopeError):
+            _log.debug("cannot judge %s", path, exc_info=True)
+        return row(error=error_text(error))

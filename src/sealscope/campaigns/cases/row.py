@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 from sealscope.campaigns.cases.case import CampaignCase
-from sealscope.diagnosis.verdict.evidence import LEAKS, Evidence
+from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Verdict
 from sealscope.errors import SealscopeError
 from sealscope.evaluation.confusion import CANNOT_TELL
+from sealscope.storage.plain_values import as_type
 
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
 #: First words of a fault as plans have it, and the cause that a detector should name for it.
@@ -53,6 +54,8 @@ def stated_evidence(values: Mapping[str, Any]) -> Evidence:
 
     Raises TypeError, KeyError or ValueError where they are no such values.
     """
+    if values["verdict"] not in get_args(Verdict) or values["cause"] not in (None, *get_args(Cause)):
+        raise ValueError("no verdict or no cause")
     return Evidence(
         verdict=values["verdict"],
         reason="",
@@ -136,9 +139,17 @@ class CaseRow:
     @classmethod
     def from_dict(cls, tree: Mapping[str, Any]) -> CaseRow:
         """Return the row of plain values; raise TypeError, KeyError or ValueError where they are none."""
+        from sealscope.diagnosis.calibration.thresholds import Place
+
+        error = tree.get("error")
+        if not isinstance(error, str | None) or not isinstance(tree["id"], str):
+            raise TypeError("an error and an id are texts")
+        if error is None:
+            as_type(Place, tree["place"])
         scores = {str(name): (_number(score), _number(onset)) for name, (score, onset, *_) in tree["scores"].items()}
         statements = {str(key): stated_evidence(plain) for key, plain in tree.get("statements", {}).items()}
-        return cls(**{**tree, "scores": scores, "statements": statements})
+        numbers = {name: _number(tree.get(name)) for name in ("flow_lpm", "seconds")}
+        return cls(**{**tree, **numbers, "scores": scores, "statements": statements})
 
 
 def _number(value: Any) -> float | None:

@@ -18,6 +18,7 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.storage import folders
 from sealscope.storage.atomic import atomic_write, remove_temporaries
 from sealscope.storage.opening import open_inner
+from sealscope.storage.plain_values import parse_json
 
 #: What rows of one folder must share, and how messages call it.
 _SAME = {
@@ -36,6 +37,7 @@ FORMAT = 2
 ROWS, HEAD, LOCK = "rows.jsonl", "campaign.json", ".lock"
 #: Longest line of a row, and largest head [bytes].
 _LONGEST_ROW = _LARGEST_HEAD = 1_000_000
+_INPUTS = ("use", "leak_lpm", "fault", "levels", "replicate")
 #: How rows are made unless in batches.
 RUN_BY_RUN = "run by run"
 
@@ -117,7 +119,7 @@ def read_rows(folder: Path) -> dict[str, CaseRow]:
                 if not line.endswith(b"\n") and len(line) < _LONGEST_ROW:
                     break
                 try:
-                    row = CaseRow.from_dict(json.loads(line))
+                    row = CaseRow.from_dict(parse_json(line))
                 except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RecursionError):
                     raise UnreadableFile(
                         f"a line of a campaign must be a row, got something else ({path}, line {number})"
@@ -134,12 +136,24 @@ def read_rows(folder: Path) -> dict[str, CaseRow]:
 def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     """Return the folder's rows that belong to the plan, by case id in rising order.
 
-    A row without one of the plan's detectors is not among them.
+    A row without one of the plan's detectors is not among them. Raises UnreadableFile for a row that says another input
+    than its case has.
     """
     rows = read_rows(folder)
-    of_plan = (rows.get(case.id) for case in sorted(cases_of(plan), key=lambda case: case.id))
     wanted = set(plan.detectors)
-    return {row.id: row for row in of_plan if row is not None and (row.error or wanted <= set(row.scores))}
+    stated = {detector.key for name in plan.detectors if (detector := plan_detector(name)).own}
+    of_plan: dict[str, CaseRow] = {}
+    for case in sorted(cases_of(plan), key=lambda case: case.id):
+        row = rows.get(case.id)
+        if row is None:
+            continue
+        if any(getattr(row, name) != getattr(case, name) for name in _INPUTS):
+            raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({folder / ROWS})")
+        if row.error is not None or (
+            wanted <= set(row.scores) and (not row.statements or stated <= set(row.statements))
+        ):
+            of_plan[row.id] = row
+    return of_plan
 
 
 def progress_of(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
@@ -155,7 +169,7 @@ def head(folder: Path) -> dict[str, Any] | None:
     path = folder / HEAD
     try:
         with open_inner(path, "a campaign's head") as file:
-            tree = json.loads(file.read(_LARGEST_HEAD))
+            tree = parse_json(file.read(_LARGEST_HEAD))
     except FileNotFoundError:
         return None
     except InputError:

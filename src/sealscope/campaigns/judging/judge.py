@@ -16,7 +16,6 @@ import numpy as np
 from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, named_cause
 from sealscope.campaigns.judging.families import FamilyFinding, family_findings
 from sealscope.campaigns.plans.detectors import Views, plan_detector
-from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.calibration.scorers import scorer
 from sealscope.diagnosis.calibration.thresholds import Calibration, Place, calibrate
 from sealscope.diagnosis.verdict.evidence import Evidence
@@ -33,6 +32,7 @@ from sealscope.evaluation.estimates import (
 from sealscope.evaluation.pod import HitMiss, SizeDetection, by_size, fit_hit_miss, proven_size
 from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 from sealscope.evaluation.table import ALWAYS, NEVER, JudgedRecord, SummaryRow, summary
+from sealscope.storage.plain_values import as_type
 
 #: (detector, row id) -> verdict
 Verdicts = Mapping[tuple[str, str], str]
@@ -142,8 +142,8 @@ class Judgement:
 
 
 def place_from(tree: Mapping[str, Any]) -> Place:
-    """Return the place of a row from its plain values."""
-    return Place(OperatingPoint.of_dict(tree["point"]), float(tree["duration_s"]))
+    """Return the place of a row from its plain values; ValueError where they are none."""
+    return as_type(Place, dict(tree))
 
 
 def calibration_of(

@@ -250,7 +250,10 @@ def write_tables(folder: Path, tables: Iterable[ResultTable]) -> list[Path]:
         if not table.rows:
             path.unlink(missing_ok=True)
             continue
-        with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        with (
+            atomic_write(path) as temporary,
+            temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,
+        ):
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(table.columns)
             writer.writerows([["" if value is None else value for value in row] for row in table.rows])

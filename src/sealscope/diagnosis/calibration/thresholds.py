@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -28,7 +28,8 @@ from sealscope.evaluation.thresholds import (
 )
 from sealscope.recordings.recording import Recording
 from sealscope.storage.atomic import atomic_write
-from sealscope.storage.opening import open_regular
+from sealscope.storage.opening import open_regular, whole
+from sealscope.storage.plain_values import parse_json
 
 FORMAT = "sealscope calibration 2"
 #: How far outside the calibrated pressure levels a recording may lie: this share of their range, and this ratio.
@@ -41,6 +42,8 @@ BY_STROKES = "rms change"
 #: How far the mean of a score moves after the recordings of a session, in deviations of its scatter.
 WANDER = LevelWander(scale=3.0, freedom=4.0)
 _LARGEST_FILE = 50_000_000
+#: Largest logarithm of a pressure: its exponential is still a number.
+_LARGEST_LEVEL = 350.0
 
 
 @dataclass(frozen=True)
@@ -287,26 +290,20 @@ def load(path: str | os.PathLike[str]) -> Calibration:
             text = opened.read(_LARGEST_FILE + 1)
         if len(text) > _LARGEST_FILE:
             raise UnreadableFile(f"a calibration must be at most {_LARGEST_FILE} bytes, got more ({file})")
-        tree = json.loads(text)
-    except InputError as error:
-        raise UnreadableFile(str(error)) from None
+        tree = parse_json(text)
     except OSError as error:
         raise UnreadableFile(f"a calibration must be readable, got: {error.strerror or error} ({file})") from None
-    except (ValueError, RecursionError):
+    except InputError as error:
+        raise UnreadableFile(str(error)) from None
+    except ValueError:
         raise UnreadableFile(
             f"a calibration must be a JSON file of sealscope calibrate, got something else ({file})"
         ) from None
     if not isinstance(tree, dict) or tree.get("format") != FORMAT:
         got = tree.get("format") if isinstance(tree, dict) else type(tree).__name__
-        raise UnreadableFile(f"a calibration must say format {FORMAT!r}, got {got!r} ({file})")
-    try:
+        raise UnreadableFile(f"a calibration must say format {FORMAT!r}, got {str(got)[:60]!r} ({file})")
+    with whole("a calibration", file):
         return _from(tree)
-    except InputError as error:
-        raise UnreadableFile(f"{error} ({file})") from None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UnreadableFile(
-            f"a calibration must be complete, got a wrong or missing entry: {error} ({file})"
-        ) from None
 
 
 def _from(tree: Mapping[str, Any]) -> Calibration:
@@ -320,6 +317,8 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
                     f"a threshold must be a finite number of a listed detector, got {threshold.value} of {name!r}"
                 )
         low, high = (float(value) for value in group["levels"])
+        if max(abs(low), abs(high)) > _LARGEST_LEVEL:
+            raise InputError(f"levels must be logarithms of pressures, got {low}, {high}")
         short, long = (float(value) for value in group["durations_s"])
         point = OperatingPoint.of_dict(group["point"])
         strokes = None if group.get("leak_free") is None else LeakFree.of_dict(group["leak_free"])
@@ -330,10 +329,20 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
     if not detectors or not groups:
         raise InputError("a calibration must have detectors and operating points")
     probability, confidence, split = (float(tree[name]) for name in ("false_alarm_rate", "confidence", "split_share"))
+    promise = tree["promise"]
+    if promise not in get_args(Promise):
+        raise InputError(f"promise must be one of {', '.join(get_args(Promise))}, got {str(promise)[:60]!r}")
     if not (0.0 < probability < 1.0 and 0.0 < confidence < 1.0 and 0.0 < split < 1.0):
         raise InputError("false_alarm_rate, confidence and split_share must be between 0 and 1")
     return Calibration(
-        probability, tree["promise"], confidence, detectors, split, tuple(groups), dict(tree["made_from"]), views
+        probability,
+        promise,
+        confidence,
+        detectors,
+        split,
+        tuple(groups),
+        dict(tree["made_from"]),
+        views,
     )
 
 

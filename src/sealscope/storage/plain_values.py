@@ -1,0 +1,55 @@
+"""Plain values of files from outside: JSON of finite numbers, and values of the types that the program counts on."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from typing import Any, TypeVar
+
+_T = TypeVar("_T")
+#: Largest whole number: beyond it, doubles are no longer exact.
+_LARGEST = 2**53
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text; ValueError where it is none, or holds a number that is not finite or too large.
+
+    Whole numbers are at most 2^53 in size.
+    """
+    try:
+        return json.loads(text, parse_float=_finite, parse_int=_whole, parse_constant=_finite)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"a number must be finite, got {text[:40]}")
+    return number
+
+
+def _whole(text: str) -> int:
+    if len(text) > 17 or abs(int(text)) > _LARGEST:
+        raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
+    return int(text)
+
+
+@cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
+
+
+def as_type(kind: type[_T], value: Any) -> _T:
+    """Return plain values as the dataclass `kind`; ValueError of one line where a value has no place in it."""
+    from pydantic import ValidationError
+
+    try:
+        return _adapter(kind).validate_python(value)  # type: ignore[no-any-return, arg-type]
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"])) or "value"
+        raise ValueError(f"{place}: {first['msg']}, got {str(first['input'])[:60]!r}") from None

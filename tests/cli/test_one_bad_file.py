@@ -1,0 +1,106 @@
+"""A batch with bad files: each gets its line, the others their results, and the status says that some failed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def batch(recordings: Path, tmp_path: Path) -> Path:
+    """A folder with good.nc, bad.nc (cut off) and other.nc."""
+    for name in ("good.nc", "other.nc"):
+        shutil.copy(recordings / "healthy_1.nc", tmp_path / name)
+    (tmp_path / "bad.nc").write_bytes((recordings / "healthy_1.nc").read_bytes()[:5000])
+    return tmp_path
+
+
+def fail_on(name: str, module: str, function: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a function raise where it handles the file `name`."""
+    from importlib import import_module
+
+    inner = getattr(import_module(module), function)
+
+    def failing(*arguments, **options):
+        if str(options.get("file", "")).endswith(name):
+            raise ZeroDivisionError("deep\ninside")
+        return inner(*arguments, **options)
+
+    monkeypatch.setattr(f"{module}.{function}", failing)
+
+
+def test_diagnose_goes_on_after_a_defect(batch, call, monkeypatch):
+    fail_on("good.nc", "sealscope.diagnosis.diagnose", "diagnose", monkeypatch)
+    done = call("diagnose", "--format", "jsonl", *(batch / name for name in ("good.nc", "bad.nc", "other.nc")))
+    assert done.status == 1
+    assert [Path(json.loads(line)["file"]).name for line in done.out.splitlines()] == ["other.nc"]
+    first, second = done.err.splitlines()
+    assert first.startswith(f"sealscope: cannot handle {batch / 'good.nc'}, got ZeroDivisionError: deep")
+    assert "must be whole" in second
+
+
+@pytest.mark.parametrize("words", [("-v", "diagnose"), ("diagnose", "--verbose")])
+def test_the_original_error_is_logged_on_demand(words, batch, shell):
+    quiet = shell("sealscope", "diagnose", batch / "bad.nc")
+    assert "Traceback" not in quiet.err
+    loud = shell("sealscope", *words, batch / "bad.nc")
+    assert (loud.status, loud.out) == (1, "")
+    assert "Traceback" in loud.err
+    assert "h5py" in loud.err
+    assert loud.err.splitlines()[-1] == quiet.err.splitlines()[-1]
+
+
+def test_report_goes_on_after_a_page_that_cannot_be_written(batch, call):
+    (batch / "pages" / "good.html").mkdir(parents=True)
+    done = call("report", "-o", batch / "pages", batch / "good.nc", batch / "other.nc")
+    assert done.status == 1
+    assert (batch / "pages" / "other.html").stat().st_size > 10_000
+    assert done.err.splitlines() == [
+        f"sealscope: a file to write must not be a folder, got {batch / 'pages' / 'good.html'}"
+    ]
+
+
+def test_calibrate_names_every_bad_file(batch, call):
+    (batch / "worse.csv").write_text("nothing")
+    files = [batch / name for name in ("bad.nc", "good.nc", "worse.csv")]
+    done = call("calibrate", "-o", batch / "c.json", "--baseline", *files)
+    assert done.status == 1
+    assert len(done.err.splitlines()) == 2
+    assert not (batch / "c.json").exists()
+
+
+def test_a_campaign_over_recordings_goes_on(batch, call, monkeypatch, tmp_path):
+    from sealscope.campaigns.cases import recordings as module
+    from sealscope.campaigns.plans.reader import load_plan
+
+    (tmp_path / "plan.toml").write_text(
+        '[campaign]\nname = "some"\ndetectors = ["sign rule: d3 of p_A fell"]\n[recordings]\n'
+        '[[recordings.sets]]\nfiles = "*.nc"\n'
+    )
+
+    def failing(*arguments):
+        raise IndexError("deep")
+
+    monkeypatch.setattr(module, "stated", failing)
+    rows = module.recorded_rows(load_plan(tmp_path / "plan.toml"), batch)
+    assert len(rows) == 3
+    assert sum(row.error == "IndexError: deep" for row in rows) == 2
+
+
+ODD = os.fsdecode(b"odd\xff\x1b[31m.nc")
+
+
+def test_odd_names_of_files(batch, shell):
+    """Bytes that are no UTF-8, and a terminal's escape."""
+    shutil.copy(batch / "good.nc", batch / ODD)
+    done = shell("sealscope", "report", "-o", batch / "page.html", batch / ODD)
+    assert (done.status, done.err) == (0, "")
+    assert "\x1b" not in done.out
+    assert "odd" in (batch / "page.html").read_text(encoding="utf-8")
+    done = shell("sealscope", "diagnose", batch / ODD)
+    assert (done.status, done.err) == (0, "")
+    assert "\x1b" not in done.out
