@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -17,7 +18,7 @@ from sealscope.diagnosis.isolation import Signatures, isolated, signatures, unas
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.verdict.fusion import ORDER, fuse
+from sealscope.diagnosis.verdict.fusion import fuse
 from sealscope.errors import InputError
 from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
@@ -25,6 +26,7 @@ from sealscope.recordings.recording import Recording
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+_log = logging.getLogger(__name__)
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
 FALSE_ALARM_PROBABILITY = 0.01
 _PROBABILITIES = (1e-4, 0.2)
@@ -110,6 +112,11 @@ class Examination:
                 # the bit
                 with np.errstate(all="ignore"), threadpool_limits(limits=1):
                     self._evidence[key] = self._run(name, detector)
+        except (ArithmeticError, np.linalg.LinAlgError) as error:
+            # a machine's readings never come to this: the numbers of others need no traceback
+            _log.debug("%s cannot be computed", name, exc_info=True)
+            reason = f"{name} cannot be computed on this recording: {' '.join(str(error).split()).lower()}"
+            self._evidence[key] = Evidence("cannot tell", reason, detector=name, usable=False)
         except Exception as error:
             self._evidence[key] = Evidence(
                 "cannot tell", failure(name, getattr(factory, "distribution", None), error), detector=name, usable=False
@@ -162,7 +169,7 @@ class Examination:
         # the limit is the process's: set here, it does not change while detectors come and go
         with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
             evidences = list(pool.map(self.evidence, detectors()))
-        fused = fuse([own if own.detector == ORDER[0] else self._isolated(own) for own in evidences])
+        fused = fuse([self._isolated(own) for own in evidences])
         if fused.verdict == "leak" or fused.cause is not None or self.distrust is not None or self._signatures is None:
             return fused
         with np.errstate(all="ignore"):
@@ -180,8 +187,12 @@ class Examination:
 
     @cached_property
     def _signatures(self) -> Signatures | None:
-        with np.errstate(all="ignore"):
-            return signatures(self.recording)
+        try:
+            with np.errstate(all="ignore"):
+                return signatures(self.recording)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            _log.debug("what else stepped cannot be computed", exc_info=True)
+            return None
 
 
 @checked_call

@@ -22,6 +22,8 @@ from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording
 
+#: The detector whose evidence rests on volumes, not on how the pressures swing.
+BALANCED = "volume balance"
 #: A block is whole cycles of about so long [s]; where the pressures are looked at as they swing, means are taken over
 #: so long first, which takes the ringing out.
 BLOCK_SECONDS, SMOOTH_SECONDS = 3.0, 0.016
@@ -43,6 +45,15 @@ GAIN, FALL = 4.0, 0.15
 UNASKED = 1.5
 #: The ringing is looked for from here [Hz] up to a share of the rate; the top of the spectrum is noise.
 LOWEST, HIGHEST, NOISE = 16.0, 0.36, 0.38
+#: Mains frequencies and their overtones [Hz], and what lies beside such a line [Hz].
+MAINS, HUM_BESIDE = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0), (1.5, 6.0)
+#: Bands of noise whose ratio shows the sensor's filter: from these shares of the rate, so wide.
+TILT, TILT_WIDTH = (0.30, 0.42), 0.07
+#: Steps that matter, as logarithms: of that ratio, of a hum line over what lies beside it; no leak moves either so far.
+FILTERED, HUMS = 0.5, 1.2
+#: A sure step anywhere in the recording; blocks of one duty correlate by more than the one, of another phase by less
+#: than the other.
+SURE_ANYWHERE, SAME_PHASE, OTHER_PHASE = 6.0, 0.7, 0.35
 #: Fewest samples of a block.
 _SHORTEST = 64
 
@@ -62,7 +73,10 @@ class Signatures:
     `t` (n,) middles [s]; `half` [s] half a block; `mean` (n, 2) of p_A and p_B; `swing` (n,) log of the mean
     |p_A - p_B| about its mean, the ringing averaged out; `duty` (n, 2) log of the command's rms and of its derivative's
     over it, None without a command; `power` (n, b) of p_A - p_B in bands about `frequency` (b,) [Hz]; `noise` (n,)
-    power of its noise in one line of the spectrum, `lines` (b,) of each band; `motion`: where the strokes changed.
+    power of its noise in one line of the spectrum, `lines` (b,) of each band; `motion`: where the strokes changed;
+    `tilt` (n, 2) log power of the noise of p_A and p_B near half the rate over that at two thirds of it; `hum` (n, 2,
+    h) log power in lines of mains frequencies over what lies beside them, `mains` (h,) [Hz]; `alike` (n - 1, 2)
+    correlation of p_A - p_B in each block with that one and two blocks before, None where the duty does not repeat.
     """
 
     t: Array
@@ -75,6 +89,10 @@ class Signatures:
     noise: Array
     lines: Array
     motion: tuple[StrokeChange, ...]
+    tilt: Array
+    hum: Array
+    mains: Array
+    alike: Array | None
 
 
 def signatures(recording: Recording) -> Signatures | None:
@@ -109,8 +127,22 @@ def signatures(recording: Recording) -> Signatures | None:
         return None
     t, mean, swing, power, noise = (values[whole] for values in (t, mean, swing, power, noise))
     duty = None if duty is None else duty[whole]
+    tilt, hum, mains = _sensors((p_A, p_B), rate)
     return Signatures(
-        t, 0.5 * length / rate, mean, swing, duty, power, frequency, noise, lines, duty_changes(recording)
+        t,
+        0.5 * length / rate,
+        mean,
+        swing,
+        duty,
+        power,
+        frequency,
+        noise,
+        lines,
+        duty_changes(recording),
+        tilt[whole],
+        hum[whole],
+        mains,
+        None if find_cycle(recording) is None else _alike(_smooth(dp, rate)[whole]),
     )
 
 
@@ -138,6 +170,37 @@ def _bands(dp: Array, rate: float) -> tuple[Array, Array, Array, Array]:
     return power, edges[:-1] * 2.0**0.25, noise, lines
 
 
+def _sensors(chambers: tuple[Array, Array], rate: float) -> tuple[Array, Array, Array]:
+    """Return what shows a change of a sensor's filter or of its wiring: tilt, hum and mains of `Signatures`."""
+    length = chambers[0].shape[1]
+    f = np.fft.rfftfreq(length, 1.0 / rate)
+    mains = np.array([hertz for hertz in MAINS if hertz + HUM_BESIDE[1] < 0.5 * rate])
+    own = np.searchsorted(f, mains) if HUM_BESIDE[0] * length > 2.0 * rate else np.empty(0, dtype=np.intp)
+    mains = mains[: own.size]
+    tilts, hums = [], []
+    for values in chambers:
+        rest = values - values.mean(axis=1, keepdims=True)
+        spectrum = np.abs(np.fft.rfft(rest * np.hanning(length), axis=1)) ** 2
+        low, high = ((f > share * rate) & (f <= (share + TILT_WIDTH) * rate) for share in TILT)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tilts.append(np.log(np.median(spectrum[:, high], axis=1) / np.median(spectrum[:, low], axis=1)))
+            lines = []
+            for hertz, line in zip(mains, own, strict=True):
+                off = np.abs(f - hertz)
+                beside = spectrum[:, (off > HUM_BESIDE[0]) & (off <= HUM_BESIDE[1])]
+                lines.append(np.log(spectrum[:, line - 1 : line + 2].max(axis=1) / beside.mean(axis=1)))
+        hums.append(np.reshape(lines, (len(lines), len(values))).T)
+    return np.stack(tilts, axis=1), np.stack(hums, axis=1), mains
+
+
+def _alike(rows: Array) -> Array:
+    """Return the correlation (n - 1, 2) of each row but the first with that one, and two, before it."""
+    rest = rows - rows.mean(axis=1, keepdims=True)
+    rest = rest / np.maximum(np.sqrt(np.sum(rest**2, axis=1, keepdims=True)), np.finfo(float).tiny)
+    before = np.sum(rest[1:] * rest[:-1], axis=1)
+    return np.stack([before, np.append(1.0, np.sum(rest[2:] * rest[:-2], axis=1))], axis=1)
+
+
 def other_cause(seen: Signatures, onset_s: float, strict: float = 1.0) -> OtherCause | None:
     """Return what else stepped near `onset_s` [s], the most certain first; None where nothing did.
 
@@ -160,10 +223,19 @@ def unasked(seen: Signatures) -> tuple[float, OtherCause] | None:
 
 
 def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
-    """Return the evidence of a leak as `cannot tell` with another cause where one stepped at its onset."""
+    """Return the evidence of a leak as `cannot tell` with another cause where one stepped at its onset.
+
+    A sensor's filter that changed counts wherever it happened: both sides of any onset are not read alike. So does hum
+    for evidence that names no cause, which comes from the spectrum alone; a model of the machine leaves it out but at
+    the onset. A duty that goes on in another phase or sense counts against all.
+    """
     if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS) or evidence.onset_s is None:
         return evidence
-    other = other_cause(seen, evidence.onset_s)
+    other = _elsewhere(seen)
+    if other is None and evidence.detector != BALANCED:
+        other = other_cause(seen, evidence.onset_s) or _readings(
+            seen, evidence.onset_s if evidence.cause is not None else None
+        )
     if other is None:
         return evidence
     return replace(
@@ -192,6 +264,44 @@ def _duty(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
         size, surely = _step(seen, values, onset)
         if abs(size) > strict * DUTY and abs(surely) > strict * SURE:
             return OtherCause("changed duty", f"the command changed, its {what} by {math.expm1(size):+.1%}")
+    return None
+
+
+def _elsewhere(seen: Signatures) -> OtherCause | None:
+    """Return whether p_A - p_B goes on in another sense or phase somewhere in a duty that repeats."""
+    if seen.alike is None or not np.median(seen.alike[:, 0]) > SAME_PHASE:
+        return None
+    worst = int(np.argmin(seen.alike[:, 0]))
+    if not seen.alike[worst, 0] < OTHER_PHASE:
+        return None
+    at = float(seen.t[worst + 1])
+    if min(seen.alike[worst : worst + 2, 1]) < -OTHER_PHASE:
+        return OtherCause("sensor fault", f"near {at:.0f} s p_A - p_B changes its sign, as if p_A and p_B were swapped")
+    return OtherCause("changed duty", f"near {at:.0f} s p_A - p_B goes on in another phase, as of another recording")
+
+
+def _readings(seen: Signatures, onset: float | None) -> OtherCause | None:
+    """Return whether a sensor's filter stepped anywhere, or hum near `onset` [s], None: anywhere, too."""
+
+    def surest(values: Array, onset: float | None) -> tuple[float, float]:
+        if onset is not None:
+            return _step(seen, values, onset)
+        middle, reach = 0.5 * float(seen.t[0] + seen.t[-1]), float(seen.t[-1] - seen.t[0])
+        return step_near(seen.t, values, seen.half, middle, near=reach, reach=2.0 * reach, fewest=FEWEST)
+
+    sure = SURE if onset is not None else SURE_ANYWHERE
+    for chamber, name in enumerate(CHAMBERS):
+        size, surely = surest(seen.tilt[:, chamber], None)
+        if abs(size) > FILTERED and abs(surely) > SURE_ANYWHERE:
+            what = "smoother" if size < 0 else "sharper"
+            return OtherCause(
+                "sensor fault", f"the noise of {name} became {what}, so its filter or its sampling changed"
+            )
+        for number, hertz in enumerate(seen.mains):
+            size, surely = surest(seen.hum[:, chamber, number], onset)
+            if abs(size) > HUMS and abs(surely) > sure:
+                verb = "began" if size > 0 else "ended"
+                return OtherCause("sensor fault", f"hum of {hertz:g} Hz {verb} in {name}")
     return None
 
 

@@ -213,6 +213,8 @@ def first_guess(short: Window, prior: Prior) -> Array:
     data = slow.slow(slow.dp)
     misfit = np.sum((slow.runs(starts) - data) ** 2, axis=1)
     slowly = (GAIN, LEAD, BIAS, F_C, F_V, K_BRK)
+    if np.all(np.isnan(misfit)):
+        raise FloatingPointError("the model of the rig diverges")
     fitted, _ = _fit(slow, starts[[int(np.nanargmin(misfit))]], prior, slowly, 12, 1e-2)
     return np.asarray(fitted[0])
 

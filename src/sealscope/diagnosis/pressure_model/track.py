@@ -40,6 +40,7 @@ from sealscope.diagnosis.pressure_model.model import (
 )
 from sealscope.recordings.recording import Array
 
+DIVERGED = "the model of the rig diverges"
 #: How far each parameter may wander in 90 s (standard deviation): shares of its value, lead in s, G in m^3/(s Pa).
 WANDER = {GAIN: 2e-3, K: 0.03, F_C: 0.06, F_V: 0.06, K_BRK: 0.02, C_C: 0.02}
 WANDER_REST = {LEAD: 1e-4, G: 3e-14, F_CFR: 2e-8, STROKE: 0.02, OFFSET: 0.05}
@@ -219,6 +220,8 @@ def track(
         N, r, squares, counts = _normal(dp, shown, limits, at / h)
         variance = float(squares[seen].sum() / counts[seen].sum())
         N, r = N * seen[:, None, None], r * seen[:, None]
+        if not (np.all(np.isfinite(N)) and np.all(np.isfinite(r)) and np.isfinite(variance)):
+            raise FloatingPointError(DIVERGED)
         allowed = leashes[min(number, len(leashes) - 1)] * walk
         misfit = float(misfits(shown[0]).sum())
         followed = Track(
@@ -251,6 +254,8 @@ def track(
         runs = model.run(tries + sizes[:, None, None] * risen, segment, np.tile(start, (_SHARES.size, 1)))
         apart = np.array([misfits(each).sum() for each in runs])
         costs = apart / variance + np.array([strain(each, allowed) for each in tries])
+        if np.all(np.isnan(costs)):
+            raise FloatingPointError(DIVERGED)
         best = int(np.nanargmin(costs))
         gained = misfit / variance + followed.strain - costs[best]
         if gained > 0.0:
@@ -299,6 +304,8 @@ def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tupl
         rest = dp[here] - shown[0, here]
         H, g = X @ X.T, X @ rest
         lost = H[:-1, -1] / H[-1, -1]
+        if not np.all(np.isfinite(H)) or not np.all(np.isfinite(g)):
+            raise FloatingPointError(DIVERGED)
         H, g, gone = H[:-1, :-1] - np.outer(lost, H[:-1, -1]), g[:-1] - lost * g[-1], g[-1] ** 2 / H[-1, -1]
         own = g[_WANDERING]
         explained = own @ np.linalg.lstsq(H[_WANDERING[:, None], _WANDERING], own, rcond=1e-12)[0]
