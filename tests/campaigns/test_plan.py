@@ -23,6 +23,8 @@ DRAWN = {
     "bench-faults": "fe66e262367aaedd",
     "bench-pressures": "a725a60b2a529fb9",
     "bench-quick": "5e2c6ad77f0da6f0",
+    "bench-strangers": "f4613fe47fdbe6c2",
+    "bench-strangers-development": "778e5fc7b49f54f0",
     "bench-thesis": "e034193cb0b6574f",
     "bench-volume": "afca12e9d27e4824",
 }

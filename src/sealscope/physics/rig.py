@@ -164,11 +164,13 @@ def initial_state(rig: Rig, x_0: float) -> np.ndarray:
 def within_limits(y: State, p: RigNumbers) -> State:
     """Return the state after a step: the drive's current is held within its limits.
 
-    Without lines p_1 = p_A and p_2 = p_B.
+    Without lines p_1 = p_A and p_2 = p_B; what no law of the rig moves is 0, so that the compiler leaves it out.
     """
+    fed = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
+    z = y[BRISTLE] if len(p.bristled) > 0 else 0.0
     current = min(max(y[CURRENT], -p.i_max), p.i_max)
     p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
-    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, y[10], y[11]
+    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, fed, z
 
 
 @contracted
