@@ -45,7 +45,8 @@ class BalanceBlocks:
     `slope` (n, c): slopes of the columns [1/s] beside the stored oil; `stored` (n, c): their coefficients of dp;
     `abs_dp`, `root_dp` (n,): means of abs(dp), sqrt(abs(dp)), of dp smoothed; `lift` (n,): the share by which noise
     lifts that root where dp is not smoothed; `motion` (n,): mean of dp times the piston's velocity; `walk` (n,):
-    variance of the conductance, over its square, that the noise of dp makes in the integral; `noise`, `noise_12` (n,):
+    variance of the conductance, over its square, that the noise of dp makes in the integral; `filled` (n,): by how much
+    the sum of both pressures rises from the first tenth of a block to its last; `noise`, `noise_12` (n,):
     variance of the noise of dp, of dp_12; `samples`: samples of a block; `seconds`: its length.
     """
 
@@ -58,6 +59,7 @@ class BalanceBlocks:
     lift: Array
     motion: Array
     walk: Array
+    filled: Array
     noise: Array
     noise_12: Array
     samples: int
@@ -284,7 +286,7 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
     abs_dp, root_dp = np.abs(smooth).mean(axis=1), root
     if motion is not None:
         abs_dp, root_dp = _over_rests(everything, *motion, length, rate)[:, :count][:, usable]
-    x = columns[:, Y]
+    x, both, tenth = columns[:, Y], cut["p_A"] + cut["p_B"], max(1, length // 10)
     return BalanceBlocks(
         t=times[usable].mean(axis=1),
         gram=rest @ rest.transpose(0, 2, 1),
@@ -295,6 +297,7 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
         lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root, np.finfo(float).tiny) - 1.0,
         motion=np.sum(0.5 * (dp[:, 1:] + dp[:, :-1]) * np.diff(x, axis=1), axis=1) / (length * step),
         walk=noise * _walk(rest[:, I_AB], step),
+        filled=both[:, -tenth:].mean(axis=1) - both[:, :tenth].mean(axis=1),
         noise=noise,
         noise_12=_noise(columns[:, DP_12]) if "p_1" in cut else np.zeros_like(noise),
         samples=length,

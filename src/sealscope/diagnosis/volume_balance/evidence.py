@@ -179,8 +179,8 @@ def _left_out_text(fit: BalanceFit) -> str:
     if not len(fit.left_out):
         return ""
     return (
-        f"; {len(fit.left_out)} of {len(fit.left_out) + len(fit.blocks)} blocks do not balance and were left out, the "
-        f"first at {fit.left_out.t[0]:.4g} s"
+        f"; {len(fit.left_out)} of {len(fit.left_out) + len(fit.blocks)} blocks do not balance, stand or are filled "
+        f"and were left out, the first at {fit.left_out.t[0]:.4g} s"
     )
 
 

@@ -41,6 +41,9 @@ _UNBALANCED = 0.05
 _STILL = 10.0
 #: The sides' areas differ where counting them apart leaves under this share of the usual sum of squares.
 _UNEQUAL = 0.5
+#: A block in which the circuit is filled: both pressures together rise by this share of the usual size of dp, and by
+#: so many times their usual rise, in no more than a share of the blocks: else it is the duty.
+_FILLED, _UNUSUAL, _SELDOM = 0.2, 5.0, 0.1
 #: Share of the blocks whose residuals are below the usual one: well under half, as most blocks may leak.
 _USUAL = 0.25
 #: A block's leak follows the root of dp where that leaves under this share of what a laminar leak leaves.
@@ -237,6 +240,16 @@ def _moving(blocks: BalanceBlocks) -> NDArray[np.bool_]:
     return np.asarray(blocks.gram[:, I_AB, I_AB] > _STILL * _noise_of_integral(blocks, blocks.noise))
 
 
+def _filling(blocks: BalanceBlocks) -> NDArray[np.bool_]:
+    """Return the blocks (n,) in which a make-up valve fills the circuit, by one side: that volume is in no balance.
+
+    It is so at the start, until the lower pressure stays above the valve's; one such block outweighed a small step.
+    """
+    rise = np.abs(blocks.filled)
+    filling = rise > max(_FILLED * float(np.median(blocks.abs_dp)), _UNUSUAL * float(np.median(rise)))
+    return np.asarray(filling & (np.mean(filling) <= _SELDOM))
+
+
 def _by_lesser_side(blocks: BalanceBlocks) -> BalanceBlocks:
     """Return the blocks with the volume displaced under pressure from the side that has it less, in place of `Y_SIDE`.
 
@@ -249,13 +262,13 @@ def _by_lesser_side(blocks: BalanceBlocks) -> BalanceBlocks:
 
 
 def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, unequal: bool = False) -> BalanceFit:
-    """Fit the balance; blocks in which the machine stands, or which do not balance under any leak, are left out.
+    """Fit the balance; blocks in which the machine stands or is filled, or that do not balance at all, are left out.
 
     `unequal`: the areas of the piston's sides are known to differ. Needs one block or more; `residual` and `signal`
     show a fit that means nothing (no motion, encoders that do not belong together).
     """
     blocks = _by_lesser_side(blocks)
-    keep = _moving(blocks)
+    keep = _moving(blocks) & ~_filling(blocks)
     if not keep.any():
         keep = np.ones(len(blocks), dtype=bool)
     freedom = max(1, blocks.samples - 4)

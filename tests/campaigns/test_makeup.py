@@ -1,0 +1,28 @@
+"""The volume balance where make-up valves fill the circuit."""
+
+from __future__ import annotations
+
+import itertools
+
+from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.machines import experiment_of
+from sealscope.campaigns.plans.reader import load_plan
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.parameters import load_rig
+from sealscope.simulation.simulate import simulate_with_truth
+
+
+def test_a_circuit_that_fills_at_the_start_hides_no_small_leak() -> None:
+    """The first block, into which a valve lets oil by one side, stood out beyond a step of 0.0002 L/min."""
+    plan = load_plan("bench-detectors")
+    leaking = (case for case in cases_of(plan) if case.leak_lpm == 0.0002)
+    (case,) = itertools.islice(leaking, 1, 2)
+    recording = simulate_with_truth(experiment_of(plan, case)).recording
+    detector = VolumeBalance(load_rig("thesis"))
+    fit, _ = detector.fit(recording)
+    assert fit is not None
+    assert len(fit.left_out) == 1
+    evidence = detector.examine(recording, [], 0.01)
+    assert evidence.verdict == "leak"
+    assert evidence.onset_interval_s is not None
+    assert evidence.onset_interval_s[0] - 1.0 <= 90.0 <= evidence.onset_interval_s[1] + 1.0
