@@ -13,6 +13,7 @@ from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, DriftStep
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Figure, LeakCourse, Passage, Verdict
 from sealscope.diagnosis.volume_balance.blocks import FLOW, Y
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, Law, discriminate, findable, search
+from sealscope.diagnosis.volume_balance.growth import grown
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -42,6 +43,8 @@ _DECISIVE = 10.0
 _SLIPPED = 20.0
 #: Flow that leaves for good, over what the rise of the conductance alone leaks, from which oil is lost to the outside.
 _LOST = 0.6
+#: A step is the whole of what grew where it is over this share of it.
+_WHOLE = 0.6
 #: The smallest leak worth finding, as a share of the pump's flow. Assumed: makers state volumetric efficiencies of
 #: 95 to 98 %; what is below the least loss of these is no reason to act.
 _WORTH = 0.02
@@ -86,7 +89,9 @@ def judge(
     onset from the samples about the step (`onset`); `healthy`: the most that pump and piston of a healthy machine pass
     together [m^3/(s Pa)], None where not known.
     """
-    step = search(fit, probability)
+    step, growth = search(fit, probability), grown(fit, probability)
+    if growth is not None and not (step.alarm and step.size > _WHOLE * growth.size):
+        return replace(describe_leak(fit, growth), passage=passage(fit, None, healthy))
     if step.alarm:
         evidence = describe_leak(fit, step if dated is None else dated(fit, step))
         return replace(evidence, passage=passage(fit, None, healthy))
