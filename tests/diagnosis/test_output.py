@@ -91,6 +91,8 @@ def test_contract_of_a_leak(leaky: Recording) -> None:
         "threshold": told["threshold"],
         "verdict": "leak",
         "reason": told["reason"],
+        "chance": told["chance"],
+        "odds": told["odds"],
     }
     assert [one["name"] for one in told["methods"][1:]] == [
         f"RMS of {quantity} of {chamber}" for chamber in ("p_A", "p_B") for quantity in ("d1", "d2", "d3", "d4", "d3d4")
