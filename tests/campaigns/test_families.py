@@ -14,9 +14,15 @@ from sealscope.campaigns.judging.tables import tables_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
+from sealscope.reporting.campaign.tables import family_lines
 from sealscope.simulation.experiment import Experiment
 
 NAME = "diagnose"
+POINT = {
+    "direction": 0, "level": 11.0, "rate": 500.0, "units": ["Pa", "Pa"], "chambers": ["p_A", "p_B"],
+    "command_rms": 2.12, "cycle": 1.57,
+}  # fmt: skip
+PLACE = {"point": POINT, "duration_s": 180.0}
 
 
 def row(number, family, verdict, leak=0.0, law="laminar", bound=None, interval=None, error=None):
@@ -24,7 +30,7 @@ def row(number, family, verdict, leak=0.0, law="laminar", bound=None, interval=N
     return CaseRow(
         id=f"{number:016x}", use="judge", leak_lpm=leak, fault="", levels={"family": family}, replicate=number,
         flow_lpm=leak, statements={} if error else {NAME: evidence}, scores={} if error else {NAME: (1.0, None)},
-        law=law, bound_lpm=bound, error=error,
+        law=law, bound_lpm=bound, error=error, place={} if error else PLACE,
     )  # fmt: skip
 
 
@@ -73,6 +79,14 @@ def test_the_table_says_which_half_it_is():
     assert {line[0] for line in families.rows} == {"held back"}
     assert {line[1] for line in families.rows} == {ALL, "hoses", "mass"}
     assert all(len(line) == len(families.columns) for line in families.rows)
+
+
+def test_the_page_shows_each_family():
+    lines = family_lines(judge(ROWS, [NAME], None))
+    assert lines[0][:3] == (NAME, ALL, "no leak")
+    both = next(line for line in lines if line[1:3] == ("hoses", "0.004 any"))
+    assert both[3].startswith("50 %")
+    assert both[6].startswith("100 %")
 
 
 def test_rows_survive_being_stored():

@@ -148,7 +148,7 @@ class CaseRow:
             as_type(Place, tree["place"])
         scores = {str(name): (_number(score), _number(onset)) for name, (score, onset, *_) in tree["scores"].items()}
         statements = {str(key): stated_evidence(plain) for key, plain in tree.get("statements", {}).items()}
-        numbers = {name: _number(tree.get(name)) for name in ("flow_lpm", "seconds")}
+        numbers = {name: _number(tree.get(name)) for name in ("flow_lpm", "bound_lpm", "seconds")}
         return cls(**{**tree, **numbers, "scores": scores, "statements": statements})
 
 

@@ -22,7 +22,7 @@ from sealscope.evaluation.roc import Area
 from sealscope.evaluation.table import SummaryRow
 from sealscope.reporting import template
 from sealscope.reporting.campaign.curves import CurvePlot, PlotCurve, draw
-from sealscope.reporting.campaign.tables import cause_tables, flow_lines, onset_lines, percent
+from sealscope.reporting.campaign.tables import cause_tables, family_lines, flow_lines, onset_lines, percent
 
 PAGE = "report.html"
 #: More sizes than this are shown together: a column for each could not be read.
@@ -238,6 +238,8 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
             (fault.detector, fault.fault, percent(fault.alarms), percent(fault.cannot_tell))
             for fault in judgement.faults
         ],
+        families=family_lines(judgement),
+        part=result.plan.part if isinstance(result.plan, SimulatedPlan) else "",
         flows=flow_lines(judgement),
         onsets=onset_lines(judgement),
         causes=cause_tables(judgement),

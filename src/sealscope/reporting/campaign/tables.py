@@ -47,6 +47,22 @@ def onset_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str]]:
     ]
 
 
+def family_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str, str, str]]:
+    """Return detector, family, leak, alarms, cannot tell, coverage of the flow, alarms where the bound allows."""
+    return [
+        (
+            row.detector,
+            row.family,
+            f"{row.leak_lpm:g} {row.law}" if row.leak_lpm else "no leak",
+            percent(row.alarms),
+            percent(row.cannot_tell),
+            percent(row.coverage),
+            percent(row.allowed),
+        )
+        for row in judgement.families
+    ]
+
+
 def flow_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str, str]]:
     """Return detector, size, records with an estimate, its bias, its median error, coverage of the interval."""
     return [
