@@ -50,6 +50,8 @@ _USUAL = 0.25
 _OTHER_LAW = 0.9
 #: Rounds of the fit of the geometry: the first add up norms, which has one minimum; the last weigh by variances.
 _ROUNDS = (12, 8)
+#: Relative changes of the coefficients at which the first rounds, and the last, are ended.
+_CLOSE, _EXACT = 1e-5, 1e-9
 #: Where a leak opens near an end of a block, the block's conductance may lie outside those of its neighbours by this
 #: share of their difference.
 _BENT = 0.25
@@ -202,19 +204,19 @@ def _reweighted(laws: tuple[Array, Array], first: Array, shared: list[int]) -> t
     """Return coefficients, covariance, and the sum of the logarithms of what is left, from the law `first`."""
     beta, inverse = _solve(first, shared, np.ones(len(first)))
     rest, logs = first, float("inf")
-    for number in range(sum(_ROUNDS)):
-        left = _left(rest, shared, beta)
-        convex = number < _ROUNDS[0]
-        if not convex:
-            left, other = (_left(law, shared, beta) for law in laws)
-            rest = np.where((other < _OTHER_LAW * left)[:, None, None], laws[1], laws[0])
-            left = np.minimum(left, other)
-        least = max(float(np.quantile(left, _USUAL)), np.finfo(float).tiny)
-        weight = least / np.maximum(left, least)
-        before, logs = beta, float(np.log(np.maximum(left, np.finfo(float).tiny)).sum())
-        beta, inverse = _solve(rest, shared, np.sqrt(weight) if convex else weight)
-        if np.allclose(beta, before, rtol=1e-9, atol=0.0) and not convex:
-            break
+    for convex, rounds in ((True, _ROUNDS[0]), (False, _ROUNDS[1])):
+        for _ in range(rounds):
+            left = _left(rest if convex else laws[0], shared, beta)
+            if not convex:
+                other = _left(laws[1], shared, beta)
+                rest = np.where((other < _OTHER_LAW * left)[:, None, None], laws[1], laws[0])
+                left = np.minimum(left, other)
+            least = max(float(np.quantile(left, _USUAL)), np.finfo(float).tiny)
+            weight = least / np.maximum(left, least)
+            before, logs = beta, float(np.log(np.maximum(left, np.finfo(float).tiny)).sum())
+            beta, inverse = _solve(rest, shared, np.sqrt(weight) if convex else weight)
+            if np.all(np.abs(beta - before) <= (_CLOSE if convex else _EXACT) * np.abs(before)):
+                break
     return beta, inverse, logs
 
 

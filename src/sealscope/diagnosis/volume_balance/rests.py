@@ -29,8 +29,9 @@ def in_motion(samples: Mapping[str, Array], rate: float) -> tuple[NDArray[np.boo
     known = np.isfinite(x + dp + turns)
     if np.count_nonzero(known) < 2:
         return None
-    at = np.arange(x.size)
-    x, dp, turns = (np.interp(at, at[known], values[known]) for values in (x, dp, turns))
+    if not known.all():
+        at = np.arange(x.size)
+        x, dp, turns = (np.interp(at, at[known], values[known]) for values in (x, dp, turns))
     width = max(1, round(_STILL_SECONDS * rate))
     piston_rests, pump_rests = _rests(np.gradient(x), width), _rests(turns, width)
     near = _AT_END * np.ptp(x)
@@ -44,5 +45,11 @@ def in_motion(samples: Mapping[str, Array], rate: float) -> tuple[NDArray[np.boo
 
 def _rests(speed: Array, width: int) -> NDArray[np.bool_]:
     """Return where the mean of abs(speed) over `width` samples is next to nothing."""
-    mean = np.convolve(np.abs(np.convolve(speed, np.ones(width) / width, "same")), np.ones(width) / width, "same")
+    mean = _mean(np.abs(_mean(speed, width)), width)
     return np.asarray(mean < _STILL * float(np.quantile(mean, 0.9)))
+
+
+def _mean(values: Array, width: int) -> Array:
+    """Return the mean over `width` samples about each, with zeros beyond the ends."""
+    sums = np.cumsum(np.pad(values, (width - width // 2, width // 2)))
+    return np.asarray((sums[width:] - sums[:-width]) / width)
