@@ -6,6 +6,8 @@ is the integral of eqs. (4.16)-(4.19) of the thesis with a leak Q_L = g (p_A - p
 taken, so that what both sides lose alike cancels. `s`, the ratio of displacement and area over the assumed one, the lag
 tau of the position's reading behind the angle's, and the line volumes are shared by all blocks, because within one
 block a wrong s passes for a leak: the integral of a rectangular pressure difference is nearly the motion itself.
+Where the areas of the piston's sides differ, A x is counted by the side that the pump feeds, which is told by the
+pump's direction or by the higher pressure. docs/decisions/0023-volume-balance.md gives reasons and figures.
 """
 
 from __future__ import annotations
