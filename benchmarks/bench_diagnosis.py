@@ -1,25 +1,29 @@
 """Time `diagnose` on 180 s of all channels at 500 Hz, and the import of what it needs in a fresh interpreter.
 
-    python benchmarks/bench_diagnosis.py [--rounds 15] [--imports 7] [--json FILE]
+    python benchmarks/bench_diagnosis.py [--rounds 15] [--imports 7] [--files 12] [--json FILE]
 
 Prints the median and the middle half (25 % to 75 %) of each [s]. `first call` is the first diagnosis of a fresh
 interpreter, imports apart. Recordings of a baseline are `known`: their own fits were made by an earlier call.
+At last, `sealscope diagnose` on several files on one core and on all.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.recordings import write
 from sealscope.simulation.simulate import simulate
 
 #: The thesis's duties.
@@ -62,10 +66,26 @@ def quartiles(values: list[float]) -> list[float]:
     return [float(q) for q in np.percentile(values, [50, 25, 75])]
 
 
+def of_many(count: int, duration: float, cores: int) -> float:
+    """Wall time [s] of `sealscope diagnose` on `count` files, on the first `cores` cores of this process."""
+    with TemporaryDirectory() as folder:
+        files = [str(Path(folder) / f"{seed}.nc") for seed in range(count)]
+        for seed, file in enumerate(files):
+            write(simulate(command=COMMANDS[seed % len(COMMANDS)], duration=duration, seed=seed), file)
+        allowed = sorted(os.sched_getaffinity(0))[:cores]
+        call = [sys.executable, "-m", "sealscope", "diagnose", "--format", "jsonl", *files]
+        return seconds(
+            lambda: subprocess.run(
+                call, check=True, capture_output=True, preexec_fn=lambda: os.sched_setaffinity(0, allowed)
+            )
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--imports", type=int, default=7)
+    parser.add_argument("--files", type=int, default=12, help="files that `sealscope diagnose` is given at once")
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     if min(chosen.rounds, chosen.imports) < 1:
@@ -92,9 +112,11 @@ def main() -> None:
     both = [fresh(_IMPORT, _FIRST_CALL) for _ in range(chosen.imports)]
     figures["import of diagnose"] = quartiles([one[0] for one in both])
     figures["first call in a fresh interpreter"] = quartiles([one[1] for one in both])
+    alone, beside = (of_many(chosen.files, 180.0, cores) for cores in (1, len(os.sched_getaffinity(0))))
     print("180 s at 500 Hz, all channels; median (25 % .. 75 %) [s]")
     for name, (middle, low, high) in figures.items():
         print(f"{name:<40}{middle:8.3f} ({low:.3f} .. {high:.3f})")
+    print(f"{chosen.files} files: {alone:.1f} s on one core, {beside:.1f} s on all: {alone / beside:.2f} times as fast")
     if chosen.json:
         unfinished = chosen.json.with_name(chosen.json.name + ".partial")
         unfinished.write_text(json.dumps(figures, indent=2) + "\n")

@@ -157,10 +157,10 @@ def _stroke(seed: int, direction: int, leaks: bool) -> str:
 
 @pytest.fixture(scope="session")
 def strokes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of foreign logs of strokes in alternating directions: `healthy_00.txt` to `healthy_15.txt`,
+    """A folder of foreign logs of strokes in alternating directions: `healthy_00.txt` to `healthy_19.txt`,
     `leak_00.txt` to `leak_03.txt`; even numbers go one way, odd ones the other."""
     folder = tmp_path_factory.mktemp("strokes")
-    for kind, count, first in (("healthy", 16, 100), ("leak", 4, 200)):
+    for kind, count, first in (("healthy", 20, 100), ("leak", 4, 200)):
         for k in range(count):
             text = _stroke(first + k, 1 if k % 2 == 0 else -1, kind == "leak")
             (folder / f"{kind}_{k:02d}.txt").write_text(text)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import redirect_stderr
 from enum import StrEnum
 from functools import partial
+from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -33,6 +35,10 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
     from sealscope.recordings.formats.columns import ChannelMap
+
+
+#: Fewer files are diagnosed one after the other: processes take a second or two to start.
+_FEWEST_SIDE_BY_SIDE = 4
 
 
 class TextFormat(StrEnum):
@@ -145,18 +151,59 @@ def diagnose(
     rig: AssumeOption = None,
 ) -> None:
     """Say for each file whether oil bypasses the piston. Exit status 1 where a file could not be read."""
-    from sealscope.reporting import diagnosis_text
+    from sealscope.campaigns.execution.workers import cores, in_order
 
     complete = True
-    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, calibration, assumed_rig(rig)):
-        if result is None:
-            complete = False
-        elif output is TextFormat.jsonl:
-            typer.echo(json.dumps(result[1].as_dict(), allow_nan=False))
-        else:
-            say(diagnosis_text(result[1]))
+    task = partial(
+        _verdicts,
+        join_them=join,
+        baseline=baseline or [],
+        maps=maps,
+        rate=rate,
+        false_alarm=false_alarm,
+        calibration=calibration,
+        rig=assumed_rig(rig),
+        output=output,
+    )
+    jobs = min(cores(), len(files))
+    if join or baseline or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:  # what a baseline costs is spent once
+        said: Iterator[tuple[str, Sequence[str | None]]] = (("", [verdict]) for verdict in task(files))
+    else:
+        said = (
+            result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
+            for part, result in in_order(jobs, partial(_aside, task), [[file] for file in files])
+        )
+    for complaints, verdicts in said:
+        typer.echo(complaints, err=True, nl=False)
+        for verdict in verdicts:
+            if verdict is None:
+                complete = False
+            else:
+                typer.echo(verdict)
     if not complete:
         raise typer.Exit(1)
+
+
+def _verdicts(files: Sequence[Path], output: TextFormat, **options: Any) -> Iterator[str | None]:
+    """Yield what is printed of each file's verdict, None for a file that cannot be read; `options` of `_diagnoses`."""
+    from sealscope.reporting import diagnosis_text
+
+    for result in _diagnoses(files, **options):
+        if result is None:
+            yield None
+        elif output is TextFormat.jsonl:
+            yield json.dumps(result[1].as_dict(), allow_nan=False)
+        else:
+            yield diagnosis_text(result[1])
+
+
+def _aside(
+    task: Callable[[Sequence[Path]], Iterator[str | None]], files: Sequence[Path]
+) -> tuple[str, list[str | None]]:
+    """Return what a task says on standard error, and what it yields."""
+    with redirect_stderr(StringIO()) as complaints:
+        verdicts = list(task(files))
+    return complaints.getvalue(), verdicts
 
 
 def report(

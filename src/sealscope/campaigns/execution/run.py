@@ -15,7 +15,7 @@ from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
 from sealscope.campaigns.execution.cluster import on_cluster
-from sealscope.campaigns.execution.workers import Workers
+from sealscope.campaigns.execution.workers import Workers, cores
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
 from sealscope.storage.folders import inner_folder
@@ -70,7 +70,7 @@ def run(
         keep = None
         if plan.keep_recordings:
             keep = inner_folder(place, RECORDINGS)
-        jobs = jobs or _cores()
+        jobs = jobs or cores()
         if batch:
             new_rows = batches.in_batches(plan, waiting, jobs, device)
         else:
@@ -122,10 +122,3 @@ def _in_processes(
             while waiting and workers.free:
                 workers.begin(waiting.popleft())
             yield from rows
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return max(1, len(os.sched_getaffinity(0)))
-    return os.cpu_count() or 1

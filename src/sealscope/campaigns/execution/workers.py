@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -112,3 +114,33 @@ def one_thread_each() -> Iterator[None]:
         for name, value in before.items():
             if value is None:
                 os.environ.pop(name, None)
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)))
+    return os.cpu_count() or 1
+
+
+def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | None]]:
+    """Yield each item and its result in the order given, as soon as it and all before it are there.
+
+    The result is None where the process died that carried the item out. Raises what `task` raised.
+    """
+    waiting = deque(enumerate(items))
+    results: dict[int, Result | None] = {}
+    place = 0
+    with Workers(jobs, partial(_numbered, task)) as workers:
+        while place < len(items):
+            while waiting and workers.free:
+                workers.begin(waiting.popleft())
+            for (number, _), result in workers.ended():
+                results[number] = result
+            while place in results:
+                yield items[place], results.pop(place)
+                place += 1
+
+
+def _numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
+    return task(numbered[1])
