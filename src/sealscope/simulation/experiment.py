@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Most samples a recording may have (about 1.4 GB of channels), so that a slip of the unit cannot fill the memory.
 MOST_SAMPLES = 20_000_000
+#: Most steps of the solver that may be asked for: an hour at 3.6 us.
+MOST_STEPS = 1_000_000_000
 #: Default for the rms error [Pa] that a pressure may have (a transducer's noise is 8600 Pa).
 PRESSURE_TOLERANCE = 100.0
 Method = Literal["auto", "rk4", "imex"]
@@ -84,6 +86,11 @@ class Experiment:
         half = self.rig.cylinder.L / 2
         if not abs(self.x_0) <= half:
             raise InputError(f"x_0 must be within the stroke, -{half:g} m to {half:g} m, got {self.x_0}")
+        if self.step is not None and self.step > 0 and self.duration / self.step > MOST_STEPS:
+            raise InputError(
+                f"a run must have at most {MOST_STEPS} steps of the solver, got {self.duration / self.step:.4g} "
+                f"(step = {self.step:g} s)"
+            )
         if self.step is not None and self.error is not None:
             raise InputError(
                 f"a run must have a stated step or a stated error, not both, got step = {self.step:g} s and "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -39,6 +40,8 @@ _PACKAGED = Path(__file__).parent / "packaged"
 #: Most records of a campaign: a mistyped count shall not plan a year of work.
 MOST_RECORDS = 1_000_000
 _LONGEST_NAME = 80
+#: Most combinations of the factors' levels.
+MOST_CELLS = 100_000
 #: Most groups of features to choose from: more have too many unions to try them all.
 MOST_GROUPS = 8
 
@@ -181,6 +184,9 @@ def _factors(given: Any, rig: Rig, profile: str, place: str) -> dict[str, tuple[
                 raise table.fail(f"{name} must be texts or numbers, got {level!r}")
             _in(f"factors.{name}", place, partial(_check_level, name, level, rig, profile))
         factors[name] = tuple(levels)
+        cells = math.prod(map(len, factors.values()))
+        if cells > MOST_CELLS:
+            raise table.fail(f"their levels must make at most {MOST_CELLS} cells, got {cells} or more")
     return factors
 
 

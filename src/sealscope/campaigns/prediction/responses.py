@@ -46,6 +46,8 @@ from sealscope.units import LITRE_PER_MINUTE
 
 ProgressCallback = Callable[[str, float], None]
 _T = TypeVar("_T")
+#: Most machines drawn: days of work.
+MOST_DRAWS = 100_000
 
 #: Blocks of a half over which the noise is taken as independent.
 BLOCKS = 16
@@ -244,8 +246,8 @@ def bench_responses(
     Raises InputError for too few draws or an unknown profile, SimulationFailed where more than a quarter of the
     machines cannot be simulated with this command.
     """
-    if draws < FEWEST:
-        raise InputError(f"draws must be >= {FEWEST} machines, got {draws}")
+    if not FEWEST <= draws <= MOST_DRAWS:
+        raise InputError(f"draws must be {FEWEST} to {MOST_DRAWS} machines, got {draws}")
     plan, levels = _bench_plan(experiment, profile, false_alarm), fixed_levels(experiment)
     problems: list[str] = []
 

@@ -18,10 +18,13 @@ from sealscope.recordings.formats.table import (
     Choose,
     RawTable,
     check_size,
+    check_texts,
     from_text,
     parse_description,
 )
 
+#: Most values that stand for a missing sample: the CF conventions know one, a few tools write two.
+_MOST_FILLS = 16
 _OWN = "sealscope_format"
 _ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
@@ -90,6 +93,7 @@ def _label(name: str, data: Any) -> Label:
 def _values(data: Any, name: str, time: bool, place: str) -> NDArray[Any]:
     """Read a data set as doubles (or, for time, stamps), with scale, offset and fill value of the CF conventions."""
     if data.dtype.kind in "OSU":
+        check_texts(data.size, data.dtype.itemsize, name, place)
         return from_text([_text(cell) or "" for cell in data[...]], time, name, place)
     if data.dtype.kind not in "fiub":
         raise UnreadableFile(f"{name} must hold numbers, got the type {data.dtype} ({place})")
@@ -98,11 +102,16 @@ def _values(data: Any, name: str, time: bool, place: str) -> NDArray[Any]:
     missing = np.zeros(raw.shape, dtype=bool)
     for key in ("_FillValue", "missing_value"):
         if key in data.attrs:
-            missing |= np.isin(raw, np.asarray(data.attrs[key]).reshape(-1).astype(raw.dtype))
+            fills = np.asarray(data.attrs[key]).reshape(-1).astype(raw.dtype)
+            for fill in np.unique(fills[:_MOST_FILLS]):
+                missing |= raw == fill
     for key, change in (("scale_factor", np.multiply), ("add_offset", np.add)):
         if key in data.attrs:
             values = change(values, _number(data.attrs[key]))
-    return np.where(missing, np.nan, values) if missing.any() else values
+    if missing.any():
+        values = values.copy() if values is raw else values
+        values[missing] = np.nan
+    return values
 
 
 def _description(file: Any, place: str) -> dict[str, Any] | None:

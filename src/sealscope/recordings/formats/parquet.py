@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sealscope.errors import MissingExtra, UnreadableFile
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.table import Choose, RawTable, check_size, from_text, parse_description
+from sealscope.recordings.formats.table import Choose, RawTable, check_size, check_texts, from_text, parse_description
 
 _OWN = b"sealscope"
 
@@ -60,6 +60,7 @@ def _values(column: Any, field: Any, time: bool, place: str) -> NDArray[Any]:
     if types.is_integer(field.type) or types.is_floating(field.type) or types.is_decimal(field.type):
         return np.asarray(column.cast(pyarrow.float64(), safe=False).to_numpy(), dtype=np.float64)
     if types.is_string(field.type) or types.is_large_string(field.type):
+        check_texts(len(column), 1, field.name, place)
         return from_text([cell or "" for cell in column.to_pylist()], time, field.name, place)
     raise UnreadableFile(f"{field.name} must hold numbers, got the type {field.type} ({place})")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,9 @@ from sealscope.units import to_si
 
 #: Most values that one file may hold in the columns used: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
 MAX_VALUES = 2**28
+#: A table up to this many bytes may be a fill value alone; a larger one at most this many times its file.
+_SMALL, _EXPANSION = 2**26, 4096
+_MOST_TEXTS, _WIDEST_TEXT = 2**22, 400
 FORMAT_VERSION = 1
 #: Decides from a table's labels which columns are read.
 Choose = Callable[[Sequence[Label]], ColumnMap]
@@ -83,11 +87,29 @@ class RawTable:
 
 
 def check_size(rows: int, columns: int, place: str) -> None:
-    """Raise UnreadableFile where a file holds more than `MAX_VALUES` in the columns used."""
+    """Raise UnreadableFile where a file holds more than `MAX_VALUES` in the columns used.
+
+    Or more than `_EXPANSION` times its own size: no logger's samples compress so well, but a fill value can stand for
+    any number of them. `place`: the file's path.
+    """
     if rows * columns > MAX_VALUES:
         raise UnreadableFile(
             f"a recording must have at most {MAX_VALUES} values in the columns used (2 GiB), "
             f"got {rows} rows of {columns}: cut it into parts ({place})"
+        )
+    if 8 * rows * columns > max(_SMALL, _EXPANSION * Path(place).stat().st_size):
+        raise UnreadableFile(
+            f"a recording must hold its samples, got {rows} rows of {columns} in a file of "
+            f"{Path(place).stat().st_size} bytes ({place})"
+        )
+
+
+def check_texts(cells: int, width: int, name: str, place: str) -> None:
+    """Raise UnreadableFile where a column of texts has more than `_MOST_TEXTS` cells, or cells wider than a number."""
+    if cells > _MOST_TEXTS or width > _WIDEST_TEXT:
+        raise UnreadableFile(
+            f"{name} must hold numbers, or at most {_MOST_TEXTS} texts of {_WIDEST_TEXT} bytes, got {cells} of {width} "
+            f"({place})"
         )
 
 

@@ -1,0 +1,80 @@
+"""Every size is known before it is allocated: a tiny file asks for no gigabytes."""
+
+import tracemalloc
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from sealscope.campaigns.plans.reader import load_plan
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings import read
+from sealscope.simulation.experiment import Experiment
+
+
+def refused(path: Path) -> str:
+    tracemalloc.start()
+    try:
+        with pytest.raises(UnreadableFile) as caught:
+            read(path, rate=500)
+        assert tracemalloc.get_traced_memory()[1] < 100e6
+    finally:
+        tracemalloc.stop()
+    return str(caught.value).replace(str(path), "FILE")
+
+
+def test_a_fill_value_for_samples_that_were_never_written(tmp_path: Path) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("p_A", (2**27,), "f8", chunks=(2**20,), fillvalue=1.0).attrs["units"] = "Pa"
+    assert path.stat().st_size < 10_000
+    assert refused(path).startswith("a recording must hold its samples, got 134217728 rows of 1 in a file of ")
+
+
+@pytest.mark.parametrize(("count", "kind"), [(2**23, "S10"), (2**16, "S100000")])
+def test_texts_in_place_of_numbers(tmp_path: Path, count: int, kind: str) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("p_A", (count,), kind, chunks=(2**10,)).attrs["units"] = "Pa"
+        file["padding"] = np.zeros(10_000)
+    assert refused(path).startswith("p_A must hold numbers, or at most 4194304 texts of 400 bytes, got ")
+
+
+def test_a_constant_column_that_compresses_well_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("p_A", data=np.full(2**20, 3e5), compression="gzip").attrs["units"] = "Pa"
+    assert path.stat().st_size < 40_000
+    assert len(read(path, rate=500)) == 2**20
+
+
+def test_fill_values_are_missing_samples(tmp_path: Path) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        file["p_A"] = np.array([1.0, -999.0, 3.0, -888.0, 5.0])
+        file["p_A"].attrs["missing_value"] = [-999.0, -888.0]
+        file["p_A"].attrs["units"] = "Pa"
+    assert np.array_equal(read(path, rate=500)["p_A"], [1, np.nan, 3, np.nan, 5], equal_nan=True)
+
+
+def test_factors_of_a_plan_do_not_multiply_without_end(tmp_path: Path) -> None:
+    path = tmp_path / "plan.toml"
+    levels = ", ".join(f'"{k} sin(4t)"' for k in range(1, 51))
+    closed = ", ".join(f'"{k} %"' for k in range(50))
+    mass = ", ".join(f"{0.01 + k / 1000}" for k in range(50))
+    path.write_text(
+        '[campaign]\nname = "big"\nduration = "6 s"\ndetectors = ["rms change"]\n'
+        f"[factors]\ncommand = [{levels}]\nclosed = [{closed}]\nV_1 = [{mass}]\n[[records]]\ncount = 1\n"
+    )
+    with pytest.raises(InputError, match=r"their levels must make at most 100000 cells, got 125000 or more"):
+        load_plan(path)
+
+
+def test_steps_and_draws_are_bounded() -> None:
+    with pytest.raises(InputError, match=r"at most 1000000000 steps of the solver, got 6e\+12"):
+        Experiment.of(duration=6.0, step=1e-12)
+    from sealscope.campaigns.prediction.responses import bench_responses
+
+    with pytest.raises(InputError, match=r"draws must be .* to 100000 machines, got 1000000000000"):
+        bench_responses(None, "bench", 10**12, 0, 0.01, ())  # type: ignore[arg-type]
