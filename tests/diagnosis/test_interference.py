@@ -40,6 +40,17 @@ def test_noise_and_a_comb_under_a_resonance_have_no_lines() -> None:
     assert line_frequencies(noise() + 2e4 * np.exp(-8.0 * since) * np.sin(430.0 * since), RATE).size == 0
 
 
+def test_a_harmonic_of_the_duty_is_no_hum_unless_it_is_far_above_the_others() -> None:
+    """A leak changes the ringing at harmonics of the duty: one was taken for hum, and the leak with it."""
+    t = np.arange(60_000) / RATE
+    cycle = np.pi / 2.0
+    harmonic = 101.0 / cycle
+    weak, strong = (noise() + size * np.sin(2.0 * np.pi * harmonic * t) for size in (1e3, 6e3))
+    assert line_frequencies(weak, RATE) == pytest.approx([harmonic], abs=0.03)
+    assert line_frequencies(weak, RATE, cycle).size == 0
+    assert line_frequencies(strong, RATE, cycle) == pytest.approx([harmonic], abs=0.03)
+
+
 def test_skew_of_the_chambers_is_measured_under_hum() -> None:
     """With noise that both channels share, which is not skewed."""
     for late in (0.0, 1.2e-3, 2.5e-3):

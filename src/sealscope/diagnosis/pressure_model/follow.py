@@ -153,7 +153,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
     theta, cost, anew = fit(long, short, prior, guess)
     if not np.isfinite(cost):
         return "the model of the rig cannot be fitted to the pressures"
-    hum = lines_in(dp - model.run(theta[None])[0], rate)
+    hum = lines_in(dp - model.run(theta[None])[0], rate, cycle)
     if np.any(hum):
         dp = dp - hum
         long, short = _windows(model, dp, theta, span)

@@ -16,6 +16,9 @@ from sealscope.recordings.recording import Array
 SEGMENT, _HALF_WIDTH = 20.0, 3
 #: A line stands out of the median, and of the largest, of its neighbours within this distance [Hz] by these factors.
 _NEAR, _OVER_MEDIAN, _OVER_LARGEST = 2.0, 8.0, 6.0
+#: ... and of its neighbours by this factor where it may be a harmonic of the duty: that near to a multiple of 1 / cycle
+#: [Hz], for cycles up to this length [s]. Longer ones make a comb so dense that no line of it stands alone.
+_ON_COMB, _COMB_WIDTH, _LONGEST_CYCLE = 50.0, 0.03, 4.0
 #: Most lines that are taken out, and the lowest frequency of one [Hz]: below, the motion itself is narrow.
 _MOST_LINES, _LOWEST = 20, 15.0
 #: A line's amplitude and phase may change over this width (Gaussian, standard deviation) [s]: mains wander.
@@ -41,8 +44,12 @@ def _spectrum(first: Array, second: Array, rate: float, seconds: float) -> tuple
     return np.asarray(np.fft.rfftfreq(length, 1.0 / rate), dtype=np.float64), sums
 
 
-def line_frequencies(residual: Array, rate: float) -> Array:
-    """Return the frequencies (m,) [Hz] of the narrow lines in a residual (n,), strongest first."""
+def line_frequencies(residual: Array, rate: float, cycle: float | None = None) -> Array:
+    """Return the frequencies (m,) [Hz] of the narrow lines in a residual (n,), strongest first.
+
+    `cycle` [s] of the duty, None where it does not repeat: what a model misses of the motion, a leak above all, lies at
+    its harmonics.
+    """
     frequency, cross = _spectrum(residual, residual, rate, SEGMENT)
     power = np.abs(cross)
     reach = round(_NEAR / frequency[1])
@@ -55,16 +62,21 @@ def line_frequencies(residual: Array, rate: float) -> Array:
         beside = power[(around <= reach) & (around > _HALF_WIDTH) & np.logical_not(known)]
         if beside.size < reach or len(lines) == _MOST_LINES:
             continue
-        if power[k] > _OVER_MEDIAN * np.median(beside) and power[k] > _OVER_LARGEST * beside.max():
-            # the vertex of the parabola through the logarithms of three bins (a Gaussian main lobe)
-            left, middle, right = np.log(power[k - 1 : k + 2])
-            lines.append(float(frequency[1] * (k + 0.5 * (left - right) / (left - 2.0 * middle + right))))
+        # the vertex of the parabola through the logarithms of three bins (a Gaussian main lobe)
+        left, middle, right = np.log(power[k - 1 : k + 2])
+        line = float(frequency[1] * (k + 0.5 * (left - right) / (left - 2.0 * middle + right)))
+        harmonic = (
+            cycle is not None and cycle <= _LONGEST_CYCLE and abs(line - round(line * cycle) / cycle) < _COMB_WIDTH
+        )
+        factor = _ON_COMB if harmonic else _OVER_LARGEST
+        if power[k] > _OVER_MEDIAN * np.median(beside) and power[k] > factor * beside.max():
+            lines.append(line)
             known[around <= _HALF_WIDTH] = True
     return np.array(lines)
 
 
-def lines_in(residual: Array, rate: float) -> Array:
-    """Return the sum of the narrow lines in a residual (n,).
+def lines_in(residual: Array, rate: float, cycle: float | None = None) -> Array:
+    """Return the sum of the narrow lines in a residual (n,) under a duty of that cycle [s].
 
     Each is ``2 Re(e(t) exp(i w t))`` with the envelope e of residual exp(-i w t), smoothed by a Gaussian.
     """
@@ -76,7 +88,7 @@ def lines_in(residual: Array, rate: float) -> Array:
     whole = residual.size // block * block
     t = np.arange(residual.size) / rate
     middles = (np.arange(whole // block) + 0.5) * block - 0.5
-    for frequency in line_frequencies(residual, rate):
+    for frequency in line_frequencies(residual, rate, cycle):
         turn = np.exp(-2j * np.pi * frequency * t)
         means = ((residual - total) * turn)[:whole].reshape(-1, block).mean(axis=1)
         envelope = gaussian_filter1d(means, _STEADY / (block / rate), mode="nearest")
