@@ -300,3 +300,11 @@ def test_a_machine_of_another_kind_is_not_judged(detector: PressureModel, sound:
     assert found.verdict == "cannot tell"
     assert "explains" in found.reason
     assert found.score is None
+
+
+def test_a_fit_far_beyond_the_rigs_stiffness_is_refused(thesis: Rig, sound: Recording) -> None:
+    """A fit with a ring too many in each reversal looks so, and its conductance steps with any drift."""
+    evidence = PressureModel(thesis.with_overrides({"fluid.K_oil": 330e6})).examine(sound, [], P)
+    assert evidence.verdict == "cannot tell"
+    assert "2.1 times as stiff" in evidence.reason
+    assert evidence.score is None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.baseline.level import Level
 from sealscope.diagnosis.pressure_model.fit import (
     LONG_WINDOW,
+    PRIOR,
     SETTLE,
     SHORT_WINDOW,
     USUAL_G,
@@ -180,6 +181,12 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
             if not isinstance(again, str) and again.excess < look.excess - 0.05:
                 theta, look = other, again
     followed = look.track
+    stiffness = float(np.mean(followed.path[:, K])) / centre[K]
+    if stiffness > 1.0 + 3.0 * PRIOR[K]:
+        return (
+            f"the rig does not describe this machine: its oil would be {stiffness:.2g} times as stiff as the rig's; "
+            "the fit has a ring too many in each reversal, or another --rig describes it"
+        )
     third = max(1, len(followed.path) // 3)
     early, late = followed.path[:third].mean(axis=0), followed.path[-third:].mean(axis=0)
     friction = _friction(late, model, speed) / _friction(early, model, speed) - 1.0
