@@ -147,3 +147,13 @@ def test_a_recorded_command_drives_the_rig_like_the_original():
 def test_an_impossible_recorded_command_is_refused(t, u):
     with pytest.raises(InputError):
         Recorded(np.array(t), np.array(u), "log.csv")
+
+
+@pytest.mark.parametrize("blank", ["\t", "\n", "\u00a0", " \t "])
+def test_white_space_of_any_kind(blank):
+    assert parse_command("3 sin(4t) + 1".replace(" ", blank)) == parse_command("3 sin(4t) + 1")
+
+
+def test_a_text_without_end_is_refused():
+    with pytest.raises(InputError, match="at most 4000 characters, got 13008"):
+        parse_command("1 period of " * 1084)

@@ -252,6 +252,9 @@ def _number(text: str | None, default: float) -> float:
     return value
 
 
+_LONGEST_TEXT = 4000
+
+
 def parse_command(text: str) -> Command:
     """Read a command from text.
 
@@ -266,6 +269,9 @@ def parse_command(text: str) -> Command:
 
         path = stripped[5:].strip()
         return recorded_command(read(path), path)
+    if len(text) > _LONGEST_TEXT:
+        raise InputError(f"command must be of at most {_LONGEST_TEXT} characters, got {len(text)}")
+    stripped = " ".join(stripped.split())
     if "period" in stripped.lower():
         form = r"\s*(\d{1,6})\s+periods?\s+of\s+(.*)"
         parts = [re.fullmatch(form, part, re.IGNORECASE) for part in stripped.split(",")]
