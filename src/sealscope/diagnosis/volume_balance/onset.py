@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import DriftStep
 from sealscope.diagnosis.volume_balance.blocks import I_AB, Geometry, Y, balance_channels, volumes
@@ -38,7 +40,8 @@ def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: 
     """
     seconds = fit.blocks.seconds
     low, high = (bound + side * _REACH * seconds for bound, side in zip(step.onset_interval, (-1, 1), strict=True))
-    part = recording.between(low, high)
+    first, last = np.searchsorted(recording.t, [low + 0.25 / recording.rate, high + 0.25 / recording.rate])
+    part = recording.samples(slice(int(first), int(last)))
     rows = {name: np.asarray(part[name], dtype=np.float64)[None] for name in balance_channels(recording)}
     before = fit.g[fit.blocks.t < step.onset - 0.5 * seconds][-_NEAREST:]
     after = fit.g[fit.blocks.t > step.onset + 0.5 * seconds][:_NEAREST]
@@ -47,18 +50,19 @@ def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: 
     if np.ptp(np.diff(part.t)) * recording.rate > 0.5 or not all(np.isfinite(row).all() for row in rows.values()):
         return step
     columns, dp, _ = volumes(rows, recording.rate, geometry)
-    sparse = slice(None, None, -(-len(part) // _SAMPLES))
+    every_nth = -(-len(part) // _SAMPLES)
+    sparse, between = slice(None, None, every_nth), every_nth / recording.rate
     t, columns, dp = part.t[sparse], columns[0][:, sparse], dp[0, sparse]
     level = float(before.mean())
     opened = fit.sense * (float(after.mean()) - level) * columns[I_AB]
     left = columns[Y] - fit.beta @ columns[list(fit.columns)] + fit.sense * level * columns[I_AB]
     free, _ = np.linalg.qr(np.column_stack([np.ones(t.size), t - t.mean(), dp - dp.mean()]))
 
-    def noise(at: Array) -> Array:
+    def noise(at: NDArray[np.signedinteger[Any]]) -> Array:
         values = left + (np.arange(t.size) >= at[:, None]) * (opened - opened[at, None])
         return np.asarray(values - (values @ free) @ free.T)
 
-    margin = math.ceil(0.25 * seconds / (t[1] - t[0]))
+    margin = round(0.25 * seconds / between)
     every = max(1, (t.size - 2 * margin) // _INSTANTS)
     at = np.arange(margin, t.size - margin, every)
     squares = np.sum(noise(at) ** 2, axis=1)
@@ -68,7 +72,7 @@ def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: 
     near = np.arange(best - every, best + every + 1, max(1, every // 16))
     at, squares = np.concatenate([at, near]), np.concatenate([squares, np.sum(noise(near) ** 2, axis=1)])
     best = int(at[np.argmin(squares)])
-    span = _SPAN * _alike(noise(np.array([best]))[0], round(_LONGEST * seconds / (t[1] - t[0])))
+    span = _SPAN * _alike(noise(np.array([best]))[0], round(_LONGEST * seconds / between))
     fitting = at[squares - squares.min() <= span * squares.min() / t.size]
     first, last = max(0, int(fitting.min()) - every), min(t.size - 1, int(fitting.max()) + every)
     if t[last] - t[first] > step.onset_interval[1] - step.onset_interval[0]:
