@@ -14,7 +14,7 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.baseline.inspection import comparable, inspected
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
-from sealscope.diagnosis.isolation import Signatures, isolated, signatures, unasked
+from sealscope.diagnosis.isolation import Signatures, elsewhere, isolated, signatures, unasked
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
@@ -170,7 +170,13 @@ class Examination:
         with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
             evidences = list(pool.map(self.evidence, detectors()))
         fused = fuse([self._isolated(own) for own in evidences])
-        if fused.verdict == "leak" or fused.cause is not None or self.distrust is not None or self._signatures is None:
+        if fused.verdict == "leak" or self.distrust is not None or self._signatures is None:
+            return fused
+        other = elsewhere(self._signatures)
+        if other is not None:  # of two recordings in one, or of swapped channels, nothing is said
+            reason = f"{fused.reason}; but {other.description}: {other.cause}"
+            return replace(fused, verdict="cannot tell", cause=other.cause, reason=reason)
+        if fused.cause is not None:
             return fused
         with np.errstate(all="ignore"):
             stepped = unasked(self._signatures)

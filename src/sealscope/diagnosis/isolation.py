@@ -222,6 +222,19 @@ def unasked(seen: Signatures) -> tuple[float, OtherCause] | None:
     return None
 
 
+def elsewhere(seen: Signatures) -> OtherCause | None:
+    """Return whether p_A - p_B goes on in another sense or phase somewhere in a duty that repeats."""
+    if seen.alike is None or not np.median(seen.alike[:, 0]) > SAME_PHASE:
+        return None
+    worst = int(np.argmin(seen.alike[:, 0]))
+    if not seen.alike[worst, 0] < OTHER_PHASE:
+        return None
+    at = float(seen.t[worst + 1])
+    if min(seen.alike[worst : worst + 2, 1]) < -OTHER_PHASE:
+        return OtherCause("sensor fault", f"near {at:.0f} s p_A - p_B changes its sign, as if p_A and p_B were swapped")
+    return OtherCause("changed duty", f"near {at:.0f} s p_A - p_B goes on in another phase, as of another recording")
+
+
 def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
     """Return the evidence of a leak as `cannot tell` with another cause where one stepped at its onset.
 
@@ -231,7 +244,7 @@ def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
     """
     if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS) or evidence.onset_s is None:
         return evidence
-    other = _elsewhere(seen)
+    other = elsewhere(seen)
     if other is None and evidence.detector != BALANCED:
         other = other_cause(seen, evidence.onset_s) or _readings(
             seen, evidence.onset_s if evidence.cause is not None else None
@@ -265,19 +278,6 @@ def _duty(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
         if abs(size) > strict * DUTY and abs(surely) > strict * SURE:
             return OtherCause("changed duty", f"the command changed, its {what} by {math.expm1(size):+.1%}")
     return None
-
-
-def _elsewhere(seen: Signatures) -> OtherCause | None:
-    """Return whether p_A - p_B goes on in another sense or phase somewhere in a duty that repeats."""
-    if seen.alike is None or not np.median(seen.alike[:, 0]) > SAME_PHASE:
-        return None
-    worst = int(np.argmin(seen.alike[:, 0]))
-    if not seen.alike[worst, 0] < OTHER_PHASE:
-        return None
-    at = float(seen.t[worst + 1])
-    if min(seen.alike[worst : worst + 2, 1]) < -OTHER_PHASE:
-        return OtherCause("sensor fault", f"near {at:.0f} s p_A - p_B changes its sign, as if p_A and p_B were swapped")
-    return OtherCause("changed duty", f"near {at:.0f} s p_A - p_B goes on in another phase, as of another recording")
 
 
 def _readings(seen: Signatures, onset: float | None) -> OtherCause | None:
