@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, TypeVar
 
@@ -47,6 +48,10 @@ def as_type(kind: type[_T], value: Any) -> _T:
     """Return plain values as the dataclass `kind`; ValueError of one line where a value has no place in it."""
     from pydantic import ValidationError
 
+    if is_dataclass(kind) and isinstance(value, dict):
+        unknown = sorted(map(str, value.keys() - {field.name for field in fields(kind)}))
+        if unknown:
+            raise ValueError(f"{unknown[0][:60]}: not known")
     try:
         return _adapter(kind).validate_python(value)  # type: ignore[no-any-return, arg-type]
     except ValidationError as error:

@@ -29,7 +29,7 @@ from sealscope.evaluation.thresholds import (
 from sealscope.recordings.recording import Recording
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
-from sealscope.storage.plain_values import parse_json
+from sealscope.storage.plain_values import as_type, parse_json
 
 FORMAT = "sealscope calibration 2"
 #: How far outside the calibrated pressure levels a recording may lie: this share of their range, and this ratio.
@@ -310,7 +310,7 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
     detectors = tuple(str(name) for name in tree["detectors"])
     groups = []
     for group in tree["groups"]:
-        thresholds = {name: Threshold(**values) for name, values in group["thresholds"].items()}
+        thresholds = {str(name): as_type(Threshold, values) for name, values in group["thresholds"].items()}
         for name, threshold in thresholds.items():
             if name not in detectors or not math.isfinite(threshold.value):
                 raise InputError(
@@ -320,7 +320,9 @@ def _from(tree: Mapping[str, Any]) -> Calibration:
         if max(abs(low), abs(high)) > _LARGEST_LEVEL:
             raise InputError(f"levels must be logarithms of pressures, got {low}, {high}")
         short, long = (float(value) for value in group["durations_s"])
-        point = OperatingPoint.of_dict(group["point"])
+        point = as_type(OperatingPoint, group["point"])
+        if point.rate <= 0 or abs(point.level) > _LARGEST_LEVEL:
+            raise InputError(f"an operating point must have a rate > 0 Hz and a level, got {point.rate}, {point.level}")
         strokes = None if group.get("leak_free") is None else LeakFree.of_dict(group["leak_free"])
         groups.append(Group(point, int(group["records"]), (low, high), (short, long), thresholds, strokes))
     views = {str(name): tuple(map(str, channels)) for name, channels in tree.get("views", {}).items()}
