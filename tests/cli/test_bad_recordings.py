@@ -29,7 +29,7 @@ def make(kind: str, path: Path) -> None:
         "empty": "",
         "header only": HEAD,
         "one column": "p_A [Pa]\n1\n2\n3\n",
-        "text in numbers": HEAD + rows(t, p_A, p_B).replace("0.100,", "0.100,high "),
+        "text in numbers": HEAD + rows(t, p_A, p_B).replace("0.10", "0.10,high "),
         "reversed time": HEAD + rows(t[::-1], p_A, p_B),
         "wrong unit": HEAD.replace("p_B [Pa]", "p_B [mm]") + rows(t, p_A, p_B),
         "unknown unit": HEAD.replace("p_B [Pa]", "p_B [wibble]") + rows(t, p_A, p_B),

@@ -279,3 +279,21 @@ def test_side_by_side_says_what_one_after_the_other_says(form, tmp_path, monkeyp
     assert beside.stderr == alone.stderr
     assert "1.nc" in beside.stderr
     assert beside.stdout.count(".nc") >= 4
+
+
+def test_five_lines_by_default_all_with_v_one_when_quiet(call, recordings):
+    short = call("diagnose", recordings / "leak.nc")
+    whole = call("-v", "diagnose", recordings / "leak.nc")
+    line = call("diagnose", "--quiet", recordings / "leak.nc")
+    labels = [text[2:12].strip() for text in short.out.splitlines()[1:] if text[2:12].strip()]
+    assert labels[0] == "since"
+    assert {"how much", "how sure", "next"} <= set(labels) and len(labels) <= 6
+    assert "method" not in labels and "  method    volume balance" in whole.out
+    assert line.out == short.out.splitlines()[0] + "\n" == f"{recordings / 'leak.nc'}: leak\n"
+
+
+def test_scripts_may_fail_on_a_verdict(call, recordings):
+    files = (recordings / "leak.nc", recordings / "healthy_1.nc")
+    assert call("diagnose", *files, "--quiet", "--fail-on", "leak").status == 3
+    assert call("diagnose", files[1], "--quiet", "--fail-on", "leak").status == 0
+    assert call("diagnose", files[1], "--quiet", "--fail-on", "leak", "--fail-on", "no leak").status == 3

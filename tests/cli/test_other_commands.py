@@ -96,7 +96,11 @@ def test_report_for_several_files_makes_a_folder_and_skips_what_cannot_be_read(c
     files = [recordings / "leak.nc", tmp_path / "absent.csv", recordings / "healthy_1.nc"]
     done = call("report", *files, "-o", tmp_path / "new" / "pages", "--baseline", recordings / "healthy_2.nc")
     assert done.refused(1).startswith("a recording must exist, got no such file")
-    assert sorted(path.name for path in (tmp_path / "new" / "pages").iterdir()) == ["healthy_1.html", "leak.html"]
+    assert sorted(path.name for path in (tmp_path / "new" / "pages").iterdir()) == [
+        "healthy_1.html",
+        "index.html",
+        "leak.html",
+    ]
     check_page(tmp_path / "new" / "pages" / "leak.html", "leak")
     check_page(tmp_path / "new" / "pages" / "healthy_1.html", "no leak")
     assert len(done.out.splitlines()) == 2
@@ -104,7 +108,7 @@ def test_report_for_several_files_makes_a_folder_and_skips_what_cannot_be_read(c
 
 def test_report_of_one_file_into_a_folder(call, recordings, tmp_path):
     assert call("report", recordings / "healthy_1.nc", "-o", tmp_path).status == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["healthy_1.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["healthy_1.html", "index.html"]
 
 
 def test_version_and_help(call, shell):

@@ -45,7 +45,10 @@ app.add_typer(campaign.campaign)
 def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Log on standard error what errors come from; anywhere in a call.")
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="Every method's verdict; errors log what they come from. Anywhere in a call."
+        ),
     ] = False,
 ) -> None:
     if verbose:

@@ -162,6 +162,8 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
         return work()
     except SealscopeError as error:
         complain(error if str(file) in str(error) else f"{error} ({file})")
+    except MemoryError:
+        complain(f"too little memory ({file})")
     except Exception as error:  # a defect of the program; the other files have their results yet
         _log.debug("cannot handle %s", file, exc_info=True)
         complain(f"cannot handle {file}, got {type(error).__name__}: {error} (-v says where)")

@@ -41,6 +41,18 @@ if TYPE_CHECKING:
 _FEWEST_SIDE_BY_SIDE = 4
 
 
+#: Exit status where a verdict is one of `--fail-on`.
+_FAILED_ON = 3
+
+
+class Verdict(StrEnum):
+    """Verdicts, as `--fail-on` names them."""
+
+    leak = "leak"
+    no_leak = "no leak"
+    cannot_tell = "cannot tell"
+
+
 class TextFormat(StrEnum):
     """How verdicts are printed."""
 
@@ -53,7 +65,9 @@ def _read_all(
 ) -> Iterator[tuple[Path, Recording | None]]:
     """Yield each file and its recording; None, with one line on standard error, where it cannot be read."""
     from sealscope.recordings import read
+    from sealscope.recordings.formats.columns import check_call
 
+    check_call(channel_map, rate)
     for file in files:
         yield file, attempt(file, partial(read, file, channel_map=channel_map or None, rate=rate))
 
@@ -69,8 +83,7 @@ def _read_parts(
 
     parts = [recording for _, recording in _read_all(files, channel_map, rate)]
     whole = [part for part in parts if part is not None]
-    joined = partial(join, whole, names=[file.name for file in files])
-    yield files[0], attempt(files[0], joined) if len(whole) == len(files) else None
+    yield files[0], join(whole, names=[file.name for file in files]) if len(whole) == len(files) else None
 
 
 def _diagnoses(
@@ -138,6 +151,7 @@ def _calibrated(
 
 
 def diagnose(
+    context: typer.Context,
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Recordings: CSV or text, NetCDF, HDF5, Parquet.")
     ],
@@ -149,13 +163,24 @@ def diagnose(
     false_alarm: FalseAlarmOption = 0.01,
     calibration: CalibrationOption = None,
     rig: AssumeOption = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
+    fail_on: Annotated[
+        list[Verdict] | None,
+        typer.Option("--fail-on", help="End with status 3 where a file has this verdict; repeat."),
+    ] = None,
 ) -> None:
-    """Say for each file whether oil bypasses the piston. Exit status 1 where a file could not be read."""
+    """Say for each file whether oil bypasses the piston; with -v by every method.
+
+    Exit status 1 where a file could not be read.
+    """
     from sealscope.campaigns.execution.workers import cores, in_order
 
-    complete = True
+    whole = bool(context.find_root().params.get("verbose"))
+    form = "jsonl" if output is TextFormat.jsonl else "line" if quiet else "whole" if whole else "short"
+    complete, failed = True, False
     task = partial(
         _verdicts,
+        form=form,
         join_them=join,
         baseline=baseline or [],
         maps=maps,
@@ -163,11 +188,10 @@ def diagnose(
         false_alarm=false_alarm,
         calibration=calibration,
         rig=assumed_rig(rig),
-        output=output,
     )
     jobs = min(cores(), len(files))
     if join or baseline or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:  # what a baseline costs is spent once
-        said: Iterator[tuple[str, Sequence[str | None]]] = (("", [verdict]) for verdict in task(files))
+        said: Iterator[tuple[str, Sequence[tuple[str, str] | None]]] = (("", [verdict]) for verdict in task(files))
     else:
         said = (
             result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
@@ -179,27 +203,34 @@ def diagnose(
             if verdict is None:
                 complete = False
             else:
-                typer.echo(verdict)
-    if not complete:
-        raise typer.Exit(1)
+                failed |= verdict[0] in (fail_on or ())
+                say(verdict[1])
+    if not complete or failed:
+        raise typer.Exit(_FAILED_ON if failed else 1)
 
 
-def _verdicts(files: Sequence[Path], output: TextFormat, **options: Any) -> Iterator[str | None]:
-    """Yield what is printed of each file's verdict, None for a file that cannot be read; `options` of `_diagnoses`."""
-    from sealscope.reporting import diagnosis_text
+def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[tuple[str, str] | None]:
+    """Yield each file's verdict and what is printed of it in a `form`: jsonl, whole, short or line.
+
+    None for a file that cannot be read; `options` of `_diagnoses`.
+    """
+    from sealscope.reporting import diagnosis_text, short_text
 
     for result in _diagnoses(files, **options):
         if result is None:
             yield None
-        elif output is TextFormat.jsonl:
-            yield json.dumps(result[1].as_dict(), allow_nan=False)
+            continue
+        diagnosis = result[1]
+        if form == "jsonl":
+            text = json.dumps(diagnosis.as_dict(), allow_nan=False)
         else:
-            yield diagnosis_text(result[1])
+            text = diagnosis_text(diagnosis) if form == "whole" else short_text(diagnosis)
+        yield diagnosis.verdict, text.partition("\n")[0] if form == "line" else text
 
 
 def _aside(
-    task: Callable[[Sequence[Path]], Iterator[str | None]], files: Sequence[Path]
-) -> tuple[str, list[str | None]]:
+    task: Callable[[Sequence[Path]], Iterator[tuple[str, str] | None]], files: Sequence[Path]
+) -> tuple[str, list[tuple[str, str] | None]]:
     """Return what a task says on standard error, and what it yields."""
     with redirect_stderr(StringIO()) as complaints:
         verdicts = list(task(files))

@@ -6,17 +6,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sealscope.reporting.charts import Mark
     from sealscope.reporting.index import write_index
-    from sealscope.reporting.messages import diagnosis_text
+    from sealscope.reporting.messages import diagnosis_text, short_text
     from sealscope.reporting.overview import overview_text
     from sealscope.reporting.page import render_page, write_page
 
-__all__ = ["Mark", "diagnosis_text", "overview_text", "render_page", "write_index", "write_page"]
+__all__ = ["Mark", "diagnosis_text", "overview_text", "render_page", "short_text", "write_index", "write_page"]
 
 _HOMES = {
     "Mark": "charts",
     "diagnosis_text": "messages",
     "overview_text": "overview",
     "render_page": "page",
+    "short_text": "messages",
     "write_index": "index",
     "write_page": "page",
 }

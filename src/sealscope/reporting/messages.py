@@ -176,8 +176,25 @@ def quality_summary(diagnosis: Diagnosis) -> str:
     return f"{count} finding{'s' if count != 1 else ''}{worst},"
 
 
+def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
+    """Return the verdict, its figures and the next step as plain text of about five lines; `width`: columns [1]."""
+    sure = diagnosis.odds or (None if diagnosis.score is None else false_alarms(diagnosis))
+    rows = [
+        ("since", since(diagnosis)),
+        ("how much", how_much(diagnosis)),
+        ("passes", passes(diagnosis) if diagnosis.verdict == "no leak" else None),
+        ("cause", cause(diagnosis)),
+        ("how sure", sure if diagnosis.verdict != "cannot tell" else None),
+        ("reason", diagnosis.reason if diagnosis.verdict == "cannot tell" else None),
+        ("data", quality_summary(diagnosis).rstrip(",") if diagnosis.quality else None),
+        ("next", next_steps(diagnosis)[0]),
+    ]
+    lines = [_row(label, text, width) for label, text in rows if text]
+    return "\n".join((f"{_printable(diagnosis.file)}: {diagnosis.verdict}", *lines))
+
+
 def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
-    """Return the verdict and its figures as plain text of a few lines, the first being `FILE: verdict`.
+    """Return the verdict and its figures as plain text, with every method and finding.
 
     `width`: columns [1]. Without colours, and without control characters that a file name or header could bring.
     """
