@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 
@@ -29,7 +30,7 @@ def make(kind: str, path: Path) -> None:
         "empty": "",
         "header only": HEAD,
         "one column": "p_A [Pa]\n1\n2\n3\n",
-        "text in numbers": HEAD + rows(t, p_A, p_B).replace("0.10", "0.10,high "),
+        "text in numbers": HEAD + re.sub(r"(0\.1\d\d),", r"\1,high ", rows(t, p_A, p_B)),
         "reversed time": HEAD + rows(t[::-1], p_A, p_B),
         "wrong unit": HEAD.replace("p_B [Pa]", "p_B [mm]") + rows(t, p_A, p_B),
         "unknown unit": HEAD.replace("p_B [Pa]", "p_B [wibble]") + rows(t, p_A, p_B),

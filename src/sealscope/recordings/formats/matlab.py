@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import MissingExtra, UnreadableFile
+from sealscope.errors import UnreadableFile
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable
@@ -49,20 +50,15 @@ def is_matlab_4(head: bytes) -> bool:
 
 def read_matlab(path: Path, choose: Choose) -> RawTable:
     """Read the chosen series of a MATLAB file; raise MissingExtra where mat-io is absent."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what its own libraries will change one day
-            from matio import load_from_mat, whosmat
-    except ImportError as error:
-        raise MissingExtra("MATLAB files need mat-io: pip install 'sealscope[io]'") from error
+    matio = library("matio", "a MATLAB file", "mat-io")
     place = str(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # on classes that have no meaning here
-        for name, (shape, *_) in whosmat(path).items():
+        for name, (shape, *_) in matio.whosmat(path).items():
             if np.prod([float(length) for length in shape]) > MAX_VALUES:
                 raise UnreadableFile(f"{name} must have at most {MAX_VALUES} values, got the shape {shape} ({place})")
         _refuse_elsewhere(path, place)
-        held = load_from_mat(path, add_table_attrs=True)
+        held = matio.load_from_mat(path, add_table_attrs=True)
     series = [
         member for name, value in held.items() if not name.startswith("__") for member in _walk("", name, value, None)
     ]

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import MissingExtra
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries
+from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import Choose, RawTable
 
@@ -24,11 +24,7 @@ def read_mdf(path: Path, choose: Choose) -> RawTable:
 
     Frames of a bus that nobody has decoded are no channels.
     """
-    try:
-        from asammdf import MDF
-    except ImportError as error:
-        raise MissingExtra("MDF needs asammdf: pip install 'sealscope[io]'") from error
-    with _opened(MDF, path) as file:
+    with _opened(library("asammdf", "MDF", "asammdf").MDF, path) as file:
         start = _start(file)
         series = []
         groups: list[Any] = file.groups

@@ -12,7 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sealscope.errors import MissingExtra, UnreadableFile
+from sealscope.errors import UnreadableFile
+from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.table import Choose, RawTable, check_size
 from sealscope.recordings.formats.text import read_text
 
@@ -22,12 +23,8 @@ def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
 
     Raises MissingExtra where python-calamine is absent, and what the largest sheet lacks where no sheet holds a log.
     """
-    try:
-        from python_calamine import CalamineWorkbook
-    except ImportError as error:
-        raise MissingExtra("spreadsheets need python-calamine: pip install 'sealscope[io]'") from error
     place = str(path)
-    workbook = CalamineWorkbook.from_path(str(path))
+    workbook = library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(str(path))
     sheets = [workbook.get_sheet_by_name(name) for name in workbook.sheet_names]
     sheets = sorted((sheet for sheet in sheets if sheet.total_height), key=lambda sheet: -sheet.total_height)
     if not sheets:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import MissingExtra
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries
+from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.series import Clock, Series, table_of, uniform
 from sealscope.recordings.formats.table import Choose, RawTable
 
@@ -24,11 +24,8 @@ def read_tdms(path: Path, choose: Choose) -> RawTable:
 
     A channel with the waveform's interval (``wf_increment``) has a clock; one without needs a time column or a rate.
     """
-    try:
-        from nptdms import TdmsFile
-    except ImportError as error:
-        raise MissingExtra("TDMS needs npTDMS: pip install 'sealscope[io]'") from error
-    with TdmsFile.open(path) as file:
+    nptdms = library("nptdms", "TDMS", "npTDMS")
+    with nptdms.TdmsFile.open(path) as file:
         series = [
             Series(
                 group.name,

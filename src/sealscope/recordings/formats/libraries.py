@@ -1,0 +1,28 @@
+"""Libraries that read a format: loaded when they are needed, and silent, as messages are the caller's."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from importlib import import_module
+from types import ModuleType
+
+from sealscope.errors import MissingExtra
+
+
+def library(module: str, reads: str, package: str) -> ModuleType:
+    """Import a library of the extra `io`; raise MissingExtra where it is absent.
+
+    `reads`: what it is needed for, in words; `package`: its name on an index. What it logs goes to handlers that a
+    program has set up, and not by itself to the terminal.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what its own libraries will change one day
+            loaded = import_module(module)
+    except ImportError as error:
+        raise MissingExtra(f"{reads} needs {package}: pip install 'sealscope[io]'") from error
+    for name in list(logging.root.manager.loggerDict):
+        if name.partition(".")[0] == module:
+            logging.getLogger(name).handlers[:] = [logging.NullHandler()]
+    return loaded
