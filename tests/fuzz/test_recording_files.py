@@ -173,7 +173,7 @@ def test_mutated_recordings(kind: str, tmp_path: Path, capfd: pytest.CaptureFixt
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_mutated_recordings(kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    counts = attack(kind, tmp_path, 400, 2)
+    counts = attack(kind, tmp_path, 1000, 2)
     assert counts["refused"] > 0
     output = capfd.readouterr()
     assert output.out == output.err == ""
