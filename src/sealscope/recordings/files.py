@@ -12,11 +12,13 @@ from typing import cast
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.apart import apart
 from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
 from sealscope.recordings.formats.lvm import is_lvm
 from sealscope.recordings.formats.matlab import is_matlab_4
+from sealscope.recordings.formats.netcdf import OWN
 from sealscope.recordings.formats.table import Choose, RawTable
 from sealscope.recordings.formats.text_layout import SNIFF
 from sealscope.recordings.recording import Recording
@@ -80,6 +82,10 @@ _FOREIGN = {
     b"CDF\x05": "a NetCDF-3 file: convert it to NetCDF-4",
     b"%PDF": "a PDF document",
 }
+#: Formats whose libraries end the process on some damaged files.
+_APART = ("matlab", "mdf")
+#: Longest time that such a file may take [s], and what is added for its size [bytes/s].
+_LONGEST, _SLOWEST = 60.0, 20e6
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -105,6 +111,26 @@ def _format_of(path: Path) -> str:
 def _reader(kind: str) -> Reader:
     """Return ``read_KIND`` of the format's module; its library is loaded now."""
     return cast("Reader", getattr(import_module(f"sealscope.recordings.formats.{kind}"), f"read_{kind}"))
+
+
+def _table(kind: str, file: Path, choose: Choose) -> RawTable:
+    """Read a table, by a process of its own where the format's C library crashes or loops on damaged files.
+
+    NetCDF files of our own mark are read here, as any number of them is read in campaigns.
+    """
+    if kind in _APART or (kind == "netcdf" and not _is_own(file)):
+        limit = _LONGEST + file.stat().st_size / _SLOWEST
+        return apart(_read_here, kind, file.absolute(), choose, limit=limit)
+    return _read_here(kind, file, choose)
+
+
+def _read_here(kind: str, file: Path, choose: Choose) -> RawTable:
+    return _reader(kind)(file, choose)
+
+
+def _is_own(file: Path) -> bool:
+    with file.open("rb") as opened:
+        return OWN.encode() in opened.read(SNIFF)
 
 
 def _writer(kind: str) -> Writer:
@@ -195,7 +221,7 @@ def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None, fo
         raise UnreadableFile(f"a file read as {format} must be {format}, got {kind} ({file})")
     choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(file))
     with whole(f"{_NAMES[kind]} file", file):
-        table = _reader(kind)(file, choose)
+        table = _table(kind, file, choose)
         if format is None and {**SUFFIXES, **_READ_ONLY}.get(file.suffix.lower(), kind) != kind:
             table = replace(table, notes=(f"name ends in {file.suffix}, content is {table.kind}", *table.notes))
         return Recording(*table.samples({"file": name}, rate=rate, infer_rate=bool(channel_map)))

@@ -25,7 +25,8 @@ from sealscope.recordings.formats.table import (
 
 #: Most values that stand for a missing sample: the CF conventions know one, a few tools write two.
 _MOST_FILLS = 16
-_OWN = "sealscope_format"
+#: Attribute that marks a file of our own.
+OWN = "sealscope_format"
 _ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
 
@@ -115,7 +116,7 @@ def _values(data: Any, name: str, time: bool, place: str) -> NDArray[Any]:
 
 
 def _description(file: Any, place: str) -> dict[str, Any] | None:
-    if _OWN not in file.attrs:
+    if OWN not in file.attrs:
         return None
     try:
         history = _text(file.attrs["history"]) or "[]"
@@ -124,7 +125,7 @@ def _description(file: Any, place: str) -> dict[str, Any] | None:
         except ValueError:  # another tool has added its own line, as the CF conventions ask
             lines = history.splitlines()
         description = {
-            "format": int(_number(file.attrs[_OWN])),
+            "format": int(_number(file.attrs[OWN])),
             "rate": _number(file.attrs["rate"]),
             "provenance": json.loads(_text(file.attrs["provenance"]) or "{}"),
             "history": lines,
@@ -139,7 +140,7 @@ def attributes(description: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "Conventions": "CF-1.11",
         "title": "Sealscope recording",
-        _OWN: FORMAT_VERSION,
+        OWN: FORMAT_VERSION,
         "rate": description["rate"],
         "provenance": json.dumps(description["provenance"]),
         "history": json.dumps(description["history"]),

@@ -1,0 +1,121 @@
+"""Work that a damaged file can crash or hold for ever, done in a process of its own with a time limit.
+
+The C libraries of some formats do both, and no signal reaches them. The process is started when it is first needed,
+serves one request after the other, and ends with the program. It is a fresh interpreter and not a copy of the program,
+so that scripts need no guard.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from threading import Lock, Timer
+from typing import Any, TypeVar
+
+from sealscope.errors import SealscopeError
+
+T = TypeVar("T")
+#: Time that starting the process may take beside the work [s].
+_START = 30.0
+
+
+class CrashedApartError(RuntimeError):
+    """The process ended before it had an answer."""
+
+
+class _Server:
+    """The process, and the lock that gives it one request at a time."""
+
+    def __init__(self) -> None:
+        self.lock = Lock()
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def ask(self, request: bytes, limit: float) -> Any:
+        with self.lock:
+            fresh = self.process is None or self.process.poll() is not None
+            if fresh:
+                self.process = subprocess.Popen(
+                    [sys.executable, "-m", "sealscope.recordings.apart"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL,
+                )
+            process = self.process
+            assert process is not None and process.stdin is not None and process.stdout is not None
+            overdue = Timer(limit + _START * fresh, process.kill)
+            overdue.daemon = True
+            overdue.start()
+            try:
+                process.stdin.write(request)
+                process.stdin.flush()
+                return pickle.load(process.stdout)
+            except (EOFError, OSError, pickle.UnpicklingError):
+                what = "crashed" if overdue.is_alive() else f"took over {limit:g} s"
+                self._end()
+                raise CrashedApartError(f"the library that reads it {what}") from None
+            except BaseException:  # an interrupt: the answer would come to the next request
+                self._end()
+                raise
+            finally:
+                overdue.cancel()
+
+    def _end(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.communicate()
+            self.process = None
+
+
+_server = _Server()
+
+
+def apart(work: Callable[..., T], *arguments: Any, limit: float) -> T:
+    """Return ``work(*arguments)``, carried out in a process of its own.
+
+    Parameters
+    ----------
+    work : callable
+        A function of a module, with arguments and a result that can be pickled.
+    *arguments
+        What it is called with.
+    limit : float
+        Longest time that it may take [s].
+
+    Raises
+    ------
+    CrashedApartError
+        The process crashed or took longer.
+    SealscopeError, RuntimeError
+        What the function raised; other kinds are a RuntimeError of the same text.
+    """
+    kind, value = _server.ask(pickle.dumps((work, arguments)), limit)
+    if kind == "raised":
+        raise value
+    return value  # type: ignore[no-any-return]
+
+
+def _serve() -> None:
+    """Answer requests on standard input until it ends; what libraries print goes nowhere."""
+    answers = os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 - for the life of the process
+    with suppress(EOFError, KeyboardInterrupt, BrokenPipeError):
+        while True:
+            work, arguments = pickle.load(sys.stdin.buffer)
+            try:
+                answer: tuple[str, Any] = ("returned", work(*arguments))
+            except SealscopeError as error:
+                answer = ("raised", error)
+            except Exception as error:
+                answer = ("raised", RuntimeError(" ".join(str(error).split()) or type(error).__name__))
+            answers.write(pickle.dumps(answer, protocol=5))
+            answers.flush()
+
+
+if __name__ == "__main__":
+    _serve()

@@ -1,0 +1,46 @@
+"""Work in a process of its own: crashes and loops end there, and the next request is served."""
+
+from __future__ import annotations
+
+import math
+import operator
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from sealscope.errors import UnreadableFile
+from sealscope.recordings import read
+from sealscope.recordings.apart import CrashedApartError, apart
+
+
+def test_results_and_errors_come_back() -> None:
+    assert apart(operator.add, 2, 3, limit=10.0) == 5
+    with pytest.raises(RuntimeError, match=r"math domain error|nonnegative"):
+        apart(math.sqrt, -1.0, limit=10.0)
+    with pytest.raises(UnreadableFile, match="no such file"):
+        apart(read, "nowhere.csv", limit=10.0)
+
+
+def test_a_crash_and_a_loop_end_there(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(CrashedApartError, match="crashed"):
+        apart(os.abort, limit=10.0)
+    apart(operator.add, 1, 1, limit=10.0)  # the start is over
+    begin = time.perf_counter()
+    with pytest.raises(CrashedApartError, match=r"took over 0\.3 s"):
+        apart(time.sleep, 60.0, limit=0.3)
+    assert time.perf_counter() - begin < 20.0
+    assert apart(operator.mul, 2, 3, limit=10.0) == 6
+    assert apart(print, "noise", limit=10.0) is None
+    output = capfd.readouterr()
+    assert output.out == output.err == ""
+
+
+def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sealscope.recordings.files._read_here", os.abort)
+    path = tmp_path / "log.mat"
+    path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    monkeypatch.setattr("sealscope.recordings.files.apart", lambda work, *_, limit: apart(work, limit=limit))
+    with pytest.raises(UnreadableFile, match=r"must be whole, got: the library that reads it crashed.*log"):
+        read(path)
