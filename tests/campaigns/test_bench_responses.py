@@ -26,7 +26,8 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A bench of machines that differ in viscous friction and would have noisy sensors; the seeds it was asked for."""
     asked: list[int] = []
 
-    def draw(profile: str, seed: int, *, rig: Rig, duration: float) -> BenchMachine:
+    def draw(profile: str, seed: int, *, rig: Rig, duration: float, family: str) -> BenchMachine:
+        assert family == ""
         asked.append(seed)
         share = np.random.default_rng(seed).uniform(0.9, 1.1)
         values = {"friction.F_v": 300.0 * share, "sensors.p_A.noise": 9e4}
@@ -89,7 +90,7 @@ def test_seeds_make_the_machines(experiment: Experiment, bench: list[int]) -> No
 def test_too_few_machines_and_machines_that_cannot_run_are_refused(
     experiment: Experiment, bench: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(InputError, match="draws must be >= 8"):
+    with pytest.raises(InputError, match="draws must be 8 to 100000 machines, got 4"):
         responses_of(experiment, 4)
 
     def failing(one: Experiment, detectors: object) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,9 @@ from sealscope.campaigns.prediction.detection import (
 )
 from sealscope.campaigns.prediction.predict import DetectionTarget, with_closing
 from sealscope.campaigns.prediction.responses import measured_responses
+from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.calibration.scorers import SCORERS
+from sealscope.diagnosis.calibration.thresholds import Place
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 
@@ -124,6 +127,7 @@ def test_bad_wishes_are_refused() -> None:
 def rows_of(folder: Path, command: str, closed: str, seed: int) -> list[str]:
     """Rows as a campaign keeps them: the change of d3 of p_A falls by 2 per L/min, with scatter 0.01."""
     random = np.random.default_rng(seed)
+    point = OperatingPoint(0, 12.0, 500.0, ("Pa", "Pa"), ("p_A", "p_B"), 2.1, 1.57)
     lines = []
     for size in (0.0, 0.001, 0.1):
         for k in range(60):
@@ -136,7 +140,7 @@ def rows_of(folder: Path, command: str, closed: str, seed: int) -> list[str]:
                 levels={"command": command, "closed": closed},
                 replicate=k,
                 flow_lpm=size * 1.1 if size else 0.0,
-                place={"duration_s": 180.0},
+                place=asdict(Place(point, 180.0)),
                 scores={"d3 of p_A fell": (-change, None)},
             )
             lines.append(json.dumps(row.as_dict()))

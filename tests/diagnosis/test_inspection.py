@@ -100,9 +100,10 @@ def test_of_a_baseline_with_a_long_gap_the_longest_stretch_is_used(healthy: list
 
 
 class Failing:
-    """Raises where it examines."""
+    """Raises `error` where it examines."""
 
     name = "observer"
+    error: Exception
 
     def __init__(self, rig: object) -> None:
         pass
@@ -111,26 +112,52 @@ class Failing:
         return None
 
     def examine(self, recording: Recording, baseline: object, probability: float) -> None:
-        raise ZeroDivisionError("float division by zero")
+        raise self.error
 
 
+@pytest.mark.parametrize(
+    ("error", "reason", "level"),
+    [
+        (RuntimeError("no\nway"), "detector 'observer' is left out: RuntimeError: no way", logging.ERROR),
+        (ValueError("wrong shape"), "detector 'observer' is left out: ValueError: wrong shape", logging.ERROR),
+        # numbers that nothing can be computed with are no defect of the detector
+        (
+            ZeroDivisionError("division by zero"),
+            "observer cannot be computed on this recording: division by zero",
+            None,
+        ),
+        (
+            np.linalg.LinAlgError("Singular matrix"),
+            "observer cannot be computed on this recording: singular matrix",
+            None,
+        ),
+    ],
+)
 def test_a_built_in_detector_that_fails_costs_its_own_evidence_alone(
-    healthy: list[Recording], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    error: Exception,
+    reason: str,
+    level: int | None,
+    healthy: list[Recording],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     rms_change = registry.DETECTORS["rms change"]
     monkeypatch.setattr(registry, "DETECTORS", {"rms change": rms_change})
     expected = diagnose(healthy[0])
     monkeypatch.setattr(registry, "DETECTORS", {"observer": Failing, "rms change": rms_change})
+    monkeypatch.setattr(Failing, "error", error, raising=False)
     detector._log_once.cache_clear()
-    with caplog.at_level(logging.ERROR, "sealscope"):
+    with caplog.at_level(logging.DEBUG, "sealscope.diagnosis.detector"):
         found = diagnose(healthy[0])
     assert (found.verdict, found.score, found.reason) == (expected.verdict, expected.score, expected.reason)
     own = next(own for own in found.parts if own.detector == "observer")
     assert own.verdict == "cannot tell"
-    assert own.reason == "detector 'observer' is left out: ZeroDivisionError: float division by zero"
+    assert own.reason == reason
     (record,) = caplog.records
-    assert record.getMessage() == own.reason
     assert record.exc_info is not None  # the traceback
+    assert record.levelno == (level or logging.DEBUG)
+    if level is not None:
+        assert record.getMessage() == own.reason
 
 
 def test_wrong_arguments_are_named(healthy: list[Recording], tmp_path: Path) -> None:

@@ -74,15 +74,19 @@ def test_every_state_on_the_way_is_the_same() -> None:
 
 
 def test_the_last_window_is_judged_as_a_recording_would_be() -> None:
-    """Same blocks, same statistic: only the probability is another."""
+    """Same blocks, same statistic: only the probability is another, and the samples date the onset of a recording."""
     rate = 0.01 / (3.14 / 3600.0)
     final = stream(WORN, [len(WORN)], window=100, alarms_per_hour=rate)[-1]
     detector = VolumeBalance(RIG)
     batch = detector.examine(WORN, [], 0.01)
     assert final.evidence.score == pytest.approx(batch.score, rel=1e-9)
     assert final.evidence.leak_lpm == pytest.approx(batch.leak_lpm, rel=1e-9)
-    # the samples about the onset, which a recording has, date it within the block
-    assert final.evidence.onset_s == pytest.approx(batch.onset_s, abs=0.1)
+    # a recording is dated by the samples about the onset, a stream by its blocks of 3.14 s and with their interval
+    assert batch.onset_s == pytest.approx(80.0, abs=0.05)
+    low, high = final.evidence.onset_interval_s
+    assert low < batch.onset_s < high
+    assert high - low < 2.0 * 3.14
+    assert final.evidence.onset_s == pytest.approx(batch.onset_s, abs=0.5 * 3.14)
 
 
 def test_alarm_soon_after_the_onset_and_stays() -> None:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol, get_args
 
+import numpy as np
+
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Verdict
 from sealscope.recordings.recording import Recording
 
@@ -72,8 +74,12 @@ def checked(evidence: Any) -> Evidence:
 def failure(name: str, distribution: str | None, error: Exception) -> str:
     """Return one line on a detector that failed, and log it with the traceback, once in a process.
 
-    `distribution`: that of a plug-in, None for a built-in detector.
+    `distribution`: that of a plug-in, None for a built-in detector. Numbers that a built-in detector cannot compute
+    with are no machine's readings, and no defect of it: the traceback is at the level of debugging alone.
     """
+    if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
+        _log.debug("%s cannot be computed", name, exc_info=True)
+        return f"{name} cannot be computed on this recording: {' '.join(str(error).split()).lower()}"
     of = f" of {distribution}" if distribution else ""
     what = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
     line = f"detector {name!r}{of} is left out: {what}"

@@ -112,11 +112,6 @@ class Examination:
                 # the bit
                 with np.errstate(all="ignore"), threadpool_limits(limits=1):
                     self._evidence[key] = self._run(name, detector)
-        except (ArithmeticError, np.linalg.LinAlgError) as error:
-            # a machine's readings never come to this: the numbers of others need no traceback
-            _log.debug("%s cannot be computed", name, exc_info=True)
-            reason = f"{name} cannot be computed on this recording: {' '.join(str(error).split()).lower()}"
-            self._evidence[key] = Evidence("cannot tell", reason, detector=name, usable=False)
         except Exception as error:
             self._evidence[key] = Evidence(
                 "cannot tell", failure(name, getattr(factory, "distribution", None), error), detector=name, usable=False
