@@ -43,7 +43,12 @@ GAPS: dict[str, Callable[[Recording], Recording]] = {
 
 
 @pytest.mark.parametrize(
-    ("gap", "view"), [*((gap, view) for gap in GAPS for view in ("all", "pressures")), (next(iter(GAPS)), "command")]
+    ("gap", "view"),
+    [
+        *((gap, "pressures") for gap in GAPS),
+        *(("one sample before the onset", view) for view in ("all", "command")),
+        *(pytest.param(gap, "all", marks=pytest.mark.slow) for gap in list(GAPS)[1:]),
+    ],
 )
 def test_a_leak_after_a_gap_is_found(gap: str, view: str, late_leak: Recording) -> None:
     diagnosis = diagnose(seen(GAPS[gap](late_leak), view))

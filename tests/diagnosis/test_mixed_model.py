@@ -79,7 +79,7 @@ def test_later_recordings_of_a_session_that_drifts_hold_the_probability(known: i
     t = np.arange(60) * 30.0
     a = np.sqrt(3.0) * np.abs(t[:, None] - t) / PRIOR.drift_time
     root = np.linalg.cholesky(0.11**2 * (1 + a) * np.exp(-a) + 1e-12 * np.eye(60))
-    y = root @ random.standard_normal((60, 1500)) + 0.012 * random.standard_normal((60, 1500))
+    y = root @ random.standard_normal((60, 500)) + 0.012 * random.standard_normal((60, 500))
     model = BaselineModel(y[:known], np.zeros(known), PRIOR, times=t[:known], sessions=np.zeros(known, int))
     for later in (known, 59):
         z = model.predict(0.0, t[later], 0).z(y[later])

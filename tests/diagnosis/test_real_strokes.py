@@ -86,8 +86,15 @@ def without_time(stroke: Recording) -> Recording:
     return replace(stroke, provenance={})
 
 
-@pytest.mark.parametrize("name", SESSIONS)
-@pytest.mark.parametrize("times", [True, False])
+@pytest.mark.parametrize(
+    ("name", "times"),
+    [
+        (SESSIONS[0], True),
+        (SESSIONS[1], False),
+        pytest.param(SESSIONS[0], False, marks=pytest.mark.slow),
+        pytest.param(SESSIONS[1], True, marks=pytest.mark.slow),
+    ],
+)
 def test_later_strokes_of_a_session_are_no_leak(name: str, times: bool, sessions: dict[str, list[Recording]]) -> None:
     """The first 20 strokes as baseline: 43 % of the later ones were `leak` while strokes counted as exchangeable."""
     strokes = sessions[name] if times else [without_time(one) for one in sessions[name]]
@@ -101,7 +108,7 @@ def test_another_healthy_specimen_is_no_leak(times: bool, sessions: dict[str, li
     """75 % of the strokes of one specimen were `leak` against the other, with no word of another machine."""
     for name, other in (SESSIONS, SESSIONS[::-1]):
         baseline = sessions[name] if times else [without_time(one) for one in sessions[name]]
-        for stroke in sessions[other][::5]:
+        for stroke in sessions[other][::12]:
             found = diagnose(stroke if times else without_time(stroke), baseline)
             assert found.verdict == "cannot tell"
             assert any(reason in found.reason for reason in ("another machine", "cannot be trusted", "pressure level"))
