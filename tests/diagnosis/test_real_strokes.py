@@ -89,10 +89,10 @@ def without_time(stroke: Recording) -> Recording:
 @pytest.mark.parametrize(
     ("name", "times"),
     [
-        (SESSIONS[0], True),
-        (SESSIONS[1], False),
-        pytest.param(SESSIONS[0], False, marks=pytest.mark.slow),
-        pytest.param(SESSIONS[1], True, marks=pytest.mark.slow),
+        (SESSIONS[1], True),
+        (SESSIONS[0], False),
+        pytest.param(SESSIONS[1], False, marks=pytest.mark.slow),
+        pytest.param(SESSIONS[0], True, marks=pytest.mark.slow),
     ],
 )
 def test_later_strokes_of_a_session_are_no_leak(name: str, times: bool, sessions: dict[str, list[Recording]]) -> None:
