@@ -13,7 +13,7 @@ from sealscope.errors import UnreadableFile
 
 PLACE = Place(OperatingPoint(0, 11.0, 500.0, ("Pa", "Pa"), ("p_A", "p_B"), 2.12, 1.57), 180.0)
 VALUES = (None, True, -1, 0, 1e308, -1e308, 2**60, float("nan"), float("inf"), "", "x" * 500, [], {}, [[]], {"a": 1})
-COUNT = 3000
+COUNT = 1000
 
 
 def nodes(tree: Any) -> list[tuple[Any, Any]]:

@@ -21,8 +21,8 @@ RECORDING = Recording(
     {"p_A": "Pa", "p_B": "Pa", "x": "m"},
     RATE,
 )
-#: Longest time that a file may take [s]; a busy machine is slow, and a loop takes for ever.
-LONGEST = 10.0
+#: Longest time that a file may take [s], with the start of a process that reads it; a loop takes for ever.
+LONGEST = 45.0
 
 
 def own(folder: Path, name: str) -> Path:
@@ -173,7 +173,7 @@ def test_mutated_recordings(kind: str, tmp_path: Path, capfd: pytest.CaptureFixt
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_mutated_recordings(kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    counts = attack(kind, tmp_path, 1000, 2)
+    counts = attack(kind, tmp_path, 600, 2)
     assert counts["refused"] > 0
     output = capfd.readouterr()
     assert output.out == output.err == ""

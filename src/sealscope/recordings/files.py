@@ -85,7 +85,7 @@ _FOREIGN = {
 #: Formats whose libraries end the process on some damaged files.
 _APART = ("matlab", "mdf")
 #: Longest time that such a file may take [s], and what is added for its size [bytes/s].
-_LONGEST, _SLOWEST = 60.0, 20e6
+_LONGEST, _SLOWEST = 10.0, 20e6
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 

@@ -174,11 +174,12 @@ def time_base(values: NDArray[Any], unit: str | None, name: str) -> TimeBase:
         t, start = _from_stamps(values)
     else:
         t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name)
-    resolved = _finer(t)
-    if resolved is not None:
-        resolution, t = resolved
-        notes.append(f"column {name} in steps of {resolution:g} s: samples in between taken as uniform")
-    return TimeBase(t, nominal_rate(t), start, tuple(notes))
+    with np.errstate(invalid="ignore", over="ignore"):  # infinite times are findings, not warnings
+        resolved = _finer(t)
+        if resolved is not None:
+            resolution, t = resolved
+            notes.append(f"column {name} in steps of {resolution:g} s: samples in between taken as uniform")
+        return TimeBase(t, nominal_rate(t), start, tuple(notes))
 
 
 def _finer(t: Array) -> tuple[float, Array] | None:
