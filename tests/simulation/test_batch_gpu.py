@@ -45,6 +45,7 @@ def assert_same(found, expected, tolerance):
     np.testing.assert_allclose(found.coefficients, expected.coefficients, rtol=tolerance)
 
 
+@pytest.mark.slow
 def test_the_simulated_gpu_finds_what_the_processor_finds(tmp_path):
     """Kernels, layout, chunks, noise, filters and sizing; each thread in plain Python, with the laws' own source."""
     if importlib.util.find_spec("numba.cuda.simulator") is None:
