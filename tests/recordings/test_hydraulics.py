@@ -13,7 +13,7 @@ import pytest
 from sealscope.recordings import CHANNEL_UNITS, Recording, read
 from sealscope.recordings.hydraulics import no_machine
 
-REAL = Path("/work/shared/data/real")
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 RATE, N = 500.0, 60_000
 RANDOM = np.random.default_rng(0)
 
