@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, cast
 
-from sealscope.errors import MissingExtra, UnreadableFile
-from sealscope.storage.opening import open_regular
+from sealscope.errors import UnreadableFile
+from sealscope.recordings.formats.libraries import library
+from sealscope.storage.opening import open_regular, whole
 
 #: First bytes -> archive.
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "xz", b"\x28\xb5\x2f\xfd": "zstd", b"PK\x03\x04": "zip"}
@@ -22,20 +23,19 @@ _CHUNK = 2**20
 
 
 def archive_of(path: Path) -> str | None:
-    """Return the kind of archive that a file is by its first bytes; None for a workbook and any other file."""
+    """Return the kind of archive that a file is by its first bytes; None for a workbook and any other file.
+
+    Raises UnreadableFile for a damaged ZIP.
+    """
     with open_regular(path, "a recording") as file:
         head = file.read(8)
     kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
-    return None if kind == "zip" and is_workbook(path) else kind
+    return None if kind == "zip" and _is_workbook(path) else kind
 
 
-def is_workbook(path: Path) -> bool:
-    """Return whether a ZIP archive is a spreadsheet."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return any(name in archive.NameToInfo for name in _WORKBOOK)
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
-        return False
+def _is_workbook(path: Path) -> bool:
+    with whole("a zip archive", path), zipfile.ZipFile(path) as archive:
+        return any(name in archive.NameToInfo for name in _WORKBOOK)
 
 
 @contextmanager
@@ -47,16 +47,10 @@ def unpacked(path: Path, kind: str) -> Iterator[Path]:
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
         name = path.stem if path.suffix.lower() in (".gz", ".bz2", ".xz", ".zst", ".zip") else path.name
-        try:
-            with _opened(path, kind) as (source, member):
-                last = Path(member or name).name
-                target = Path(folder) / (last if last.strip(".") else "recording")
-                _copy(source, target, path)
-        except (UnreadableFile, MissingExtra):
-            raise
-        except Exception as error:  # each library has kinds of its own for a damaged archive
-            text = " ".join(str(error).split())[:160] or type(error).__name__
-            raise UnreadableFile(f"a {kind} archive must be whole, got: {text} ({path})") from error
+        with whole(f"a {kind} archive", path), _opened(path, kind) as (source, member):
+            last = Path(member or name).name
+            target = Path(folder) / (last if last.strip(".") else "recording")
+            _copy(source, target, path)
         yield target
 
 
@@ -88,11 +82,7 @@ def _stream(path: Path, kind: str) -> Any:
         import lzma
 
         return lzma.open(path)
-    try:
-        import pyarrow
-    except ImportError as error:
-        raise MissingExtra(".zst archives need pyarrow: pip install 'sealscope[io]'") from error
-    return pyarrow.CompressedInputStream(str(path), "zstd")
+    return library("pyarrow", "a .zst archive", "pyarrow").CompressedInputStream(str(path), "zstd")
 
 
 def _copy(source: IO[bytes], target: Path, path: Path) -> None:

@@ -11,16 +11,11 @@ from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
+from sealscope.reporting.charts import shown_unit
 
 _BARS = "▁▂▃▄▅▆▇█"
 #: Width of a curve in characters.
 CURVE = 32
-#: Range of values -> the unit they are shown in, and its size.
-_SHOWN = {
-    "Pa": ("bar", 1e5),
-    "m": ("mm", 1e-3),
-    "m^3/s": ("L/min", 1e-3 / 60.0),
-}
 
 
 def curve(values: Array, width: int = CURVE) -> str:
@@ -51,7 +46,7 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
     seconds = len(recording) / recording.rate
     lines = [f"{name}: {kind}{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}"]
     for channel, values in recording.channels.items():
-        unit, size = _SHOWN.get(recording.units[channel], (recording.units[channel], 1.0))
+        unit, size = shown_unit(recording.units[channel], "bar")
         known = values[np.isfinite(values)] / size
         ends = f"{known.min():.4g} to {known.max():.4g} {unit}" if known.size else "no values"
         lines.append(f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<30}{curve(values)}")

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import InputError, MissingExtra
+from sealscope.errors import InputError
 from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import attributes
 from sealscope.recordings.formats.table import FORMAT_VERSION, Choose, RawTable, from_text, parse_description
 
@@ -23,11 +24,7 @@ _PLACE = "data frame"
 
 
 def _pandas() -> Any:
-    try:
-        import pandas
-    except ImportError as error:
-        raise MissingExtra("a data frame needs pandas: pip install 'sealscope[io]'") from error
-    return pandas
+    return library("pandas", "a data frame", "pandas")
 
 
 def to_pandas(
@@ -89,10 +86,7 @@ def _values(pandas: Any, series: Any, time: bool, name: str) -> NDArray[Any]:
 
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
     """Make a data set over the coordinate `t`, with `units` and `long_name` of each variable as the NetCDF files."""
-    try:
-        import xarray
-    except ImportError as error:
-        raise MissingExtra("a data set needs xarray: pip install 'sealscope[io]'") from error
+    xarray = library("xarray", "a data set", "xarray")
     variables = {
         name: ("t", series.copy(), {"units": units[name], "long_name": LONG_NAMES.get(name, name)})
         for name, series in values.items()

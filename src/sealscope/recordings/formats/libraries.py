@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import warnings
 from importlib import import_module
 from types import ModuleType
@@ -16,13 +17,14 @@ def library(module: str, reads: str, package: str) -> ModuleType:
     `reads`: what it is needed for, in words; `package`: its name on an index. What it logs goes to handlers that a
     program has set up, and not by itself to the terminal.
     """
+    fresh = module not in sys.modules
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what its own libraries will change one day
             loaded = import_module(module)
     except ImportError as error:
         raise MissingExtra(f"{reads} needs {package}: pip install 'sealscope[io]'") from error
-    for name in list(logging.root.manager.loggerDict):
+    for name in list(logging.root.manager.loggerDict) if fresh else ():
         if name.partition(".")[0] == module:
             logging.getLogger(name).handlers[:] = [logging.NullHandler()]
     return loaded

@@ -10,21 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import MissingExtra, UnreadableFile
+from sealscope.errors import UnreadableFile
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.table import Choose, RawTable, check_size, check_texts, from_text, parse_description
 
 _OWN = b"sealscope"
 
 
 def _pyarrow() -> tuple[Any, Any]:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingExtra("Parquet needs pyarrow: pip install 'sealscope[io]'") from error
-    return pyarrow, pyarrow.parquet
+    return library("pyarrow", "Parquet", "pyarrow"), library("pyarrow.parquet", "Parquet", "pyarrow")
 
 
 def read_parquet(path: Path, choose: Choose) -> RawTable:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, Array
-from sealscope.recordings.formats.columns import ColumnMap
+from sealscope.recordings.formats.columns import ColumnMap, listed
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.table import Choose, RawTable, check_size, from_text
 from sealscope.recordings.timebase import nominal_rate
@@ -127,7 +127,7 @@ def _distinct(series: Sequence[Series]) -> tuple[list[Series], tuple[str, ...]]:
     repeated = {name for name, times in Counter(member.label.name.casefold() for member in series).items() if times > 1}
     if repeated & known:
         group = first[min(repeated & known)].group
-        others = listed_groups(member.group for member in series if member.group != group)
+        others = listed(dict.fromkeys(member.group for member in series if member.group != group), 4)
         notes.append(f"channels of group {group} read, not those of the same name of {others}")
     named = []
     for member in series:
@@ -135,12 +135,6 @@ def _distinct(series: Sequence[Series]) -> tuple[list[Series], tuple[str, ...]]:
         label = Label(member.path, member.label.name if own else member.path, member.label.unit)
         named.append(replace(member, group="", label=label))
     return named, tuple(notes)
-
-
-def listed_groups(names: Any) -> str:
-    """Join the names of groups, each once, for a note."""
-    distinct = list(dict.fromkeys(names))
-    return ", ".join(distinct[:4]) + (f" and {len(distinct) - 4} more" if len(distinct) > 4 else "")
 
 
 def _samples(series: Series, time: bool, place: str) -> NDArray[Any]:
