@@ -10,6 +10,7 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
+from sealscope.recordings.timebase import seconds_of
 
 #: Files of the same start [s] have a clock that goes on from file to file.
 _SAME_START = 1e-6
@@ -20,10 +21,7 @@ def _start(recording: Recording) -> float | None:
     provenance = recording.provenance
     if "start_epoch_s" in provenance:
         return float(provenance["start_epoch_s"])
-    try:
-        return float(np.datetime64(str(provenance["start"]), "ns").astype(np.int64)) / 1e9
-    except (KeyError, ValueError):
-        return None
+    return seconds_of(str(provenance.get("start", "")))
 
 
 @checked_call

@@ -79,6 +79,15 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
         raise
 
 
+def seconds_of(stamp: str) -> float | None:
+    """Return an ISO stamp as seconds since 1970, to a millisecond; None where it is none."""
+    try:
+        moment = np.datetime64(stamp, "ms")
+    except ValueError:
+        return None
+    return None if np.isnat(moment) else float(moment.astype(np.int64)) / 1e3
+
+
 def _date_of(match: re.Match[str], day_first: bool) -> str:
     """Return the date of a stamp as ISO writes it; 1970-01-01 for the time of a day alone."""
     if match["first"]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from sealscope.diagnosis.baseline.mixed_model import FEWEST_SESSIONS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.timebase import seconds_of
 from sealscope.signals.filters import IntArray
 
 #: A longer pause between two recordings [s] ends the session: a machine cools down, or is another one.
@@ -36,18 +37,10 @@ _TWELVE_HOURS = re.compile(
 
 def start_seconds(recording: Recording) -> float | None:
     """Return when the recording's first sample was taken [s since 1970], None where it is not known."""
-    start = _stamp(str(recording.provenance.get("start", "")))
+    start = seconds_of(str(recording.provenance.get("start", "")))
     if start is None:
         start = _stamp_in_name(str(recording.provenance.get("file", "")))
     return None if start is None else start + (float(recording.t[0]) if len(recording) else 0.0)
-
-
-def _stamp(text: str) -> float | None:
-    try:
-        stamp = np.datetime64(text, "ms")
-    except ValueError:
-        return None
-    return None if np.isnat(stamp) else float(stamp.astype(np.int64)) / 1e3
 
 
 def _stamp_in_name(name: str) -> float | None:
@@ -58,7 +51,7 @@ def _stamp_in_name(name: str) -> float | None:
     hour = int(fields["hour"])
     if fields.get("half"):
         hour = hour % 12 + (12 if fields["half"].upper() == "P" else 0)
-    return _stamp(
+    return seconds_of(
         f"{fields['year']}-{int(fields['month']):02d}-{int(fields['day']):02d}"
         f"T{hour:02d}:{fields['minute']}:{fields['second'] or '00'}"
     )
