@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.fleet.fleet import Fleet
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.diagnosis.volume_balance.stream import SequentialBalance
+    from sealscope.monitor.stream.watch import Watch, watch
     from sealscope.parameters import Rig, load_rig
     from sealscope.recordings import Recording, inspect, read, write
     from sealscope.reporting import write_page
@@ -33,6 +34,7 @@ _HOMES = {
     "Rig": "parameters",
     "RmsStream": "signals.windows",
     "SequentialBalance": "diagnosis.volume_balance.stream",
+    "Watch": "monitor.stream.watch",
     "diagnose": "diagnosis.diagnose",
     "inspect": "recordings",
     "load_rig": "parameters",
@@ -41,6 +43,7 @@ _HOMES = {
     "simulate": "simulation.simulate",
     "simulate_batch": "simulation.batch.batch",
     "simulate_with_truth": "simulation.simulate",
+    "watch": "monitor.stream.watch",
     "write": "recordings",
     "write_page": "reporting",
 }
@@ -54,6 +57,7 @@ __all__ = [
     "Rig",
     "RmsStream",
     "SequentialBalance",
+    "Watch",
     "__version__",
     "diagnose",
     "inspect",
@@ -63,6 +67,7 @@ __all__ = [
     "simulate",
     "simulate_batch",
     "simulate_with_truth",
+    "watch",
     "write",
     "write_page",
 ]

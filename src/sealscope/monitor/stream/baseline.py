@@ -1,0 +1,117 @@
+"""What an actuator is compared with: learned over stated hours of healthy running, then frozen, with a version."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+from sealscope.storage.plain_values import as_type
+
+_T = TypeVar("_T")
+#: Logarithm by which pressure and flow of a duty may lie outside what was learned.
+_DUTY_MARGIN = 0.2
+
+
+@dataclass(frozen=True)
+class WatchBaseline:
+    """A healthy machine, as it was while the baseline was learned.
+
+    Parameters
+    ----------
+    version : int
+        1 for the first, one more after each repair.
+    learned_s : float
+        Clock when it was complete [s].
+    hours : float
+        Operating hours it rests on.
+    level, low, high : float
+        Conductance of pump and piston: mean, and least and largest mean of successive blocks [m^3/(s Pa)].
+    lpm, low_lpm, high_lpm : float or None
+        The same as a flow under the pressure difference learned with [L/min], None where L/min cannot be stated.
+    duty_low, duty_high : tuple of two floats
+        Least and largest logarithm of mean pressure difference [Pa] and of rms flow of the pump [m^3/s].
+    """
+
+    version: int
+    learned_s: float
+    hours: float
+    level: float
+    low: float
+    high: float
+    lpm: float | None
+    low_lpm: float | None
+    high_lpm: float | None
+    duty_low: tuple[float, float]
+    duty_high: tuple[float, float]
+
+    def knows(self, duty: Array) -> bool:
+        """Return whether a duty (2,) is among those learned, within 20 %."""
+        low, high = np.array(self.duty_low) - _DUTY_MARGIN, np.array(self.duty_high) + _DUTY_MARGIN
+        return bool(np.all((duty >= low) & (duty <= high)))
+
+
+@dataclass
+class BaselineLearning:
+    """Sums of the baseline that is being learned."""
+
+    blocks: int = 0
+    total: float = 0.0
+    flow: float = 0.0
+    low: float = math.inf
+    high: float = -math.inf
+    duty_low: tuple[float, float] = (math.inf, math.inf)
+    duty_high: tuple[float, float] = (-math.inf, -math.inf)
+    group: list[float] = field(default_factory=list)
+
+    def add(self, g: float, flow: float, duty: Array, group: int) -> None:
+        """Take a block's conductance, flow of a unit of it [L/min] and duty; means are of `group` blocks."""
+        self.blocks += 1
+        self.total += g
+        self.flow += flow
+        self.duty_low = (min(self.duty_low[0], float(duty[0])), min(self.duty_low[1], float(duty[1])))
+        self.duty_high = (max(self.duty_high[0], float(duty[0])), max(self.duty_high[1], float(duty[1])))
+        self.group.append(g)
+        if len(self.group) == group:
+            mean = sum(self.group) / group
+            self.low, self.high, self.group = min(self.low, mean), max(self.high, mean), []
+
+    def frozen(self, version: int, at: float, hours: float, litres: bool) -> WatchBaseline:
+        """Return the baseline."""
+        level, flow = self.total / self.blocks, self.flow / self.blocks
+        if self.low > self.high:  # shorter than one group
+            low, high = min(self.group), max(self.group)
+        else:
+            low, high = self.low, self.high
+        lpm, low_lpm, high_lpm = (level * flow, low * flow, high * flow) if litres else (None, None, None)
+        return WatchBaseline(
+            version, at, hours, level, low, high, lpm, low_lpm, high_lpm, self.duty_low, self.duty_high
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Return all of it as plain values; infinite ones are None."""
+        values = asdict(self)
+        for name in ("low", "high"):
+            values[name] = values[name] if math.isfinite(values[name]) else None
+        for name in ("duty_low", "duty_high"):
+            values[name] = list(values[name]) if math.isfinite(values[name][0]) else None
+        return values
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> BaselineLearning:
+        """Return what `state` was of; raises InputError where it does not fit."""
+        known = {name: value for name, value in state.items() if value is not None}
+        return plain_dataclass(cls, known, "learning")
+
+
+def plain_dataclass(kind: type[_T], state: Any, name: str) -> _T:
+    """Return a part of a saved state as the dataclass `kind`; raises InputError where it does not fit."""
+    try:
+        return as_type(kind, state)
+    except ValueError as error:
+        raise InputError(f"saved state's {name} does not fit: {error}") from None

@@ -1,0 +1,191 @@
+"""The sequential tests of one actuator, which share a stated rate of false alarms per operating hour.
+
+Three tests look at the conductance of pump and piston, each at another pace:
+
+- *step*: the last blocks are searched for a rise that no smooth drift explains (`volume_balance.evidence.judge`, as
+  `SequentialBalance` does), when a cheap contrast has shown one worth searching for;
+- *rise*: the same search over means of `GROUP` blocks, some fifty minutes;
+- *level*: a mean of `GROUP` blocks over `WARMEST` times the least one of the baseline: more than oil that warms by 30 K
+  makes of it.
+
+The first two take 45 % of the rate each, the third 10 %. Each look has the probability rate x seconds between looks, so
+the rate is an upper bound: looks overlap (Lai, JRSS B 57 (1995) 613-658).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, find_step
+from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.volume_balance.blocks import BalanceBlocks
+from sealscope.diagnosis.volume_balance.evidence import judge, trouble
+from sealscope.diagnosis.volume_balance.fit import fit_balance
+from sealscope.diagnosis.volume_balance.growth import WARMEST
+from sealscope.errors import InputError
+from sealscope.monitor.stream.baseline import WatchBaseline
+from sealscope.monitor.stream.geometry import duty_of
+from sealscope.recordings.recording import Array
+
+#: Blocks of one mean of the slower tests.
+GROUP = 16
+#: Blocks, or means, that are searched for a rise.
+WINDOW = 60
+#: Share of the rate of false alarms that each test takes.
+_SHARES = {"step": 0.45, "rise": 0.45, "level": 0.1}
+#: Probabilities of a look for which a threshold is tabled.
+_PROBABILITIES = (1e-7, 0.05)
+#: A search is worth its time where the contrast of a step is this many deviations; every alarm has more.
+_WORTH_A_SEARCH = 3.5
+#: Logarithm by which the duty changes where a rise of the conductance is not compared across it.
+_OTHER_DUTY = 0.15
+#: A rise that comes from these is an alarm, whichever of them it is.
+_CAUSES = ("piston leak", "piston or pump leak", "pump leak", "external leak")
+
+
+@dataclass(frozen=True)
+class Rise:
+    """A rise of the conductance that a test shows.
+
+    `test`: which one; `onset_s`, `onset_interval_s`: clock [s]; `size`, `size_sd`: [m^3/(s Pa)]; `cause`, `reason`: in
+    words; `score`, `threshold`.
+    """
+
+    test: str
+    onset_s: float
+    onset_interval_s: tuple[float, float]
+    size: float
+    size_sd: float
+    cause: str
+    reason: str
+    score: float
+    threshold: float
+
+
+def probability_of(test: str, false_alarms_per_1000_h: float, seconds: float) -> float:
+    """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
+
+    Raises InputError where no threshold is tabled for it.
+    """
+    probability = _SHARES[test] * false_alarms_per_1000_h / 1000.0 * seconds / 3600.0
+    low, high = _PROBABILITIES
+    if not low <= probability <= high:
+        scale = 1000.0 * 3600.0 / (_SHARES[test] * seconds)
+        raise InputError(
+            f"false_alarms_per_1000_h must be {low * scale:.2g} to {high * scale:.2g}, got {false_alarms_per_1000_h:g}"
+        )
+    return probability
+
+
+@cache
+def _contrasts(n: int) -> Array:
+    """Return steps of a series of n values beyond a + b t, as unit vectors (k, n)."""
+    steps = (np.arange(n)[None, :] >= np.arange(3, n - 2)[:, None]).astype(float)
+    basis, _ = np.linalg.qr(np.stack([np.ones(n), np.arange(n)], axis=1))
+    steps -= (steps @ basis) @ basis.T
+    return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
+
+
+def worth_a_search(g: Array) -> bool:
+    """Return whether any step in a series (n,) beyond a straight line is so large that a search could raise an alarm.
+
+    The scale of the noise is that of the second differences, by their median, which a step does not move.
+    """
+    noise = float(np.median(np.abs(np.diff(g, 2)))) / (0.6745 * np.sqrt(6.0))
+    return bool(np.max(_contrasts(g.size) @ g) > _WORTH_A_SEARCH * noise)
+
+
+def step_of(
+    blocks: BalanceBlocks, g: Array, probability: float, unequal: bool, *, again: bool = False
+) -> tuple[Rise | None, str | None]:
+    """Return the rise that the last blocks show, and what else was seen that forbids to compare them, in one line.
+
+    `g` (n,): their conductances; `again`: an alarm stands, and is to be stated anew.
+    """
+    if len(blocks) < FEWEST or not (again or worth_a_search(g)):
+        return None, None
+    fit = fit_balance(blocks, metres=True, unequal=unequal)
+    problem = trouble(fit)
+    if problem is not None:
+        return None, problem
+    evidence = judge(fit, probability, window=True)
+    if not evidence.alarmed or evidence.onset_s is None:
+        return None, None
+    if evidence.cause not in _CAUSES:
+        return None, evidence.cause or evidence.reason
+    if (duty := _other_duty(blocks, evidence.onset_s)) is not None:
+        return None, duty
+    return _rise(evidence, blocks, g), None
+
+
+def _rise(evidence: Evidence, blocks: BalanceBlocks, g: Array) -> Rise:
+    onset = evidence.onset_s or 0.0
+    before, after = g[blocks.t < onset - 0.5 * blocks.seconds], g[blocks.t > onset + 0.5 * blocks.seconds]
+    before, after = before[-GROUP:], after[:GROUP]
+    if min(before.size, after.size) == 0:
+        before, after = g[:1], g[-1:]
+    scatter = float(np.median(np.abs(np.diff(g)))) / (0.6745 * np.sqrt(2.0))
+    return Rise(
+        "step",
+        onset,
+        evidence.onset_interval_s or (onset, onset),
+        float(after.mean() - before.mean()),
+        scatter * math.sqrt(1.0 / before.size + 1.0 / after.size),
+        evidence.cause or "",
+        evidence.reason,
+        float(evidence.score or 0.0),
+        float(evidence.threshold or 0.0),
+    )
+
+
+def _other_duty(blocks: BalanceBlocks, onset: float) -> str | None:
+    """Return that the duty changed with the rise, in one line, or None."""
+    duty, after = duty_of(blocks), blocks.t >= onset
+    if min(after.sum(), (~after).sum()) < 3:
+        return None
+    moved = np.abs(np.median(duty[after], axis=0) - np.median(duty[~after], axis=0))
+    return "changed duty" if float(moved.max()) > _OTHER_DUTY else None
+
+
+def slow_rise_of(t: Array, g: Array, sd: Array, probability: float) -> Rise | None:
+    """Return the rise that means of blocks show: middles `t` (n,), conductances `g` (n,), deviations `sd` (n,)."""
+    if g.size < FEWEST or not worth_a_search(g):
+        return None
+    step = find_step(t, g, sd, probability)
+    if not step.alarm:
+        return None
+    reason = (
+        f"the leakage conductance rises at {step.onset:.0f} s beyond its smooth drift over {t[-1] - t[0]:.0f} s "
+        f"(score {step.score:.1f}, threshold {step.threshold:.1f})"
+    )
+    return Rise(
+        "rise",
+        step.onset,
+        step.onset_interval,
+        step.size,
+        step.size_sd,
+        "piston or pump leak",
+        reason,
+        step.score,
+        step.threshold,
+    )
+
+
+def level_rise_of(at: float, g: float, sd: float, baseline: WatchBaseline, probability: float) -> Rise | None:
+    """Return the rise where a mean conductance is over `WARMEST` times the baseline's least."""
+    from scipy.special import ndtri
+
+    ceiling = WARMEST * max(baseline.low, 0.0)
+    score, threshold = (g - ceiling) / sd, -float(ndtri(probability))
+    if score <= threshold:
+        return None
+    reason = (
+        f"the leakage conductance is {g:.3g} m^3/(s Pa), over {WARMEST:g} times the least of the baseline: more than "
+        f"oil that warms by 30 K makes of it (score {score:.1f}, threshold {threshold:.1f})"
+    )
+    size = g - max(baseline.level, 0.0)
+    return Rise("level", at, (baseline.learned_s, at), size, sd, "piston or pump leak", reason, score, threshold)

@@ -1,0 +1,46 @@
+"""Arrays as plain values that JSON holds to the bit, and back."""
+
+from __future__ import annotations
+
+from base64 import b64decode, b64encode
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+
+#: Most numbers of one array: what is larger is no state of a stream.
+_LARGEST = 50_000_000
+
+
+def plain_array(values: Array) -> dict[str, Any]:
+    """Return an array of numbers as a mapping of its shape and its bytes (little endian, base64)."""
+    values = np.ascontiguousarray(values, dtype="<f8")
+    return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
+
+
+def array_of(value: Any, name: str) -> Array:
+    """Return the array that `plain_array` made a mapping of; `name` stands in the error.
+
+    Raises InputError where it is none.
+    """
+    try:
+        shape = tuple(int(size) for size in value["shape"])
+        if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _LARGEST:
+            raise ValueError(f"got shape {shape}")
+        data = b64decode(value["f8"], validate=True)
+        return np.frombuffer(data, dtype="<f8").reshape(shape).astype(np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"saved state's {name} must be an array with its shape: {error}") from None
+
+
+def part_of(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
+    """Return the part `name` of a saved state; raises InputError where it is missing or of another kind."""
+    if not isinstance(state, Mapping) or name not in state:
+        raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
+    value = state[name]
+    if not isinstance(value, kind):
+        raise InputError(f"saved state's {name} must be {kind}, got {type(value).__name__}")
+    return value

@@ -1,0 +1,210 @@
+"""A watched actuator: the same for blocks of any size and after a restart; disorder is counted, never raised."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+import sealscope as ss
+from sealscope.errors import InputError
+from sealscope.monitor.stream.watch import BlockEstimate, Watch
+from sealscope.recordings.recording import Recording
+
+from ..diagnosis.balance_machine import machine, step
+
+#: Conductance of the leak [m^3/(s Pa)], and the seconds from which it is open.
+LEAK, OPENS = 3.0e-13, 110.0
+WORN = machine(1, G=step(0.0, LEAK, at=OPENS), duration=160.0, rate=50.0)
+LEARN = 0.02
+
+
+def run(recording: Recording, sizes: list[int], watch: Watch | None = None) -> tuple[Watch, list[BlockEstimate]]:
+    """The watch and its estimates after samples in pieces of these sizes over and over."""
+    watch = watch or ss.watch("thesis", learn_hours=LEARN)
+    estimates, start, turn = [], 0, 0
+    while start < len(recording):
+        stop = start + sizes[turn % len(sizes)]
+        estimates += watch.update(recording.samples(slice(start, stop)))
+        start, turn = stop, turn + 1
+    return watch, estimates
+
+
+def truth_lpm(recording: Recording) -> float:
+    """Mean flow of the leak [L/min]."""
+    late = recording.between(OPENS, recording.t[-1])
+    return LEAK * float(np.mean(np.abs(late["p_A"] - late["p_B"]))) * 60_000.0
+
+
+WHOLE = run(WORN, [len(WORN)])
+
+
+def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
+    watch, estimates = WHOLE
+    assert watch.leak is not None and watch.baseline is not None
+    low, high = watch.leak.onset_interval_s
+    assert low <= OPENS <= high
+    assert OPENS < watch.leak.raised_s < OPENS + 15.0
+    low_lpm, high_lpm = estimates[-1].leak_interval_lpm
+    assert low_lpm <= truth_lpm(WORN) <= high_lpm
+    assert estimates[-1].leak_lpm == pytest.approx(truth_lpm(WORN), rel=0.05)
+    assert [estimate.number for estimate in estimates] == list(range(1, len(estimates) + 1))
+    assert {estimate.status for estimate in estimates} == {"learning", "watched", "alarm"}
+    watched = [estimate for estimate in estimates if estimate.status == "watched" and estimate.t < OPENS]
+    assert all(estimate.leak_interval_lpm[0] == 0.0 for estimate in watched[2:])
+
+
+@settings(
+    max_examples=3,
+    deadline=None,
+    phases=(Phase.explicit, Phase.reuse, Phase.generate),
+    suppress_health_check=[HealthCheck.too_slow],
+)
+@given(sizes=st.lists(st.integers(7, 4000), min_size=1, max_size=4))
+def test_results_do_not_depend_on_the_cuts(sizes: list[int]):
+    watch, estimates = run(WORN, sizes)
+    assert estimates == WHOLE[1]
+    assert json.dumps(watch.state()) == json.dumps(WHOLE[0].state())
+
+
+@pytest.mark.parametrize("stop", [1000, 5700])
+def test_a_restart_continues_with_the_same_bits(stop: int):
+    first, before = run(WORN.samples(slice(0, stop)), [700])
+    again = Watch.from_state(json.loads(json.dumps(first.state(), allow_nan=False)))
+    _, after = run(WORN.samples(slice(stop, len(WORN))), [700], again)
+    assert before + after == WHOLE[1]
+    assert again.leak == WHOLE[0].leak
+    assert json.dumps(again.state()) == json.dumps(WHOLE[0].state())
+
+
+def moved(recording: Recording, seconds: float) -> Recording:
+    return Recording(recording.t + seconds, recording.channels, recording.units, recording.rate)
+
+
+def changed(recording: Recording, **channels: Any) -> Recording:
+    return Recording(recording.t, {**recording.channels, **channels}, recording.units, recording.rate)
+
+
+def test_repeated_and_late_samples_are_dropped():
+    watch = ss.watch("thesis", learn_hours=LEARN)
+    estimates = []
+    for start in range(0, len(WORN), 500):
+        estimates += watch.update(WORN.samples(slice(start, start + 500)))
+        estimates += watch.update(WORN.samples(slice(max(0, start - 700), start + 100)))
+    assert estimates == WHOLE[1]
+    assert watch.counters["late or repeated samples"] > 10_000
+
+
+def disordered() -> list[Recording]:
+    """The worn machine's samples with every kind of trouble between them, the leak's onset whole."""
+    pieces = [WORN.samples(slice(k, k + 500)) for k in range(0, len(WORN), 500)]
+    del pieces[8]
+    broken = pieces[10]
+    pieces[10] = changed(broken, p_A=np.where(np.arange(len(broken)) == 99, np.nan, broken["p_A"]))
+    pieces[13:] = [moved(piece, -1000.0) for piece in pieces[13:]]
+    pieces.insert(5, pieces[4].only(["p_A", "p_B"]))
+    pieces.insert(5, Recording(pieces[4].t, pieces[4].channels, {**pieces[4].units, "x": "count"}, 50.0))
+    pieces.insert(5, Recording(np.full(500, np.nan), pieces[4].channels, pieces[4].units, 50.0))
+    pieces.insert(5, Recording(pieces[4].t, pieces[4].channels, pieces[4].units, 1e9))
+    fast = pieces[-1]
+    pieces.append(Recording(fast.t[-1] + 0.02 + np.arange(500) / 100.0, dict(fast.channels), fast.units, 100.0))
+    return pieces
+
+
+def test_disorder_is_counted_by_reason_and_never_raised():
+    watch = ss.watch("thesis", learn_hours=LEARN)
+    for piece in disordered():
+        watch.update(piece)
+    assert set(watch.counters) == {
+        "gap",
+        "blocks: missing values",
+        "blocks: another duty",  # the last piece, played at double speed
+        "clock set back",
+        "rate changed",
+        "samples without x",
+        "samples of x not in m",
+        "samples without a time",
+        "samples at a rate outside 10 to 100000 Hz",
+    }
+    assert watch.leak is not None
+    assert watch.leak.leak_lpm == pytest.approx(truth_lpm(WORN), rel=0.1)
+
+
+def test_disorder_does_not_depend_on_the_cuts():
+    whole, fine = ss.watch("thesis", learn_hours=LEARN), ss.watch("thesis", learn_hours=LEARN)
+    estimates: tuple[list[BlockEstimate], list[BlockEstimate]] = ([], [])
+    for piece in disordered():
+        estimates[0].extend(whole.update(piece))
+        for start in range(0, len(piece), 77):
+            estimates[1].extend(fine.update(piece.samples(slice(start, start + 77))))
+    assert estimates[0] == estimates[1]
+    assert whole.counters == fine.counters
+
+
+def test_warm_oil_and_another_duty_are_no_leak():
+    warm = machine(2, G_pump=lambda t: 2.4e-13 * (1.0 + 0.6 * (1.0 - np.exp(-t / 150.0))), duration=170.0, rate=50.0)
+    watch, _ = run(warm, [997])
+    assert watch.leak is None
+    other = machine(
+        3, speed=lambda t: 24.0 * np.sin(4.0 * t), load=lambda t: 4e5 * np.sin(4.0 * t), duration=60.0, rate=50.0
+    )
+    estimates = watch.update(moved(other, 200.0))
+    assert {estimate.status for estimate in estimates} == {"another duty"}
+    assert watch.leak is None
+
+
+def test_a_machine_at_rest_is_not_judged():
+    still = machine(4, speed=lambda t: np.where(t < 130.0, 12.0 * np.sin(4.0 * t), 0.0), duration=170.0, rate=50.0)
+    watch, estimates = run(still, [1000])
+    assert estimates[-1].status == "at rest"
+    assert watch.leak is None
+    assert watch.counters["blocks: at rest"] > 5
+
+
+def test_a_repair_begins_a_new_baseline():
+    watch = Watch.from_state(WHOLE[0].state())
+    watch.relearn()
+    assert watch.leak is None and watch.baseline is None
+    sound = machine(5, duration=90.0, rate=50.0)
+    _, estimates = run(moved(sound, 400.0), [900], watch)
+    assert watch.baseline is not None and watch.baseline.version == 2
+    assert watch.leak is None
+    assert estimates[-1].status == "watched"
+
+
+def test_a_dismissed_leak_is_compared_with_nothing_before():
+    watch = Watch.from_state(WHOLE[0].state())
+    watch.dismiss()
+    more = machine(1, G=LEAK, duration=100.0, rate=50.0)
+    run(moved(more, 300.0), [900], watch)
+    assert watch.leak is None
+    assert watch.baseline == WHOLE[0].baseline
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"version": 99},
+        {"window": {"t": 1}},
+        {"samples": None},
+        {"leak": {"raised_s": "x"}},
+        {"means": {"shape": [1e12, 4], "f8": ""}},
+        {"means": {"shape": [1, 4], "f8": "AAAA"}},
+        {"blocks": None},
+    ],
+)
+def test_a_damaged_state_is_refused_in_one_line(damage: dict[str, Any]):
+    with pytest.raises(InputError) as raised:
+        Watch.from_state({**WHOLE[0].state(), **damage})
+    assert "\n" not in str(raised.value)
+
+
+def test_wrong_settings_are_refused():
+    with pytest.raises(InputError, match="false_alarms_per_1000_h must be"):
+        ss.watch("thesis", false_alarms_per_1000_h=1e-6)
+    with pytest.raises(InputError, match="learn_hours must be"):
+        ss.watch("thesis", learn_hours=0.0)
