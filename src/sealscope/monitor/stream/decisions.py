@@ -48,7 +48,7 @@ _CAUSES = ("piston leak", "piston or pump leak", "pump leak", "external leak")
 
 
 @dataclass(frozen=True)
-class Rise:
+class ConductanceRise:
     """A rise of the conductance that a test shows.
 
     `test`: which one; `onset_s`, `onset_interval_s`: clock [s]; `size`, `size_sd`: [m^3/(s Pa)]; `cause`, `reason`: in
@@ -101,7 +101,7 @@ def worth_a_search(g: Array) -> bool:
 
 def step_of(
     blocks: BalanceBlocks, g: Array, probability: float, unequal: bool, *, again: bool = False
-) -> tuple[Rise | None, str | None]:
+) -> tuple[ConductanceRise | None, str | None]:
     """Return the rise that the last blocks show, and what else was seen that forbids to compare them, in one line.
 
     `g` (n,): their conductances; `again`: an alarm stands, and is to be stated anew.
@@ -122,14 +122,14 @@ def step_of(
     return _rise(evidence, blocks, g), None
 
 
-def _rise(evidence: Evidence, blocks: BalanceBlocks, g: Array) -> Rise:
+def _rise(evidence: Evidence, blocks: BalanceBlocks, g: Array) -> ConductanceRise:
     onset = evidence.onset_s or 0.0
     before, after = g[blocks.t < onset - 0.5 * blocks.seconds], g[blocks.t > onset + 0.5 * blocks.seconds]
     before, after = before[-GROUP:], after[:GROUP]
     if min(before.size, after.size) == 0:
         before, after = g[:1], g[-1:]
     scatter = float(np.median(np.abs(np.diff(g)))) / (0.6745 * np.sqrt(2.0))
-    return Rise(
+    return ConductanceRise(
         "step",
         onset,
         evidence.onset_interval_s or (onset, onset),
@@ -151,7 +151,7 @@ def _other_duty(blocks: BalanceBlocks, onset: float) -> str | None:
     return "changed duty" if float(moved.max()) > _OTHER_DUTY else None
 
 
-def slow_rise_of(t: Array, g: Array, sd: Array, probability: float) -> Rise | None:
+def slow_rise_of(t: Array, g: Array, sd: Array, probability: float) -> ConductanceRise | None:
     """Return the rise that means of blocks show: middles `t` (n,), conductances `g` (n,), deviations `sd` (n,)."""
     if g.size < FEWEST or not worth_a_search(g):
         return None
@@ -162,7 +162,7 @@ def slow_rise_of(t: Array, g: Array, sd: Array, probability: float) -> Rise | No
         f"the leakage conductance rises at {step.onset:.0f} s beyond its smooth drift over {t[-1] - t[0]:.0f} s "
         f"(score {step.score:.1f}, threshold {step.threshold:.1f})"
     )
-    return Rise(
+    return ConductanceRise(
         "rise",
         step.onset,
         step.onset_interval,
@@ -175,7 +175,9 @@ def slow_rise_of(t: Array, g: Array, sd: Array, probability: float) -> Rise | No
     )
 
 
-def level_rise_of(at: float, g: float, sd: float, baseline: WatchBaseline, probability: float) -> Rise | None:
+def level_rise_of(
+    at: float, g: float, sd: float, baseline: WatchBaseline, probability: float
+) -> ConductanceRise | None:
     """Return the rise where a mean conductance is over `WARMEST` times the baseline's least."""
     from scipy.special import ndtri
 
@@ -188,4 +190,6 @@ def level_rise_of(at: float, g: float, sd: float, baseline: WatchBaseline, proba
         f"oil that warms by 30 K makes of it (score {score:.1f}, threshold {threshold:.1f})"
     )
     size = g - max(baseline.level, 0.0)
-    return Rise("level", at, (baseline.learned_s, at), size, sd, "piston or pump leak", reason, score, threshold)
+    return ConductanceRise(
+        "level", at, (baseline.learned_s, at), size, sd, "piston or pump leak", reason, score, threshold
+    )

@@ -28,7 +28,7 @@ from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, p
 from sealscope.monitor.stream.decisions import (
     GROUP,
     WINDOW,
-    Rise,
+    ConductanceRise,
     level_rise_of,
     probability_of,
     slow_rise_of,
@@ -348,7 +348,7 @@ class Watch:
             level = float(before.mean()) if before.size else float(g[0])
             self._raise(rise, end, level, float(np.median(self._balance.flow(self._window))))
 
-    def _raise(self, rise: Rise, raised: float, before: float, flow: float) -> None:
+    def _raise(self, rise: ConductanceRise, raised: float, before: float, flow: float) -> None:
         balance = self._balance
         assert balance is not None
         size, half = rise.size * flow, 1.96 * rise.size_sd * flow
