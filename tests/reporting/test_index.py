@@ -22,3 +22,5 @@ def test_the_most_severe_stand_first_and_every_name_leads_to_its_page(tmp_path, 
     assert re.findall(r'href="page%20(\d)%20%231\.html"', page) == ["3", "1", "2", "0"]
     assert "<script" not in page
     assert "default-src 'none'" in page
+    assert "Rule out a fault of the data first: clipped (p_1)." in page  # what to do stands beside the verdict
+    assert page.count("<strong>leak</strong>") == 2

@@ -12,11 +12,14 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.recordings.quality import Finding
 from sealscope.reporting import Mark, render_page, write_page
+from sealscope.reporting.particulars import particulars_of
+from sealscope.reporting.schematic import circuit_of, schematic
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 EVIL = '"><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7*7 }}</script>'
@@ -222,9 +225,68 @@ def test_the_schematic_tells_recorded_sensors_from_others_and_shows_the_rigs_val
     assert "in chamber A, p_A, in this recording" in page and "in chamber B, p_B, not in this recording" in page
     rig = load_rig("thesis").with_overrides({"cylinder.A_B": 500e-6})
     text = Reader(render_page(recording, make_diagnosis(), rig=rig)).text
-    for value in ("633 mm²", "500 mm²", "600 mm", "4.9 cm³/rev", f"Values: {rig.title}."):
+    for value in ("633 mm² at A and 500 mm² at B", "600 mm", "4.9 cm³/rev", rig.title):
         assert value in text
     assert "4.9 cm³/rev" in Reader(render_page(recording, make_diagnosis(), rig="thesis")).text
+
+
+def circuit(recording, **overrides):
+    rig = load_rig("thesis").with_overrides(overrides)
+    drawing = circuit_of(rig, recording)
+    return drawing, Reader(schematic(recording, _judged(), drawing))
+
+
+def _judged():
+    return Diagnosis("no leak", "", false_alarm_probability=0.01)
+
+
+def test_the_drawing_is_the_machines_own(recording):
+    """Areas that differ make a single-rod cylinder; what the rig has not is not drawn."""
+    double, read = circuit(recording.only(["p_A"]))
+    assert (double.rods, double.throttles, double.make_up, double.bypass) == ("AB", False, False, False)
+    assert "double-rod cylinder" in read.text and "throttle" not in read.text and "needle valve" not in read.text
+    single, read = circuit(recording, **{"cylinder.A_B": 316.5e-6, "makeup.check_valves": "present"})
+    assert single.rods == "B"
+    assert single.rod == pytest.approx(78 * 0.5**0.5, abs=0.1)  # the rod's thickness follows from the areas
+    assert "single-rod cylinder" in read.text and "The rod leaves chamber B." in read.text
+    assert "accumulator" in read.text and "needle valve" in read.text  # the flow meter was recorded
+    assert circuit(recording, **{"cylinder.A_A": 316.5e-6})[0].rods == "A"
+    assert "one-way throttle A" in circuit(recording, **{"line.orifices": "present"})[1].text
+    unknown = circuit_of(None, recording)
+    assert (unknown.cylinder, unknown.throttles) == ("cylinder", False)
+
+
+def test_sensors_carry_the_files_own_names(recording, make_diagnosis):
+    named = replace(recording, provenance={"columns": {"p_A": "Druck A [bar]", "q": "no channel"}})
+    text = Reader(render_page(named, make_diagnosis())).text
+    assert "in chamber A, p_A, in this recording as Druck A [bar]" in text
+    assert "column Druck A [bar]" in text and "no channel" not in text.split("Where the recording")[0]
+
+
+def test_machine_date_operator_and_oil_stand_under_the_title(recording, make_diagnosis):
+    about = {"Bediener": "A. B.", "Test": "weekly", "Öltemperatur": "41 °C", "Prüfling": "Press 7"}
+    known = replace(recording, provenance={"about": about, "start": "2026-05-31T14:05:00.250000000"})
+    particulars = particulars_of(known)
+    assert particulars.leading == (
+        ("Machine", "Press 7"),
+        ("Date", "2026-05-31 14:05:00"),
+        ("Operator", "A. B."),
+        ("Oil temperature", "41 °C"),
+    )
+    assert particulars.others == (("Test", "weekly"),)
+    page = render_page(known, make_diagnosis())
+    assert page.index("Press 7") < page.index('class="verdict') and "A. B." in page
+    assert particulars_of(replace(recording, provenance={}), load_rig("thesis")).get("Date") is None
+    assert particulars_of(recording, load_rig("thesis")).get("Machine") == load_rig("thesis").title
+
+
+def test_no_legend_is_empty(page, reader):
+    """Each key names its lines; the values appear with the cursor."""
+    assert "legend: {show: false}" in reader.scripts[-1]
+    keys = re.findall(r'<span class="key">(.*?)<span class="at">', page)
+    assert keys and all("<output></output>" in key for key in keys)
+    (pressures,) = [key for key in keys if ">p_A <" in key]
+    assert ">p_B <" in pressures and pressures.count("<path") == 2
 
 
 def test_three_minutes_at_500_hz_stay_under_two_megabytes(make_recording, make_diagnosis):
@@ -289,6 +351,23 @@ def test_the_leak_is_drawn_over_time_with_its_band(recording, make_diagnosis):
     (band,) = re.findall(r'<path class="interval" d="([^"]*)"', page)
     assert len(re.findall("[ML]", band)) == 2 * found.t.size
     assert band.endswith("Z")
+    (still,) = re.findall(r'data-chart="course".*?</svg>', page, re.DOTALL)
+    assert still.index('class="interval"') < still.index('class="line a"')  # the estimate above its interval
+    assert len(re.findall('class="line ', still)) == 1  # the ends of the interval are no lines
+
+
+def test_one_wide_interval_does_not_press_the_curve_flat(recording, make_diagnosis):
+    wide = course()
+    wide.low[0], wide.high[0] = -5.0, 5.0
+    page = render_page(recording, make_diagnosis(course=wide))
+    chart = next(one for one in chart_data(Reader(page))["charts"] if one["key"] == "course")
+    low, high = chart["limits"]
+    assert low < -0.0005 and 0.004 < high < 0.01
+    assert "95 % interval, cut at the frame" in page
+    (d,) = re.findall(r'<path class="interval" d="([^"]*)"', page)
+    heights = [float(y) for y in re.findall(r"[ML]\S+ ([-\d.]+)", d)]
+    assert min(heights) >= -0.1 and max(heights) <= chart["height"] + 0.1
+    assert "cut at the frame" not in render_page(recording, make_diagnosis(course=course()))
 
 
 def test_a_course_without_ends_or_without_anything(recording, make_diagnosis):

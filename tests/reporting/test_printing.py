@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
 import pytest
 
 from sealscope.errors import InputError, MissingExtra
-from sealscope.reporting import printing
+from sealscope.reporting import printing, write_page
 
 PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
 BROWSER = next(filter(None, map(shutil.which, printing.BROWSERS)), None)
@@ -21,6 +22,13 @@ def test_a_browser_prints(tmp_path: Path) -> None:
     assert data.startswith(b"%PDF-")
     assert data.rstrip().endswith(b"%%EOF")
     assert [path.name for path in tmp_path.iterdir()] == ["page.pdf"]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser of Chromium's family on this machine")
+def test_the_page_of_a_leak_fits_a_sheet(tmp_path: Path, recording, make_diagnosis) -> None:
+    """What is not folded stands on a single sheet of A4, the schematic and the rig's values included."""
+    page = write_page(tmp_path / "page.pdf", recording, make_diagnosis(quality=()), rig="thesis-calibrated")
+    assert len(re.findall(rb"/Type */Page\b", page.read_bytes())) == 1
 
 
 def test_without_a_printer_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,7 +68,8 @@ class Chart:
     """One chart.
 
     `base`: the time axis of its lines (all samples, the centres of the RMS windows, or the instants of the leak's
-    course); `band`: whether the second and third lines are the ends of the first one's interval.
+    course); `band`: whether the second and third lines are the ends of the first one's interval; `limits`: the least
+    and greatest value shown, None where every value is.
     """
 
     key: str
@@ -79,6 +80,15 @@ class Chart:
     base: str = SAMPLES
     height: int = 150
     band: bool = False
+    limits: tuple[float, float] | None = None
+
+    @property
+    def cut(self) -> bool:
+        """Whether values lie beyond the limits."""
+        if self.limits is None:
+            return False
+        low, high = self.limits
+        return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
 
 def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
@@ -159,8 +169,24 @@ def course_charts(course: LeakCourse | None) -> list[Chart]:
     if course is None or not np.isfinite(course.lpm).any():
         return []
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high))
-    lines = (ChartLine("leak", "a", course.lpm), ChartLine("95 %: low", "d1", low), ChartLine("95 %: high", "d1", high))
-    return [Chart(COURSE, COURSE, "Leak past the piston", "L/min", lines, COURSE, 190, band=True)]
+    lines = (ChartLine("leak", "a", course.lpm), ChartLine("low", "d1", low), ChartLine("high", "d1", high))
+    limits = _limits(course.lpm, low, high)
+    return [Chart(COURSE, COURSE, "Leak past the piston", "L/min", lines, COURSE, 190, band=True, limits=limits)]
+
+
+def _limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
+    """Return the least and greatest value to show: zero, every estimate and every interval.
+
+    Where that is more than twice as far as zero, the estimates and 9 in 10 ends of the intervals, it is those: a single
+    wide interval would press the curve flat.
+    """
+    always = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
+    ends = [(end[np.isfinite(end)], least) for end, least in ((low, True), (high, False)) if np.any(np.isfinite(end))]
+    whole = [*always, *(float(end.min() if least else end.max()) for end, least in ends)]
+    most = [*always, *(float(np.quantile(end, 0.1 if least else 0.9)) for end, least in ends)]
+    shown = whole if max(whole) - min(whole) <= 2.0 * (max(most) - min(most)) else most
+    margin = 0.06 * (max(shown) - min(shown)) or 0.5
+    return min(shown) - margin, max(shown) + margin
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
@@ -224,6 +250,7 @@ def draw(
                 "unit": chart.unit,
                 "height": chart.height,
                 "band": chart.band,
+                "limits": chart.limits,
                 "series": [
                     {"label": line.label, "style": line.style}
                     | coded(base.reduce(line.values) if sampled else line.values)
@@ -256,14 +283,15 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
     if high - low <= 0:
         low, high = low - 0.5, high + 0.5
     margin = 0.04 * (high - low)
-    low, high = low - margin, high + margin
+    low, high = chart.limits or (low - margin, high + margin)
+    lines = [np.clip(line, low, high) for line in lines]
     start, stop = span if span[1] > span[0] else (span[0], span[0] + 1)
 
     def across(seconds: Array) -> Array:
         return (seconds - start) / (stop - start) * width
 
     paths = []
-    for drawn_line, line in zip(chart.lines, lines, strict=True):
+    for drawn_line, line in zip(chart.lines[: 1 if chart.band else None], lines, strict=False):
         drawn = np.isfinite(line)
         pen = drawn & ~np.append(False, drawn[:-1])
         points = zip(pen[drawn], across(t)[drawn], height * (high - line[drawn]) / (high - low), strict=True)

@@ -1,4 +1,4 @@
-"""The index of a folder of pages: one line a recording, the most severe first."""
+"""The index of a folder of pages: one line a recording with what to do, the most severe first."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagno
             "since": messages.since(diagnosis),
             "how_much": messages.how_much(diagnosis),
             "cause": messages.cause(diagnosis),
-            "reason": diagnosis.reason,
+            "action": diagnosis.reason if diagnosis.verdict == "cannot tell" else messages.next_steps(diagnosis)[0],
         }
         for page, diagnosis in ordered
     ]

@@ -116,6 +116,11 @@ def how_sure(diagnosis: Diagnosis) -> str:
     return f"{odds}{text}{by}; {false_alarms(diagnosis)}"
 
 
+def in_short(diagnosis: Diagnosis) -> str:
+    """Return how many healthy recordings look like this; where that is not stated, what the threshold was set for."""
+    return diagnosis.odds or false_alarms(diagnosis)
+
+
 def false_alarms(diagnosis: Diagnosis) -> str:
     """Return what the threshold was set for."""
     p = diagnosis.false_alarm_probability
@@ -178,7 +183,7 @@ def quality_summary(diagnosis: Diagnosis) -> str:
 
 def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     """Return the verdict, its figures and the next step as plain text of about five lines; `width`: columns [1]."""
-    sure = diagnosis.odds or (None if diagnosis.score is None else false_alarms(diagnosis))
+    sure = in_short(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
         ("since", since(diagnosis)),
         ("how much", how_much(diagnosis)),

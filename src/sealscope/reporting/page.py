@@ -14,26 +14,14 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.formats.headings.preamble import remarks_of
-from sealscope.recordings.recording import CHANNEL_UNITS, Recording
+from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, features, messages, template
 from sealscope.reporting.charts import Mark
+from sealscope.reporting.particulars import particulars_of
+from sealscope.reporting.schematic import Circuit, circuit_of, columns_of, schematic
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
-
-#: What a file says of its recording stands under the title, so many entries of it.
-_MOST_REMARKS = 6
-#: Parameters of the rig that label the schematic: symbol, unit shown, SI per unit.
-_VALUES = {
-    "cylinder.A_A": ("A_A", "mm²", 1e-6),
-    "cylinder.A_B": ("A_B", "mm²", 1e-6),
-    "cylinder.L": ("L", "mm", 1e-3),
-    "pump.q_b": ("q_b", "cm³/rev", 1e-6),
-    "line.d_line": ("d_line", "mm", 1e-3),
-    "line.closed_A": ("closed_A", "%", 1e-2),
-    "line.closed_B": ("closed_B", "%", 1e-2),
-}
 
 
 @checked_call
@@ -136,6 +124,8 @@ def render_page(
     ]
     drawn = charts.draw(recording, chambers, shown, diagnosis, all_marks)
     uplot_js, charts_js = template.packaged("vendor/uPlot.iife.min.js"), template.packaged("templates/charts.js")
+    circuit = circuit_of(known_rig, recording)
+    particulars = particulars_of(recording, known_rig)
     facts = f"{len(recording)} samples at {recording.rate:g} Hz, {messages.clock(recording.duration)}"
     return template.render(
         "page.html.j2",
@@ -143,13 +133,15 @@ def render_page(
         messages=messages,
         title=title or Path(diagnosis.file).name,
         subtitle=f"{diagnosis.file} · {facts}",
-        about=list(remarks_of(recording.provenance).items())[:_MOST_REMARKS],
+        particulars=particulars,
         known=_known(diagnosis, truth_onset_s, truth_leak_lpm),
         marks=all_marks,
         charts=shown,
         notes=[note for _, note in details if note],
-        schematic=Markup(_schematic(recording, diagnosis, known_rig)),
-        schematic_note=_schematic_note(known_rig),
+        schematic=Markup(schematic(recording, diagnosis, circuit)),
+        machine=_machine(circuit, known_rig),
+        assumed=_assumed(circuit, known_rig),
+        columns=columns_of(recording),
         recording=recording,
         channels=[_summary(recording, name, pressure_unit) for name in recording.channels],
         provenance=list(_flat(recording.provenance)),
@@ -169,32 +161,30 @@ def _script_json(value: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _schematic(recording: Recording, diagnosis: Diagnosis, rig: Rig | None) -> str:
-    """Return the actuator as a labelled schematic: which sensors recorded, whether oil bypasses the piston."""
-    values = dict.fromkeys((label for label, _, _ in _VALUES.values()), "")
-    if rig is not None:
-        values = {
-            label: f"{messages.number(float(rig[name]) / size)} {unit}" for name, (label, unit, size) in _VALUES.items()
-        }
-    leaking = diagnosis.verdict == "leak"
-    amount = f"{messages.number(diagnosis.leak_lpm)} L/min" if leaking and diagnosis.leak_lpm is not None else ""
-    return template.render(
-        "schematic.svg.j2",
-        leaking=leaking,
-        leak_label=f"leak {amount}".strip() if leaking else "",
-        recorded={name: name in recording for name in CHANNEL_UNITS},
-        values=values,
-        verdict=diagnosis.verdict,
-    )
+def _areas(circuit: Circuit) -> str:
+    at_A, at_B = circuit.values["A_A"], circuit.values["A_B"]
+    return at_A if at_A == at_B else f"{at_A} at A and {at_B} at B"
 
 
-def _schematic_note(rig: Rig | None) -> str:
+def _assumed(circuit: Circuit, rig: Rig | None) -> str:
+    """Return what L/min rests on; "" where no rig was given."""
     if rig is None:
-        return (
-            "The reference circuit of a pump-controlled actuator. The parameters of this machine were not given, "
-            "and its circuit may differ."
-        )
-    return f"Values: {rig.title or rig.name}."
+        return ""
+    return f"{rig.title or rig.name}: piston area {_areas(circuit)}, pump {circuit.values['q_b']}"
+
+
+def _machine(circuit: Circuit, rig: Rig | None) -> list[tuple[str, str]]:
+    """Return what the rig says of the machine, as the page shows it beside the drawing."""
+    if rig is None:
+        return []
+    values = circuit.values
+    throttles = f"closed {values['closed_A']} at A, {values['closed_B']} at B" if circuit.throttles else "none"
+    return [
+        ("Rig", rig.title or rig.name),
+        ("Cylinder", f"{circuit.cylinder}, area {_areas(circuit)}, stroke {values['L']}"),
+        ("Pump", f"displacement {values['q_b']}"),
+        ("Throttles", throttles),
+    ]
 
 
 def _known(diagnosis: Diagnosis, truth_onset_s: float | None, truth_leak_lpm: float | None) -> str:
@@ -245,9 +235,6 @@ def _evidence(
         return None if onset is None else (max(span[0], onset - seconds), min(span[1], onset + seconds))
 
     groups = {group: [c for c in shown if c.group == group] for group in (charts.COURSE, "rms", "channels", "details")}
-    line_key = ["p_A, p_1 dark and p_B, p_2 light"] if any(len(c.lines) == 2 for c in shown) else []
-    if groups["rms"]:
-        line_key.append("d1 thin light, d2 dashed, d3 thick, d4 dotted")
     return {
         "groups": groups,
         "still": drawn.still,
@@ -256,7 +243,6 @@ def _evidence(
         "around": around(20.0),
         "close": (first, last) if base.width > 1 else around(2.0),
         "decimation": decimation,
-        "line_key": line_key,
         "window": features.WINDOW,
         "step": features.STEP,
     }

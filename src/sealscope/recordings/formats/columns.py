@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import Literal
 
@@ -49,7 +49,8 @@ ChannelMap = Mapping[str, str] | Literal["auto"]
 class ColumnMap:
     """What to load of a table: the number of the time column and its label, name -> (column, unit) of each channel.
 
-    `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day.
+    `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day;
+    `names`: channel -> label of its column, where the file calls it otherwise.
     """
 
     time: int | None
@@ -57,6 +58,7 @@ class ColumnMap:
     channels: Mapping[str, tuple[int, str]]
     notes: tuple[str, ...] = ()
     date: int | None = None
+    names: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def columns(self) -> list[tuple[int, bool]]:
@@ -218,4 +220,5 @@ def choose_columns(labels: Sequence[Label], channel_map: ChannelMap, rate: float
     if ignored:
         notes.append(f"columns not used: {listed(ignored, 40)}")
     order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel][0])}
-    return ColumnMap(time, time_label, order, tuple(notes), None if time is None else date)
+    names = {channel: labels[column].whole for channel, (column, _) in order.items() if labels[column].name != channel}
+    return ColumnMap(time, time_label, order, tuple(notes), None if time is None else date, names)

@@ -83,6 +83,8 @@ class RawTable:
         if own is not None:
             return RecordingFields(t, channels, units, rate, own["provenance"], (*own["history"], *notes))
         about = {"about": dict(self.about)} if self.about else {}
+        if choice.names:
+            about["columns"] = dict(choice.names)
         return RecordingFields(t, channels, units, rate, {**source, "format": self.kind, **start, **about}, notes)
 
 

@@ -49,6 +49,18 @@
     ctx.restore();
   }
 
+  // The values under the cursor stand beside the key of the chart, and nothing while there is no cursor.
+  function readOut(u, c, series, box) {
+    const at = u.cursor.idx, head = box.previousElementSibling;
+    head.querySelector(".at").textContent = at == null ? "" : u.data[0][at].toFixed(2) + " s";
+    const ends = c.band && at != null ? [u.data[1][at], u.data[2][at]] : [];
+    for (const [k, text] of head.querySelectorAll(".key output").entries()) {
+      if (at == null) text.textContent = "";
+      else if (c.band && k === 1) text.textContent = ends.map((v) => shown(v, "")).join(" to ");
+      else text.textContent = shown(u.data[c.band ? 3 : k + 1][at], c.unit);
+    }
+  }
+
   function link(from, min, max) {
     if (linking) return;
     linking = true;
@@ -64,19 +76,19 @@
       if (!box || !box.clientWidth || box.classList.contains("live")) continue; // folded, or drawn already
       const series = c.band ? [c.series[1], c.series[2], c.series[0]] : c.series; // the estimate above its interval
       const pen = (s) => ({
-        label: s.label, stroke: color("--" + s.style), width: widths[s.style] || 1.1, dash: dashes[s.style],
-        points: {show: c.axis !== "samples" && axes[c.axis].length < 60}, value: (u, v) => shown(v, c.unit),
+        stroke: color("--" + s.style), width: widths[s.style] || 1.1, dash: dashes[s.style],
+        points: {show: c.axis !== "samples" && axes[c.axis].length < 60, size: 4, fill: color("--" + s.style)},
       });
       const axis = {stroke: color("--soft"), grid: {stroke: color("--grid"), width: 1}, ticks: {stroke: color("--rule"), width: 1}, font: "12px system-ui, sans-serif"};
       const plot = new uPlot({
         width: box.clientWidth, height: c.height,
-        scales: {x: {time: false}, y: {range: (u, min, max) => min == null ? [0, 1] : uPlot.rangeNum(min, max, 0.06, true)}},
+        scales: {x: {time: false}, y: {range: (u, min, max) => c.limits || (min == null ? [0, 1] : uPlot.rangeNum(min, max, 0.06, true))}},
         axes: [Object.assign({size: 30, values: (u, list) => list.map((v) => v + " s")}, axis), Object.assign({size: 66, space: 22, values: (u, list) => list.map((v) => (v == null ? "" : (Math.abs(v) >= 1e5 ? v.toExponential().replace("e+", "e") : String(+v.toPrecision(6))).replace("-", "−")))}, axis)],
-        series: [{label: "t", value: (u, v) => (v == null ? "–" : v.toFixed(2) + " s")}].concat(series.map((s, i) => c.band && i < 2 ? Object.assign(pen(s), {width: 0, points: {show: false}}) : pen(s))),
+        series: [{}].concat(series.map((s, i) => c.band && i < 2 ? Object.assign(pen(s), {width: 0, points: {show: false}}) : pen(s))),
         bands: c.band ? [{series: [2, 1], fill: color("--fill-a")}] : [],
-        legend: {markers: {width: 1, fill: (u, i) => u.series[i]._stroke || color("--" + series[i - 1].style)}},
+        legend: {show: false},
         cursor: {sync: {key: "t", scales: ["x", null]}, drag: {x: true, y: false}},
-        hooks: {draw: [(u) => marksOver(u, color)], setScale: [(u, key) => {if (key === "x" && u.status) link(u, u.scales.x.min, u.scales.x.max);}]},
+        hooks: {draw: [(u) => marksOver(u, color)], setCursor: [(u) => readOut(u, c, series, box)], setScale: [(u, key) => {if (key === "x" && u.status) link(u, u.scales.x.min, u.scales.x.max);}]},
       }, [stretched(c.axis, axes[c.axis], first, last)].concat(series.map((s) => stretched(c.axis, values(s), null, null))), box);
       box.classList.add("live");
       plot.drawnHeight = c.height;
