@@ -14,10 +14,19 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+#: Longest word that near ones are looked for: the search takes longer than in proportion to the length.
+_LONGEST_WORD = 200
+
+
+def nearest(word: str, known: Iterable[str], count: int = 1, share: float = 0.5) -> list[str]:
+    """Return up to `count` of the known words that have at least a `share` of their letters in common with `word`."""
+    return difflib.get_close_matches(word, known, n=count, cutoff=share) if len(word) <= _LONGEST_WORD else []
+
+
 def closest(word: str, known: Iterable[str]) -> str:
     """Return ``; did you mean NAME?`` with the known name nearest to `word`, or an empty text."""
     folded = {name.casefold(): name for name in known}
-    near = difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.5)
+    near = nearest(word.casefold(), folded)
     return f"; did you mean {folded[near[0]]}?" if near else ""
 
 

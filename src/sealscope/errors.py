@@ -6,9 +6,21 @@ Each message is one line that names the rule, the value and the place, for examp
 
 from __future__ import annotations
 
+#: Most characters of a message at its beginning, where the rule stands, and at its end, where the place does.
+_BEGINNING, _END = 1500, 2500
+
 
 class SealscopeError(Exception):
-    """Base of every error that Sealscope raises on purpose; its text is one line, fit to print."""
+    """Base of every error that Sealscope raises on purpose; its text is one line, fit to print.
+
+    Line breaks of a text from outside become blanks, and the middle of a very long one is left out.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        line = " ".join(str(message).splitlines())
+        if len(line) > _BEGINNING + _END:
+            line = f"{line[:_BEGINNING]} ... {line[-_END:]}"
+        super().__init__(line)
 
 
 class InputError(SealscopeError, ValueError):

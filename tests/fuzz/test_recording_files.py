@@ -13,6 +13,8 @@ import pytest
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import Recording, inspect, read, write
 
+from .mutations import changed_bytes
+
 RATE, N = 500.0, 240
 T = np.arange(N) / RATE
 RECORDING = Recording(
@@ -101,46 +103,6 @@ KINDS: dict[str, Callable[[Path], Path]] = {
     "spreadsheet": xlsx,
     "gzip": gzipped,
 }
-WORDS = (
-    b"\0",
-    b"\xff" * 8,
-    b"nan",
-    b"inf",
-    b"1e999",
-    b'"',
-    b";" * 40,
-    b"\n" * 9,
-    b"-",
-    b"9" * 30,
-    b"\x7f" * 4,
-    b"t [s]",
-)
-
-
-def mutated(whole: bytes, draw: random.Random) -> bytes:
-    """Bytes changed, cut, doubled, moved, or replaced by awkward ones, mostly in the head, where lengths stand."""
-    data = bytearray(whole)
-    for _ in range(draw.choice((1, 1, 2, 4, 16))):
-        head = draw.random() < 0.5
-        at = draw.randrange(min(len(data), 600) if head else len(data))
-        match draw.randrange(6):
-            case 0:
-                data[at] = draw.randrange(256)
-            case 1:
-                data[at] ^= 1 << draw.randrange(8)
-            case 2:
-                data[at:at] = draw.choice(WORDS)
-            case 3:
-                word = draw.choice(WORDS)
-                data[at : at + len(word)] = word
-            case 4:
-                data[at : at + draw.randint(1, 200)] = b""
-            case 5:
-                data = (
-                    data[: max(1, at)] if draw.random() < 0.3 else data[:at] + data[: draw.randint(1, 400)] + data[at:]
-                )
-        data = data or bytearray(b"\0")
-    return bytes(data)
 
 
 def attack(kind: str, folder: Path, count: int, seed: int) -> dict[str, int]:
@@ -149,7 +111,7 @@ def attack(kind: str, folder: Path, count: int, seed: int) -> dict[str, int]:
     path = KINDS[kind](folder)
     whole, counts = path.read_bytes(), {"recording": 0, "refused": 0}
     for number in range(count):
-        path.write_bytes(mutated(whole, draw))
+        path.write_bytes(changed_bytes(whole, draw))
         begin = time.perf_counter()
         try:
             inspect(read(path))

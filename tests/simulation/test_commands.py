@@ -155,5 +155,5 @@ def test_white_space_of_any_kind(blank):
 
 
 def test_a_text_without_end_is_refused():
-    with pytest.raises(InputError, match="at most 4000 characters, got 13008"):
+    with pytest.raises(InputError, match="at most 1000 characters, got 13008"):
         parse_command("1 period of " * 1084)

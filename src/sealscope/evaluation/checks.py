@@ -46,8 +46,14 @@ def flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
     return np.asarray(array == 1.0, dtype=np.bool_)
 
 
+#: Smallest probability that is asked for: what no number of records can show.
+LEAST_SHARE = 1e-15
+
+
 def share(value: float, what: str) -> float:
-    """Return `value`, a probability strictly between 0 and 1."""
+    """Return `value`, a probability strictly between 0 and 1, and not so small that its inverse overflows."""
     if not 0.0 < value < 1.0:
         raise InputError(f"{what} must be between 0 and 1, got {value}")
+    if value < LEAST_SHARE:
+        raise InputError(f"{what} must be at least {LEAST_SHARE:g}, got {value:g}")
     return float(value)

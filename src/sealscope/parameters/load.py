@@ -9,6 +9,7 @@ from pathlib import Path
 from sealscope.calls import checked_call, closest
 from sealscope.errors import InputError
 from sealscope.parameters.rig import ParameterEntry, Rig, flatten
+from sealscope.storage.opening import names_a_file
 from sealscope.storage.toml_file import read_toml
 
 _PACKAGED = Path(__file__).parent / "rigs"
@@ -70,7 +71,7 @@ def _packaged(name: str) -> Rig:
 
 
 def _is_path(text: str) -> bool:
-    return text.endswith(".toml") or "/" in text or os.sep in text or Path(text).is_file()
+    return text.endswith(".toml") or "/" in text or os.sep in text or names_a_file(text)
 
 
 def _build(path: Path, place: str) -> Rig:

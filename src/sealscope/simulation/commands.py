@@ -198,21 +198,29 @@ def recorded_command(recording: Recording, origin: str) -> Recorded:
     return Recorded(recording.t - recording.t[0], recording["u"], origin)
 
 
+#: Samples of a command that are looked at together, so that a long one does not fill the memory.
+_CHECKED_AT_ONCE = 1_000_000
+
+
 def check_command(command: Command, t: Array, limit: float) -> None:
     """Raise InputError where the command leaves +-`limit` [V], the converter's range.
 
     That, or no number, at any of the times `t` [s].
     """
-    u = command.volts(t)
-    bad = ~(np.abs(u) <= limit * (1 + 1e-12))
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise InputError(f"command must stay within +-{limit:g} V, got {u[k]:.4g} V at t = {t[k]:.4g} s ({command})")
+    for start in range(0, t.size, _CHECKED_AT_ONCE):
+        part = t[start : start + _CHECKED_AT_ONCE]
+        u = command.volts(part)
+        bad = ~(np.abs(u) <= limit * (1 + 1e-12))
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise InputError(
+                f"command must stay within +-{limit:g} V, got {u[k]:.4g} V at t = {part[k]:.4g} s ({command})"
+            )
 
 
 #: Patterns in texts of commands, leaks and faults: a number without and with a sign, and a time ("90", "90 s",
 #: "1.5[min]").
-UNSIGNED = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+UNSIGNED = r"(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 NUMBER = rf"[-+]?{UNSIGNED}"
 TIME = rf"{UNSIGNED}\s*(?:\[\s*\w+\s*\]|(?:s|ms|min|h)\b)?"
 _N, _T = NUMBER, rf"[-+]?{TIME}"
@@ -252,7 +260,14 @@ def _number(text: str | None, default: float) -> float:
     return value
 
 
-_LONGEST_TEXT = 4000
+_LONGEST_TEXT = 1000
+
+
+def plain_text(text: str, what: str) -> str:
+    """Return the text of an option with single blanks; raise InputError for one of more than 1000 characters."""
+    if len(text) > _LONGEST_TEXT:
+        raise InputError(f"{what} must be of at most {_LONGEST_TEXT} characters, got {len(text)}")
+    return " ".join(text.split())
 
 
 def parse_command(text: str) -> Command:
@@ -269,9 +284,7 @@ def parse_command(text: str) -> Command:
 
         path = stripped[5:].strip()
         return recorded_command(read(path), path)
-    if len(text) > _LONGEST_TEXT:
-        raise InputError(f"command must be of at most {_LONGEST_TEXT} characters, got {len(text)}")
-    stripped = " ".join(stripped.split())
+    stripped = plain_text(text, "command")
     if "period" in stripped.lower():
         form = r"\s*(\d{1,6})\s+periods?\s+of\s+(.*)"
         parts = [re.fullmatch(form, part, re.IGNORECASE) for part in stripped.split(",")]

@@ -17,7 +17,7 @@ import numpy as np
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
 from sealscope.simulation.changes import GROUPS, Adjustment, Effect, Hold
-from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, number_text, seconds
+from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, number_text, plain_text, seconds
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 if TYPE_CHECKING:
@@ -455,11 +455,11 @@ class ChangedDuty:
 
 #: When, in texts of leaks and faults: `from 90 s`, `growing from 1 min to 120 s`.
 _WHEN = rf"(?:\s+(?:from\s+(?P<at>{TIME})|growing\s+from\s+(?P<start>{TIME})\s+to\s+(?P<stop>{TIME})))?"
-_MEAN = rf"(?P<mean>{UNSIGNED}\s*(?:\[[^\]]+\]|[a-zA-Z^0-9]+/[a-zA-Z]+))"
+_MEAN = rf"(?P<mean>{UNSIGNED}\s*(?:\[[^\]]+\]|[a-zA-Z][a-zA-Z^0-9]*/[a-zA-Z]+))"
 _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(?P<law>laminar|orifice))?{_WHEN}"
 _FACTOR = rf"(?:x\s*(?P<times>{NUMBER})|(?P<percent>[-+]\s*{UNSIGNED})\s*%)"
 _SHARE = rf"(?P<share>{NUMBER})\s*(?P<sign>%?)"
-_SIZE = rf"(?P<size>{NUMBER}\s*(?:\[[^\]]+\]|[a-zA-Z0-9^/_]+))"
+_SIZE = rf"(?P<size>{NUMBER}\s*(?:\[[^\]]+\]|[a-zA-Z][a-zA-Z0-9^/_]*))"
 _SENSOR = r"sensor\s+(?P<channel>\w+)"
 _Part = dict[str, str | None]
 
@@ -490,7 +490,7 @@ def parse_leak(text: str) -> Leak | None:
         if not (np.all(np.isfinite(flow)) and peak > 0 and flow.min() >= 0):
             raise InputError(f"q_leak of a leak table must be finite, >= 0 and somewhere > 0 ({stripped[6:].strip()})")
         return Leak("laminar", mean=peak, opening=Tabulated(table.t, flow / peak))
-    match = re.fullmatch(_LEAK, stripped)
+    match = re.fullmatch(_LEAK, plain_text(text, "leak"))
     if not match:
         raise InputError(
             "leak must be like '0.0042 L/min from 90 s', '0.01 L/min orifice growing from 60 s to 120 s', "
@@ -568,7 +568,7 @@ def parse_fault(text: str) -> Fault | None:
     from 90 s``, ``sensor p_A gain -1 %``, ``sensor p_A stuck from 90 s to 100 s``, and ``duty amplitude x1.5 frequency
     x0.8 from 90 s``. Raises InputError that shows the forms when the text is none of them.
     """
-    stripped = text.strip()
+    stripped = plain_text(text, "fault")
     if stripped.lower() in ("none", "no fault"):
         return None
     for pattern, make in _FORMS:

@@ -26,6 +26,11 @@ _KINDS = (
 )
 
 
+def names_a_file(text: str | os.PathLike[str]) -> bool:
+    """Whether a text from outside is the path of a file; False, too, for what no path can be (too long, odd bytes)."""
+    return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for these until Python 3.14
+
+
 def kind_of(mode: int) -> str | None:
     """Return what a file of this `st_mode` is, in words; None for a regular file."""
     return next((name for is_kind, name in _KINDS if is_kind(mode)), None)

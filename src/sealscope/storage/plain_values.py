@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 _T = TypeVar("_T")
 #: Largest whole number: beyond it, doubles are no longer exact.
-_LARGEST = 2**53
+LARGEST_WHOLE = 2**53
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -32,7 +32,7 @@ def _finite(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    if len(text) > 17 or abs(int(text)) > _LARGEST:
+    if len(text) > 17 or abs(int(text)) > LARGEST_WHOLE:
         raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
     return int(text)
 

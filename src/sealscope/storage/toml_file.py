@@ -8,6 +8,7 @@ from typing import Any
 
 from sealscope.errors import InputError
 from sealscope.storage.opening import open_regular
+from sealscope.storage.plain_values import LARGEST_WHOLE
 
 #: Largest file read [bytes]; what is larger is no file of settings.
 LARGEST = 1_000_000
@@ -16,7 +17,8 @@ LARGEST = 1_000_000
 def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
     """Return the tables of the TOML file `path`; `what` it is ("a rig file") and its `place` stand in the errors.
 
-    Raises InputError where it cannot be read, is larger than `LARGEST`, is not UTF-8 or not TOML.
+    Raises InputError where it cannot be read, is larger than `LARGEST`, is not UTF-8 or not TOML, or holds a whole
+    number beyond 2^53, which doubles do not hold.
     """
     try:
         with open_regular(path, what) as file:
@@ -29,8 +31,17 @@ def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
     if len(data) > LARGEST:
         raise InputError(f"{what} must be at most {LARGEST} bytes, got more ({place})")
     try:
-        return tomllib.loads(data.decode("utf-8-sig"))
+        tree = tomllib.loads(data.decode("utf-8-sig"))
+        _check_whole_numbers(tree)
     except UnicodeDecodeError as error:
         raise InputError(f"{what} must be UTF-8 text, got byte {data[error.start]:#04x} ({place})") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # tomllib lets errors of dates and of very long numbers through
         raise InputError(f"{what} must be TOML: {str(error).splitlines()[0]} ({place})") from None
+    return tree
+
+
+def _check_whole_numbers(value: Any) -> None:
+    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+        raise ValueError("a whole number must be at most 2^53 in size")
+    for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _check_whole_numbers(inner)

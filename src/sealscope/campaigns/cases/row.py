@@ -148,8 +148,9 @@ class CaseRow:
             as_type(Place, tree["place"])
         scores = {str(name): (_number(score), _number(onset)) for name, (score, onset, *_) in tree["scores"].items()}
         statements = {str(key): stated_evidence(plain) for key, plain in tree.get("statements", {}).items()}
-        numbers = {name: _number(tree.get(name)) for name in ("flow_lpm", "bound_lpm", "seconds")}
-        return cls(**{**tree, **numbers, "scores": scores, "statements": statements})
+        numbers = {name: _number(tree.get(name)) for name in ("flow_lpm", "bound_lpm")}
+        seconds = float(tree.get("seconds", 0.0))
+        return cls(**{**tree, **numbers, "seconds": seconds, "scores": scores, "statements": statements})
 
 
 def _number(value: Any) -> float | None:

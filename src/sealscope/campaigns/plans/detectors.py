@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 
+from sealscope.calls import nearest
 from sealscope.diagnosis.calibration.scorers import CALIBRATED, SCORERS, VIEW, scorer, split_view
 from sealscope.diagnosis.registry import detectors
 from sealscope.errors import InputError
@@ -75,10 +76,8 @@ def check_detector(name: str, views: Views) -> None:
         raise InputError(f"{DIAGNOSE!r} has no score of its own and cannot be calibrated, got {name!r}")
     if parsed.of in known:
         return
-    import difflib
-
     choices = [*SCORERS, *known, *(f"{detector}{CALIBRATED}" for detector in known[1:])]
-    near = difflib.get_close_matches(split_view(name)[0], choices, n=1)
+    near = nearest(split_view(name)[0], choices, share=0.6)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InputError(
         f"a detector must be one of {', '.join(known)}, or a scorer's name such as 'd3 of p_A fell', got {name!r}{hint}"

@@ -30,6 +30,7 @@ from sealscope.campaigns.plans.model import (
 )
 from sealscope.campaigns.plans.table import PlanTable
 from sealscope.errors import InputError
+from sealscope.storage.opening import names_a_file
 from sealscope.storage.toml_file import read_toml
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
     text = os.fspath(name_or_path)
     if text in plan_names():
         return read_plan(read_toml(_PACKAGED / f"{text}.toml", "a plan", f"plans/{text}.toml"), f"plans/{text}.toml")
-    if not (text.endswith(".toml") or Path(text).is_file()):
+    if not (text.endswith(".toml") or names_a_file(text)):
         raise InputError(f"{text!r} is no packaged plan ({', '.join(plan_names())}) and no .toml file")
     return read_plan(read_toml(Path(text), "a plan", text), text)
 
@@ -289,6 +290,10 @@ def _recording_set(table: PlanTable) -> RecordingSet:
         raise table.fail(f"size must be >= 0, and 0 to calibrate, got {recordings.size:g}")
     if Path(recordings.files).is_absolute() or ".." in Path(recordings.files).parts:
         raise table.fail(f"files must be a pattern within the folder, got {recordings.files!r}")
+    if "\0" in recordings.files or any("**" in part and part != "**" for part in Path(recordings.files).parts):
+        raise table.fail(f"files must be a pattern of names, got {recordings.files!r}")
+    if recordings.files.count("**") > 1:
+        raise table.fail(f"files must have ** once at most, got {recordings.files!r}")
     return recordings
 
 

@@ -133,7 +133,8 @@ class PlanTable:
     def _channels(self, key: str, given: Any) -> tuple[str, ...]:
         from sealscope.recordings.recording import CHANNEL_UNITS
 
-        if not isinstance(given, list) or not given or len({repr(channel) for channel in given}) < len(given):
+        texts = isinstance(given, list) and all(isinstance(channel, str) for channel in given)
+        if not texts or not given or len(set(given)) < len(given):
             raise self.fail(f"{key} must be a list of channels, each once, got {given!r}")
         for channel in given:
             if channel not in CHANNEL_UNITS:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from typing import Literal
 
+from sealscope.calls import nearest
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.headings.labels import Label, square_brackets
@@ -80,7 +80,7 @@ def check_channel(channel: str) -> None:
     """Raise InputError, with the nearest name, where `channel` is neither a channel nor `t`."""
     known = [*CHANNEL_UNITS, "t"]
     if channel not in known:
-        near = difflib.get_close_matches(channel, known, 1, 0.5)
+        near = nearest(channel, known)
         hint = f" (did you mean {near[0]}?)" if near else ""
         raise InputError(f"a mapped channel must be one of {', '.join(known)}, got {channel}{hint}")
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from sealscope.storage.atomic import atomic_write, remove_temporaries
 from sealscope.storage.folders import inner_folder, locked
-from sealscope.storage.opening import open_inner
+from sealscope.storage.opening import names_a_file, open_inner
 from sealscope.thesis.engine.context import SimulatedRun
 from sealscope.thesis.engine.products import Claim, Product
 from sealscope.thesis.engine.serialization import load, load_note, save
@@ -72,7 +72,7 @@ class ResultsFolder:
             key, files = str(note["key"]), tuple(map(str, note["files"]))
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return "", ()
-        return key if all((self.folder / name).is_file() for name in files) else "", files
+        return key if all(names_a_file(self.folder / name) for name in files) else "", files
 
     def keep_drawn(self, item: str, key: str, files: tuple[str, ...]) -> None:
         """Note what was drawn; remove files of an earlier drawing that are no longer made."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,6 +10,7 @@ from fnmatch import fnmatchcase
 from graphlib import CycleError, TopologicalSorter
 from typing import TYPE_CHECKING, Literal
 
+from sealscope.calls import nearest
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
         else:
             matches = [name for name in ids if name == folded or fnmatchcase(name, folded)]
         if not matches:
-            near = difflib.get_close_matches(folded, [*ids, "all"], n=3, cutoff=0.5)
+            near = nearest(folded, [*ids, "all"], 3)
             hint = f"; closest: {', '.join(near)}" if near else ""
             raise InputError(
                 "an item must be an id of the list (sealscope reproduce --list), all, chapter-N or a wildcard such as "

@@ -1,0 +1,353 @@
+"""What is fuzzed beside recordings: for each kind of input, a function that draws a hostile one and uses it.
+
+A use returns whether the input was taken. It raises whatever escapes the errors of the house, and AssertionError where
+a message is more than a line.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import sealscope
+from sealscope.campaigns.cases.case import CampaignCase, cases_of
+from sealscope.campaigns.cases.recordings import recorded_rows
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.execution import store
+from sealscope.campaigns.execution.run import run
+from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
+from sealscope.campaigns.plans.reader import load_plan, plan_names
+from sealscope.campaigns.results import simulated_result, write_result
+from sealscope.errors import SealscopeError
+from sealscope.parameters import load_rig, parse_overrides, rig_names
+from sealscope.recordings import split_map_option
+from sealscope.recordings.formats.columns import Label, check_call, choose_columns
+from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
+from sealscope.simulation.bench.profile import load_profile
+from sealscope.simulation.commands import parse_command
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.faults import parse_fault, parse_leak
+from sealscope.thesis.engine.folder import ResultsFolder
+from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
+from sealscope.units import parse_quantity, parse_unit
+
+from .mutations import change_tree, changed_bytes, changed_option, changed_toml
+
+#: Draws a hostile input and uses it; whether it was taken.
+Use = Callable[[random.Random], bool]
+_SOURCES = Path(sealscope.__file__).parent
+
+
+def taken(work: Callable[[], object]) -> bool:
+    """Whether the work ends well; False for an error of the house, which must be one line that can be printed."""
+    try:
+        work()
+    except SealscopeError as error:
+        assert "\n" not in str(error), str(error)[:300]
+        assert 0 < len(str(error)) < 5000, str(error)[:300]
+        return False
+    return True
+
+
+COMMANDS = (
+    "3 sin(4t)",
+    "3 sin(4t + 0.5) - 1",
+    "6 periods of 5 sin(2t), 10 periods of 3 sin(4t)",
+    "step 5 at 1 s",
+    "ramp 5 from 1 s to 3 s",
+    "chirp 3 from 0.1 Hz to 5 Hz over 60 s",
+    "prbs 2 every 0.5 s seed 1",
+)
+LEAKS = (
+    "0.0042 L/min from 90 s",
+    "0.01[L/min] orifice growing from 1 min to 2 min",
+    "G = 6.1e-13 from 90 s",
+    "C = 2e-10",
+)
+FAULTS = (
+    "pump leak x3 from 90 s",
+    "pump leak G = 5e-13",
+    "rod seal A 0.01 L/min from 90 s",
+    "friction +20 % growing from 60 s to 120 s",
+    "air 1 % from 90 s",
+    "sensor p_A offset 2 psi from 90 s",
+    "sensor p_A gain -1 %",
+    "sensor p_A stuck from 90 s to 100 s",
+    "duty amplitude x1.5 frequency x0.8 from 90 s",
+)
+SIZES = ("3 min", "180", "500 Hz", "20[Pa]", "1e-5 s", "2[L/min]", "0.8[ohm]", "50 %", "3 psi")
+UNITS = ("Pa", "m^3/(s Pa)", "N m/A", "cm3/rev", "rad/s/V", "kelvin", "bar(a)", "N/(m m)", "µm", "BTU/(ft*h)")
+MAPS = ("p_A=PG_1[psi]", "p_B=#3", "x=#4[mm]", "t=Time", "p_A=p (port A)[bar]")
+SETS = ("V_1=50[cm^3]", "orifices=present", "sensors.p_A.noise=1[psi]", "K_oil=689 MPa", "sample_rate=1 kHz")
+LABELS = [Label.parse(text) for text in ("Time", "PG_1", "PG_2 [psi]", "Pos", "p (port A)")]
+T = np.linspace(0.0, 10.0, 50)
+
+
+def _command(text: str) -> None:
+    command = parse_command(text)
+    command.volts(T)
+    assert str(parse_command(str(command))) == str(command)
+
+
+def _leak(text: str) -> None:
+    leak = parse_leak(text)
+    if leak is not None:
+        leak.opening.share(T)
+        str(leak)
+
+
+def _fault(text: str) -> None:
+    fault = parse_fault(text)
+    if fault is not None:
+        with np.errstate(all="ignore"):
+            fault.commanded(parse_command("3 sin(4t)")).volts(T)
+        fault.effects(load_rig("thesis"))
+        str(fault)
+
+
+def _columns(text: str) -> None:
+    channel, column = split_map_option(text)
+    check_call({channel: column}, None)
+    choose_columns(LABELS, {channel: column}, 500.0, "FILE")
+
+
+def _experiment(key: str, text: str) -> None:
+    Experiment.of(**{"duration": "2 s", key: text})
+
+
+def _quantity(text: str) -> None:
+    for unit in ("s", "Pa", "m^3/s", "rad", "K", "1"):
+        taken(lambda unit=unit: parse_quantity(text, unit))
+
+
+OPTIONS: dict[str, tuple[tuple[str, ...], Callable[[str], object]]] = {
+    "command": (COMMANDS, _command),
+    "leak": (LEAKS, _leak),
+    "fault": (FAULTS, _fault),
+    "quantity": (SIZES, _quantity),
+    "unit": (UNITS, parse_unit),
+    "map": (MAPS, _columns),
+    "set": (SETS, lambda text: load_rig("thesis").with_overrides(parse_overrides([text]))),
+    "heading": (("p_A [psi]", "p / bar", "p (N/(m m))"), Label.parse),
+    **{key: (SIZES, partial(_experiment, key)) for key in ("duration", "rate", "step", "error", "x_0")},
+}
+
+
+def options(folder: Path) -> Use:
+    """Texts of options; they name files of the folder only."""
+    os.chdir(folder)
+
+    def use(draw: random.Random) -> bool:
+        texts, work = OPTIONS[draw.choice(list(OPTIONS))]
+        text = changed_option(draw.choice(texts), draw)
+        if text.lower().strip().startswith(("file ", "table ")):
+            text = f"{text[:5]} none"
+        return taken(lambda: work(text))
+
+    return use
+
+
+def _toml(texts: list[str], read: Callable[[Path], object], folder: Path) -> Use:
+    path = folder / "given.toml"
+
+    def use(draw: random.Random) -> bool:
+        path.write_bytes(changed_toml(draw.choice(texts), draw))
+        return taken(lambda: read(path))
+
+    return use
+
+
+def rigs(folder: Path) -> Use:
+    """Rigs as TOML files, whole and as extensions of another."""
+    whole = [(_SOURCES / "parameters" / "rigs" / f"{name}.toml").read_text() for name in rig_names()]
+    small = (
+        '[rig]\nname = "mine"\nextends = "thesis"\n[motor]\nR_c = { value = 0.8, unit = "ohm", source = "measured" }\n'
+        '[line.orifices]\nvalue = "present"\nsource = "seen"\n'
+    )
+
+    def read(path: Path) -> None:
+        rig = load_rig(path)
+        rig.table()
+        json.dumps(rig.as_dict())
+        Experiment.of(rig=rig, duration=1.0)
+
+    return _toml([*whole, small, small], read, folder)
+
+
+def profiles(folder: Path) -> Use:
+    """Profiles of nuisances as TOML files; a machine of one is drawn."""
+    from sealscope.simulation.bench.machines import draw as draw_machine
+
+    places = sorted((_SOURCES / "simulation" / "bench" / "profiles").glob("*.toml"))
+
+    def read(path: Path) -> None:
+        profile = load_profile(path)
+        for seed in range(3):
+            draw_machine(profile, seed, duration=2.0)
+
+    return _toml([place.read_text() for place in places], read, folder)
+
+
+def plans(folder: Path) -> Use:
+    """Plans of all three kinds as TOML files."""
+    empty = folder / "empty"
+    empty.mkdir()
+    places = [_SOURCES / "campaigns" / "plans" / "packaged" / f"{name}.toml" for name in plan_names()]
+
+    def read(path: Path) -> None:
+        plan = load_plan(path)
+        if isinstance(plan, SimulatedPlan) and plan.size <= 3000:
+            store.made_from(plan)
+            cases_of(plan)
+        if isinstance(plan, RecordedPlan):
+            taken(lambda: recorded_rows(plan, empty))
+
+    return _toml([place.read_text() for place in places], read, folder)
+
+
+PLAN = """
+[campaign]
+name = "tiny"
+duration = "6 s"
+onset = "3 s"
+false_alarm = 0.2
+seed = 3
+detectors = ["d3 of p_A changed", "rms change, own threshold"]
+
+[[records]]
+use = "calibrate"
+count = 6
+
+[[records]]
+count = 3
+
+[[records]]
+leak = "0.015 L/min"
+count = 3
+"""
+
+
+def _unmade(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow:
+    return CaseRow.of(case, error="not carried out")
+
+
+def campaigns(folder: Path) -> Use:
+    """Folders of a campaign: rows, head, lock and the results beside them, changed, replaced or linked."""
+    plan_file, whole, given, outside = (folder / name for name in ("plan.toml", "whole", "given", "outside"))
+    plan_file.write_text(PLAN)
+    plan = load_plan(plan_file)
+    assert isinstance(plan, SimulatedPlan)
+    assert run(plan, whole, jobs=1).failed == 0
+    write_result(simulated_result(plan, whole), whole)
+    outside.mkdir()
+    (outside / "diary.txt").write_text("kept\n")
+    names = [store.ROWS, store.ROWS, store.ROWS, store.HEAD, store.LOCK]
+
+    def change(draw: random.Random) -> None:
+        name = draw.choice(names)
+        path = given / name
+        data = path.read_bytes() if path.is_file() else b"\n"
+        match draw.randrange(8):
+            case 0:
+                path.unlink(missing_ok=True)
+                path.symlink_to(outside / draw.choice(("diary.txt", "new.txt")))
+            case 1:
+                path.unlink(missing_ok=True)
+                path.mkdir() if draw.random() < 0.5 else os.mkfifo(path)
+            case 2 | 3:
+                path.write_bytes(changed_bytes(data or b"\n", draw))
+            case _:
+                lines = data.splitlines() if name == store.ROWS else [data]
+                at = draw.randrange(len(lines)) if lines else 0
+                try:
+                    tree = json.loads(lines[at])
+                except (ValueError, IndexError):
+                    return
+                change_tree(tree, draw)
+                lines[at] = json.dumps(tree).encode()
+                path.write_bytes(b"\n".join(lines) + b"\n" * (draw.random() < 0.9))
+
+    def work() -> None:
+        store.progress_of(plan, given)
+        run(plan, given, jobs=1, task=_unmade)
+        result = simulated_result(plan, given)
+        write_result(result, given)
+        campaign_text(result)
+        write_campaign_page(result, given / PAGE, [])
+
+    def use(draw: random.Random) -> bool:
+        shutil.rmtree(given, ignore_errors=True)
+        shutil.copytree(whole, given)
+        change(draw)
+        done = taken(work)
+        assert [path.name for path in outside.iterdir()] == ["diary.txt"]
+        assert (outside / "diary.txt").read_text() == "kept\n"
+        return done
+
+    return use
+
+
+def _products() -> tuple[Any, ...]:
+    curve = FigureCurve(T, np.sin(T), "p_A", "A")
+    image = Image(T[:4], T[:3], np.ones((3, 4)), "power")
+    panel = Panel("t [s]", "p_A [MPa]", (curve,), "title", ((1.0, "onset"),), None, (0.0, 5.0))
+    return (
+        Figure("fig-1", "A figure", (panel, Panel("x", "y", image=image)), (Number("n", 1.0, "s"),), resolved=True),
+        ThesisTable("tab-1", "A table", ("a", "b"), ((1, "x"), (None, 2.5))),
+        Claim("c-1", "p. 1", "a claim", "sheet", "simulation", "holds", "why"),
+    )
+
+
+def kept(folder: Path) -> Use:
+    """What a reproduction keeps: products and notes, changed in their bytes or in their structure."""
+    results = ResultsFolder(folder / "results")
+    results.keep("fig-1", False, {"key": "k"}, _products())
+    path = next((folder / "results" / "kept" / "items").glob("*.npz"))
+    whole = path.read_bytes()
+    note = folder / "results" / "kept" / "drawn" / "fig-1.json"
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+
+    def use(draw: random.Random) -> bool:
+        if draw.random() < 0.5:
+            path.write_bytes(changed_bytes(whole, draw))
+        else:
+            changed = dict(arrays)
+            name = draw.choice(("value", "note"))
+            tree = json.loads(bytes(changed[name]))
+            change_tree(tree, draw)
+            changed[name] = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
+            with path.open("wb") as file:
+                np.savez(file, **changed)
+        tree = {"key": "k", "files": ["figures/a.svg"]}
+        change_tree(tree, draw)
+        note.write_text(json.dumps(tree))
+
+        def work() -> object:
+            results.drawn("fig-1")
+            results.record("fig-1", False)
+            return results.products("fig-1", False)
+
+        assert taken(work)  # a damaged file is one that is not there
+        return results.products("fig-1", False) is not None
+
+    return use
+
+
+#: Name -> what makes the use of inputs of that kind, given a folder of its own.
+TARGETS: dict[str, Callable[[Path], Use]] = {
+    "options": options,
+    "rigs": rigs,
+    "profiles": profiles,
+    "plans": plans,
+    "campaign folders": campaigns,
+    "kept files": kept,
+}

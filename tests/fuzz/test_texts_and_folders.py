@@ -1,0 +1,43 @@
+"""Hostile options, settings and folders: taken, or refused by one line; soon, in little memory, and nothing else."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+from .runs import MOST_MEMORY, attack, peak_memory
+from .targets import TARGETS
+
+FEW = {"options": 300, "rigs": 60, "profiles": 120, "plans": 30, "campaign folders": 15, "kept files": 60}
+MANY = {"options": 6000, "rigs": 2000, "profiles": 1500, "plans": 1000, "campaign folders": 500, "kept files": 1500}
+
+
+def some(kind: str, folder: Path, seeds: range, capfd: pytest.CaptureFixture[str]) -> None:
+    before = peak_memory()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        count = attack(kind, folder, seeds)
+    assert count.taken > 0
+    assert count.refused > 0
+    assert peak_memory() - before < MOST_MEMORY
+    output = capfd.readouterr()
+    assert output.out == output.err == ""
+
+
+@pytest.mark.parametrize("kind", TARGETS)
+def test_hostile_inputs(
+    kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    some(kind, tmp_path, range(FEW[kind]), capfd)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", TARGETS)
+def test_many_hostile_inputs(
+    kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    some(kind, tmp_path, range(10**6, 10**6 + MANY[kind]), capfd)

@@ -1,0 +1,133 @@
+"""Texts from outside, of files and options: what is wrong with one is a line of bounded length, and soon said."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.campaigns.execution import store
+from sealscope.campaigns.plans.reader import load_plan
+from sealscope.errors import InputError, MissingExtra, SealscopeError, SimulationFailed, UnreadableFile
+from sealscope.parameters import load_rig, parse_overrides
+from sealscope.recordings import split_map_option
+from sealscope.simulation.commands import Chirp, check_command, parse_command
+from sealscope.simulation.faults import FrictionChange, parse_fault, parse_leak
+from sealscope.storage.opening import names_a_file
+from sealscope.thesis.engine.folder import ResultsFolder
+from sealscope.units import parse_quantity
+
+PLAN = '[campaign]\nname = "a"\nduration = "6 s"\ndetectors = ["rms change"]\n[[records]]\ncount = 1\n'
+
+
+@pytest.mark.parametrize("kind", [SealscopeError, InputError, UnreadableFile, SimulationFailed, MissingExtra])
+def test_a_message_is_one_line_of_bounded_length(kind: type[SealscopeError]) -> None:
+    assert str(kind("p (port\r\nA) must be\u2028a column")) == "p (port A) must be a column"
+    long = str(kind(f"x must be a number, got {'9' * 10**6} (log.csv)"))
+    assert len(long) < 5000
+    assert long.startswith("x must be a number, got 999")
+    assert long.endswith("9 (log.csv)")
+    assert str(kind()) == ""
+
+
+@pytest.mark.parametrize(
+    ("entry", "rule"),
+    [
+        (f"seed = {'1' * 4400}", "a plan must be TOML"),
+        (f"seed = {2**53 + 1}", r"a whole number must be at most 2\^53 in size"),
+        (f"duration = 1{'0' * 400}", r"a whole number must be at most 2\^53 in size"),
+        ("channels = [['p_A']]", r"channels must be a list of channels, each once, got \[\['p_A'\]\]"),
+        (f'rig = "{"thesis" * 900}"', "is no packaged rig"),
+        ("false_alarm = 1e-320", "the false-alarm probability must be at least 1e-15"),
+    ],
+)
+def test_settings_of_a_plan(entry: str, rule: str, tmp_path: Path) -> None:
+    path, key = tmp_path / "plan.toml", entry.partition(" ")[0]
+    lines = [line for line in PLAN.splitlines() if not line.startswith(f"{key} =")]
+    calibrated = '[[records]]\nuse = "calibrate"\ncount = 9\n' if key == "false_alarm" else ""
+    detectors = "d3 of p_A fell" if calibrated else "rms change, own threshold"
+    text = "\n".join([lines[0], entry, *lines[1:], calibrated]).replace("rms change", detectors)
+    path.write_text(text)
+    with pytest.raises(InputError, match=rule):
+        load_plan(path)
+
+
+@pytest.mark.parametrize("files", ["**x/*.csv", "**/**/*.csv", "a\\u0000b"])
+def test_patterns_of_a_plan(files: str, tmp_path: Path) -> None:
+    (tmp_path / "plan.toml").write_text(
+        '[campaign]\nname = "a"\ndetectors = ["rms change, own threshold"]\n[recordings]\n[[recordings.sets]]\n'
+        f'files = "{files}"\n'
+    )
+    with pytest.raises(InputError, match="files must"):
+        load_plan(tmp_path / "plan.toml")
+
+
+@pytest.mark.parametrize("name", ["thesis" * 1000, "a\0b", "\udcff"])
+def test_what_no_path_can_be_is_no_file(name: str) -> None:
+    assert not names_a_file(name)
+    with pytest.raises(InputError, match="is no packaged rig"):
+        load_rig(name)
+
+
+def test_a_note_of_drawn_files_with_such_a_name(tmp_path: Path) -> None:
+    kept = ResultsFolder(tmp_path)
+    (tmp_path / "kept" / "drawn" / "fig-1.json").write_text('{"key": "k", "files": ["' + "x" * 500 + '"]}')
+    assert kept.drawn("fig-1")[0] == ""
+
+
+def test_a_row_without_its_time_is_no_row(tmp_path: Path) -> None:
+    row = '{"id": "a", "use": "judge", "leak_lpm": 0, "fault": "", "levels": {}, "replicate": 0, "error": "e", '
+    (tmp_path / store.ROWS).write_text(row + '"scores": {}, "seconds": null}\n')
+    with pytest.raises(UnreadableFile, match="a line of a campaign must be a row, got something else"):
+        store.read_rows(tmp_path)
+
+
+@pytest.mark.parametrize("blank", [" ", "\t", "  ", "\u00a0"])
+def test_any_blank_after_a_sign(blank: str) -> None:
+    assert parse_fault(f"friction +{blank}20 % from{blank}9 s") == parse_fault("friction +20 % from 9 s")
+    assert parse_leak(f"0.01{blank}L/min from 9{blank}s") == parse_leak("0.01 L/min from 9 s")
+    assert str(parse_command(f"3 sin(4t +{blank}1)")) == "3 sin(4t + 1)"
+    assert isinstance(parse_fault(f"friction +{blank}20 %"), FrictionChange)
+
+
+LONG = 200_000
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda: parse_leak("1" * LONG),
+        lambda: parse_leak("0.01 " + "L" * LONG),
+        lambda: parse_fault("rod seal A " + "1" * LONG),
+        lambda: parse_command("3 sin(" + "4" * LONG),
+        lambda: parse_overrides(["V" * LONG + "=1"]),
+        lambda: load_rig("thesis").with_overrides({"V" * LONG: 1.0}),
+        lambda: split_map_option("p_A" * LONG + "=x"),
+        lambda: parse_quantity("1" * LONG + "x", "s"),
+        lambda: load_rig("thesis" * LONG),
+    ],
+)
+def test_long_options_are_refused_soon(read: Callable[[], object]) -> None:
+    start = time.process_time()
+    try:
+        read()
+    except InputError as error:
+        assert len(str(error)) < 5000
+    assert time.process_time() - start < 1.0
+
+
+def test_a_long_command_is_checked_in_little_memory() -> None:
+    import tracemalloc
+
+    t = np.arange(8_000_000) / 1000.0
+    tracemalloc.start()
+    try:
+        check_command(Chirp(3.0, 0.1, 5.0, 60.0), t, 10.0)
+        with pytest.raises(InputError, match=r"got 11 V at t = 5000 s"):
+            check_command(parse_command("step 11 at 5000 s"), t, 10.0)
+        assert tracemalloc.get_traced_memory()[1] < 100e6
+    finally:
+        tracemalloc.stop()
