@@ -322,9 +322,9 @@ def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path, recording, make_
         write_page(tmp_path / "absent" / "page.html", recording, make_diagnosis())
 
 
-@pytest.mark.parametrize("name", ["page.PNG", "page.html.gz", "page"])
+@pytest.mark.parametrize("name", ["page.svg", "page.html.gz", "page"])
 def test_a_page_is_a_page_and_nothing_else(tmp_path, recording, make_diagnosis, name):
-    with pytest.raises(InputError, match=rf"^a page must be a file \.html, \.htm, \.pdf, got .*{name}$"):
+    with pytest.raises(InputError, match=rf"^a page must be a file \.html, \.htm, \.pdf, \.png, got .*{name}$"):
         write_page(tmp_path / name, recording, make_diagnosis())
     assert list(tmp_path.iterdir()) == []
     assert write_page(tmp_path / "page.HTM", recording, make_diagnosis()).is_file()

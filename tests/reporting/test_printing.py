@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError, MissingExtra
 from sealscope.reporting import printing, write_page
+from sealscope.reporting.card import render_card
 
 PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
 BROWSER = next(filter(None, map(shutil.which, printing.BROWSERS)), None)
@@ -31,6 +35,55 @@ def test_the_page_of_a_leak_fits_a_sheet(tmp_path: Path, recording, make_diagnos
     assert len(re.findall(rb"/Type */Page\b", page.read_bytes())) == 1
 
 
+@pytest.mark.skipif(BROWSER is None, reason="no browser of Chromium's family on this machine")
+def test_a_card_is_a_picture_of_its_stated_size(tmp_path: Path, recording, make_diagnosis) -> None:
+    leak = write_page(tmp_path / "leak.png", recording, make_diagnosis()).read_bytes()
+    head = b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4, "big") + b"IHDR"
+    assert leak.startswith(head + (1200).to_bytes(4, "big") + (630).to_bytes(4, "big"))
+    other = write_page(tmp_path / "other.PNG", recording, make_diagnosis(verdict="no leak")).read_bytes()
+    assert len(leak) > 5_000 and leak != other  # it shows the verdict
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["leak.png", "other.PNG"]
+
+
+def test_a_card_says_what_a_reader_must_know(recording, make_diagnosis) -> None:
+    about = {"Machine": "Press <7>", "Date": "2026-05-31", "Oil temperature": "41 degC"}
+    course = LeakCourse(*(np.linspace(0, end, 9) for end in (40.0, 0.004, 0.003, 0.005)))
+    card = render_card(replace(recording, provenance={"about": about}), make_diagnosis(course=course))
+    flow = "0.00421 L/min, between 0.0031 and 0.0057 L/min"
+    for text in (
+        "Press &lt;7&gt;",
+        "2026-05-31",
+        "41 degC",
+        "Leak: oil bypasses",
+        flow,
+        "Since 20.4 s",
+        "95 % interval",
+    ):
+        assert text in card
+    assert "<script" not in card and 'class="interval"' in card
+    unsure = render_card(recording, make_diagnosis(verdict="cannot tell", course=None))
+    assert "d3 fell in both chambers" in unsure and 'class="still"' not in unsure
+
+
+def test_without_a_browser_no_card_is_drawn(tmp_path: Path, monkeypatch, recording, make_diagnosis) -> None:
+    monkeypatch.setattr(printing, "BROWSERS", ())
+    with pytest.raises(MissingExtra, match=r"^a picture needs Chromium, got none: install it, or write \.html .*\.png"):
+        write_page(tmp_path / "card.png", recording, make_diagnosis())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_of_another_size_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = tmp_path / "browser"
+    small.write_text(
+        '#!/bin/sh\nfor a in "$@"; do case $a in --screenshot=*) printf \'\\211PNG\' > "${a#*=}";; esac; done\n'
+    )
+    small.chmod(0o755)
+    monkeypatch.setattr(printing, "BROWSERS", (str(small),))
+    with pytest.raises(InputError, match="must make a picture of the size asked for, got status 0: no message"):
+        printing.draw_page(PAGE, tmp_path / "card.png", 1200, 630)
+    assert [path.name for path in tmp_path.iterdir()] == ["browser"]
+
+
 def test_without_a_printer_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(printing, "BROWSERS", ())
     monkeypatch.setitem(__import__("sys").modules, "weasyprint", None)
@@ -44,6 +97,6 @@ def test_a_browser_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest
     broken.write_text("#!/bin/sh\necho no display >&2\nexit 3\n")
     broken.chmod(0o755)
     monkeypatch.setattr(printing, "BROWSERS", (str(broken),))
-    with pytest.raises(InputError, match=r"must print a PDF, got status 3: no display"):
+    with pytest.raises(InputError, match=r"must make a PDF, got status 3: no display"):
         printing.print_page(PAGE, tmp_path / "page.pdf")
     assert [path.name for path in tmp_path.iterdir()] == ["browser"]

@@ -240,7 +240,12 @@ def _aside(
 def report(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings to report on.")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="The page (.html, .pdf), or a folder where there are several files.")
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="The page (.html, .pdf) or its card (.png), or a folder where there are several files.",
+        ),
     ],
     baseline: BaselineOption = None,
     maps: MapOption = None,

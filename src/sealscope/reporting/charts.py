@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any
@@ -164,14 +165,14 @@ def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart
 COURSE = "course"
 
 
-def course_charts(course: LeakCourse | None) -> list[Chart]:
+def course_charts(course: LeakCourse | None, *, height: int = 190) -> list[Chart]:
     """Return the chart of the leak over the recording with its interval, where a detector follows it."""
     if course is None or not np.isfinite(course.lpm).any():
         return []
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high))
     lines = (ChartLine("leak", "a", course.lpm), ChartLine("low", "d1", low), ChartLine("high", "d1", high))
     limits = _limits(course.lpm, low, high)
-    return [Chart(COURSE, COURSE, "Leak past the piston", "L/min", lines, COURSE, 190, band=True, limits=limits)]
+    return [Chart(COURSE, COURSE, "Leak past the piston", "L/min", lines, COURSE, height, band=True, limits=limits)]
 
 
 def _limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
@@ -272,6 +273,17 @@ def onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float
         return float(onset), None
     low, high = (float(np.clip(end, *span)) for end in interval)
     return float(onset), (low, high)
+
+
+def events(diagnosis: Diagnosis, span: tuple[float, float], marks: Sequence[Mark]) -> list[dict[str, Any]]:
+    """Return what is marked on a still picture: the onset with its interval, and the moments given."""
+    onset, interval = onset_within(diagnosis, span)
+    marked: list[dict[str, Any]] = []
+    if interval is not None:
+        marked.append({"t": interval[0], "width": interval[1] - interval[0], "kind": ""})
+    if onset is not None:
+        marked.append({"t": onset, "width": None, "kind": ""})
+    return marked + [{"t": mark.t, "width": None, "kind": "known" if mark.known else "other"} for mark in marks]
 
 
 def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, float]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
-from sealscope.reporting import charts, features, messages, template
+from sealscope.reporting import card, charts, features, messages, printing, template
 from sealscope.reporting.charts import Mark
 from sealscope.reporting.particulars import particulars_of
 from sealscope.reporting.schematic import Circuit, circuit_of, columns_of, schematic
@@ -42,8 +42,9 @@ def write_page(
     Parameters
     ----------
     path : str or path-like
-        The page, ending in .html, .htm or .pdf. It is complete under its name or not there at all. A PDF is printed by
-        a browser of Chromium's family or by WeasyPrint, whichever is on the machine.
+        The page, ending in .html, .htm or .pdf, or its card, ending in .png. It is complete under its name or not there
+        at all. A PDF is printed by a browser of Chromium's family or by WeasyPrint, whichever is on the machine. The
+        card is a picture of 1200 x 630 pixels with machine, date, verdict, L/min and its curve; a browser draws it.
     recording : Recording
         The recording that was judged.
     diagnosis : Diagnosis
@@ -69,7 +70,7 @@ def write_page(
     InputError
         The recording is empty, the path is no page's or cannot be written, or a unit or rig is not known.
     MissingExtra
-        A PDF is asked for, and nothing on the machine prints it.
+        A PDF or a picture is asked for, and nothing on the machine makes it.
 
     Examples
     --------
@@ -79,17 +80,37 @@ def write_page(
     >>> page.read_text(encoding="utf-8")[:15]
     '<!DOCTYPE html>'
     """
+    from sealscope.parameters import load_rig
+
+    target = template.check_page(path)
+    known_rig = None if rig is None else load_rig(rig)
+    if target.suffix.lower() == ".png":
+        _check_samples(recording)
+        all_marks = _all_marks(marks, truth_onset_s)
+        picture = card.render_card(recording, diagnosis, rig=known_rig, marks=all_marks, title=title)
+        printing.draw_page(picture, target, card.WIDTH, card.HEIGHT)
+        return target
     page = render_page(
         recording,
         diagnosis,
-        rig=rig,
+        rig=known_rig,
         marks=marks,
         truth_onset_s=truth_onset_s,
         truth_leak_lpm=truth_leak_lpm,
         title=title,
         pressure_unit=pressure_unit,
     )
-    return template.write(template.check_page(path), page)
+    return template.write(target, page)
+
+
+def _check_samples(recording: Recording) -> None:
+    if len(recording) == 0:
+        raise InputError("recording must have at least 1 sample to be reported, got 0")
+
+
+def _all_marks(marks: Sequence[Mark], truth_onset_s: float | None) -> tuple[Mark, ...]:
+    known = () if truth_onset_s is None else (Mark(float(truth_onset_s), "true onset", known=True),)
+    return (*marks, *known)
 
 
 def render_page(
@@ -108,12 +129,9 @@ def render_page(
 
     from sealscope.parameters import load_rig
 
-    if len(recording) == 0:
-        raise InputError("recording must have at least 1 sample to be reported, got 0")
+    _check_samples(recording)
     known_rig = None if rig is None else load_rig(rig)
-    all_marks = list(marks)
-    if truth_onset_s is not None:
-        all_marks.append(Mark(float(truth_onset_s), "true onset", known=True))
+    all_marks = list(_all_marks(marks, truth_onset_s))
     details = [features.chamber_details(recording, name) for name in CHAMBERS]
     chambers = [chamber for chamber, _ in details if chamber is not None]
     shown = [
@@ -207,7 +225,7 @@ def _evidence(
     marks: list[Mark],
 ) -> dict[str, Any]:
     base, span = drawn.base, drawn.data["span"]
-    onset, interval = charts.onset_within(diagnosis, span)
+    onset, _ = charts.onset_within(diagnosis, span)
     fine = base.fine
 
     def base_t(sample: int) -> float:
@@ -224,12 +242,6 @@ def _evidence(
         )
     if base.by_sample:
         decimation += " The time stamps are out of order: time is drawn as the sample's number over the rate."
-    events: list[dict[str, Any]] = []
-    if interval is not None:
-        events.append({"t": interval[0], "width": interval[1] - interval[0], "kind": ""})
-    if onset is not None:
-        events.append({"t": onset, "width": None, "kind": ""})
-    events += [{"t": mark.t, "width": None, "kind": "known" if mark.known else "other"} for mark in marks]
 
     def around(seconds: float) -> tuple[float, float] | None:
         return None if onset is None else (max(span[0], onset - seconds), min(span[1], onset + seconds))
@@ -238,7 +250,7 @@ def _evidence(
     return {
         "groups": groups,
         "still": drawn.still,
-        "events": events,
+        "events": charts.events(diagnosis, span, marks),
         "span": span,
         "around": around(20.0),
         "close": (first, last) if base.width > 1 else around(2.0),

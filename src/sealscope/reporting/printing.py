@@ -1,4 +1,4 @@
-"""A page as a PDF, printed by a program that is on the machine: a browser of Chromium's family, or WeasyPrint."""
+"""A page as a PDF or a picture, made by a program on the machine: a browser of Chromium's family, or WeasyPrint."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ _OPTIONS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    "--no-pdf-header-footer",
 )
-#: Longest time that printing may take [s].
+#: Longest time that a browser may take [s].
 _LONGEST = 120.0
 
 
@@ -31,10 +30,10 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
 
     Raises MissingExtra where neither a browser nor WeasyPrint is installed, and InputError where printing fails.
     """
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    browser = _browser()
     with atomic_write(path) as temporary:
         if browser is not None:
-            _by_browser(browser, page, temporary)
+            _by_browser(browser, page, temporary, ["--no-pdf-header-footer", f"--print-to-pdf={temporary}"], b"%PDF")
             return Path(browser).name
         try:
             from weasyprint import HTML
@@ -46,23 +45,50 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
         return "WeasyPrint"
 
 
-def _by_browser(browser: str, page: str, target: Path) -> None:
+def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) -> str:
+    """Write a page (HTML) as a PNG of `width` x `height` pixels, whole or not at all, and return what drew it.
+
+    Raises MissingExtra where no browser is installed, and InputError where drawing fails.
+    """
+    browser = _browser()
+    if browser is None:
+        raise MissingExtra(f"a picture needs Chromium, got none: install it, or write .html ({path})")
+    with atomic_write(path) as temporary:
+        picture = temporary.with_name(f"{temporary.name}.png")  # a browser draws only into a name that ends so
+        options = ["--hide-scrollbars", "--force-device-scale-factor=1", f"--window-size={width},{height}"]
+        try:
+            head = b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4, "big") + b"IHDR"
+            size = width.to_bytes(4, "big") + height.to_bytes(4, "big")
+            _by_browser(browser, page, picture, [*options, f"--screenshot={picture}"], head + size)
+            picture.replace(temporary)
+        finally:
+            picture.unlink(missing_ok=True)
+        return Path(browser).name
+
+
+def _browser() -> str | None:
+    return next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
+def _by_browser(browser: str, page: str, target: Path, options: list[str], begins: bytes) -> None:
+    """Let a browser write `target`, a file that must begin so."""
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"
-        source.write_text(page, encoding="utf-8")
-        options = [*_OPTIONS, f"--user-data-dir={folder}/profile", f"--print-to-pdf={target}"]
+        source.write_text(page, encoding="utf-8", errors="backslashreplace")
+        command = [browser, *_OPTIONS, *options, f"--user-data-dir={folder}/profile"]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
-            options.append("--no-sandbox")  # a browser's sandbox does not start for this user
+            command.append("--no-sandbox")  # a browser's sandbox does not start for this user
         try:
             done = subprocess.run(
-                [browser, *options, source.as_uri()],
+                [*command, source.as_uri()],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=_LONGEST,
                 check=False,
             )
         except (OSError, subprocess.TimeoutExpired) as error:
-            raise InputError(f"printing must end within {_LONGEST:g} s, got: {error} ({browser})") from None
-    if not target.read_bytes().startswith(b"%PDF"):
+            raise InputError(f"a browser must end within {_LONGEST:g} s, got: {error} ({browser})") from None
+    if not (target.is_file() and target.read_bytes().startswith(begins)):
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
-        raise InputError(f"a browser must print a PDF, got status {done.returncode}: {last[0][:160]} ({browser})")
+        kind = "PDF" if begins.startswith(b"%PDF") else "picture of the size asked for"
+        raise InputError(f"a browser must make a {kind}, got status {done.returncode}: {last[0][:160]} ({browser})")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import jinja2
     from markupsafe import Markup
 
-_SUFFIXES = (".html", ".htm", ".pdf")
+_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 
 @cache
