@@ -14,8 +14,9 @@ from sealscope.compiled import contracted, kernel
 from sealscope.physics.friction import stribeck_friction
 from sealscope.physics.lanes import WIDTH, anywhere, exponential, load, power_of_two, select, spread, store
 from sealscope.physics.motor import winding_current_rate
+from sealscope.physics.rest import initial_state
 from sealscope.physics.restrictors import implicit_orifice_flow, orifice_flow
-from sealscope.physics.rig import CHOICES, NUMBERS, OUTPUTS, RigNumbers, initial_state, rig_numbers
+from sealscope.physics.rig import CHOICES, NUMBERS, OUTPUTS, RigNumbers, rig_numbers
 from sealscope.physics.solvers.rk4 import RK4_NODES
 from sealscope.physics.vector.fixed import left_to_table
 from sealscope.physics.vector.runs import (
@@ -175,7 +176,7 @@ def test_a_parameter_is_listed_once_and_every_list_of_numbers_follows(check_rig)
     rig = check_rig(True)
     numbers = rig_numbers(rig)
     symbols = {row.symbol: row.value for row in rig.table() if not row.name.startswith(("sensors.", "daq."))}
-    within = {"omega_max", "C_d", "d_line", "closed_A", "closed_B", "rho", "V_hose_A", "V_hose_B"}
+    within = {"omega_max", "C_d", "d_line", "closed_A", "closed_B", "rho", "V_hose_A", "V_hose_B", "V_rod"}
     taken = {symbol for symbol, value in symbols.items() if isinstance(value, float)} - within
     assert set(NUMBERS) - taken == {"c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B"}
     assert all(getattr(numbers, symbol) == symbols[symbol] for symbol in taken)

@@ -11,6 +11,7 @@ from scipy import stats
 
 from sealscope.compiled import kernel
 from sealscope.errors import InputError, SimulationFailed
+from sealscope.parameters import load_rig
 from sealscope.physics.lanes import WIDTH, load, store
 from sealscope.signals.details import details
 from sealscope.simulation.batch.batch import DETAILS, simulate_batch
@@ -68,6 +69,21 @@ def test_each_run_is_what_it_is_by_itself(check_rig, throttled, volumes):
     changed = simulate_batch([seen], bounds=bounds)
     np.testing.assert_allclose(changed.rms[0], rms_of(simulate_with_truth(seen).recording, bounds), rtol=1e-6)
     assert np.abs(changed.rms[0] / batch.rms[1] - 1.0).max() > 1e-3
+
+
+@pytest.mark.slow
+def test_single_rods_run_side_by_side():
+    rig = load_rig("single-rod-eha").with_overrides({**FINE, "sensors.p_A.range_hi": 1e8})
+    options = {"command": "5 sin(2t)", "duration": 4.0, "step": 1e-4, "allow_unresolved": True}
+    experiments = [
+        Experiment.of(rig=rig, set={"F_l": force}, leak=leak, **options)
+        for force, leak in ((0.0, None), (2000.0, "G = 1e-11 from 2 s"), (-2000.0, "G = 1e-12"))
+    ]
+    batch = simulate_batch(experiments, bounds=[0.0, 4.0])
+    for k, experiment in enumerate(experiments):
+        alone = rms_of(simulate_with_truth(experiment).recording, [0.0, 4.0])
+        np.testing.assert_allclose(batch.rms[k], alone, rtol=2e-3)
+    assert np.all(np.ptp(batch.rms, axis=0) > 0)
 
 
 def test_hum_is_read_as_by_itself_up_to_its_phase(check_rig):

@@ -8,13 +8,17 @@ from sealscope.parameters.fields import Part, choice, quantity
 
 
 class Cylinder(Part):
-    """Double-rod cylinder between two caps, eqs. (4.13)-(4.15), (4.18), (4.19); x = 0 at mid-stroke, |x| <= L/2."""
+    """Cylinder between two caps, eqs. (4.13)-(4.15), (4.18), (4.19), and its load; x = 0 at mid-stroke, |x| <= L/2.
+
+    Double-rod where A_A = A_B, single-rod where not.
+    """
 
     A_A: Annotated[float, quantity("piston area on side A", "m^2", gt=0, le=10)]
     A_B: Annotated[float, quantity("piston area on side B", "m^2", gt=0, le=10)]
     L: Annotated[float, quantity("stroke", "m", gt=0, le=100)]
     M_eq: Annotated[float, quantity("moving mass", "kg", gt=0, le=1e6)]
     V: Annotated[float, quantity("volume of each side at mid-stroke", "m^3", gt=0, le=100)]
+    V_rod: Annotated[float, quantity("rod in side B at mid-stroke: V less this is left", "m^3", absent=0, ge=0, le=100)]
     volumes: Annotated[Literal["fixed", "position"], choice("chamber volumes: constant V, or V + A_A x and V - A_B x")]
     balance: Annotated[
         Literal["mass", "volume"], choice("what chambers balance where volumes move with the piston", absent="mass")
@@ -24,6 +28,7 @@ class Cylinder(Part):
     V_hose_A: Annotated[float, quantity("hose on side A: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)]
     V_hose_B: Annotated[float, quantity("hose on side B: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)]
     k_load: Annotated[float, quantity("spring of the load about mid-stroke", "N/m", absent=0, ge=0, le=1e9)]
+    d_load: Annotated[float, quantity("damper of the load", "N s/m", absent=0, ge=0, le=1e9)]
     F_l: Annotated[float, quantity("constant external load", "N", ge=-1e8, le=1e8)]
     G_ext_A: Annotated[float, quantity("leakage conductance of the rod seal of A", "m^3/(s Pa)", ge=0, le=1e-6)]
     G_ext_B: Annotated[float, quantity("leakage conductance of the rod seal of B", "m^3/(s Pa)", ge=0, le=1e-6)]

@@ -71,12 +71,29 @@ class Fluid(Part):
 
 
 class MakeUp(Part):
-    """Accumulator and check valves that replace the oil lost to the outside; `check_valves = "absent"`: none.
+    """Accumulator, with check and relief valves between it and each side; `check_valves = "absent"`: none.
 
-    The accumulator holds the charge pressure at the start and feeds each side of the circuit through a check valve.
+    The accumulator holds the charge pressure at the start. Check valves feed the circuit; pilot-operated ones, which
+    the pressure of the other side opens, also let oil back: what the rod of a single-rod cylinder displaces.
     """
 
-    check_valves: Annotated[Literal["absent", "present"], choice("make-up from an accumulator in the model")]
+    check_valves: Annotated[
+        Literal["absent", "present", "pilot-operated"], choice("make-up from an accumulator in the model")
+    ]
     p_crack: Annotated[float, quantity("pressure that opens a check valve", "Pa", ge=0, le=1e7)]
     G_check: Annotated[float, quantity("conductance of an open check valve", "m^3/(s Pa)", gt=0, le=1e-6)]
     V_gas: Annotated[float, quantity("gas in the accumulator at the charge pressure", "m^3", gt=0, le=10)]
+    n_gas: Annotated[float, quantity("polytropic exponent of the gas in the accumulator", "1", absent=1, ge=1, le=2)]
+    k_pilot: Annotated[float, quantity("pilot ratio of a pilot-operated check valve", "1", absent=3, gt=0, le=100)]
+    p_open: Annotated[
+        float,
+        quantity(
+            "pressure from cracking to full opening of a pilot-operated check valve", "Pa", absent=5e4, gt=0, le=1e7
+        ),
+    ]
+    p_relief: Annotated[
+        float, quantity("pressure above the accumulator's that opens a relief valve", "Pa", absent=2e7, gt=0, le=1e9)
+    ]
+    G_relief: Annotated[
+        float, quantity("conductance of a relief valve above its pressure", "m^3/(s Pa)", absent=0, ge=0, le=1e-6)
+    ]

@@ -71,11 +71,26 @@ class Rig(Part):
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
         c = self.cylinder
-        for symbol in ("A_A", "A_B") if c.volumes == "position" else ():
+        if c.V_rod >= c.V:
+            raise ValueError(f"cylinder.V_rod must be < V = {with_unit(c.V, 'm^3')}, got {with_unit(c.V_rod, 'm^3')}")
+        for symbol, volume in (("A_A", c.V), ("A_B", c.V - c.V_rod)) if c.volumes == "position" else ():
             swept = getattr(c, symbol) * c.L / 2.0
-            if swept >= c.V:
+            if swept >= volume:
                 rule = f'must be > {symbol} L/2 = {with_unit(swept, "m^3")} when volumes = "position"'
-                raise ValueError(f"cylinder.V {rule}, got {c.V}")
+                less = " - V_rod" if volume < c.V else ""
+                raise ValueError(f"cylinder.V{less} {rule}, got {with_unit(volume, '') if less else volume}")
+        m = self.makeup
+        if m.G_relief > 0 and m.check_valves == "absent":
+            raise ValueError(
+                f"makeup.G_relief = {m.G_relief:g} m^3/(s Pa): relief valves must have an accumulator to open into "
+                "(makeup.check_valves = present or pilot-operated), got check_valves = absent"
+            )
+        rod = abs(c.A_A - c.A_B) * c.L
+        if m.check_valves == "pilot-operated" and m.V_gas <= rod:
+            raise ValueError(
+                f"makeup.V_gas must be > the oil that the rod displaces over the stroke, |A_A - A_B| L = "
+                f"{with_unit(rod, 'm^3')}, got {with_unit(m.V_gas, 'm^3')}"
+            )
         f = self.friction
         if f.law != "stribeck" and (f.coulomb_pressure != "sum" or f.F_pr <= 0):
             raise ValueError(

@@ -1,4 +1,4 @@
-"""The double-rod cylinder: chamber volumes, pressure build-up, hard stops at both caps, the piston's acceleration."""
+"""The cylinder: chamber volumes, pressure build-up, hard stops at both caps, its load, the piston's acceleration."""
 
 from __future__ import annotations
 
@@ -39,6 +39,12 @@ def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) 
     side = math.copysign(1.0, x)
     depth = abs(x) - 0.5 * L
     return select(depth > 0.0, -side * max(k_stop * depth + d_stop * (side * v), 0.0), 0.0)  # type: ignore[no-any-return]
+
+
+@contracted
+def load_force(x: float, F_l: float, k_load: float) -> float:
+    """Force [N] of the load against +x: F_l + k_load x, a constant force (weight) and a spring about mid-stroke."""
+    return F_l + k_load * x
 
 
 @contracted

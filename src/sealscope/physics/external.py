@@ -1,6 +1,8 @@
-"""What leaves and enters the closed circuit: leakage at the rod seals, and the make-up that replaces it."""
+"""What leaves and enters the circuit: leakage at the rod seals, and valves between each side and an accumulator."""
 
 from __future__ import annotations
+
+import math
 
 from sealscope.compiled import contracted
 from sealscope.physics.fluid import P_ATM
@@ -26,9 +28,39 @@ def accumulator_pressure(V_up: float, p_charge: float, V_gas: float) -> float:
 
 
 @contracted
+def polytropic_pressure(V_up: float, p_charge: float, V_gas: float, n_gas: float) -> float:
+    """Return the pressure [Pa gauge] of a gas accumulator that has given off V_up [m^3] of oil (taken in: V_up < 0).
+
+    p_abs (V_gas + V_up)^n is constant, n = 1 in equilibrium of heat (`accumulator_pressure`), 1.4 of nitrogen without
+    exchange of heat (Merritt, Hydraulic Control Systems, 1967, accumulators).
+    """
+    return (p_charge + P_ATM) * math.pow(V_gas / (V_gas + V_up), n_gas) - P_ATM
+
+
+@contracted
 def check_valve_flow(dp: float, p_crack: float, G_check: float) -> float:
     """Return the flow [m^3/s] through a check valve under dp [Pa].
 
     Q = G_check (dp - p_crack) above the cracking pressure, none below it.
     """
     return G_check * max(dp - p_crack, 0.0)
+
+
+@contracted
+def pilot_opening(dp: float, dp_pilot: float, p_crack: float, k_pilot: float, p_open: float) -> float:
+    """Return how far a pilot-operated check valve is open: (dp + k_pilot dp_pilot - p_crack)/p_open within 0 .. 1.
+
+    dp [Pa] across the valve in its free direction, dp_pilot [Pa] of the pilot over the inlet, which only opens. So oil
+    flows back against dp < 0 once k_pilot dp_pilot > p_crack - dp.
+
+    Source: the pilot-operated check valve of the Simscape Fluids library (area linear in the pressure on the poppet).
+    """
+    return min(max((dp + k_pilot * max(dp_pilot, 0.0) - p_crack) / p_open, 0.0), 1.0)
+
+
+@contracted
+def pilot_valve_flow(
+    dp: float, dp_pilot: float, p_crack: float, G_check: float, k_pilot: float, p_open: float
+) -> float:
+    """Return the flow [m^3/s] through a pilot-operated check valve: Q = G_check dp times its opening, either way."""
+    return G_check * dp * pilot_opening(dp, dp_pilot, p_crack, k_pilot, p_open)

@@ -20,8 +20,20 @@ import numpy as np
 from sealscope.compiled import contracted
 from sealscope.parameters import Rig
 from sealscope.parameters.fields import leaves, unit_of
-from sealscope.physics.cylinder import chamber_volumes, hard_stop_force, piston_acceleration, pressure_rate
-from sealscope.physics.external import accumulator_pressure, check_valve_flow, external_leakage
+from sealscope.physics.cylinder import (
+    chamber_volumes,
+    hard_stop_force,
+    load_force,
+    piston_acceleration,
+    pressure_rate,
+)
+from sealscope.physics.external import (
+    accumulator_pressure,
+    check_valve_flow,
+    external_leakage,
+    pilot_valve_flow,
+    polytropic_pressure,
+)
 from sealscope.physics.fluid import effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
 from sealscope.physics.friction import (
     bristle_rate,
@@ -48,7 +60,6 @@ from sealscope.physics.state import (
     P_A,
     P_B,
     POSITION,
-    STATES,
     VELOCITY,
     Pressures,
     State,
@@ -60,7 +71,7 @@ from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
 #: the volumes of a side.
 _NOT_TAKEN = {
     *("pump.omega_max", "line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "fluid.rho"),
-    *("cylinder.V_hose_A", "cylinder.V_hose_B"),
+    *("cylinder.V_hose_A", "cylinder.V_hose_B", "cylinder.V_rod"),
 }
 #: Dotted name of each parameter that the laws take, by its symbol, as the models declare them.
 _PARAMETERS = {
@@ -68,23 +79,26 @@ _PARAMETERS = {
     for name, field in leaves(Rig)
     if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN
 }
-#: Choices that the laws take as truth values, each with the parameter and the value that stand for True.
+#: Choices that the laws take as truth values, each with the parameter and the value that stand for True; `made_up` is
+#: True with check valves of either kind.
 _CHOICES = {
     "throttled": ("line.orifices", "present"),
     "position_dependent": ("cylinder.volumes", "position"),
     "coulomb_of_difference": ("friction.coulomb_pressure", "difference"),
     "literal_bracket": ("friction.bracket", "literal"),
-    "made_up": ("makeup.check_valves", "present"),
 }
 #: The numbers of `RigNumbers`: parameters, coefficients of throttle A (from the pump to the cylinder, back) and B, and
 #: the volumes of both sides at mid-stroke.
 NUMBERS = (*_PARAMETERS, "c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B")
 #: Laws that most rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out. Air
 #: in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has bristles, that differs
-#: between the directions.
-LAWS = ("aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided")
+#: between the directions; check valves with pilots, relief valves, an accumulator that exchanges little heat; a damper.
+LAWS = (
+    *("aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
+    *("piloted", "relieved", "polytropic", "damped"),
+)
 #: The choices: truth values, and the laws.
-CHOICES = (*_CHOICES, *LAWS)
+CHOICES = (*_CHOICES, "made_up", *LAWS)
 
 if TYPE_CHECKING:
 
@@ -103,6 +117,10 @@ if TYPE_CHECKING:
         sticking: tuple[bool, ...]
         bristled: tuple[bool, ...]
         one_sided: tuple[bool, ...]
+        piloted: tuple[bool, ...]
+        relieved: tuple[bool, ...]
+        polytropic: tuple[bool, ...]
+        damped: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> float: ...
@@ -134,6 +152,7 @@ def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
 def rig_numbers(rig: Rig) -> RigNumbers:
     """Return the rig's parameters as the compiled laws take them."""
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
+    choices["made_up"] = rig.makeup.check_valves != "absent"
     laws = {
         "aerated": rig.fluid.air > 0,
         "open_circuit": choices["made_up"] or rig.cylinder.G_ext_A > 0 or rig.cylinder.G_ext_B > 0,
@@ -141,23 +160,19 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "sticking": rig.friction.law == "karnopp",
         "bristled": rig.friction.law == "lugre",
         "one_sided": rig.friction.backward != 1.0,
+        "piloted": rig.makeup.check_valves == "pilot-operated",
+        "relieved": rig.makeup.G_relief > 0,
+        "polytropic": choices["made_up"] and rig.makeup.n_gas != 1.0,
+        "damped": rig.cylinder.d_load > 0,
     }
     return RigNumbers(
         *(attrgetter(name)(rig) for name in _PARAMETERS.values()),
         *throttle_coefficients(rig),
         rig.cylinder.V + rig.cylinder.V_hose_A,
-        rig.cylinder.V + rig.cylinder.V_hose_B,
+        rig.cylinder.V - rig.cylinder.V_rod + rig.cylinder.V_hose_B,
         **choices,
         **{name: (True,) if there else () for name, there in laws.items()},
     )
-
-
-def initial_state(rig: Rig, x_0: float) -> np.ndarray:
-    """State at rest: every pressure at the charge pressure, the piston at x_0 [m] from mid-stroke, all else zero."""
-    y = np.zeros(len(STATES))
-    y[POSITION] = x_0
-    y[[P_A, P_B, P_1, P_2]] = rig.fluid.p_charge
-    return y
 
 
 @contracted
@@ -264,34 +279,46 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 @contracted
 def supply_pressure(y: State, p: RigNumbers) -> float:
     """Pressure [Pa] of the make-up's accumulator."""
+    if len(p.polytropic) > 0:
+        return polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
 
 @contracted
 def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Return the flows [m^3/s] of the make-up into side 1 (A) and side 2 (B).
+    """Return the flows [m^3/s] from the accumulator into side 1 (A) and side 2 (B), through check and relief valves.
 
-    At the pump's ports, or at the chambers without lines.
+    At the pump's ports, or at the chambers without lines. The pilot of a side's check valve is the other side.
     """
     supply = supply_pressure(y, p)
     p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
-    G_check = p.G_check if p.made_up else 0.0 * p.G_check
-    return check_valve_flow(supply - p_1, p.p_crack, G_check), check_valve_flow(supply - p_2, p.p_crack, G_check)
+    if len(p.piloted) > 0:
+        up_1 = pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
+        up_2 = pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
+    else:
+        G_check = p.G_check if p.made_up else 0.0 * p.G_check
+        up_1 = check_valve_flow(supply - p_1, p.p_crack, G_check)
+        up_2 = check_valve_flow(supply - p_2, p.p_crack, G_check)
+    if len(p.relieved) > 0:
+        up_1 = up_1 - check_valve_flow(p_1 - supply, p.p_relief, p.G_relief)
+        up_2 = up_2 - check_valve_flow(p_2 - supply, p.p_relief, p.G_relief)
+    return up_1, up_2
 
 
 @contracted
 def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     """Return what leaves at the rod seals and what the make-up feeds.
 
-    Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s].
+    Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s], counted at the accumulator's pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     up_1, up_2 = make_up_flows(y, p)
     out_A, out_B = external_leakage(y[P_A], p.G_ext_A), external_leakage(y[P_B], p.G_ext_B)
-    fed, supply = up_1 + up_2, supply_pressure(y, p)
-    up_1 = volumes_exchanged(up_1, supply, y[P_1] if p.throttled else y[P_A], p)[1]
-    up_2 = volumes_exchanged(up_2, supply, y[P_2] if p.throttled else y[P_B], p)[1]
+    supply = supply_pressure(y, p)
+    given_1, up_1 = volumes_exchanged(up_1, supply, y[P_1] if p.throttled else y[P_A], p)
+    given_2, up_2 = volumes_exchanged(up_2, supply, y[P_2] if p.throttled else y[P_B], p)
+    fed = given_1 + given_2
     if p.throttled:
         rate_1 = pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
@@ -312,7 +339,9 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, p: RigNumber
     current = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
     spin = shaft_acceleration(y[CURRENT], y[OMEGA], pump_torque(dp_pump, p.q_b), p.C_m, p.B_M, p.J_M)
     stop = hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
-    load = p.F_l + p.k_load * x
+    load = load_force(x, p.F_l, p.k_load)
+    if len(p.damped) > 0:
+        load = load + p.d_load * v
     friction, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
     push = piston_acceleration(p_A, p_B, friction, load, stop, p.A_A, p.A_B, p.M_eq)
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)

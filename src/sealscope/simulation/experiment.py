@@ -48,6 +48,17 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
     return method
 
 
+def check_circuit(rig: Rig) -> None:
+    """Raise InputError for a single-rod cylinder in a circuit from which its rod cannot displace oil."""
+    c, m = rig.cylinder, rig.makeup
+    if c.A_A != c.A_B and not (m.check_valves == "pilot-operated" or m.G_relief > 0):
+        raise InputError(
+            f"a single-rod cylinder (A_A = {1e6 * c.A_A:g} mm^2, A_B = {1e6 * c.A_B:g} mm^2) must have "
+            "makeup.check_valves = pilot-operated, through which its rod displaces oil, got "
+            f"makeup.check_valves = {m.check_valves}"
+        )
+
+
 @dataclass(frozen=True, repr=False)
 class Experiment:
     """Everything a run depends on; equal experiments give equal bytes.
@@ -97,6 +108,7 @@ class Experiment:
                 f"error = {self.error:g} Pa"
             )
         choose_method(self.rig, self.method)
+        check_circuit(self.rig)
         command, u_max = self.commanded, self.rig.daq.u_max
         if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
             check_command(command, self.sample_times(), u_max)

@@ -235,7 +235,8 @@ def integrate(
     rig, the leak or a stop that was hit, when a given step does not pass the check, when a state is not finite, or when
     a pressure falls below vacuum; `allow_unresolved` lets all but a state that is not finite pass.
     """
-    from sealscope.physics.rig import initial_state, rig_numbers
+    from sealscope.physics.rest import initial_state
+    from sealscope.physics.rig import rig_numbers
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 

@@ -58,13 +58,16 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
     breakaway = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
     breakaway += 0.0 if p.literal_bracket else p.F_v
-    running = _longest_for_pair(p.F_v / p.M_eq, column)
-    stuck = _longest_for_pair(max(1.0, p.backward) * breakaway / p.M_eq, column)
+    running = _longest_for_pair((p.F_v + p.d_load) / p.M_eq, column)
+    stuck = _longest_for_pair((max(1.0, p.backward) * breakaway + p.d_load) / p.M_eq, column)
     if len(p.bristled) > 0:
-        stuck = _longest_for_pair((p.sigma_1 + p.F_v) / p.M_eq, column + p.sigma_0 / p.M_eq)
+        stuck = _longest_for_pair((p.sigma_1 + p.F_v + p.d_load) / p.M_eq, column + p.sigma_0 / p.M_eq)
     pump = _longest_for_pair(ports * p.G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
     leak = _longest_for_pair(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
-    outward = _longest_for_pair(chambers * max(p.G_ext_A, p.G_ext_B) + ports * p.G_check * p.made_up, 0.0)
+    # Q = G dp (dp - p_crack)/p_open of a pilot-operated valve is steepest where it is fully open
+    steepest = 2.0 + p.p_crack / p.p_open if len(p.piloted) > 0 else 1.0
+    valves = max(p.G_check * steepest * p.made_up, p.G_relief * (len(p.relieved) > 0))
+    outward = _longest_for_pair(chambers * max(p.G_ext_A, p.G_ext_B) + ports * valves, 0.0)
     return float(min(loop, running, stuck, pump, leak, outward))
 
 

@@ -306,7 +306,7 @@ class SetRun:
         bounds: Array | None,
         most: int | None = None,
     ) -> None:
-        from sealscope.physics.rig import initial_state
+        from sealscope.physics.rest import initial_state
         from sealscope.physics.solvers.imex import IMEX_NODES
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.physics.solvers.rk4 import RK4_NODES

@@ -1,0 +1,83 @@
+"""The state at rest: pressures that carry the load, and a motor that holds them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sealscope.compiled import kernel
+from sealscope.errors import InputError
+from sealscope.physics.cylinder import hard_stop_force, load_force
+from sealscope.physics.fluid import P_ATM
+from sealscope.physics.pump import pump_torque
+from sealscope.physics.state import CURRENT, INTEGRAL, P_1, P_2, P_A, P_B, POSITION, STATES
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+
+@kernel
+def carried_at_rest(x: float, F_l: float, k_load: float, L: float, k_stop: float, d_stop: float) -> float:
+    """Force [N] against +x that the pressures carry at rest at x [m]: the load less that of a stop."""
+    return load_force(x, F_l, k_load) - hard_stop_force(x, 0.0, L, k_stop, d_stop)
+
+
+@kernel
+def holding_current(dp: float, q_b: float, C_m: float) -> float:
+    """Winding current [A] that holds the pump against dp [Pa]: T_load/C_m, eq. (4.5) at rest."""
+    return pump_torque(dp, q_b) / C_m
+
+
+def rest_pressures(rig: Rig, force: float) -> tuple[float, float]:
+    """Return p_A, p_B [Pa] that carry `force` [N] against +x at rest: p_A A_A - p_B A_B = force.
+
+    With a make-up the lower of both is at the accumulator's charge pressure. Without one the circuit holds as much oil
+    as at the charge pressure throughout: the mean of both, weighted by the volumes, stays.
+
+    Raises InputError where one of them is below vacuum.
+    """
+    c, charge = rig.cylinder, rig.fluid.p_charge
+    if rig.makeup.check_valves != "absent":
+        p_B = max((charge * c.A_A - force) / c.A_B, charge)
+        p_A = max((charge * c.A_B + force) / c.A_A, charge)
+        return p_A, p_B
+    lack = force - charge * (c.A_A - c.A_B)  # of force, at the charge pressure
+    V_A, V_B = c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
+    if rig.line.orifices == "present":
+        V_A, V_B = V_A + rig.line.V_1, V_B + rig.line.V_2
+    moved = lack / (c.A_A / V_A + c.A_B / V_B)
+    p_A, p_B = charge + moved / V_A, charge - moved / V_B
+    if min(p_A, p_B) < -P_ATM:
+        raise InputError(
+            f"a load of {force:.4g} N must be carried at rest by pressures above vacuum, got p_A = {p_A:.4g} Pa and "
+            f"p_B = {p_B:.4g} Pa; raise fluid.p_charge, or let a make-up hold the low side (makeup.check_valves)"
+        )
+    return p_A, p_B
+
+
+def initial_state(rig: Rig, x_0: float) -> np.ndarray:
+    """State (12,) at rest with the piston at x_0 [m] from mid-stroke.
+
+    The pressures carry the load (`rest_pressures`), the motor holds the pump against them: i = T_load/C_m, with the
+    speed controller's integral at R_c i/K_i, which gives that current. A machine that leaks creeps from there. Without
+    a load and with equal areas all pressures are at the charge pressure and all else is zero.
+
+    Raises InputError where the pressures are below vacuum, or the drive cannot hold them.
+    """
+    c, m = rig.cylinder, rig.motor
+    y = np.zeros(len(STATES))
+    y[POSITION] = x_0
+    force = carried_at_rest(x_0, c.F_l, c.k_load, c.L, c.k_stop, c.d_stop)
+    p_A, p_B = rest_pressures(rig, force)
+    y[[P_A, P_1]], y[[P_B, P_2]] = p_A, p_B
+    y[CURRENT] = holding_current(p_A - p_B, rig.pump.q_b, m.C_m)
+    if abs(y[CURRENT]) > m.i_max or m.R_c * abs(y[CURRENT]) > m.V_max:
+        most = min(m.i_max, m.V_max / m.R_c)
+        raise InputError(
+            f"the drive must hold the load of {force:.4g} N at rest, which takes {abs(y[CURRENT]):.4g} A, got at most "
+            f"{most:.4g} A (motor.i_max, motor.V_max); take a smaller load or pump"
+        )
+    if m.K_i > 0:
+        y[INTEGRAL] = m.R_c * y[CURRENT] / m.K_i
+    return y

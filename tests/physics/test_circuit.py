@@ -1,0 +1,281 @@
+"""A single-rod cylinder: its valves and accumulator against closed forms, oil, energy, rest, an independent program."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad, simpson, solve_ivp
+from scipy.interpolate import CubicSpline
+
+from sealscope.errors import InputError
+from sealscope.parameters import load_rig
+from sealscope.physics.external import pilot_opening, pilot_valve_flow, polytropic_pressure
+from sealscope.physics.fluid import P_ATM
+from sealscope.physics.rest import initial_state, rest_pressures
+from sealscope.simulation.experiment import Experiment
+
+#: Constant volumes: volume flows are balanced, and the energies are simple.
+FIXED = {"volumes": "fixed", "d_load": 500.0}
+
+
+def single_rod(**values):
+    return load_rig("single-rod-eha").with_overrides(values)
+
+
+def accumulator(rig, run) -> np.ndarray:
+    """Pressure of the accumulator [Pa], (n,), from the polytropic law."""
+    f, m = rig.fluid, rig.makeup
+    return (f.p_charge + P_ATM) * (m.V_gas / (m.V_gas + run["V_up"])) ** m.n_gas - P_ATM
+
+
+def valve_flows(rig, run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Flows [m^3/s] into A and B through the check valves, and out of A and B through the relief valves."""
+    m, supply = rig.makeup, accumulator(rig, run)
+
+    def check(side, other):
+        opening = (supply - run[side] + m.k_pilot * np.maximum(run[other] - supply, 0.0) - m.p_crack) / m.p_open
+        return m.G_check * (supply - run[side]) * np.clip(opening, 0.0, 1.0)
+
+    def relief(side):
+        return m.G_relief * np.maximum(run[side] - supply - m.p_relief, 0.0)
+
+    return check("p_A", "p_B"), check("p_B", "p_A"), relief("p_A"), relief("p_B")
+
+
+@given(back=st.floats(0.0, 5e6), p_crack=st.floats(0.0, 1e5), k=st.floats(1.0, 10.0), p_open=st.floats(1e3, 1e6))
+def test_the_pilot_opens_where_its_force_reaches_that_of_the_line_and_the_spring(back, p_crack, k, p_open):
+    """Against a line `back` above the inlet: begins at (p_crack + back)/k, fully open p_open/k later, shut before."""
+    begins = (p_crack + back) / k
+    opening = [pilot_opening(-back, begins + more * p_open / k, p_crack, k, p_open) for more in (-0.1, 0.0, 0.5, 1.1)]
+    assert opening == pytest.approx([0.0, 0.0, 0.5, 1.0], abs=1e-6 + 1e-9 * (back + p_crack) / p_open)
+    assert pilot_valve_flow(-back, begins + 1.1 * p_open / k, p_crack, 1e-9, k, p_open) == pytest.approx(-1e-9 * back)
+
+
+def test_without_a_pilot_it_is_a_check_valve():
+    for dp, share in ((-1e6, 0.0), (2e4, 0.0), (4.5e4, 0.5), (7e4, 1.0), (1e6, 1.0)):
+        for pilot in (0.0, -1e6):  # a low pilot does not close it
+            assert pilot_valve_flow(dp, pilot, 2e4, 1e-9, 3.0, 5e4) == pytest.approx(1e-9 * dp * share, abs=1e-20)
+
+
+@given(V_up=st.floats(-1e-3, 5e-3), n=st.floats(1.0, 1.7))
+def test_what_the_gas_gives_is_the_work_of_a_polytropic(V_up, n):
+    p_0, V_gas = 6e5, 2e-3
+    work, _ = quad(lambda V: polytropic_pressure(V, p_0, V_gas, n) + P_ATM, 0.0, V_up, epsrel=1e-11)
+    ratio = (V_gas + V_up) / V_gas
+    closed = V_gas * (math.log(ratio) if n == 1.0 else (ratio ** (1.0 - n) - 1.0) / (1.0 - n))
+    if abs(n - 1.0) > 1e-3 and abs(V_up) > 1e-6:
+        assert work == pytest.approx((p_0 + P_ATM) * closed, rel=1e-6)
+    assert polytropic_pressure(0.0, p_0, V_gas, n) == pytest.approx(p_0)
+
+
+@pytest.fixture(scope="module")
+def strokes(drive):
+    """Long strokes, out and in."""
+    rig = single_rod()
+    return rig, drive(rig, 8.0, u=lambda t: 10.0 * np.sin(2.0 * t), rate=4000.0, step=6.25e-5)
+
+
+@pytest.mark.slow
+def test_the_accumulator_takes_and_gives_what_the_rod_displaces(strokes):
+    rig, run = strokes
+    c = rig.cylinder
+    rod = (c.A_A - c.A_B) * (run["x"] - run["x"][0])
+    assert np.ptp(rod) > 5e-5
+    assert np.abs(run["V_up"] - rod).max() < 0.01 * np.ptp(rod)  # but for what the oil is compressed
+    assert run["q_up"].max() > 5e-5
+    assert run["q_up"].min() < -5e-5  # through a pilot
+    np.testing.assert_allclose(run["q_up"], np.subtract(sum(valve_flows(rig, run)[:2]), sum(valve_flows(rig, run)[2:])))
+
+
+@pytest.mark.slow
+def test_mass_of_chambers_and_accumulator_is_kept(strokes):
+    rig, run = strokes
+    c, f, m = rig.cylinder, rig.fluid, rig.makeup
+    held = (c.V + c.A_A * run["x"]) * np.exp(run["p_A"] / f.K_oil)
+    held = held + (c.V - c.V_rod - c.A_B * run["x"]) * np.exp(run["p_B"] / f.K_oil)
+    given = np.linspace(run["V_up"].min(), run["V_up"].max(), 401)
+    density = np.exp([polytropic_pressure(V, f.p_charge, m.V_gas, m.n_gas) / f.K_oil for V in given])
+    lost = CubicSpline(given, density).antiderivative()
+    total = held - lost(run["V_up"])
+    assert np.abs(total - total[0]).max() <= 1e-9 * total[0]
+
+
+@settings(max_examples=6, deadline=None)
+@given(
+    amplitude=st.floats(0.5, 10.0), force=st.floats(-3e3, 3e3), G=st.floats(0.0, 1e-11), p_relief=st.floats(5e5, 2e6)
+)
+def test_where_volumes_are_fixed_no_oil_is_lost(drive, amplitude, force, G, p_relief):
+    """Compressed oil, what the accumulator gave, what the rod displaced: a linear invariant."""
+    rig = single_rod(**FIXED, F_l=force, p_relief=p_relief)
+    run = drive(rig, 3.0, u=amplitude, G=G)
+    c = rig.cylinder
+    held = (c.V * run["p_A"] + (c.V - c.V_rod) * run["p_B"]) / rig.fluid.K_oil
+    total = held - run["V_up"] + (c.A_A - c.A_B) * run["x"]
+    assert np.abs(total - total[0]).max() <= 1e-9 * c.V
+
+
+def test_what_the_wires_bring_is_found_again(drive):
+    rig = single_rod(**FIXED, F_l=300.0, k_load=2000.0, p_relief="0.1 MPa", p_charge="0.3 MPa")
+    step = 1e-5
+    run = drive(rig, 2.0 + step, u=8.0, G=1e-12, rate=1 / step, step=step)
+    m, c, f, K = rig.motor, rig.cylinder, rig.friction, rig.fluid.K_oil
+    supply = accumulator(rig, run)
+    up_A, up_B, out_A, out_B = valve_flows(rig, run)
+    speed = np.abs(run["v"])
+    F_C = f.F_pr + f.F_cfr * (run["p_A"] + run["p_B"])
+    running = F_C * (1 + (f.K_brk - 1) * np.exp(-f.C_c * speed)) + f.F_v * speed
+    standing = speed / f.v_th * (F_C * (1 + (f.K_brk - 1) * np.exp(-f.C_c * f.v_th)) + f.F_v * f.v_th)
+    dp = run["p_A"] - run["p_B"]
+
+    def total(power):
+        return float(simpson(power, x=run.t))
+
+    def gained(energy):
+        return float(energy[-1] - energy[0])
+
+    gas = rig.makeup.V_gas + run["V_up"]  # work of the polytropic against the atmosphere
+    n = rig.makeup.n_gas
+    stored = (supply + P_ATM) * gas / (n - 1.0) + P_ATM * gas
+    terms = {
+        "copper": total(m.R_c * run["i"] ** 2),
+        "motor and pump, viscous": total(m.B_M * run["omega"] ** 2),
+        "pump leakage": total(rig.pump.G_pump * dp**2),
+        "piston leakage": total(1e-12 * dp**2),
+        "friction": total(np.where(speed > f.v_th, running, standing) * speed),
+        "damper": total(c.d_load * run["v"] ** 2),
+        "check valves": total(up_A * (supply - run["p_A"]) + up_B * (supply - run["p_B"])),
+        "relief valves": total(out_A * (run["p_A"] - supply) + out_B * (run["p_B"] - supply)),
+        "load": total(c.F_l * run["v"]),
+        "spring": gained(0.5 * c.k_load * run["x"] ** 2),
+        "winding": gained(0.5 * m.L_c * run["i"] ** 2),
+        "rotor": gained(0.5 * m.J_M * run["omega"] ** 2),
+        "piston": gained(0.5 * c.M_eq * run["v"] ** 2),
+        "gas": gained(stored),
+        "oil": gained(0.5 * (c.V * run["p_A"] ** 2 + (c.V - c.V_rod) * run["p_B"] ** 2) / K),
+    }
+    came = total(run["V"] * run["i"])
+    assert came > 10.0
+    assert sum(terms.values()) == pytest.approx(came, rel=1e-6), terms
+    for name in ("check valves", "relief valves", "damper", "gas", "spring", "load"):
+        assert abs(terms[name]) > 1e-4 * came, (name, terms)
+
+
+def test_a_dead_headed_pump_turns_on_over_the_relief_valve(drive):
+    """p_A - p_s = p_relief + Q/G once the piston stands at its cap."""
+    rig = single_rod(**FIXED, p_relief="1 MPa", G_pump=0.0)
+    run = drive(rig, 3.0, u=lambda t: np.full_like(t, 4.0), x_0=0.19)
+    over = run["p_A"] - accumulator(rig, run)
+    expected = rig.makeup.p_relief + run["Q_1"] / rig.makeup.G_relief
+    assert run["Q_1"][-1] > 5e-5
+    np.testing.assert_allclose(over[-200:], expected[-200:], rtol=1e-3)
+
+
+@pytest.mark.parametrize("force", [0.0, 200.0, 2000.0, -2000.0])
+@pytest.mark.parametrize("x_0", [0.0, 0.1])
+def test_a_run_starts_in_equilibrium_whatever_the_load(drive, force, x_0):
+    rig = single_rod(**FIXED, F_l=force, k_load=3000.0, G_pump=0.0)
+    run = drive(rig, 1.0, u=0.0, x_0=x_0)
+    c, carried = rig.cylinder, force + 3000.0 * x_0
+    assert run["p_A"][0] * c.A_A - run["p_B"][0] * c.A_B == pytest.approx(carried, abs=1e-6)
+    assert min(run["p_A"][0], run["p_B"][0]) == rig.fluid.p_charge
+    assert np.abs(run["x"] - x_0).max() < 1e-12
+    assert np.abs(run["omega"]).max() < 1e-9
+    assert np.ptp(run["p_A"]) < 1e-3
+
+
+def test_a_closed_circuit_carries_a_load_with_the_oil_it_has(check_rig):
+    rig = check_rig(F_l=200.0)
+    p_A, p_B = rest_pressures(rig, 200.0)
+    assert p_A + p_B == pytest.approx(2 * rig.fluid.p_charge)
+    assert (p_A - p_B) * rig.cylinder.A_A == pytest.approx(200.0)
+    unloaded = initial_state(check_rig(), 0.1)
+    assert set(unloaded[6:10]) == {rig.fluid.p_charge}
+    assert not unloaded[[0, 1, 2, 3, 5, 10, 11]].any()
+
+
+def test_a_load_that_nothing_can_hold_is_refused_in_a_line(check_rig):
+    with pytest.raises(
+        InputError, match=r"a load of 2000 N must be carried at rest .* above vacuum.*p_charge.*make-up"
+    ):
+        initial_state(check_rig(F_l=2000.0), 0.0)
+    with pytest.raises(InputError, match=r"drive must hold the load of 4e\+04 N at rest, which takes .* at most 23 A"):
+        initial_state(single_rod(F_l=4e4), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "rule"),
+    [
+        ({"check_valves": "absent"}, r"relief valves must have an accumulator"),
+        ({"check_valves": "absent", "G_relief": 0.0}, r"single-rod cylinder \(A_A = 3117.25 .* pilot-operated"),
+        ({"check_valves": "present", "G_relief": 0.0}, r"single-rod cylinder .* got makeup.check_valves = present"),
+        ({"V_gas": "0.3 L"}, r"V_gas must be > the oil that the rod displaces .* 0.000384848 m\^3, got 0.0003 m\^3"),
+        ({"V_rod": "800[cm^3]"}, r"V_rod must be < V = 0.0007735 m\^3, got 0.0008 m\^3"),
+        ({"V_rod": "400[cm^3]"}, r"cylinder.V - V_rod must be > A_B L/2"),
+    ],
+)
+def test_an_impossible_circuit_is_one_line(values, rule):
+    with pytest.raises(InputError, match=rule) as refused:
+        Experiment.of(rig="single-rod-eha", set=values, duration=1.0)
+    assert "\n" not in str(refused.value)
+
+
+def oracle(t: float, y: np.ndarray, force: float) -> list[float]:
+    """dy/dt of the single-rod rig in plain Python, with its numbers typed in: 5 sin 2t, a load, a leak."""
+    integral, i, w, x, v, pa, pb, fed = y
+    A, B, K, M, q = 3117.25e-6, 2155.13e-6, 1e9, 100.0, 16e-6 / (2 * math.pi)
+    VA, VB = 773.5e-6 + A * x, 773.5e-6 - 192.4e-6 - B * x
+    ps = (0.5e6 + 101325) * (2e-3 / (2e-3 + fed)) ** 1.2 - 101325
+    wd = 100 * math.pi / 30 * 5.0 * math.sin(2.0 * t)
+    volts = 1.2 * (wd - w) + 10 * integral
+    dp = pa - pb
+
+    def valve(p: float, other: float) -> float:
+        s = (ps - p + 3 * max(other - ps, 0.0) - 2e4) / 5e4
+        return 1e-9 * (ps - p) * min(max(s, 0.0), 1.0)
+
+    def mass(Q: float, source: float, sink: float) -> float:
+        return Q * math.exp((source if Q > 0 else sink) / K)
+
+    from_B_to_A = mass(q * w - 1e-12 * dp, pb, pa)
+    leak = mass(1e-11 * dp, pa, pb)
+    up_A, up_B = mass(valve(pa, pb), ps, pa), mass(valve(pb, pa), ps, pb)
+    fc = 100 + 5e-5 * (pa + pb)
+    if abs(v) > 0.005:
+        f = fc * (1 + 0.5 * math.exp(-10 * abs(v))) * math.copysign(1, v) + 2000 * v
+    else:
+        f = v / 0.005 * (fc * (1 + 0.5 * math.exp(-10 * 0.005)) + 2000 * 0.005)
+    return [
+        wd - w,
+        (volts - 0.73 * i - 0.6963 * w) / 3.55e-3,
+        (0.6963 * i - 4.855e-4 * w - q * dp) / 8.74e-4,
+        v,
+        (pa * A - pb * B - f - force) / M,
+        K / VA * ((from_B_to_A - leak + up_A) * math.exp(-pa / K) - A * v),
+        K / VB * ((leak - from_B_to_A + up_B) * math.exp(-pb / K) + B * v),
+        (up_A + up_B) * math.exp(-ps / K),
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("force", "step"), [(2000.0, None), (800.0, 2e-5)], ids=["one side carries", "the carrying side changes"]
+)
+def test_an_independent_program_finds_the_same_over_20_s(drive, force, step):
+    """Under 800 N both valves switch within each stroke; the finest step that is chosen, 50 us, is 270 Pa off there."""
+    rig = single_rod(F_l=force)
+    options = {} if step is None else {"step": step}
+    run = drive(rig, 20.01, u=lambda t: 5.0 * np.sin(2.0 * t), G=1e-11, **options)
+    y = initial_state(rig, 0.0)[[0, 1, 2, 4, 5, 6, 7, 10]]
+    t = np.linspace(0.0, 20.0, 2001)
+    atol = 1e-9 * np.array([1, 1, 10, 1e-3, 1e-2, 1e4, 1e4, 1e-6])
+    theirs = solve_ivp(oracle, (0.0, 20.0), y, "LSODA", t, args=(force,), rtol=1e-9, atol=atol)
+    assert theirs.success
+    ours = np.searchsorted(run.t, t - 1e-9)
+    assert np.abs(run["x"][ours] - theirs.y[3]).max() < 1e-6
+    for name, row in (("p_A", 5), ("p_B", 6)):
+        assert np.sqrt(np.mean((run[name][ours] - theirs.y[row]) ** 2)) < 100.0
+    assert np.ptp(run["x"]) > 0.03
