@@ -1,21 +1,30 @@
 """Recordings that fool: what the verdict says where machine, sensor, logger or label changed, and where nothing leaks.
 
-    python benchmarks/fooling.py INTO.md [--machines N] [--first NUMBER] [--rows TEXT] [--records FOLDER]
+    python benchmarks/fooling.py VERDICTS.jsonl [--machines N] [--first NUMBER] [--rows TEXT] [--views NAME...]
+        [--records FOLDER] [--minutes M] [--table INTO.csv]
 
 Takes N healthy machines of the plan `bench-detectors` from number FIRST on, and as many with a leak of 0.0042 L/min
-from half on; makes of every record those of `TRANSFORMATIONS`, and diagnoses each through three sets of channels: all,
-the chamber pressures with the command, and the pressures alone. --records keeps the simulated records.
+from half on; makes of every record those of `ROWS`, and diagnoses each through three sets of channels: all, the chamber
+pressures with the command, and the pressures alone. A verdict is a line of VERDICTS.jsonl; those that it holds are not
+made again, so that an interrupted run goes on where it was (a run after a change of the source needs another file).
+--records keeps the simulated records, --minutes ends a run in time, --table writes the counts.
 
-Rows of the group `garbage` leave no machine to judge: only `cannot tell` is right there. Of all others, a healthy
-machine must not be called `leak` in more than 3 % of the records.
+Rows were mended on machines 0 to 15 and are judged on machines 16 to 31; any four in a row differ in command and
+throttles. Rows of the group `garbage` leave no machine to judge: only `cannot tell` is right there. Of all others, a
+healthy machine must not be called `leak` in more than 3 % of the records.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import json
+import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +32,7 @@ from numpy.typing import NDArray
 from verdicts import recording_of
 
 import sealscope as ss
-from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.case import CampaignCase, cases_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.recordings.channels import Array
 
@@ -34,13 +43,58 @@ PRESSURES = ("p_1", "p_2", *CHAMBERS)
 PLAN, LEAK = "bench-detectors", 0.0042
 
 
+#: Machines on which rows were mended; those from there on judge.
+DEVELOPMENT = range(16)
+#: Cells of the plan (command and throttles): machine k and machine k + 16 run the same duty.
+_CELLS = 16
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine of the plan: its `case`, the `spare` one of the same duty, the folder in which records are kept."""
+
+    case: CampaignCase
+    spare: CampaignCase
+    folder: Path | None = None
+
+    @cached_property
+    def record(self) -> ss.Recording:
+        """Return its record."""
+        return recording_of(self.case, self.folder)
+
+    @cached_property
+    def other(self) -> ss.Recording:
+        """Return the record of another machine at the same duty."""
+        return recording_of(self.spare, self.folder)
+
+    def another(self, fault: str = "", leak: bool = True) -> ss.Recording:
+        """Return another record of this machine: with a fault from half on, or without its leak."""
+        own = replace(self.case, fault=fault, leak_lpm=self.case.leak_lpm if leak else 0.0)
+        name = f"{self.case.id}-{fault or 'sound'}".replace(" ", "-").replace("%", "percent")
+        return recording_of(replace(own, id=name, noise_seed=self.case.noise_seed ^ 1), self.folder)
+
+
 @dataclass(frozen=True)
 class Sample:
-    """What a transformation may use: the record, a random generator, and the same duty on another machine."""
+    """What a transformation may use: the record, a random generator, and where it comes from.
+
+    `other`: the record of another machine at the same duty; `machine`: what else the same machine recorded.
+    """
 
     record: ss.Recording
     random: np.random.Generator
     other: ss.Recording
+    machine: Machine | None = None
+
+    def faulty(self, fault: str) -> ss.Recording:
+        """Return the record of this machine with a fault from half on."""
+        assert self.machine is not None
+        return self.machine.another(fault)
+
+    def sound(self) -> ss.Recording:
+        """Return another record of this machine, without a leak."""
+        assert self.machine is not None
+        return self.machine.another(leak=False)
 
     @property
     def late(self) -> Flags:
@@ -72,14 +126,25 @@ class Sample:
 
 
 Transformation = Callable[[Sample], ss.Recording]
-TRANSFORMATIONS: dict[str, tuple[str, Transformation]] = {}
 
 
-def row(name: str, group: str) -> Callable[[Transformation], Transformation]:
-    """Enter a transformation under its name in one of the groups gap, sensor, logger, duty, machine, garbage."""
+@dataclass(frozen=True)
+class Row:
+    """A row of the table: its group (gap, sensor, logger, duty, machine, baseline, garbage), and what is diagnosed."""
+
+    group: str
+    change: Transformation
+    baseline: Transformation | None = None
+
+
+ROWS: dict[str, Row] = {}
+
+
+def row(name: str, group: str, baseline: Transformation | None = None) -> Callable[[Transformation], Transformation]:
+    """Enter a transformation under its name."""
 
     def enter(transformation: Transformation) -> Transformation:
-        TRANSFORMATIONS[name] = (group, transformation)
+        ROWS[name] = Row(group, transformation, baseline)
         return transformation
 
     return enter
@@ -89,6 +154,16 @@ def _low_pass(values: Array, width: int) -> Array:
     kernel = np.hanning(width + 2)[1:-1]
     padded = np.pad(values, width // 2, mode="edge")
     return np.convolve(padded, kernel / kernel.sum(), "valid")[: values.size]
+
+
+def _smooth_sensor(record: ss.Recording) -> ss.Recording:
+    own = {name: _low_pass(record[name], 5) for name in CHAMBERS}
+    return replace(record, channels={**record.channels, **own})
+
+
+def _humming(record: ss.Recording) -> ss.Recording:
+    line = 0.01 * float(np.std(record["p_A"] - record["p_B"])) * np.sin(2 * np.pi * 50.0 * record.t)
+    return replace(record, channels={**record.channels, **{name: record[name] + line for name in CHAMBERS}})
 
 
 def _hum(s: Sample, hertz: float, size: float) -> Array:
@@ -234,78 +309,154 @@ row("time in ms labelled s", "garbage")(lambda s: _stretched(s, 1e3))
 row("bar labelled Pa", "garbage")(lambda s: s.changed(lambda values: values * 1e-5, PRESSURES))
 row("Pa labelled bar", "garbage")(lambda s: s.changed(lambda values: values * 1e5, PRESSURES))
 row("a square wave for p_A", "garbage")(
-    lambda s: s.changed(lambda v: np.where(np.sin(s.record.t) > 0, 4e5, 2e5) + s.white(1e2), ("p_A",))
+    lambda s: s.changed(lambda v: np.where(np.sin(0.7 * s.record.t) > 0, 4e5, 2e5) + s.white(1e2), ("p_A",))
+)
+
+for _fault in ("air 1 %", "air 2 %", "friction +20 %", "rod seal A 0.01 L/min", "sensor p_A offset 5 psi"):
+    row(f"{_fault} from half on", "machine")(lambda s, fault=_fault: s.faulty(fault))
+
+row("against its own baseline", "baseline", lambda s: s.sound())(lambda s: s.record)
+row("against a copy of itself", "baseline", lambda s: s.record)(lambda s: s.record)
+row("against another machine's baseline", "baseline", lambda s: s.other)(lambda s: s.record)
+row("against a baseline with a smoother filter", "baseline", lambda s: _smooth_sensor(s.sound()))(lambda s: s.record)
+row("against a baseline with hum", "baseline", lambda s: _humming(s.sound()))(lambda s: s.record)
+row("against a baseline of noise", "baseline", lambda s: s.changed(lambda v: v.mean() + s.white(1e5)))(
+    lambda s: s.record
 )
 
 
-def machines(number: int, first: int, folder: Path | None) -> list[tuple[ss.Recording, ss.Recording]]:
-    """Return a healthy and a leaking record for each machine, from the folder where they were kept."""
-    cases = list(cases_of(load_plan(PLAN)))
-    healthy = [case for case in cases if not case.leak_lpm and not case.fault][first : first + number]
-    leaking = [case for case in cases if case.leak_lpm == LEAK and not case.fault][first : first + number]
-    return [
-        (recording_of(sound, folder), recording_of(worn, folder)) for sound, worn in zip(healthy, leaking, strict=True)
+def machines(number: int, first: int, leaking: bool, folder: Path | None) -> list[Machine]:
+    """Return machines of the plan, healthy or leaking; four in a row differ in command and throttles."""
+    cases = [
+        case for case in cases_of(load_plan(PLAN)) if case.leak_lpm == (LEAK if leaking else 0.0) and not case.fault
     ]
 
+    def place(k: int) -> int:
+        return k // _CELLS * _CELLS + 5 * k % _CELLS
 
-@dataclass(frozen=True)
-class Counts:
-    """Verdicts on one transformation through one set of channels, of the healthy and of the leaking machines."""
-
-    healthy: Counter[str]
-    leaking: Counter[str]
-    causes: Counter[str]
-
-    @staticmethod
-    def text(verdicts: Counter[str]) -> str:
-        """Return the counts of leak, no leak and cannot tell."""
-        return "|".join(str(verdicts[verdict]) for verdict in ("leak", "no leak", "cannot tell"))
+    most = 2 * _CELLS
+    return [Machine(cases[place(k)], cases[place(k) + most], folder) for k in range(first, min(first + number, most))]
 
 
-def judged(pairs: list[tuple[ss.Recording, ss.Recording]], name: str, view: str) -> Counts:
-    """Return the verdicts on one transformation of all machines."""
-    _, transformation = TRANSFORMATIONS[name]
-    counts = Counts(Counter(), Counter(), Counter())
-    for number, pair in enumerate(pairs):
-        others = pairs[(number + 1) % len(pairs)]
-        for record, other, verdicts in zip(pair, others, (counts.healthy, counts.leaking), strict=True):
-            random = np.random.default_rng([number, *name.encode()])
-            made = transformation(Sample(record, random, other))
-            channels = VIEWS[view]
-            kept = [own for own in made.channels if own != "q_leak" and (channels is None or own in channels)]
-            diagnosis = ss.diagnose(made.only(kept))
-            verdicts[diagnosis.verdict] += 1
-            counts.causes[diagnosis.cause or "none"] += 1
-    return counts
+def made_of(name: str, machine: Machine, number: int, view: str) -> tuple[ss.Recording, list[ss.Recording]]:
+    """Return the record that a row makes, and its baseline, through a set of channels."""
+    random = np.random.default_rng([number, *name.encode()])
+    sample, channels = Sample(machine.record, random, machine.other, machine), VIEWS[view]
+
+    def seen(made: ss.Recording) -> ss.Recording:
+        return made.only([own for own in made.channels if own != "q_leak" and (channels is None or own in channels)])
+
+    change, baseline = ROWS[name].change, ROWS[name].baseline
+    return seen(change(sample)), [] if baseline is None else [seen(baseline(sample))]
 
 
-def table(pairs: list[tuple[ss.Recording, ss.Recording]], names: Iterable[str]) -> Iterator[str]:
-    """Yield the lines of the table, as they are made."""
-    yield f"Verdicts on {len(pairs)} healthy and {len(pairs)} leaking machines, as leak|no leak|cannot tell."
-    yield ""
-    yield "| group | transformation | " + " | ".join(f"{view}: healthy | leaking" for view in VIEWS) + " |"
-    yield "| --- | --- |" + " --- | --- |" * len(VIEWS)
-    for name in names:
-        own = [judged(pairs, name, view) for view in VIEWS]
-        cells = " | ".join(f"{Counts.text(counts.healthy)} | {Counts.text(counts.leaking)}" for counts in own)
-        yield f"| {TRANSFORMATIONS[name][0]} | {name} | {cells} |"
+def digest(recordings: Iterable[ss.Recording]) -> str:
+    """Return a hash of all that a diagnosis sees."""
+    whole = sha256()
+    for recording in recordings:
+        whole.update(repr((recording.rate, sorted(recording.units.items()))).encode())
+        for name in ("", *sorted(recording.channels)):
+            whole.update(name.encode() + (recording[name] if name else recording.t).tobytes())
+    return whole.hexdigest()[:16]
+
+
+Key = tuple[str, str, bool, int]
+
+
+def known_verdicts(file: Path) -> list[dict[str, object]]:
+    """Return the lines of a file of verdicts; a line that was cut off is left out."""
+    lines = []
+    for line in file.read_text(encoding="utf-8").split("\n")[:-1] if file.is_file() else []:
+        try:
+            lines.append(json.loads(line))
+        except ValueError:
+            continue
+    return lines
+
+
+def key_of(line: dict[str, object]) -> Key:
+    """Return what a line is the verdict on."""
+    return str(line["row"]), str(line["view"]), bool(line["leaking"]), int(str(line["machine"]))
+
+
+def judge(file: Path, machines_of: dict[bool, list[Machine]], first: int, keys: Sequence[Key], minutes: float) -> bool:
+    """Add the verdicts that the file lacks; return whether none is missing now."""
+    lines = known_verdicts(file)
+    have, by_digest = {key_of(line) for line in lines}, {line["digest"]: line for line in lines}
+    missing = [key for key in keys if key not in have]
+    end = time.monotonic() + 60.0 * minutes
+    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+    with file.open("a", encoding="utf-8") as out:
+        if text and not text.endswith("\n"):
+            out.write("\n")
+        for done, (name, view, leaking, number) in enumerate(missing):
+            if time.monotonic() > end:
+                print(f"{len(keys) - len(missing) + done} of {len(keys)} verdicts; call again for the rest")
+                return False
+            if done % 50 == 0:
+                print(f"{len(keys) - len(missing) + done} of {len(keys)} verdicts", flush=True)
+            record, baseline = made_of(name, machines_of[leaking][number - first], number, view)
+            own = digest([record, *baseline])
+            if (line := by_digest.get(own)) is None:
+                diagnosis = ss.diagnose(record, baseline)
+                line = {"verdict": diagnosis.verdict, "cause": diagnosis.cause, "digest": own}
+                line |= {"by": diagnosis.detector, "reason": diagnosis.reason}
+                by_digest[own] = line
+            line = line | {"row": name, "view": view, "leaking": leaking, "machine": number}
+            print(json.dumps(line), file=out, flush=True)
+    return True
+
+
+def write_table(file: Path, lines: Iterable[dict[str, object]]) -> None:
+    """Write how often each row was called what, through each set of channels, as CSV."""
+    counts: dict[tuple[str, str, bool], Counter[str]] = {}
+    for line in lines:
+        name, view, leaking, _ = key_of(line)
+        counts.setdefault((name, view, leaking), Counter())[str(line["verdict"])] += 1
+        counts[name, view, leaking][f"cause: {line['cause']}"] += 1
+    verdicts = ("leak", "no leak", "cannot tell")
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        sides = [f"{side}: {verdict}" for side in ("healthy", "leaking") for verdict in verdicts]
+        writer.writerow(["group", "row", "channels", *sides, "causes named, healthy"])
+        for name, own in ROWS.items():
+            for view in VIEWS:
+                sound, worn = (counts.get((name, view, leaking), Counter[str]()) for leaking in (False, True))
+                if not sound and not worn:
+                    continue
+                named = [(key.removeprefix("cause: "), count) for key, count in sorted(sound.items())]
+                causes = [f"{cause} {count}" for cause, count in named if cause not in (*verdicts, "None")]
+                cells = [side[verdict] for side in (sound, worn) for verdict in verdicts]
+                writer.writerow([own.group, name, view, *cells, "; ".join(causes)])
 
 
 def main() -> None:
-    """Make the table."""
+    """Judge, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("into", type=Path)
-    parser.add_argument("--machines", type=int, default=16, help="How many, at most 32.")
-    parser.add_argument("--first", type=int, default=0, help="Number of the first.")
-    parser.add_argument("--rows", default="", help="Transformations whose name, or group, holds this text.")
+    parser.add_argument("verdicts", type=Path)
+    parser.add_argument("--machines", type=int, default=16, help="How many of each kind.")
+    parser.add_argument("--first", type=int, default=16, help="Number of the first, 0 to 31.")
+    parser.add_argument("--rows", default="", help="Rows whose name, or group, holds this text.")
+    parser.add_argument("--views", nargs="+", choices=list(VIEWS), default=list(VIEWS), help="Sets of channels.")
     parser.add_argument("--records", type=Path, help="Folder of the simulated records.")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="Stop after this time.")
+    parser.add_argument("--table", type=Path, help="Write the counts of all verdicts in the file here.")
     arguments = parser.parse_args()
-    pairs = machines(arguments.machines, arguments.first, arguments.records)
-    names = [name for name, (group, _) in TRANSFORMATIONS.items() if arguments.rows in f"{group}: {name}"]
-    with arguments.into.open("w", encoding="utf-8") as file:
-        for line in table(pairs, names):
-            print(line, flush=True)
-            print(line, file=file, flush=True)
+    names = [name for name, own in ROWS.items() if arguments.rows in f"{own.group}: {name}"]
+    both = {
+        leaking: machines(arguments.machines, arguments.first, leaking, arguments.records) for leaking in (False, True)
+    }
+    numbers = range(arguments.first, arguments.first + len(both[False]))
+    keys = [
+        (name, view, leaking, number)
+        for leaking in both
+        for view in reversed(arguments.views)
+        for number in numbers
+        for name in names
+    ]
+    judge(arguments.verdicts, both, arguments.first, keys, arguments.minutes)
+    if arguments.table:
+        write_table(arguments.table, [line for line in known_verdicts(arguments.verdicts) if key_of(line) in set(keys)])
 
 
 if __name__ == "__main__":

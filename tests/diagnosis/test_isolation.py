@@ -131,6 +131,22 @@ def test_a_leak_becomes_cannot_tell_and_keeps_its_score() -> None:
     assert isolated(FOUND, sound) is FOUND
 
 
+@pytest.mark.parametrize("detector", ["rms change", "volume balance"])
+def test_both_means_that_step_are_no_leak(detector: str) -> None:
+    """A leak between the chambers does not bring that about; another machine's readings from there on do."""
+    found = replace(FOUND, detector=detector)
+    for mean_A, mean_B, reason in ((1e4, 1e4, "both chambers' means step by +1"), (-1e4, -9e3, "means step by -1")):
+        seen = signatures(made(mean_A=mean_A, mean_B=mean_B, ringing=0.6))
+        assert seen is not None
+        other = isolated(found, seen)
+        assert (other.verdict, other.cause) == ("cannot tell", None)
+        assert reason in other.reason
+    for mean_A, mean_B in ((1e4, -1e4), (3e3, 3e3)):
+        seen = signatures(made(mean_A=mean_A, mean_B=mean_B, ringing=0.6))
+        assert seen is not None
+        assert isolated(found, seen) is found
+
+
 def test_the_fused_verdict_heeds_it_and_a_volume_balance_does_not_need_it(monkeypatch: pytest.MonkeyPatch) -> None:
     class Says:
         def __init__(self, name: str) -> None:

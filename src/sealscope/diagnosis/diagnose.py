@@ -169,7 +169,7 @@ class Examination:
             return fused
         other = elsewhere(self._signatures)
         if other is not None:  # of two recordings in one, or of swapped channels, nothing is said
-            reason = f"{fused.reason}; but {other.description}: {other.cause}"
+            reason = f"{fused.reason}; but {other.text}"
             return replace(fused, verdict="cannot tell", cause=other.cause, reason=reason)
         if fused.cause is not None:
             return fused
@@ -178,22 +178,32 @@ class Examination:
         if stepped is None:
             return fused
         onset, other = stepped
-        reason = f"{fused.reason}; near {onset:.0f} s {other.description}: {other.cause}"
+        reason = f"{fused.reason}; near {onset:.0f} s {other.text}"
         return replace(fused, cause=other.cause, reason=reason)
 
     def _isolated(self, evidence: Evidence) -> Evidence:
         if evidence.verdict != "leak" or self._signatures is None:
             return evidence
-        return isolated(evidence, self._signatures)
+        with np.errstate(all="ignore"):
+            return isolated(evidence, self._signatures, self._known if evidence.onset_s is None else ())
 
     @cached_property
     def _signatures(self) -> Signatures | None:
-        try:
-            with np.errstate(all="ignore"):
-                return signatures(self.recording)
-        except (ArithmeticError, np.linalg.LinAlgError):
-            _log.debug("what else stepped cannot be computed", exc_info=True)
-            return None
+        return _signatures(self.recording)
+
+    @cached_property
+    def _known(self) -> list[Signatures]:
+        """Signatures of the baseline."""
+        return [seen for own in self.baseline if (seen := _signatures(own)) is not None]
+
+
+def _signatures(recording: Recording) -> Signatures | None:
+    try:
+        with np.errstate(all="ignore"):
+            return signatures(recording)
+    except (ArithmeticError, np.linalg.LinAlgError):
+        _log.debug("what else stepped cannot be computed", exc_info=True)
+        return None
 
 
 @checked_call

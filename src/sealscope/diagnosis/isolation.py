@@ -9,6 +9,7 @@ is the likelier cause. A detector that sees the pressures as a whole cannot say 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.baseline.duty import StrokeChange, duty_changes
 from sealscope.diagnosis.changepoint.even_drift import step_near
+from sealscope.diagnosis.rms_change.detector import FEWEST_RECORDINGS
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
@@ -36,6 +38,11 @@ SURE = 4.5
 DUTY, FRICTION, MEAN = 0.02, 0.08, 0.04
 #: Both means fall by at least this, over that mean difference, where oil is lost.
 LOST = 0.05
+#: Both means step by at least this, over that mean difference, where the charge pressure is another one: a leak of 0.5
+#: L/min on the thesis's rig steps them by 0.02.
+CHARGED = 0.1
+#: Log power of the noise from which a baseline was made with other noise than the recording.
+NOISY = 0.2
 #: One chamber's mean moves alone where the other moves by less than this share of it, both move alike above that one.
 ALONE, ALIKE = 0.3, 0.6
 #: A band of half an octave that gains this factor in power while the ringing's frequency falls by this share: the
@@ -60,10 +67,15 @@ _SHORTEST = 64
 
 @dataclass(frozen=True)
 class OtherCause:
-    """What stepped, and a description that says by how much; no cause where a leak may be it, too."""
+    """What stepped, and a description that says by how much; no cause where none can be named."""
 
     cause: Cause | None
     description: str
+
+    @property
+    def text(self) -> str:
+        """Return the description, and the cause where there is one."""
+        return self.description if self.cause is None else f"{self.description}: {self.cause}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,30 +247,89 @@ def elsewhere(seen: Signatures) -> OtherCause | None:
     return OtherCause("changed duty", f"near {at:.0f} s p_A - p_B goes on in another phase, as of another recording")
 
 
-def isolated(evidence: Evidence, seen: Signatures) -> Evidence:
+def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] = ()) -> Evidence:
     """Return the evidence of a leak as `cannot tell` with another cause where one stepped at its onset.
 
     A sensor's filter that changed counts wherever it happened: both sides of any onset are not read alike. So does hum
     for evidence that names no cause, which comes from the spectrum alone; a model of the machine leaves it out but at
-    the onset. A duty that goes on in another phase or sense counts against all.
+    the onset. A duty that goes on in another phase or sense counts against all. Evidence without an onset comes from
+    the comparison with a baseline, of the signatures `known`: there counts what differs from all of it.
     """
-    if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS) or evidence.onset_s is None:
+    if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS):
         return evidence
-    other = elsewhere(seen)
-    if other is None and evidence.detector != BALANCED:
-        other = other_cause(seen, evidence.onset_s) or _readings(
-            seen, evidence.onset_s if evidence.cause is not None else None
-        )
+    if evidence.onset_s is None:
+        other = unlike(seen, known) if evidence.cause is None else None
+    else:
+        other = elsewhere(seen) or _charge(seen, evidence.onset_s)
+        if other is None and evidence.detector != BALANCED:
+            other = other_cause(seen, evidence.onset_s) or _readings(
+                seen, evidence.onset_s if evidence.cause is not None else None
+            )
     if other is None:
         return evidence
     return replace(
         evidence,
         verdict="cannot tell",
-        reason=f"{evidence.reason}; but {other.description}: {other.cause or 'a changed duty'}, which may be all of it",
+        reason=f"{evidence.reason}; but {other.text}, which may be all of it",
         leak_lpm=None,
         leak_interval_lpm=None,
         cause=other.cause,
         course=None,
+    )
+
+
+def unlike(seen: Signatures, known: Sequence[Signatures]) -> OtherCause | None:
+    """Return in what a recording differs from all leak-free ones that a leak does not move; None where in nothing.
+
+    That is a sensor's filter or hum; against fewer than `FEWEST_RECORDINGS`, whose scatter from day to day nobody
+    knows, also the charge pressure (both chambers' means), friction and noise. A recording that lies within the range
+    of the leak-free ones, or outside by no more than what matters, differs in nothing.
+    """
+    if not known:
+        return None
+
+    def outside(own: Array, others: Sequence[Array]) -> Array:
+        """Return by how much medians over the blocks (..,) lie over or under those of all others."""
+        value, range_ = np.median(own, axis=0), np.stack([np.median(other, axis=0) for other in others])
+        low, high = range_.min(axis=0), range_.max(axis=0)
+        return np.asarray(np.maximum(value - high, 0.0) + np.minimum(value - low, 0.0))
+
+    tilt = outside(seen.tilt, [other.tilt for other in known])
+    alike = [other.hum for other in known if np.array_equal(other.mains, seen.mains)]
+    hum = outside(seen.hum, alike) if alike and seen.mains.size else np.zeros((len(CHAMBERS), 0))
+    for chamber, name in enumerate(CHAMBERS):
+        if abs(tilt[chamber]) > FILTERED:
+            what = "smoother" if tilt[chamber] < 0 else "sharper"
+            return OtherCause(
+                "sensor fault", f"the noise of {name} is {what} than in the baseline, as by another filter"
+            )
+        for hertz, change in zip(seen.mains, hum[chamber], strict=True):
+            if abs(change) > HUMS:
+                which = "more" if change > 0 else "less"
+                return OtherCause(
+                    "sensor fault", f"there is {which} hum of {hertz:g} Hz in {name} than in the baseline"
+                )
+    if len(known) >= FEWEST_RECORDINGS:
+        return None
+    scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
+    mean = outside(seen.mean / scale, [other.mean / scale for other in known])
+    swing = float(outside(seen.swing, [other.swing for other in known]))
+    with np.errstate(divide="ignore"):
+        noise = float(outside(np.log(seen.noise), [np.log(other.noise) for other in known]))
+    differing = []
+    if np.abs(mean).max() > CHARGED:
+        largest = float(mean[np.argmax(np.abs(mean))])
+        differing.append(f"the chambers' means by up to {largest:+.0%} of the strokes' pressure difference")
+    if abs(swing) > FRICTION:
+        differing.append(f"the strokes' pressure difference by {math.expm1(swing):+.1%}, which friction sets")
+    if abs(noise) > NOISY:
+        differing.append(f"the noise by {math.expm1(0.5 * noise):+.1%}")
+    if not differing:
+        return None
+    return OtherCause(
+        None,
+        f"what a leak does not move differs from the baseline, too ({', '.join(differing)}), so it is of another day "
+        "or another machine",
     )
 
 
@@ -269,8 +340,10 @@ def _step(seen: Signatures, values: Array, onset: float) -> tuple[float, float]:
 def _duty(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
     near = [change for change in seen.motion if abs(change.t - onset) <= NEAR]
     if near:
-        certain = any(change.certain for change in near)
-        return OtherCause("changed duty" if certain else None, "the " + ", ".join(change.text for change in near))
+        text = "the " + ", ".join(change.text for change in near)
+        if any(change.certain for change in near):
+            return OtherCause("changed duty", text)
+        return OtherCause(None, f"{text}: a changed duty")
     if seen.duty is None:
         return None
     for values, what in zip(seen.duty.T, ("size", "rate"), strict=True):
@@ -317,6 +390,21 @@ def _sensor(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
         "sensor fault",
         f"the mean of {CHAMBERS[largest]} alone steps by {size[largest]:+.1%} of the strokes' pressure difference, "
         "which a piston that floats between both chambers does not allow",
+    )
+
+
+def _charge(seen: Signatures, onset: float) -> OtherCause | None:
+    """Return whether both chambers' means step alike, which a leak between them does not bring about."""
+    scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
+    size, surely = np.array([_step(seen, values / scale, onset) for values in seen.mean.T]).T
+    if np.abs(size).min() < max(CHARGED, ALIKE * np.abs(size).max()) or np.abs(surely).min() < SURE:
+        return None
+    if size[0] * size[1] < 0.0:
+        return None
+    return OtherCause(
+        None,
+        f"both chambers' means step by {size.mean():+.0%} of the strokes' pressure difference, which a leak between "
+        "them does not bring about: another charge pressure, or another machine's readings",
     )
 
 
