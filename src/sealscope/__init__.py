@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sealscope.diagnosis.diagnose import diagnose
     from sealscope.diagnosis.fleet.fleet import Fleet
+    from sealscope.diagnosis.trend.trend import Trend, trend
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.diagnosis.volume_balance.stream import SequentialBalance
     from sealscope.monitor.stream.watch import Watch, watch
@@ -34,6 +35,7 @@ _HOMES = {
     "Rig": "parameters",
     "RmsStream": "signals.windows",
     "SequentialBalance": "diagnosis.volume_balance.stream",
+    "Trend": "diagnosis.trend.trend",
     "Watch": "monitor.stream.watch",
     "diagnose": "diagnosis.diagnose",
     "inspect": "recordings",
@@ -43,6 +45,7 @@ _HOMES = {
     "simulate": "simulation.simulate",
     "simulate_batch": "simulation.batch.batch",
     "simulate_with_truth": "simulation.simulate",
+    "trend": "diagnosis.trend.trend",
     "watch": "monitor.stream.watch",
     "write": "recordings",
     "write_page": "reporting",
@@ -57,6 +60,7 @@ __all__ = [
     "Rig",
     "RmsStream",
     "SequentialBalance",
+    "Trend",
     "Watch",
     "__version__",
     "diagnose",
@@ -67,6 +71,7 @@ __all__ = [
     "simulate",
     "simulate_batch",
     "simulate_with_truth",
+    "trend",
     "watch",
     "write",
     "write_page",

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import campaign, prediction, recordings, reproduction, simulation
+from sealscope.cli import campaign, prediction, recordings, reproduction, simulation, trend
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -30,6 +30,7 @@ for command in (
     simulation.simulate,
     recordings.diagnose,
     recordings.report,
+    trend.trend,
     simulation.parameters,
     prediction.predict,
     recordings.inspect,

@@ -89,8 +89,11 @@ def operating_point(recording: Recording) -> OperatingPoint:
     )
 
 
-def difference(point: OperatingPoint, other: OperatingPoint) -> str | None:
-    """Return why two recordings must not be compared, None where they may; the pressure level is judged elsewhere."""
+def difference(point: OperatingPoint, other: OperatingPoint, *, certain: bool = False) -> str | None:
+    """Return why two recordings must not be compared, None where they may; the pressure level is judged elsewhere.
+
+    `certain`: leave out what a leak could have made, too.
+    """
     if point.chambers != other.chambers or point.units != other.units:
         return "other channels or units"
     if abs(point.rate / other.rate - 1.0) > 1e-3:
@@ -109,6 +112,6 @@ def difference(point: OperatingPoint, other: OperatingPoint) -> str | None:
         ):
             return "another cycle of the command"
     moved = motion_difference(point.motion, other.motion, MOTION)
-    if moved is not None:
+    if moved is not None and (moved.certain or not certain):
         return moved.text if moved.certain else f"{moved.text}, or a leak that takes as much"
     return None

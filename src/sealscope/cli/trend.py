@@ -1,0 +1,167 @@
+"""The command that follows a machine over its recordings: trend."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sealscope.cli.options import (
+    AssumeOption,
+    MapOption,
+    RateOption,
+    assumed_rig,
+    attempt,
+    channel_map_of,
+    check_folder,
+    progress,
+    say,
+)
+from sealscope.errors import InputError, UnreadableFile
+
+if TYPE_CHECKING:
+    from sealscope.diagnosis.trend.reading import LeakReading
+    from sealscope.parameters import Rig
+    from sealscope.recordings.formats.columns import ChannelMap
+
+#: Exit status where a leak was seen and `--fail-on leak` asks for it.
+_FAILED_ON = 3
+
+
+class TrendFormat(StrEnum):
+    """How a trend is printed."""
+
+    text = "text"
+    json = "json"
+    csv = "csv"
+
+
+def _files(given: Sequence[Path]) -> list[Path]:
+    """Return the files of a call, those of its folders in the order of their names; hidden ones are left out."""
+    files: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            inside = sorted(own for own in path.iterdir() if own.is_file() and not own.name.startswith("."))
+            if not inside:
+                raise InputError(f"a folder must hold recordings, got none in {path}")
+            files += inside
+        else:
+            files.append(path)
+    return files
+
+
+def _readings(
+    files: Sequence[Path], channel_map: ChannelMap, rate: float | None, rig: Rig | None
+) -> Iterator[LeakReading | None]:
+    """Yield what each file states of the leakage, None for one that cannot be read."""
+    from sealscope.diagnosis.trend.reading import reading_of
+    from sealscope.parameters import load_rig
+    from sealscope.recordings import read
+
+    assumed = rig or load_rig("thesis")
+    with progress() as update:
+        for k, file in enumerate(files):
+            recording = attempt(file, partial(read, file, channel_map=channel_map or None, rate=rate))
+            reading = None
+            if recording is not None:
+                reading = attempt(file, partial(reading_of, recording, assumed, file.name))
+            yield reading
+            update("recordings", (k + 1) / len(files))
+
+
+def trend(
+    context: typer.Context,
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Recordings of a single machine, or a folder of them.")
+    ],
+    output_format: Annotated[
+        TrendFormat, typer.Option("--format", help="Text, one JSON object, or a table.")
+    ] = TrendFormat.text,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Also write a page (.html, .pdf), or .json, or .csv.")
+    ] = None,
+    healthy: Annotated[
+        int, typer.Option("--healthy", help="How many of the first recordings are known to be of a healthy machine.")
+    ] = 1,
+    limit: Annotated[
+        str | None,
+        typer.Option(
+            "--limit",
+            metavar="L/min",
+            help="Flow past pump and piston at which a repair is due; by default 5 % of the pump's flow.",
+        ),
+    ] = None,
+    years: Annotated[
+        float, typer.Option("--years", help="Machine-years in which a healthy machine has one false alarm.")
+    ] = 10.0,
+    every: Annotated[
+        str | None,
+        typer.Option(
+            "--every", metavar="TIME", help="Time from one recording to the next (1d, 12h), of files that state none."
+        ),
+    ] = None,
+    maps: MapOption = None,
+    rate: RateOption = None,
+    rig: AssumeOption = None,
+    fail_on: Annotated[
+        list[str] | None, typer.Option("--fail-on", help="End with status 3 on this verdict; repeat.")
+    ] = None,
+) -> None:
+    """Follow a machine over its recordings: L/min, change, growth, and when it reaches the limit.
+
+    Exit status 1 where a file could not be read.
+    """
+    from sealscope.diagnosis.trend.trend import trend_of
+    from sealscope.recordings.formats.columns import check_call
+    from sealscope.reporting.trend.text import trend_csv, trend_text
+    from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+
+    if wrong := [verdict for verdict in fail_on or () if verdict not in ("leak", "no leak", "cannot tell")]:
+        raise InputError(f"--fail-on must be leak, no leak or cannot tell, got {wrong[0]!r}")
+    channel_map = channel_map_of(maps)
+    check_call(channel_map, rate)
+    lpm = None
+    if limit is not None:
+        bare = limit.replace(".", "", 1).replace("e-", "").isdigit()
+        lpm = parse_quantity(f"{limit} L/min" if bare else limit, "m^3/s", name="--limit") / LITRE_PER_MINUTE
+    spacing = None if every is None else parse_quantity(every, "s", name="--every")
+    if output is not None:
+        _check_output(output, files)
+    paths = _files(files)
+    read = list(_readings(paths, channel_map, rate, assumed_rig(rig)))
+    readings = [reading for reading in read if reading is not None]
+    if not readings:
+        raise UnreadableFile("no recording could be read, so there is no trend")
+    result = trend_of(readings, healthy=healthy, limit=lpm, years=years, every=spacing)
+    whole = bool(context.find_root().params.get("verbose"))
+    texts = {
+        "text": lambda: trend_text(result, whole=whole),
+        "json": lambda: json.dumps(result.as_dict(), allow_nan=False, indent=1),
+        "csv": lambda: trend_csv(result).rstrip("\n"),
+    }
+    say(texts[output_format.value]())
+    if output is not None:
+        _write(output, texts[output.suffix[1:].lower()]() + "\n")
+    failed = result.verdict in (fail_on or ())
+    if failed or len(readings) < len(read):
+        raise typer.Exit(_FAILED_ON if failed else 1)
+
+
+def _check_output(output: Path, files: Sequence[Path]) -> None:
+    if output.suffix.lower() not in (".json", ".csv"):
+        raise InputError(f"a trend must be written as .json or .csv, got {output}")
+    if output.resolve() in {file.resolve() for file in files}:
+        raise InputError(f"a trend must not replace a recording, got {output}")
+    check_folder(output)
+
+
+def _write(output: Path, text: str) -> None:
+    from sealscope.storage.atomic import atomic_write
+
+    with atomic_write(output) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")

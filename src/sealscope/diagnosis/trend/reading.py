@@ -1,0 +1,171 @@
+"""Reading: what a single recording states of the leakage, by the best detector that its channels allow."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sealscope.diagnosis.baseline.inspection import inspected
+from sealscope.diagnosis.baseline.level import DayToDay, Level
+from sealscope.diagnosis.baseline.operating_point import OperatingPoint
+from sealscope.diagnosis.baseline.sessions import start_seconds
+from sealscope.diagnosis.detector import unusable
+from sealscope.diagnosis.observer.against_baseline import level as observer_level
+from sealscope.diagnosis.observer.detector import Observer
+from sealscope.diagnosis.observer.evidence import misfit
+from sealscope.diagnosis.observer.model import G_UNIT
+from sealscope.diagnosis.pressure_model.detector import DAY_TO_DAY, PressureModel, is_followed
+from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole_log_rms
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.diagnosis.volume_balance.evidence import level as balance_level
+from sealscope.diagnosis.volume_balance.evidence import states_flow
+from sealscope.parameters import Rig
+from sealscope.recordings.chambers import CHAMBERS, chambers_of
+from sealscope.recordings.formats.headings.preamble import remarks_of
+from sealscope.recordings.recording import Recording
+from sealscope.units import LITRE_PER_MINUTE
+
+#: What a level rests on, the most specific first. `conductance` is a volume balance without a unit of flow: a position
+#: in counts, or another geometry than the assumed one; `ringing` is the damping of the pressures' details.
+Basis = Literal["volume balance", "conductance", "pressure model", "observer", "ringing"]
+BASES: tuple[Basis, ...] = ("volume balance", "conductance", "pressure model", "observer", "ringing")
+#: Bases whose level is a conductance in m^3/(s Pa).
+FLOWS: tuple[Basis, ...] = ("volume balance", "pressure model", "observer")
+#: From day to day a level moves by this share of itself, or by this much; both known as from five recordings. Those of
+#: the conductances are what `diagnose` assumes; that of the ringing is `rms change`'s between sessions.
+_SHARE, _BY_RINGING, _RINGING, _FREEDOM = 0.1, 0.6 * G_UNIT, 0.11, 4.0
+#: Error of a ringing's logarithm that a recording states of itself.
+_RINGING_ERROR = 0.01
+_TEMPERATURE = re.compile(
+    r"(?P<value>[-+]?\d{1,3}(?:[.,]\d{1,3})?)\s*(?P<unit>°\s?[CF]|deg\s?[CF]|[CFK]\b|℃)", re.IGNORECASE
+)
+_UNIT_OF_NAME = re.compile(r"[\[(]\s*([^\])]{1,6}?)\s*[\])]")
+_OIL = re.compile(r"temp|oil|öl|oel|fluid|huile|olio|aceite", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class LeakReading:
+    """What a recording states of the leakage.
+
+    `start`: of its first sample [s since 1970], None where not known, and `duration` [s]; `basis`, None where nothing
+    can be stated, and `problem`: why; `level`: conductance of pump and piston together [m^3/(s Pa)], or a relative
+    index; `pressure`: mean |p_A - p_B|, `delivery`: mean flow of the pump [L/min] where it is known; `temperature` of
+    the oil [deg C], None where the file does not say; `scale`: displacement over area, over the assumed one; `point`:
+    operating point; `digest`: equal for copies.
+    """
+
+    file: str
+    start: float | None
+    duration: float
+    basis: Basis | None
+    level: Level
+    pressure: float
+    delivery: float | None
+    temperature: float | None
+    scale: float | None
+    point: OperatingPoint | None
+    digest: bytes
+    problem: str = ""
+
+
+def reading_of(recording: Recording, rig: Rig, file: str = "") -> LeakReading:
+    """Return what a recording states of the leakage; `rig`: what may be assumed of the machine."""
+    inspection = inspected(recording)
+    part, problem = inspection.part, inspection.defect
+    basis: Basis | None = None
+    level, scale = Level(float("nan"), float("nan")), None
+    if problem is None:
+        with np.errstate(all="ignore"):
+            basis, level, scale = _level(part, rig)
+        if basis is None:
+            problem = "no detector states a level: " + _reasons(part, rig)
+    chambers = chambers_of(part)
+    both = len(chambers) == len(CHAMBERS) and len(part) > 0
+    return LeakReading(
+        file=file or str(recording.provenance.get("file", "recording")),
+        start=start_seconds(recording),
+        duration=recording.duration,
+        basis=basis,
+        level=level,
+        pressure=float(np.mean(np.abs(part["p_A"] - part["p_B"]))) if both else float("nan"),
+        delivery=_delivery(part, rig) if problem is None else None,
+        temperature=oil_temperature(recording),
+        scale=scale,
+        point=inspection.point if problem is None else None,
+        digest=inspection.digest,
+        problem=problem or "",
+    )
+
+
+def _level(part: Recording, rig: Rig) -> tuple[Basis | None, Level, float | None]:
+    """Return the most specific level that a recording without a defect allows, and displacement over area."""
+    balance = VolumeBalance(rig)
+    if unusable(balance, part) is None:
+        fit, _ = balance.fit(part)
+        if fit is not None:
+            own = balance_level(fit)
+            total = Level(own.value + (fit.pump or 0.0), float(np.hypot(own.error, fit.pump_sd)))
+            return ("volume balance" if states_flow(fit) else "conductance"), total, abs(fit.scale)
+    model = PressureModel(rig)
+    if unusable(model, part) is None:
+        followed = model.follow(part)
+        if not isinstance(followed, str) and is_followed(followed):
+            return "pressure model", followed.level, None
+    observer = Observer(rig)
+    if unusable(observer, part) is None:
+        series = observer.follow(part)
+        if series.G.size > 1 and misfit(series.estimates, series.formulation, rig) is None:
+            own = observer_level(series)
+            return "observer", Level(own.value * G_UNIT, own.error * G_UNIT), None
+    log_rms = whole_log_rms(part).reshape(-1, len(QUANTITIES))
+    ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
+    if np.isfinite(ringing):
+        return "ringing", Level(ringing, _RINGING_ERROR), None
+    return None, Level(float("nan"), float("nan")), None
+
+
+def _reasons(part: Recording, rig: Rig) -> str:
+    reasons = (unusable(detector(rig), part) for detector in (VolumeBalance, PressureModel, Observer))
+    return "; ".join(dict.fromkeys(reason for reason in reasons if reason)) or "the pressures do not ring"
+
+
+def _delivery(part: Recording, rig: Rig) -> float | None:
+    """Return the mean flow that the pump delivers [L/min], from its angle, its speed or its command."""
+    if "theta" in part and part.units["theta"] == "rad":
+        theta = part["theta"][np.isfinite(part["theta"])]
+        speed = float(np.abs(np.diff(theta)).sum()) / max(part.duration, 1e-9)
+    elif "omega" in part and part.units["omega"] == "rad/s":
+        speed = float(np.nanmean(np.abs(part["omega"])))
+    elif "u" in part and part.units["u"] == "V":
+        speed = float(np.nanmean(np.abs(part["u"]))) * rig.motor.omega_per_volt
+    else:
+        return None
+    return rig.pump.q_b / (2.0 * np.pi) * speed / LITRE_PER_MINUTE
+
+
+def oil_temperature(recording: Recording) -> float | None:
+    """Return the oil's temperature [deg C] by what the file says beside its samples, None where it does not."""
+    for name, text in remarks_of(recording.provenance).items():
+        if not _OIL.search(name):
+            continue
+        unit_of_name = _UNIT_OF_NAME.search(name)
+        match = _TEMPERATURE.search(text if unit_of_name is None else f"{text} {unit_of_name[1]}")
+        if match is None:
+            continue
+        value, unit = float(match["value"].replace(",", ".")), match["unit"].upper().replace("℃", "C")[-1]
+        celsius = (value - 32.0) / 1.8 if unit == "F" else value - 273.15 if unit == "K" else value
+        if -60.0 < celsius < 200.0:
+            return celsius
+    return None
+
+
+def scatter_of(basis: Basis, usual: float) -> DayToDay:
+    """Return the prior on the scatter of a level from day to day, for a machine of that usual level."""
+    if basis in ("volume balance", "conductance"):
+        return DayToDay(max(_SHARE * abs(usual), float(np.finfo(float).tiny)), _FREEDOM)
+    if basis == "pressure model":
+        return DAY_TO_DAY
+    return DayToDay(_BY_RINGING if basis == "observer" else _RINGING, _FREEDOM)

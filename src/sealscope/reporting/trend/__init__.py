@@ -1,0 +1,1 @@
+"""Texts and the page of a trend."""

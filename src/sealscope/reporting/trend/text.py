@@ -1,0 +1,150 @@
+"""The trend in words: what a person reads first, on the terminal and on the page."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+
+import numpy as np
+
+from sealscope.diagnosis.trend.timeline import DAY
+from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.wear import MONTH, Interval
+from sealscope.reporting.messages import number
+
+#: Times are shown to the minute where all recordings lie within so many days.
+_WITHIN_DAYS = 3.0
+#: Furthest time that is stated, in months.
+_FURTHEST = 120.0
+_BASES = {
+    "volume balance": "by the volume balance",
+    "pressure model": "by the pressure model",
+    "observer": "by the observer",
+    "conductance": "by the volume balance, relative: geometry or unit of the position do not give L/min",
+    "ringing": "the damping of the pressures' ringing, relative: no L/min",
+}
+
+
+def moment(trend: Trend, day: float) -> str:
+    """Return a time of a trend: a date, with the time of day where the recordings lie close, or a number of days."""
+    if not trend.dated or not trend.points:
+        return f"day {day:.3g}"
+    first, last = trend.points[0], trend.points[-1]
+    stamp = str(np.datetime64(round((first.start + (day - first.day) * DAY) * 1e3), "ms"))
+    return stamp[:16].replace("T", " ") if last.day - first.day < _WITHIN_DAYS else stamp[:10]
+
+
+def figure(interval: Interval, unit: str, digits: int = 2) -> str:
+    """Return an estimate with its interval; an end that is not known is left open."""
+    if not math.isfinite(interval.value):
+        return "not known"
+    ends = (number(end, digits) if math.isfinite(end) else "open" for end in (interval.low, interval.high))
+    return f"{number(interval.value, digits)} {unit} ({' to '.join(ends)})"
+
+
+def headline(trend: Trend) -> str:
+    """Return verdict and what it rests on, in one line."""
+    count, wear = len(trend.points), trend.wear
+    span = f", {moment(trend, trend.points[0].day)} to {moment(trend, trend.points[-1].day)}" if count else ""
+    text = f"{trend.verdict} in {count} recording{'' if count == 1 else 's'}{span}"
+    if wear is not None and wear.onset is not None:
+        onset = wear.onset
+        text += f", since {moment(trend, onset.value)} ({moment(trend, onset.low)} to {moment(trend, onset.high)})"
+    return text
+
+
+def level(trend: Trend) -> str | None:
+    """Return the present level beside the healthy band, None where there is no level."""
+    wear = trend.wear
+    if wear is None or trend.basis is None:
+        return None
+    at = "" if trend.pressure is None else f" at {number(trend.pressure / 1e6, 2)} MPa"
+    band = f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)}"
+    return f"{figure(wear.now, trend.unit)}{at}; healthy {band}; {_BASES[trend.basis]}"
+
+
+def growth(trend: Trend) -> str | None:
+    """Return how the level changes, None where there is no level."""
+    wear = trend.wear
+    if wear is None:
+        return None
+    if wear.step is not None:
+        return f"a step of {figure(wear.step, trend.unit)}"
+    if not math.isfinite(wear.growth.value):
+        return "not known from so few recordings"
+    return f"{figure(wear.growth, trend.unit)} a month"
+
+
+def _wait(days: float) -> str:
+    months = days / MONTH
+    if not months <= _FURTHEST:
+        return f"more than {_FURTHEST / 12:.0f} years"
+    return f"{days:.0f} days" if months < 2.0 else f"{months:.0f} months"
+
+
+def reach(trend: Trend) -> str | None:
+    """Return when the level reaches the limit, None where no limit is known."""
+    wear = trend.wear
+    if wear is None or wear.reach is None or trend.limit is None:
+        return None
+    limit = f"{number(trend.limit, 2)} {trend.unit}"
+    own = wear.reach
+    if own.value == 0.0:
+        text = f"{limit} is reached"
+    elif not math.isfinite(own.value) or own.value / MONTH > _FURTHEST:
+        text = f"{limit} not before {_wait(own.low)}" if own.low / MONTH <= _FURTHEST else f"{limit} not in sight"
+    else:
+        text = f"{limit} in {_wait(own.value)} ({_wait(own.low)} to {_wait(own.high)}) if it goes on so"
+    return f"{text}; the limit is {trend.limit_source}"
+
+
+def events(trend: Trend) -> list[str]:
+    """Return alarms and repairs, in the order of their times."""
+    lines = []
+    for own in trend.episodes:
+        if own.fell:
+            begin = trend.points[trend.rows[own.begin]]
+            lines.append(f"{moment(trend, begin.day)} the level fell: a repair, or a part exchanged ({begin.file})")
+        if own.alarm is not None:
+            point = trend.points[trend.rows[own.alarm]]
+            lines.append(f"{moment(trend, point.day)} alarm ({point.file})")
+    return lines
+
+
+def trend_text(trend: Trend, *, whole: bool = False) -> str:
+    """Return the trend as lines for the terminal; `whole`: with the reason and all findings."""
+    rows = [("now", level(trend)), ("growth", growth(trend)), ("limit", reach(trend))]
+    rows += [("event", line) for line in events(trend)]
+    findings = [finding.text for finding in trend.findings]
+    if whole:
+        rows += [("reason", trend.reason), *(("data", text) for text in findings)]
+    elif findings:
+        more = f" (and {len(findings) - 1} more, see -v)" if len(findings) > 1 else ""
+        rows.append(("data", findings[0] + more))
+    if trend.wear is None and not whole:
+        rows.append(("reason", trend.reason))
+    rows.append(("next", trend.next_check))
+    return "\n".join([headline(trend), *(f"  {name:<8}{text}" for name, text in rows if text)])
+
+
+def trend_csv(trend: Trend) -> str:
+    """Return the recordings of a trend as a table, one row each."""
+    rows = trend.as_dict()["points"]
+    unit = trend.unit
+    names = {
+        "file": "file",
+        "time": "time" if trend.dated else "time [d]",
+        "day": "day [d]",
+        "value": f"level [{unit}]",
+        "low": f"low [{unit}]",
+        "high": f"high [{unit}]",
+        "group": "group",
+        "temperature_C": "temperature [degC]",
+        "note": "note",
+    }
+    with io.StringIO(newline="") as text:
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(names.values())
+        table.writerows(["" if row[name] is None else row[name] for name in names] for row in rows)
+        return text.getvalue()

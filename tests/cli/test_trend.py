@@ -1,0 +1,81 @@
+"""`sealscope trend` as a user calls it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import sealscope as ss
+
+DAYS = 8
+
+
+@pytest.fixture(scope="module")
+def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of eight days, `day_1.csv` to `day_8.csv`; from the sixth on 0.01 L/min leak."""
+    folder = tmp_path_factory.mktemp("days")
+    for k in range(1, DAYS + 1):
+        leak = "0.01 L/min from 0 s" if k >= 6 else None
+        day = ss.simulate(duration="20 s", rate=100.0, seed=k, leak=leak, set={"pump.G_pump": 2.4e-13})
+        ss.write(replace(day, provenance={"start": f"2024-05-{k:02d}T08:00"}), folder / f"day_{k}.nc")
+    return folder
+
+
+def test_a_folder_becomes_a_few_lines(call, days: Path) -> None:
+    told = call("trend", days, "--healthy", 3)
+    lines = told.out.splitlines()
+    assert told.status == 0 and told.err == ""
+    assert lines[0] == "leak in 8 recordings, 2024-05-01 to 2024-05-08, since 2024-05-06 (2024-05-06 to 2024-05-06)"
+    assert len(lines) <= 6 and [line.split()[0] for line in lines[1:]] == ["now", "growth", "limit", "event", "next"]
+    assert "L/min" in lines[1] and "healthy" in lines[1]
+    assert call("trend", days, "--healthy", 3, "--fail-on", "leak").status == 3
+
+
+def test_json_and_csv_hold_every_recording(call, days: Path, tmp_path: Path) -> None:
+    tree = json.loads(call("trend", days, "--format", "json", "-o", tmp_path / "trend.csv").out)
+    assert tree["verdict"] == "leak" and len(tree["points"]) == DAYS and tree["unit"] == "L/min"
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "trend.csv").read_text())))
+    assert [row["file"] for row in rows] == [f"day_{k}.nc" for k in range(1, DAYS + 1)]
+    assert float(rows[-1]["level [L/min]"]) == tree["points"][-1]["value"]
+
+
+def test_the_order_of_files_does_not_matter(call, days: Path) -> None:
+    files = [days / f"day_{k}.nc" for k in (3, 1, 2, 8, 7, 5, 6, 4)]
+    assert call("trend", *files).out == call("trend", days).out
+
+
+def test_a_bad_file_is_named_and_the_others_are_followed(call, days: Path, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.csv"
+    bad.write_text("nothing")
+    told = call("trend", days, bad)
+    assert told.status == 1 and "bad.csv" in told.err and told.out.startswith("leak in 8 recordings")
+
+
+def test_files_without_a_time_ask_for_every(call, days: Path, tmp_path: Path) -> None:
+    for k in (1, 2, 3):
+        own = replace(ss.read(days / f"day_{k}.nc"), provenance={})
+        ss.write(own, tmp_path / f"run_{k}.nc")
+    complaint = call("trend", tmp_path).refused()
+    assert "--every 1d" in complaint and "run_1.nc" in complaint
+    told = call("trend", tmp_path, "--every", "1d")
+    assert told.status == 0 and "day 0 to day 2" in told.out
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--limit", "5 bar"), "--limit"),
+        (("--every", "-1d"), "every must be > 0"),
+        (("--healthy", "0"), "healthy recordings must be 1 or more"),
+        (("--years", "0"), "machine-years"),
+        (("--fail-on", "rust"), "--fail-on must be leak, no leak or cannot tell"),
+        (("-o", "trend.docx"), "a trend must be written as"),
+    ],
+)
+def test_wrong_options_are_refused_in_a_line(call, days: Path, words: tuple[str, ...], complaint: str) -> None:
+    assert complaint in call("trend", days / "day_1.nc", *words).refused()

@@ -1,0 +1,340 @@
+"""The trend of a machine: its test against a slow oracle, its false alarms, and what it makes of a life with events."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import halfnorm, multivariate_normal
+
+import sealscope as ss
+from sealscope.diagnosis.baseline.level import DayToDay, Level
+from sealscope.diagnosis.baseline.operating_point import OperatingPoint
+from sealscope.diagnosis.trend import wear
+from sealscope.diagnosis.trend.reading import LeakReading, oil_temperature, reading_of
+from sealscope.diagnosis.trend.trend import Trend, trend_of
+from sealscope.diagnosis.trend.wear import MONTH, Levels, WearPrior, episodes, search
+from sealscope.errors import InputError
+from sealscope.units import LITRE_PER_MINUTE
+
+PRIOR = WearPrior(DayToDay(1.0, 4.0), 7.0)
+POINT = OperatingPoint(0, 11.0, 500.0, ("Pa", "Pa"), ("p_A", "p_B"), 2.1, 1.57)
+#: 0.0044 L/min at 0.11 MPa.
+HEALTHY, PRESSURE = 6.7e-13, 1.1e5
+DAY = 86_400.0
+
+
+def reading(day: float, level: float = HEALTHY, *, number: int | None = None, **more: object) -> LeakReading:
+    """A recording of 60 s whose volume balance states a level, made on a day of 2024."""
+    own = round(day) if number is None else number
+    fields = {
+        "file": f"day_{own}.csv",
+        "start": 1.704e9 + day * DAY,
+        "duration": 60.0,
+        "basis": "volume balance",
+        "level": Level(level, 0.02 * HEALTHY),
+        "pressure": PRESSURE,
+        "delivery": 1.0,
+        "temperature": None,
+        "scale": 1.0,
+        "point": POINT,
+        "digest": f"{day} {level}".encode(),
+    }
+    return LeakReading(**(fields | more))  # type: ignore[arg-type]
+
+
+def life(
+    days: int, *, wears: float = 0.0, since: float = 0.0, scatter: float = 0.07, seed: int = 0
+) -> list[LeakReading]:
+    """One recording a day; `wears` L/min a month from day `since` on."""
+    random = np.random.default_rng(seed)
+    growth = wears * LITRE_PER_MINUTE / PRESSURE / MONTH
+    return [
+        reading(day, HEALTHY * (1.0 + scatter * random.standard_normal()) + growth * max(day - since, 0.0))
+        for day in range(days)
+    ]
+
+
+def flow(level: float) -> float:
+    return level * PRESSURE / LITRE_PER_MINUTE
+
+
+def oracle(levels: Levels, prior: WearPrior, known: int) -> float:
+    """Shiryaev and Roberts's R after all recordings, each likelihood as an integral over the size of the change."""
+    n, flat = len(levels), 1e4
+    nodes = wear._Model(levels, prior, np.zeros((n, 1))).grid()
+    kinds = [("step", scale) for scale in wear._STEPS] + [("growth", every) for every in wear._INTERVALS]
+    joint, null = dict.fromkeys(itertools.product(range(known, n), kinds), 0.0), 0.0
+    for tau, share, log_prior in nodes:
+        lasting = np.exp(-np.abs(levels.t[:, None] - levels.t) / prior.lasting)
+        cov = tau**2 * ((1 - share) * np.eye(n) + share * lasting) + np.diag(levels.error**2) + flat**2
+        law = multivariate_normal(np.full(n, levels.value[0]), cov, allow_singular=True)
+        weight = math.exp(log_prior)
+        null += weight * law.pdf(levels.value)
+        for (j, (kind, scale)), before in joint.items():
+            if kind == "step":
+                shape, size = (np.arange(n) >= j).astype(float), scale * tau
+            else:
+                shape = np.maximum(levels.t - levels.t[j - 1], 0.0)
+                size = tau / scale / levels.interval
+
+            def integrand(d: float, law=law, shape=shape, size=size) -> float:
+                return law.pdf(levels.value - d * shape) * halfnorm.pdf(d, scale=size)
+
+            value = quad(integrand, 0.0, 8.0 * size, limit=60, points=[0.01 * size, 0.1 * size, size])[0]
+            joint[j, (kind, scale)] = before + weight * value
+    many = {"step": len(wear._STEPS), "growth": len(wear._INTERVALS)}
+    waits = np.diff(levels.t)
+    return sum(waits[j - 1] * value / null / 2.0 / many[kind] for (j, (kind, _)), value in joint.items())
+
+
+def test_the_statistic_is_the_ratio_of_the_likelihoods(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sums of one factorisation against integrals of multivariate normal densities, unequal errors and waits."""
+    monkeypatch.setattr(wear, "_NODES", 3)
+    monkeypatch.setattr(wear, "_LASTING", (0.5,))
+    levels = Levels.of(np.array([0.0, 1.0, 3.0, 4.0]), np.array([5.0, 5.5, 6.2, 6.9]), np.array([0.1, 0.5, 0.2, 0.3]))
+    assert np.all(wear._held(levels, PRIOR) == levels.value)
+    assert search(levels, PRIOR, 2).log_R[-1] == pytest.approx(math.log(oracle(levels, PRIOR, 2)), abs=2e-3)
+
+
+def test_later_recordings_do_not_change_what_was_said_before() -> None:
+    random = np.random.default_rng(3)
+    levels = Levels.of(np.arange(12.0), random.standard_normal(12), 0.1)
+    whole = search(levels, PRIOR, 2).log_R
+    part = search(levels.part(slice(0, 7)), PRIOR, 2).log_R
+    # but for the upper end of the grid of tau, which follows the range of the values
+    assert whole[2:7] == pytest.approx(part[2:], abs=0.1)
+
+
+def alarms(machines: int, days: int, years: float, *, seed: int, tails: float = np.inf, lasting: float = 0.0) -> int:
+    """Healthy machines that alarm within some days; their scatter is drawn from the prior."""
+    random = np.random.default_rng(seed)
+    count = 0
+    for _ in range(machines):
+        tau = math.sqrt(PRIOR.scatter.freedom / random.chisquare(PRIOR.scatter.freedom))
+        noise = random.standard_normal(days)
+        if math.isfinite(tails):
+            noise = random.standard_t(tails, days) / math.sqrt(tails / (tails - 2.0))
+        for k in range(1, days):
+            noise[k] = lasting * noise[k - 1] + math.sqrt(1.0 - lasting**2) * noise[k]
+        levels = Levels.of(np.arange(float(days)), 3.0 + tau * noise, 0.02)
+        count += search(levels, PRIOR, 1).alarm(years * 365.25) is not None
+    return count
+
+
+def test_the_rate_of_false_alarms_is_at_most_the_stated_one() -> None:
+    """With 1 in 0.1 years, 36.5 days, at most 20/36.5 of all machines alarm within 20 days, and some do."""
+    machines, days, years = 120, 21, 0.1
+    count = alarms(machines, days, years, seed=1)
+    most = (days - 1) / (years * 365.25)
+    assert 0 < count <= machines * most + 2.0 * math.sqrt(machines * most * (1.0 - most))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tails", "lasting"), [(np.inf, 0.0), (4.0, 0.0), (np.inf, 0.6)], ids=["", "tails", "lasting"])
+def test_the_rate_holds_for_other_scatter(tails: float, lasting: float) -> None:
+    """Heavy tails, and scatter that lasts from day to day, within 60 days at 1 in 0.5 years."""
+    machines, days, years = 150, 61, 0.5
+    most = (days - 1) / (years * 365.25)
+    assert alarms(machines, days, years, seed=2, tails=tails, lasting=lasting) <= machines * most
+
+
+def delay(wears: float, seed: int) -> float:
+    trend = trend_of(life(80, wears=wears, since=20.0, seed=seed), healthy=20)
+    assert trend.alarm is not None
+    return trend.alarm.day - 20.0
+
+
+def test_faster_wear_alarms_earlier_and_before_it_has_doubled_the_level() -> None:
+    slow, fast = (np.median([delay(wears, seed) for seed in range(4)]) for wears in (0.002, 0.02))
+    assert 1.0 <= fast < 0.5 * slow
+    assert slow * 0.002 / MONTH < flow(HEALTHY)
+
+
+def test_growth_and_limit_hold_the_truth() -> None:
+    trend = trend_of(life(60, wears=0.006, since=15.0), healthy=5, limit=0.02)
+    own = trend.wear
+    assert (trend.verdict, trend.unit, trend.basis) == ("leak", "L/min", "volume balance")
+    assert own is not None and own.step is None and own.onset is not None and own.reach is not None
+    assert own.growth.low < 0.006 < own.growth.high < 0.0075
+    assert own.onset.low <= 15.0 <= own.onset.high
+    truth = flow(HEALTHY) + 0.006 * (59.0 - 15.0) / MONTH
+    assert own.now.low < truth < own.now.high
+    assert own.reach.low < (0.02 - truth) / 0.006 * MONTH < own.reach.high
+    assert own.healthy.low < flow(HEALTHY) < own.healthy.high
+
+
+def test_a_healthy_machine_is_no_leak_and_its_growth_is_about_none() -> None:
+    trend = trend_of(life(40), healthy=5)
+    assert trend.verdict == "no leak" and trend.alarm is None and trend.wear is not None
+    assert trend.wear.growth.low < 0.0 < trend.wear.growth.high < 0.001
+    assert trend.limit == pytest.approx(0.05) and "5 %" in trend.limit_source
+
+
+def test_a_few_recordings_do_not_show_that_nothing_grows() -> None:
+    for count in (1, 2):
+        trend = trend_of(life(count))
+        assert trend.verdict == "cannot tell" and "too few" in trend.reason
+
+
+def test_the_order_of_files_does_not_matter_and_a_repeated_file_counts_once() -> None:
+    days = life(30, wears=0.02, since=10.0)
+    ordered = trend_of(days, healthy=5)
+    mixed = trend_of([*days[::-2], *days[-2::-2]], healthy=5)
+    assert mixed == ordered
+    copies = [replace(days[7], file="copy.csv"), *days]
+    again = trend_of(copies, healthy=5)
+    assert again.wear == ordered.wear
+    assert [point.note for point in again.points if point.value is None] == ["the same samples as copy.csv"]
+    assert any("the same samples" in finding.text for finding in again.findings)
+
+
+def test_a_single_outlier_neither_alarms_nor_counts() -> None:
+    days = life(30)
+    days[14] = replace(days[14], level=Level(3.0 * HEALTHY, 0.02 * HEALTHY))
+    trend = trend_of(days, healthy=5)
+    assert trend.verdict == "no leak"
+    assert "left out" in trend.points[14].note
+    at_the_end = trend_of(days[:15], healthy=5)
+    assert at_the_end.alarm is None  # the last recording is not confirmed by another one
+    stepped = [replace(own, level=Level(3.0 * HEALTHY, 0.02 * HEALTHY)) for own in days[14:17]]
+    trend = trend_of([*days[:14], *stepped], healthy=5)
+    assert trend.alarm is not None and trend.alarm.day <= 15.0
+    assert trend.wear is not None and trend.wear.step is not None and trend.wear.onset is not None
+    assert trend.wear.onset.value == 14.0
+
+
+def test_a_repair_begins_a_new_stretch() -> None:
+    worn, after = life(50, wears=0.02, since=20.0), life(75, seed=9)[50:]
+    trend = trend_of([*worn, *after], healthy=5)
+    assert [own.alarm is not None for own in trend.episodes] == [True, False]
+    assert [point.day for point in trend.repairs] == [50.0]
+    assert trend.verdict == "no leak" and "since the repair" in trend.reason
+    assert trend.wear is not None and trend.wear.now.high < 1.2 * flow(HEALTHY)
+
+
+def test_another_duty_and_other_sensors_are_compared_among_themselves() -> None:
+    days = life(60)
+    other = replace(POINT, command_rms=4.2)
+    changed = [replace(own, point=other, level=Level(1.3 * own.level.value, own.level.error)) for own in days[30:40]]
+    sensor = [replace(own, scale=1.03, level=Level(0.8 * own.level.value, own.level.error)) for own in days[40:]]
+    trend = trend_of([*days[:30], *changed, *sensor], healthy=5)
+    assert trend.verdict == "no leak" and len(trend.groups) == 3 and trend.alarm is None
+    texts = [finding.text for finding in trend.findings]
+    assert any("another command" in text and "10 of 60" in text for text in texts)
+    assert any("a sensor exchanged" in text and "20 of 60" in text for text in texts)
+    one = [*days[:30], *changed, *(replace(own, level=Level(own.level.value * 2.0, 1e-14)) for own in days[40:])]
+    assert trend_of(one, healthy=5).verdict == "leak"  # the first duty again, and twice as much
+
+
+def test_the_oil_s_temperature_is_taken_out_where_it_is_known() -> None:
+    """A summer: the oil warms by 25 K within 60 days, and a healthy machine passes 2.7 times as much."""
+    days = life(60, scatter=0.03)
+    warm = [
+        replace(
+            own,
+            temperature=25.0 + 25.0 * k / 59.0,
+            level=Level(own.level.value * math.exp(0.04 * 25.0 * k / 59.0), own.level.error),
+        )
+        for k, own in enumerate(days)
+    ]
+    assert trend_of(warm, healthy=5).verdict == "no leak"
+    unknown = [replace(own, temperature=None) for own in warm]
+    assert trend_of(unknown, healthy=5).verdict == "leak"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("Oil temperature", "42 degC", 42.0),
+        ("Öltemperatur", "41,5 °C", 41.5),
+        ("Oil", "104 °F", 40.0),
+        ("Temp [C]", "38", 38.0),
+        ("Operator", "7 C", None),
+        ("Oil", "ISO VG 46", None),
+    ],
+)
+def test_the_temperature_is_read_beside_the_samples(name: str, text: str, expected: float | None) -> None:
+    recording = ss.Recording(np.arange(4.0), {"p_A": np.ones(4)}, {"p_A": "Pa"}, 1.0, {"about": {name: text}})
+    assert oil_temperature(recording) == (None if expected is None else pytest.approx(expected))
+
+
+def test_a_clock_set_back_and_a_gap_are_named() -> None:
+    days = life(30)
+    back = [*days[:20], *(replace(own, start=(own.start or 0.0) - 3.5 * DAY) for own in days[20:])]
+    text = next(own.text for own in trend_of(back, healthy=5).findings if own.code == "clock")
+    assert "day_20.csv is numbered after day_19.csv" in text and "set back" in text
+    overlapping = [*days, reading(12.0003, number=12)]
+    text = next(own.text for own in trend_of(overlapping, healthy=5).findings if own.code == "clock")
+    assert "was still recording" in text
+    gapped = trend_of([*days[:10], *days[24:]], healthy=5)
+    assert any(own.code == "gap" and "15 days after day_9.csv" in own.text for own in gapped.findings)
+
+
+def test_files_without_a_time_are_refused_or_spaced() -> None:
+    days = [replace(own, start=None) for own in life(12)]
+    with pytest.raises(InputError, match=r"got none of day_0\.csv.*--every 1d"):
+        trend_of(days)
+    trend = trend_of(days[::-1], every=DAY)
+    assert [point.file for point in trend.points] == [f"day_{k}.csv" for k in range(12)]
+    assert [point.day for point in trend.points] == list(range(12))
+
+
+@pytest.mark.parametrize("wrong", [{"healthy": 0}, {"years": 0.0}, {"limit": -1.0}, {"every": math.nan}])
+def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="got"):
+        trend_of(life(3), **wrong)  # type: ignore[arg-type]
+
+
+def test_many_recordings_are_merged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wear, "MOST", 60)
+    trend = trend_of(life(150, wears=0.004, since=100.0, scatter=0.05), healthy=20)
+    assert trend.verdict == "leak" and len(trend.rows) == 50 and len(trend.points) == 150
+    assert trend.alarm is not None and 100.0 < trend.alarm.day < 125.0
+
+
+def test_a_trend_is_plain_json(tmp_path_factory: pytest.TempPathFactory) -> None:
+    tree = trend_of(life(3)).as_dict()
+    assert json.loads(json.dumps(tree, allow_nan=False)) == tree
+    assert tree["points"][0]["time"] == "2023-12-31T05:20:00"
+
+
+@pytest.fixture(scope="module")
+def simulated() -> Trend:
+    """Real recordings of a simulated machine, with all channels: four healthy days, then 0.004 L/min more each day."""
+    days = [
+        ss.simulate(duration="20 s", rate=100.0, seed=k, set={"pump.G_pump": 2.4e-13}, leak=leak)
+        for k, leak in enumerate([None] * 4 + [f"{0.004 * k} L/min from 0 s" for k in (1, 2, 3)])
+    ]
+    return ss.trend(
+        [replace(own, provenance={"start": f"2024-05-0{k + 1}T08:00"}) for k, own in enumerate(days)], healthy=4
+    )
+
+
+def test_recordings_become_a_trend(simulated: Trend) -> None:
+    assert simulated.verdict == "leak" and simulated.basis == "volume balance"
+    assert simulated.alarm is not None and simulated.alarm.day == 5.0  # the second one that leaks
+    rise = simulated.points[-1].value - np.mean([point.value for point in simulated.points[:5]])
+    assert rise == pytest.approx(0.012, rel=0.15)
+
+
+def test_a_recording_that_states_nothing_is_left_out() -> None:
+    still = ss.Recording(
+        np.arange(400) / 100.0, {"p_A": np.ones(400), "p_B": np.ones(400)}, {"p_A": "Pa", "p_B": "Pa"}, 100.0
+    )
+    own = reading_of(still, ss.load_rig("thesis"), "still.csv")
+    assert own.basis is None and "constant" in own.problem
+    trend = trend_of([replace(own, start=1.704e9), *life(5)])
+    assert trend.points[0].value is None or trend.points[1].value is None
+    assert any("still.csv" in finding.text for finding in trend.findings)
+
+
+def test_each_stretch_counts_its_own_false_alarms() -> None:
+    levels = Levels.of(np.arange(10.0), np.zeros(10), 0.1)
+    (only,) = episodes(levels, PRIOR, years=10.0, limit=None)
+    assert (only.begin, only.end, only.alarm, only.fell) == (0, 10, None, False)
