@@ -207,9 +207,13 @@ def appending(folder: Path) -> Iterator[Callable[[CaseRow], None]]:
             file.truncate(keep)
 
         def append(row: CaseRow) -> None:
-            file.write(json.dumps(row.as_dict(), allow_nan=False, sort_keys=True).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
+            line = json.dumps(row.as_dict(), allow_nan=False, sort_keys=True).encode() + b"\n"
+            try:
+                while line:  # past the buffer of `file`, which would be written again at its end
+                    line = line[os.write(file.fileno(), line) :]
+                os.fsync(file.fileno())
+            except OSError as error:
+                raise InputError(f"cannot write {folder / ROWS}: {error.strerror or error}") from error
 
         yield append
 

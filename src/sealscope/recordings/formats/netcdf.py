@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -150,13 +151,19 @@ def attributes(description: Mapping[str, Any]) -> dict[str, Any]:
 def write_netcdf(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write NetCDF-4 (an HDF5 file): dimension `t`, one variable a channel with `units`; doubles, to the bit."""
+    """Write NetCDF-4 (an HDF5 file): dimension `t`, one variable a channel with `units`; doubles, to the bit.
+
+    The file is made in memory first: libhdf5 ends the process where a disk is full.
+    """
     import h5netcdf
 
-    with h5netcdf.File(path, "w") as file:
+    content = BytesIO()
+    with h5netcdf.File(content, "w") as file:
         file.attrs.update(attributes(description))
         file.dimensions = {"t": len(values["t"])}
         for name, series in values.items():
             variable = file.create_variable(name, ("t",), np.float64, data=series)
             variable.attrs["units"] = units[name]
             variable.attrs["long_name"] = LONG_NAMES[name]
+    with path.open("wb") as target, content.getbuffer() as view:
+        target.write(view)
