@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import campaign, prediction, recordings, reproduction, simulation, trend
+from sealscope.cli import campaign, monitoring, prediction, recordings, reproduction, simulation, trend
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -40,6 +40,7 @@ for command in (
 ):
     app.command()(command)
 app.add_typer(campaign.campaign)
+app.add_typer(monitoring.monitor)
 
 
 @app.callback(invoke_without_command=True)
@@ -108,6 +109,8 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
 
 def arguments_of(words: Sequence[str]) -> list[str]:
     """Return the words of a call as the commands take them: `-v` first, an option for each baseline."""
+    if list(words[:1]) == ["monitor"] and words[1:] and words[1] not in monitoring.COMMANDS:
+        words = ["monitor", "run", *words[1:]]  # `sealscope monitor FILE`
     end = list(words).index("--") if "--" in words else len(words)
     verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
     plain = [word for word in words[:end] if word not in ("-v", "--verbose")]

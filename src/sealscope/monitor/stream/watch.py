@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -185,16 +185,23 @@ class Watch:
         list of BlockEstimate
             Of every block that the samples complete.
         """
+        return [estimate for estimate, _ in self.each(samples, follows=follows)]
+
+    def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
+        """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
         if not follows:
             self._samples.restart("restart")
-        estimates: list[BlockEstimate] = []
         for _ in self._samples.runs(samples):
             if not self._seconds and not self._find_duty():
                 continue
             length = round(self._seconds * self._samples.rate)
             while len(self._samples) >= length:
-                estimates.append(self._take(self._samples.taken(length)))
-        return estimates
+                estimate = self._take(self._samples.taken(length))
+                yield estimate, self.leak
+
+    def continue_from(self, before: Watch) -> None:
+        """Count blocks and baselines on from those of another watch, whose settings were others."""
+        self.blocks, self._version = before.blocks, before._version + 1
 
     def relearn(self) -> None:
         """Learn a new baseline from now on: the machine was repaired, or is another."""

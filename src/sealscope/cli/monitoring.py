@@ -1,0 +1,56 @@
+"""`sealscope monitor`: the service, and its file of settings."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+#: Words after `monitor` that are no file of settings.
+COMMANDS = ("init", "run", "demo", "-h", "--help")
+
+monitor = typer.Typer(
+    name="monitor",
+    help="Watch running actuators: alarms in litres per minute. `sealscope monitor FILE` is the service.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+)
+
+
+@monitor.command()
+def init(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write.")] = Path("monitor.toml"),
+) -> None:
+    """Write a commented file of settings."""
+    from sealscope.errors import InputError
+    from sealscope.monitor.settings import TEMPLATE
+    from sealscope.storage.atomic import atomic_write
+
+    if file.exists():
+        raise InputError(f"a new file of settings must not exist yet, got {file}")
+    with atomic_write(file) as temporary:
+        temporary.write_text(TEMPLATE, encoding="utf-8")
+    typer.echo(f"{file}: written; sealscope monitor {file}")
+
+
+@monitor.command()
+def run(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Settings, as `sealscope monitor init` writes them.")],
+    once: Annotated[
+        bool, typer.Option("--once", help="End when standard input and the folders hold nothing new.")
+    ] = False,
+) -> None:
+    """Watch the actuators of FILE: blocks in, alarms as JSON lines on standard output."""
+    from sealscope.monitor.service import Service
+    from sealscope.monitor.settings import read_settings
+
+    if not logging.getLogger("sealscope").handlers:
+        logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
+    service = Service(read_settings(file), once=once)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: service.stop())
+    service.run()

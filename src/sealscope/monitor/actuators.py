@@ -1,0 +1,231 @@
+"""Every actuator's detector and alarm, and the database behind them: a block is taken whole or not at all."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from sealscope.errors import InputError
+from sealscope.monitor.alarms.alarm import Alarm, status_word
+from sealscope.monitor.alarms.judging import AlarmJudge
+from sealscope.monitor.memory.store import PENDING_BLOCKS, PENDING_BYTES, MonitorStore
+from sealscope.monitor.settings import ActuatorSettings
+from sealscope.monitor.sources.source_block import SourceBlock
+from sealscope.monitor.stream.baseline import plain_dataclass
+from sealscope.monitor.stream.watch import BlockEstimate, Watch, watch
+from sealscope.recordings.recording import Recording
+
+_log = logging.getLogger(__name__)
+#: What a person may say of an alarm.
+MARKS = ("acknowledged", "comment", "shelved", "false", "repaired")
+_LONGEST_TEXT = 2000
+
+
+@dataclass
+class _Actuator:
+    """What is in memory of an actuator."""
+
+    settings: ActuatorSettings
+    watch: Watch
+    judge: AlarmJudge
+    pending: int = 0
+    bytes: int = 0
+    last: BlockEstimate | None = None
+
+
+class WatchedActuators:
+    """The actuators of a monitor, restored from its database.
+
+    `counters`: blocks that were dropped since the start, by reason.
+    """
+
+    def __init__(self, settings: list[ActuatorSettings], store: MonitorStore) -> None:
+        self.store = store
+        self.counters: dict[str, int] = {}
+        self.changes = threading.Condition()
+        self.changed = 0
+        self._lock = threading.RLock()
+        self._settings = {each.name: each for each in settings}
+        self._actuators = {name: self._restored(each) for name, each in self._settings.items()}
+
+    def _restored(self, settings: ActuatorSettings) -> _Actuator:
+        """Return an actuator as its last transaction left it."""
+        saved = self.store.checkpoint(settings.name)
+        fresh = watch(
+            settings.rig,
+            false_alarms_per_1000_h=settings.false_alarms_per_1000_h,
+            learn_hours=settings.learn_hours,
+        )
+        if saved is None:
+            actuator = _Actuator(settings, fresh, AlarmJudge(settings.name))
+            with self.store.writing() as connection:
+                self._checkpoint(connection, actuator)
+            return actuator
+        learned_with, state, pending = saved
+        judge = AlarmJudge.from_state(state["judge"])
+        actuator = _Actuator(settings, Watch.from_state(state["watch"]), judge)
+        if state["last"] is not None:
+            actuator.last = plain_dataclass(BlockEstimate, state["last"], "last")
+        for samples, follows in pending:
+            self._judged(actuator, samples, follows)
+            actuator.pending += 1
+            actuator.bytes += _size(samples)
+        if learned_with != settings.learned_with:
+            _log.warning("%s: learned with %s, begins anew with other settings", settings.name, learned_with)
+            fresh.continue_from(actuator.watch)
+            actuator.watch = fresh
+            with self.store.writing() as connection:
+                self._checkpoint(connection, actuator)
+        return actuator
+
+    def count(self, reason: str) -> None:
+        """Count something that was dropped."""
+        self.counters[reason] = self.counters.get(reason, 0) + 1
+
+    def take(self, block: SourceBlock) -> list[BlockEstimate]:
+        """Take a block in one transaction: samples, estimates, alarms and the block's identity, or nothing of it.
+
+        Raises what the database raises; the block can then be taken again.
+        """
+        if block.actuator not in self._settings:
+            self.count("blocks of an actuator that is not in the settings")
+            return []
+        with self._lock:
+            actuator = self._actuator(block.actuator)
+            try:
+                with self.store.writing() as connection:
+                    if self.store.knows(connection, block.actuator, block.identity):
+                        self.count("blocks stored already")
+                        return []
+                    self.store.keep_block(connection, block.actuator, block.identity)
+                    estimates = [] if block.samples is None else self._taken(connection, actuator, block, block.samples)
+            except BaseException:
+                # what the detector took is not stored: the next block begins at the last transaction
+                del self._actuators[block.actuator]
+                raise
+        self._tell()
+        return estimates
+
+    def _actuator(self, name: str) -> _Actuator:
+        if name not in self._actuators:
+            self._actuators[name] = self._restored(self._settings[name])
+        return self._actuators[name]
+
+    def _taken(
+        self, connection: Any, actuator: _Actuator, block: SourceBlock, samples: Recording
+    ) -> list[BlockEstimate]:
+        name = block.actuator
+        estimates, happened = self._judged(actuator, samples, block.follows)
+        self.store.keep_estimates(connection, name, estimates)
+        for alarm, kind, t in happened:
+            if kind:
+                self.store.keep_event(connection, alarm, kind, t)
+        for alarm in {alarm.id: alarm for alarm, _, _ in happened}.values():
+            self.store.keep_alarm(connection, alarm)
+        actuator.pending += 1
+        actuator.bytes += _size(samples)
+        if actuator.pending >= PENDING_BLOCKS or actuator.bytes >= PENDING_BYTES:
+            self._checkpoint(connection, actuator)
+        else:
+            self.store.keep_pending(connection, name, actuator.pending, samples, block.follows)
+            self.store.keep_summary(connection, name, self._summary(actuator))
+        return estimates
+
+    @staticmethod
+    def _judged(
+        actuator: _Actuator, samples: Recording, follows: bool
+    ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
+        """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
+        estimates, happened = [], []
+        for estimate, leak in actuator.watch.each(samples, follows=follows):
+            version = 0 if actuator.watch.baseline is None else actuator.watch.baseline.version
+            change = actuator.judge.take(estimate, leak, version, actuator.settings.thresholds)
+            estimates.append(estimate)
+            if change is not None:
+                happened.append((*change, estimate.t))
+        if estimates:
+            actuator.last = estimates[-1]
+        return estimates, happened
+
+    def _checkpoint(self, connection: Any, actuator: _Actuator) -> None:
+        last = None if actuator.last is None else asdict(actuator.last)
+        state = {"watch": actuator.watch.state(), "judge": actuator.judge.state(), "last": last}
+        settings = actuator.settings
+        self.store.keep_checkpoint(connection, settings.name, settings.learned_with, state, self._summary(actuator))
+        actuator.pending = actuator.bytes = 0
+
+    @staticmethod
+    def _summary(actuator: _Actuator) -> dict[str, Any]:
+        """Return what an actuator shows now, as plain values."""
+        last, baseline, alarm = actuator.last, actuator.watch.baseline, actuator.judge.alarm
+        return {
+            "blocks": actuator.watch.blocks,
+            "t": None if last is None else last.t,
+            "status": "waits for samples" if last is None else last.status,
+            "total_lpm": None if last is None else last.total_lpm,
+            "leak_lpm": None if last is None else last.leak_lpm,
+            "leak_interval_lpm": None if last is None else last.leak_interval_lpm,
+            "baseline": None
+            if baseline is None
+            else {"version": baseline.version, "hours": baseline.hours, "lpm": baseline.lpm},
+            "alarm": None if alarm is None else alarm.id,
+            "status_word": status_word([] if alarm is None else [alarm]),
+            "counters": actuator.watch.counters,
+        }
+
+    def mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "", hours: float = 8.0) -> Alarm:
+        """Keep what a person says of an actuator's alarm, in one transaction.
+
+        `mark`: one of `MARKS`; ``false`` takes the leak back, ``repaired`` begins a new baseline as well; ``shelved``
+        announces nothing for `hours`. Raises InputError where there is no such alarm.
+        """
+        if mark not in MARKS:
+            raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
+        if len(text) > _LONGEST_TEXT or len(by_whom) > 80:
+            raise InputError(f"a comment must have at most {_LONGEST_TEXT} characters, a name 80")
+        if not 0.0 < hours <= 10_000.0:
+            raise InputError(f"an alarm must be shelved for > 0 h, got {hours:g}")
+        with self._lock:
+            if name not in self._settings:
+                raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
+            actuator = self._actuator(name)
+            at = actuator.last.t if actuator.last is not None else 0.0
+            try:
+                with self.store.writing() as connection:
+                    if mark == "comment":
+                        if actuator.judge.alarm is None:
+                            raise InputError(f"{name} must have an alarm to be commented on, got none")
+                        alarm = actuator.judge.alarm
+                    else:
+                        alarm = actuator.judge.marked(mark, at, at + hours * 3600.0)
+                    if mark == "false":
+                        actuator.watch.dismiss()
+                    elif mark == "repaired":
+                        actuator.watch.relearn()
+                    self.store.keep_alarm(connection, alarm)
+                    self.store.keep_event(connection, alarm, mark, at, by_whom, text)
+                    self._checkpoint(connection, actuator)
+            except InputError:
+                raise
+            except BaseException:
+                del self._actuators[name]
+                raise
+        self._tell()
+        return alarm
+
+    def plain(self) -> dict[str, dict[str, Any]]:
+        """Return what each actuator of the settings shows now, as its last transaction left it."""
+        known = self.store.summaries()
+        return {name: known[name] for name in self._settings if name in known}
+
+    def _tell(self) -> None:
+        with self.changes:
+            self.changed += 1
+            self.changes.notify_all()
+
+
+def _size(samples: Recording) -> int:
+    """Return about how many bytes samples take."""
+    return 8 * len(samples) * (1 + len(samples.channels))

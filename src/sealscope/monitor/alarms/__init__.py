@@ -1,0 +1,1 @@
+"""Alarms: their life, and what turns estimates into them."""

@@ -1,0 +1,268 @@
+"""The monitor's database: what is written is written in one transaction, whole or not at all.
+
+SQLite in WAL mode with full synchronisation, or any database that SQLAlchemy knows, by URL.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sealscope.errors import InputError, MissingExtra
+from sealscope.monitor.alarms.alarm import Alarm
+from sealscope.monitor.memory.packing import packed, unpacked_samples
+from sealscope.monitor.stream.watch import BlockEstimate
+from sealscope.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection, Engine, Table
+
+#: Blocks of samples between two checkpoints, and their bytes.
+PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
+#: Identities of blocks that are kept for each actuator.
+_ESTIMATES = (
+    "total_lpm",
+    "total_low_lpm",
+    "total_high_lpm",
+    "leak_lpm",
+    "leak_low_lpm",
+    "leak_high_lpm",
+)
+
+
+class MonitorStore:
+    """The database of a monitor, `database` a file of SQLite or a URL; raises InputError where it cannot be opened."""
+
+    def __init__(self, database: str) -> None:
+        try:
+            import sqlalchemy
+        except ImportError:
+            raise MissingExtra("the monitor's memory needs SQLAlchemy: pip install 'sealscope[serve]'") from None
+        from sealscope.monitor.memory import tables
+
+        self.tables = tables
+        self._is_file = "://" not in database
+        url = f"sqlite:///{Path(database)}" if self._is_file else database
+        try:
+            self.engine: Engine = sqlalchemy.create_engine(url)
+            if self.engine.dialect.name == "sqlite":
+                sqlalchemy.event.listen(self.engine, "connect", _prepare_sqlite)
+            with self.engine.begin() as connection:
+                tables.metadata.create_all(connection)
+                known = connection.execute(sqlalchemy.select(tables.facts.c.value)).scalar()
+                if known is None:
+                    connection.execute(tables.facts.insert().values(name="schema", value=str(tables.SCHEMA)))
+        except (sqlalchemy.exc.SQLAlchemyError, ImportError, ValueError) as error:
+            reason = str(getattr(error, "orig", None) or error).splitlines()[0]
+            raise InputError(f"the monitor's database must be a file of SQLite or a URL, got: {reason}") from None
+        if known not in (None, str(tables.SCHEMA)):
+            raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {known} ({database})")
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """Return a connection whose changes are kept together when the block ends well."""
+        with self.engine.begin() as connection:
+            yield connection
+
+    def knows(self, connection: Connection, actuator: str, identity: str) -> bool:
+        """Return whether a block is stored."""
+        from sqlalchemy import select
+
+        blocks = self.tables.blocks
+        query = select(blocks.c.identity).where(blocks.c.actuator == actuator, blocks.c.identity == identity)
+        return connection.execute(query).first() is not None
+
+    def is_known(self, actuator: str, identity: str) -> bool:
+        """Return whether a block is stored, by a connection of its own."""
+        with self.engine.connect() as connection:
+            return self.knows(connection, actuator, identity)
+
+    def keep_block(self, connection: Connection, actuator: str, identity: str) -> None:
+        """Store the identity of a block."""
+        connection.execute(self.tables.blocks.insert().values(actuator=actuator, identity=identity))
+
+    def keep_estimates(self, connection: Connection, actuator: str, estimates: list[BlockEstimate]) -> None:
+        """Store the estimates of blocks."""
+        rows = [
+            {
+                "actuator": actuator,
+                "number": estimate.number,
+                "t": estimate.t,
+                "status": estimate.status[:160],
+                **dict(
+                    zip(
+                        _ESTIMATES,
+                        (
+                            estimate.total_lpm,
+                            *(estimate.total_interval_lpm or (None, None)),
+                            estimate.leak_lpm,
+                            *(estimate.leak_interval_lpm or (None, None)),
+                        ),
+                        strict=True,
+                    )
+                ),
+            }
+            for estimate in estimates
+        ]
+        if rows:
+            connection.execute(self.tables.estimates.insert(), rows)
+
+    def keep_alarm(self, connection: Connection, alarm: Alarm) -> None:
+        """Store an alarm as it is now."""
+        values = {"actuator": alarm.actuator, "state": alarm.state, "alarm": json.dumps(alarm.plain())}
+        self._put(connection, self.tables.alarms, {"id": alarm.id}, values)
+
+    def keep_event(
+        self, connection: Connection, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = ""
+    ) -> None:
+        """Append what happened to an alarm, or what a person said of it."""
+        values = {
+            "actuator": alarm.actuator,
+            "t": t,
+            "kind": kind,
+            "alarm_id": alarm.id,
+            "by_whom": by_whom,
+            "text": text,
+            "alarm": json.dumps(alarm.plain()),
+        }
+        connection.execute(self.tables.events.insert().values(**values))
+
+    def keep_pending(
+        self, connection: Connection, actuator: str, number: int, samples: Recording, follows: bool
+    ) -> None:
+        """Store samples that a restart goes through once more after the checkpoint."""
+        values = {"actuator": actuator, "number": number, "samples": packed(samples, follows)}
+        connection.execute(self.tables.pending.insert().values(**values))
+
+    def keep_checkpoint(
+        self, connection: Connection, actuator: str, settings: str, checkpoint: dict[str, Any], summary: dict[str, Any]
+    ) -> None:
+        """Store the state of an actuator, which takes the place of the samples since the last checkpoint."""
+        pending = self.tables.pending
+        connection.execute(pending.delete().where(pending.c.actuator == actuator))
+        values = {
+            "settings": settings,
+            "checkpoint": json.dumps(checkpoint, allow_nan=False),
+            "summary": json.dumps(summary),
+        }
+        self._put(connection, self.tables.actuators, {"actuator": actuator}, values)
+
+    def keep_summary(self, connection: Connection, actuator: str, summary: dict[str, Any]) -> None:
+        """Store what an actuator shows now."""
+        actuators = self.tables.actuators
+        statement = actuators.update().where(actuators.c.actuator == actuator)
+        connection.execute(statement.values(summary=json.dumps(summary)))
+
+    def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
+        """Return settings and state as of the checkpoint, and the samples since then; None where there is none."""
+        from sqlalchemy import select
+
+        actuators, pending = self.tables.actuators, self.tables.pending
+        with self.engine.connect() as connection:
+            row = connection.execute(select(actuators).where(actuators.c.actuator == actuator)).first()
+            query = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
+            samples = [unpacked_samples(data) for (data,) in connection.execute(query)]
+        return None if row is None else (row.settings, json.loads(row.checkpoint), samples)
+
+    def summaries(self) -> dict[str, dict[str, Any]]:
+        """Return what each actuator showed last."""
+        from sqlalchemy import select
+
+        actuators = self.tables.actuators
+        with self.engine.connect() as connection:
+            rows = connection.execute(select(actuators.c.actuator, actuators.c.summary))
+            return {name: json.loads(summary) for name, summary in rows}
+
+    def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
+        """Return alarms as plain values, the latest first."""
+        from sqlalchemy import select
+
+        alarms = self.tables.alarms
+        query = select(alarms.c.alarm)
+        if open_only:
+            query = query.where(alarms.c.state != "normal")
+        if actuator is not None:
+            query = query.where(alarms.c.actuator == actuator)
+        with self.engine.connect() as connection:
+            values = [json.loads(text) for (text,) in connection.execute(query)]
+        return sorted(values, key=lambda alarm: -float(alarm["raised_s"]))
+
+    def events_since(
+        self, number: int, most: int = 1000, *, actuator: str | None = None
+    ) -> list[tuple[int, dict[str, Any]]]:
+        """Return events beyond a number with their own numbers, in their order."""
+        from sqlalchemy import select
+
+        events = self.tables.events
+        query = select(events).where(events.c.number > number).order_by(events.c.number).limit(most)
+        if actuator is not None:
+            query = query.where(events.c.actuator == actuator)
+        with self.engine.connect() as connection:
+            return [
+                (
+                    row.number,
+                    {
+                        "number": row.number,
+                        "event": row.kind,
+                        "t": row._mapping["t"],
+                        "by": row.by_whom,
+                        "text": row.text,
+                        "alarm": json.loads(row.alarm),
+                    },
+                )
+                for row in connection.execute(query)
+            ]
+
+    def course(self, actuator: str, most: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
+        """Return the estimates of an actuator, means of successive ones where there are more than `most`.
+
+        `seconds`: only the last of them.
+        """
+        from sqlalchemy import func, select
+
+        estimates = self.tables.estimates
+        with self.engine.connect() as connection:
+            chosen = estimates.c.actuator == actuator
+            last = connection.execute(select(func.max(estimates.c.number), func.max(estimates.c.t)).where(chosen)).one()
+            if last[0] is None:
+                return []
+            if seconds is not None:
+                chosen &= estimates.c.t >= last[1] - seconds
+            count = connection.execute(select(func.count()).where(chosen)).scalar() or 0
+            every = max(1, -(-count // most))
+            group = estimates.c.number - estimates.c.number % every
+            columns = [func.avg(estimates.c[name]).label(name) for name in ("t", *_ESTIMATES)]
+            query = select(*columns).where(chosen).group_by(group).order_by(group)
+            return [dict(row._mapping) for row in connection.execute(query)]
+
+    def position(self, name: str) -> int:
+        """Return the number of the last event that an output has passed on."""
+        from sqlalchemy import select
+
+        facts = self.tables.facts
+        with self.engine.connect() as connection:
+            return int(connection.execute(select(facts.c.value).where(facts.c.name == name)).scalar() or 0)
+
+    def keep_position(self, name: str, number: int) -> None:
+        """Store how far an output is."""
+        with self.writing() as connection:
+            self._put(connection, self.tables.facts, {"name": name}, {"value": str(number)})
+
+    @staticmethod
+    def _put(connection: Connection, table: Table, key: dict[str, Any], values: dict[str, Any]) -> None:
+        """Change the row of a key, or insert it."""
+        statement = table.update()
+        for name, value in key.items():
+            statement = statement.where(table.c[name] == value)
+        if connection.execute(statement.values(**values)).rowcount == 0:
+            connection.execute(table.insert().values(**key, **values))
+
+
+def _prepare_sqlite(connection: Any, record: object) -> None:
+    cursor = connection.cursor()
+    for setting in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=5000", "foreign_keys=ON"):
+        cursor.execute(f"PRAGMA {setting}")
+    cursor.close()

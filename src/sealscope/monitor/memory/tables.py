@@ -1,0 +1,70 @@
+"""The tables of the monitor's database."""
+
+from __future__ import annotations
+
+from sqlalchemy import Column, Float, Integer, LargeBinary, MetaData, String, Table, Text
+
+metadata = MetaData()
+#: Version of the tables, kept in `facts`.
+SCHEMA = 1
+
+facts = Table("facts", metadata, Column("name", String(40), primary_key=True), Column("value", Text, nullable=False))
+#: Blocks that are stored, by identity.
+blocks = Table(
+    "blocks",
+    metadata,
+    Column("actuator", String(120), primary_key=True),
+    Column("identity", String(120), primary_key=True),
+)
+#: Samples since the checkpoint, which a restart goes through once more.
+pending = Table(
+    "pending",
+    metadata,
+    Column("actuator", String(120), primary_key=True),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("samples", LargeBinary, nullable=False),
+)
+#: State of the detector and of the alarm, as of the checkpoint, in JSON; and what an actuator shows now.
+actuators = Table(
+    "actuators",
+    metadata,
+    Column("actuator", String(120), primary_key=True),
+    Column("settings", Text, nullable=False),
+    Column("checkpoint", Text, nullable=False),
+    Column("summary", Text, nullable=False),
+)
+estimates = Table(
+    "estimates",
+    metadata,
+    Column("actuator", String(120), primary_key=True),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("t", Float(53), nullable=False),
+    Column("status", String(160), nullable=False),
+    Column("total_lpm", Float(53)),
+    Column("total_low_lpm", Float(53)),
+    Column("total_high_lpm", Float(53)),
+    Column("leak_lpm", Float(53)),
+    Column("leak_low_lpm", Float(53)),
+    Column("leak_high_lpm", Float(53)),
+)
+alarms = Table(
+    "alarms",
+    metadata,
+    Column("id", String(160), primary_key=True),
+    Column("actuator", String(120), nullable=False, index=True),
+    Column("state", String(20), nullable=False, index=True),
+    Column("alarm", Text, nullable=False),
+)
+#: What happened to alarms, and what persons said of them, in order; outputs keep how far they are.
+events = Table(
+    "events",
+    metadata,
+    Column("number", Integer, primary_key=True),
+    Column("actuator", String(120), nullable=False, index=True),
+    Column("t", Float(53), nullable=False),
+    Column("kind", String(20), nullable=False),
+    Column("alarm_id", String(160), nullable=False),
+    Column("by_whom", String(80), nullable=False),
+    Column("text", Text, nullable=False),
+    Column("alarm", Text, nullable=False),
+)

@@ -1,0 +1,1 @@
+"""Where alarms go: JSON lines, Prometheus, a broker."""

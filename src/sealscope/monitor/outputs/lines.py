@@ -1,0 +1,33 @@
+"""Alarms as JSON lines: every event once more after a crash rather than never."""
+
+from __future__ import annotations
+
+import json
+from typing import TextIO
+
+from sealscope.monitor.memory.store import MonitorStore
+
+_NAME = "lines"
+
+
+class EventLines:
+    """Writes the events of a store, in their order, to a stream of text.
+
+    How far it is stands in the store, so that a restart goes on there; an event whose line was written just before a
+    crash is written again, with the same number.
+    """
+
+    def __init__(self, store: MonitorStore, stream: TextIO) -> None:
+        self._store, self._stream = store, stream
+        self._position = store.position(_NAME)
+
+    def pass_on(self) -> None:
+        """Write what is new."""
+        events = self._store.events_since(self._position)
+        if not events:
+            return
+        for number, event in events:
+            self._stream.write(json.dumps(event) + "\n")
+            self._position = number
+        self._stream.flush()
+        self._store.keep_position(_NAME, self._position)

@@ -1,0 +1,190 @@
+"""The monitor's settings: a TOML file, checked whole before anything is opened."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sealscope.errors import InputError
+from sealscope.monitor.alarms.judging import Thresholds
+from sealscope.storage.toml_file import read_toml
+
+_Text = Annotated[str, Field(min_length=1, max_length=100)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class WatchSettings(_Part):
+    """How an actuator is watched."""
+
+    rig: _Text = "thesis"
+    false_alarms_per_1000_h: float = Field(default=1.0, gt=0)
+    learn_hours: float = Field(default=8.0, gt=0, le=1000)
+    warning_lpm: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    error_lpm: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    debounce_blocks: int = Field(default=2, ge=1, le=1000)
+    return_share: float = Field(default=0.7, gt=0, lt=1)
+
+    @property
+    def thresholds(self) -> Thresholds:
+        """What makes an alarm."""
+        return Thresholds(self.warning_lpm, self.error_lpm, self.debounce_blocks, self.return_share)
+
+    @property
+    def learned_with(self) -> str:
+        """The settings that a saved state depends on."""
+        return f"{self.rig}, {self.learn_hours:g} h, {self.false_alarms_per_1000_h:g} per 1000 h"
+
+
+class ActuatorSettings(WatchSettings):
+    """An actuator: its name, where its samples come from, and what differs from the defaults."""
+
+    name: _Text
+    folder: Path | None = None
+    pattern: str = "*"
+    map: dict[str, str] = Field(default_factory=dict)
+    topic: str | None = None
+
+
+class PageSettings(_Part):
+    """The page."""
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=8765, ge=0, le=65535)
+    token_file: Path | None = None
+
+
+class BrokerSettings(_Part):
+    """The MQTT broker."""
+
+    host: _Text = "localhost"
+    port: int = Field(default=1883, ge=1, le=65535)
+    client_id: _Text = "sealscope-monitor"
+    user: str | None = None
+    password_file: Path | None = None
+    tls: bool = False
+    ca_file: Path | None = None
+    alarms_topic: str | None = "sealscope"
+
+
+class MonitorSettings(_Part):
+    """All settings of a monitor."""
+
+    database: str = "monitor.db"
+    lines: bool = False
+    settle_s: float = Field(default=5.0, ge=0, le=3600)
+    keep_days: float = Field(default=400.0, gt=0)
+    defaults: WatchSettings = Field(default_factory=WatchSettings)
+    page: PageSettings | None = None
+    mqtt: BrokerSettings | None = None
+    actuator: list[ActuatorSettings] = Field(min_length=1, max_length=10_000)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _defaults_reach_actuators(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        defaults, actuators = values.get("defaults", {}), values.get("actuator")
+        if not (isinstance(defaults, dict) and isinstance(actuators, list)):
+            return values
+        spread = [{**defaults, **actuator} if isinstance(actuator, dict) else actuator for actuator in actuators]
+        return {**values, "actuator": spread}
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> MonitorSettings:
+        names = [actuator.name for actuator in self.actuator]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"actuators must have names of their own, got {name!r} twice")
+        topics = [actuator.topic for actuator in self.actuator if actuator.topic is not None]
+        for topic in topics:
+            if topics.count(topic) > 1 or any(letter in topic for letter in "+#"):
+                raise ValueError(f"each actuator must have a topic of its own without wildcards, got {topic!r}")
+        if topics and self.mqtt is None:
+            raise ValueError("an actuator with a topic needs the table [mqtt]")
+        local = self.page is None or self.page.host in ("127.0.0.1", "localhost", "::1")
+        if self.page is not None and not local and self.page.token_file is None:
+            raise ValueError(f"a page beyond this machine needs page.token_file, got host {self.page.host!r} without")
+        return self
+
+
+def read_settings(path: Path) -> MonitorSettings:
+    """Return the settings of a file, paths in it taken from its folder.
+
+    Raises InputError of one line where it cannot be read or breaks a rule.
+    """
+    values = read_toml(path, "the monitor's settings", os.fspath(path))
+    try:
+        settings = MonitorSettings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"])) or "settings"
+        message = first["msg"].removeprefix("Value error, ")
+        value = "" if first["type"] in ("value_error", "missing") else f", got {str(first['input'])[:60]!r}"
+        raise InputError(f"{place}: {message}{value} ({path})") from None
+    folder = path.resolve().parent
+    database = settings.database if "://" in settings.database else str(folder / settings.database)
+    actuators = [
+        one if one.folder is None else one.model_copy(update={"folder": folder / one.folder})
+        for one in settings.actuator
+    ]
+    return settings.model_copy(update={"database": database, "actuator": actuators})
+
+
+def secret_of(path: Path | None, what: str) -> str | None:
+    """Return the first line of a file that holds a secret; raises InputError where it cannot be read or is empty."""
+    if path is None:
+        return None
+    try:
+        secret = path.read_text(encoding="utf-8").strip().splitlines()[:1]
+    except (OSError, ValueError) as error:
+        raise InputError(f"{what} must be a readable file: {getattr(error, 'strerror', None) or error}") from None
+    if not secret:
+        raise InputError(f"{what} must hold a secret in its first line, got an empty file ({path})")
+    return secret[0]
+
+
+#: A commented file of settings.
+TEMPLATE = """\
+# Settings of `sealscope monitor`; paths are taken from this file's folder.
+
+database = "monitor.db"          # a file of SQLite, or a URL such as postgresql+psycopg://user@host/name
+lines = false                    # take JSON lines from standard input
+settle_s = 5.0                   # a file is read when it has not changed for so long [s]
+
+[defaults]                       # of every actuator
+rig = "thesis"                   # by name, or the path of a rig's TOML file
+false_alarms_per_1000_h = 1.0    # of a healthy actuator, at most
+learn_hours = 8.0                # operating hours of healthy running that the baseline is learned from
+warning_lpm = 0.0                # a leak of so much is a warning [L/min]; 0: every leak that the tests show
+# error_lpm = 0.01               # ... and of so much an error
+debounce_blocks = 2              # successive blocks (some 3 s each) that must say so
+return_share = 0.7               # an alarm returns below this share of its threshold
+
+[page]
+host = "127.0.0.1"
+port = 8765
+# token_file = "token.txt"       # needed for any other host; put a proxy with TLS before it
+
+# [mqtt]                         # MQTT 5
+# host = "localhost"
+# port = 1883
+# user = "monitor"
+# password_file = "password.txt"
+# tls = false
+# ca_file = "ca.pem"
+# alarms_topic = "sealscope"     # alarms go to sealscope/ACTUATOR/alarm, retained
+
+[[actuator]]
+name = "press 1"
+folder = "press 1"               # recordings that appear here are read, in any format that `sealscope diagnose` reads
+pattern = "*"
+# map = { p_A = "PG_1[bar]" }    # channels from foreign columns
+# topic = "plant/press1/samples" # JSON or CBOR: {"t": 0.0, "rate": 500, "p_A": [...], "p_B": [...], "x": [...], ...}
+# error_lpm = 0.02               # what differs from the defaults
+"""

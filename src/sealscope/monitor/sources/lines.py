@@ -1,0 +1,28 @@
+"""Blocks from a stream of lines, one JSON message a line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import BinaryIO
+
+from sealscope.errors import InputError
+from sealscope.monitor.sources.source_block import LARGEST, SourceBlock, decoded
+
+
+def blocks_of_lines(stream: BinaryIO) -> Iterator[SourceBlock | InputError]:
+    """Yield the block of every line, or the error where a line holds none; empty lines are passed over."""
+    while True:
+        line = stream.readline(LARGEST + 1)
+        if not line:
+            return
+        if len(line) > LARGEST:
+            while line and not line.endswith(b"\n"):
+                line = stream.readline(LARGEST)
+            yield InputError(f"a line must have at most {LARGEST} bytes, got more")
+            continue
+        if not line.strip():
+            continue
+        try:
+            yield decoded(line.strip())
+        except InputError as error:
+            yield error

@@ -1,0 +1,124 @@
+"""A plant of two actuators whose samples come as JSON lines or as files, and what a monitor stored of them."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import random
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import create_engine, inspect, text
+
+from sealscope.monitor.service import Service
+from sealscope.monitor.settings import MonitorSettings, read_settings
+from sealscope.recordings import write
+from sealscope.recordings.recording import Recording
+
+SETTINGS = """
+database = "{database}"
+lines = true
+settle_s = 0.1
+[defaults]
+learn_hours = 0.02
+warning_lpm = 0.0005
+error_lpm = 0.05
+[[actuator]]
+name = "press 1"
+[[actuator]]
+name = "press 2"
+{more}
+"""
+CHANNELS = ("p_A", "p_B", "x", "theta")
+
+
+def settings_in(folder: Path, more: str = "", database: str = "monitor.db") -> MonitorSettings:
+    file = folder / "monitor.toml"
+    file.write_text(SETTINGS.format(more=more, database=database), encoding="utf-8")
+    return read_settings(file)
+
+
+def message(actuator: str, samples: Recording) -> dict[str, Any]:
+    channels = {name: [float(f"{value:.9g}") for value in samples[name]] for name in CHANNELS}
+    return {"actuator": actuator, "t": float(samples.t[0]), "rate": samples.rate, **channels}
+
+
+def lines_of(recordings: dict[str, Recording], size: int) -> bytes:
+    """JSON lines of recordings, the actuators in turn."""
+    lines = []
+    longest = max(len(recording) for recording in recordings.values())
+    for start in range(0, longest, size):
+        for actuator, recording in recordings.items():
+            part = recording.samples(slice(start, start + size))
+            if len(part):
+                lines.append(json.dumps(message(actuator, part)))
+    return "\n".join(lines).encode() + b"\n"
+
+
+def served(settings: MonitorSettings, lines: bytes = b"") -> tuple[Service, str]:
+    """A service that has taken all lines and files, and what it wrote."""
+    out = io.StringIO()
+    service = Service(settings, once=True, stdin=io.BytesIO(lines), stdout=out)
+    service.run()
+    return service, out.getvalue()
+
+
+def rows_of(database: str) -> dict[str, list[tuple[Any, ...]]]:
+    """All rows of a monitor's database but the positions of outputs; the numbers of events are left out."""
+    url = database if "://" in database else f"sqlite:///{database}"
+    engine = create_engine(url)
+    rows = {}
+    with engine.connect() as connection:
+        for table in inspect(engine).get_table_names():
+            if table == "facts":
+                continue
+            columns = [column["name"] for column in inspect(engine).get_columns(table)]
+            chosen = ", ".join(name for name in columns if (table, name) != ("events", "number"))
+            rows[table] = sorted(map(tuple, connection.execute(text(f"select {chosen} from {table}"))))
+    engine.dispose()
+    return rows
+
+
+def write_files(folder: Path, recording: Recording, seconds: float, began: float = 1.7e9) -> None:
+    """Write a recording as files of so many seconds, as a logger that began at the clock `began` would have."""
+    folder.mkdir(exist_ok=True)
+    for k, start in enumerate(np.arange(0.0, recording.duration, seconds)):
+        part = recording.between(start, start + seconds)
+        file = folder / f"{k:03d}.csv"
+        write(part.only(CHANNELS), file)
+        at = began + float(part.t[-1])
+        os.utime(file, (at, at))
+
+
+def kill_often(settings: MonitorSettings, lines: Path, kills: int, seed: int) -> int:
+    """Run a monitor over a file of lines, kill it at random instants, and let the last run end; return the kills.
+
+    Each run begins the file anew, as a source that repeats what was not acknowledged.
+    """
+    chance, killed = random.Random(seed), 0
+    while True:
+        child = os.fork()
+        if child == 0:
+            status = 1
+            try:
+                with lines.open("rb") as stream, Path(os.devnull).open("w") as out:
+                    Service(settings, once=True, stdin=stream, stdout=out).run()
+                status = 0
+            finally:
+                os._exit(status)
+        if killed < kills:
+            time.sleep(chance.uniform(0.01, 0.6))
+            os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        if os.WIFSIGNALED(status):
+            killed += 1
+            continue
+        assert os.waitstatus_to_exitcode(status) == 0
+        if killed >= kills:
+            return killed
+        # it ended before the instant: a fresh start, or there is nothing left to disturb
+        Path(settings.database).unlink()

@@ -1,0 +1,225 @@
+"""The service: what comes in is stored once, alarms go out, and a restart or an error changes no row."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy.exc import OperationalError
+
+from sealscope.errors import InputError
+from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.service import Service
+from sealscope.monitor.settings import TEMPLATE, read_settings
+
+from ..diagnosis.balance_machine import machine, step
+from .plant import kill_often, lines_of, message, rows_of, served, settings_in, write_files
+
+WORN = machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=130.0, rate=50.0)
+SOUND = machine(2, duration=130.0, rate=50.0)
+LINES = lines_of({"press 1": WORN, "press 2": SOUND}, 150)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, list[tuple[Any, ...]]], str]:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    _, out = served(settings_in(folder), LINES)
+    return rows_of(str(folder / "monitor.db")), out
+
+
+def test_a_leak_becomes_one_alarm_with_litres_per_minute(undisturbed):
+    rows, out = undisturbed
+    events = [json.loads(line) for line in out.splitlines()]
+    assert [event["event"] for event in events] == ["raised"]
+    alarm = events[0]["alarm"]
+    assert alarm["actuator"] == "press 1"
+    assert (alarm["level"], alarm["state"], alarm["diagnostic_number"]) == ("warning", "unacknowledged", 4101)
+    assert alarm["onset_s"] == pytest.approx(100.0, abs=2.0)
+    low, high = alarm["leak_interval_lpm"]
+    assert low < 0.00195 < high
+    assert "hold a load" in alarm["next_check"]
+    assert len(rows["alarms"]) == 1
+    assert {row[0] for row in rows["estimates"]} == {"press 1", "press 2"}
+    assert len(rows["estimates"]) == 2 * 41
+
+
+def test_what_is_replayed_is_known(undisturbed, tmp_path):
+    settings = settings_in(tmp_path)
+    served(settings, LINES[: len(LINES) // 2])  # the cut goes through a line, which holds no block
+    service, out = served(settings, LINES)
+    assert rows_of(settings.database) == undisturbed[0]
+    assert service.actuators.counters["blocks stored already"] > 20
+    _, again = served(settings, LINES)
+    assert rows_of(settings.database) == undisturbed[0]
+    assert (out, again) == (undisturbed[1], "")
+
+
+def test_kills_at_random_instants_change_no_row(undisturbed, tmp_path):
+    settings = settings_in(tmp_path)
+    lines = tmp_path / "lines.jsonl"
+    lines.write_bytes(LINES)
+    assert kill_often(settings, lines, 4, seed=1) == 4
+    assert rows_of(settings.database) == undisturbed[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 6))
+def test_many_kills_change_no_row(undisturbed, tmp_path, seed):
+    settings = settings_in(tmp_path)
+    lines = tmp_path / "lines.jsonl"
+    lines.write_bytes(LINES)
+    assert kill_often(settings, lines, 5, seed=seed) == 5
+    assert rows_of(settings.database) == undisturbed[0]
+
+
+@pytest.mark.slow
+def test_errors_of_the_database_change_no_row(undisturbed, tmp_path, monkeypatch):
+    """Every tenth write fails after the detector has taken the block."""
+    settings = settings_in(tmp_path)
+    keep, calls = MonitorStore.keep_estimates, iter(range(10_000))
+
+    def failing(self: MonitorStore, *arguments: Any) -> None:
+        keep(self, *arguments)
+        if next(calls) % 10 == 7:
+            raise OperationalError("insert", {}, sqlite3.OperationalError("database or disk is full"))
+
+    monkeypatch.setattr(MonitorStore, "keep_estimates", failing)
+    service, _ = served(settings, LINES)
+    assert rows_of(settings.database) == undisturbed[0]
+    assert service.actuators.counters["waits for the database"] > 5
+
+
+def test_files_that_appear_are_read_once_and_in_order(tmp_path):
+    write_files(tmp_path / "press 3", WORN, 65.0)
+    more = '[[actuator]]\nname = "press 3"\nfolder = "press 3"\npattern = "*.csv"'
+    settings = settings_in(tmp_path, more)
+    _, out = served(settings)
+    events = [json.loads(line) for line in out.splitlines()]
+    assert [(event["event"], event["alarm"]["actuator"]) for event in events] == [("raised", "press 3")]
+    before = rows_of(settings.database)
+    assert len(before["blocks"]) == 2
+    _, again = served(settings)
+    assert again == ""
+    assert rows_of(settings.database) == before
+
+
+def test_a_file_that_is_being_written_is_waited_for(tmp_path):
+    write_files(tmp_path / "press 3", WORN, 200.0)
+    (file,) = (tmp_path / "press 3").iterdir()
+    whole = file.read_bytes()
+    more = '[[actuator]]\nname = "press 3"\nfolder = "press 3"\n'
+    settings = settings_in(tmp_path, more).model_copy(update={"lines": False, "settle_s": 0.4})
+    from sealscope.monitor.sources.folder import WatchedFolder
+
+    folder = WatchedFolder("press 3", tmp_path / "press 3", "*", 0.4, lambda name, identity: False)
+    for share in (0.2, 0.5, 1.0):
+        file.write_bytes(whole[: int(share * len(whole))])
+        os.utime(file)
+        assert list(folder.blocks()) == []
+    (file.parent / "next.csv.part").write_bytes(whole)
+    time.sleep(0.5)
+    (block,) = folder.blocks()
+    assert block.samples is not None
+    assert len(block.samples) == len(WORN)
+    assert list(folder.blocks()) == []
+    assert settings.settle_s == 0.4
+
+
+def test_lines_without_a_block_are_counted(tmp_path, caplog):
+    good = json.dumps(message("press 1", SOUND.samples(slice(0, 10))))
+    bad = [
+        b"{",
+        b"[1, 2]",
+        b'{"actuator": "press 1", "t": NaN, "rate": 500, "x": [1]}',
+        b'{"actuator": "press 1", "t": 0, "rate": -1, "x": [1]}',
+        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": ["a"]}',
+        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "p_A": [1, 2]}',
+        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "units": {"x": "bar"}}',
+        b'{"t": 0, "rate": 500, "x": [1]}',
+        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "valve": 3}',
+        b"\xff\xfe",
+    ]
+    other = good.replace("press 1", "<script>alert(1)</script>").encode()
+    service, _ = served(settings_in(tmp_path), b"\n".join([*bad, other, b"", good.encode()]))
+    assert service.actuators.counters == {
+        "messages that hold no block": len(bad),
+        "blocks of an actuator that is not in the settings": 1,
+    }
+    assert len(rows_of(service.settings.database)["blocks"]) == 1
+    assert 4 <= len(caplog.records) < len(bad)
+
+
+def test_marks_are_kept_and_act(tmp_path):
+    settings = settings_in(tmp_path)
+    service, _ = served(settings, LINES)
+    with pytest.raises(InputError, match="to be acknowledged, got none"):
+        service.actuators.mark("press 2", "acknowledged")
+    assert service.actuators.mark("press 1", "acknowledged", by_whom="Ada").state == "acknowledged"
+    with pytest.raises(InputError, match="acknowledged already"):
+        service.actuators.mark("press 1", "acknowledged")
+    service.actuators.mark("press 1", "comment", text="<b>seal ordered</b>")
+    assert service.actuators.mark("press 1", "shelved", hours=2.0).shelved_until_s > 7200.0
+    assert service.actuators.mark("press 1", "repaired").state == "normal"
+    again = Service(settings, once=True)
+    again._hold.close()
+    assert again.actuators.plain()["press 1"]["alarm"] is None
+    kinds = [event["event"] for _, event in again.store.events_since(0)]
+    assert kinds == ["raised", "acknowledged", "comment", "shelved", "repaired"]
+    _, after = again.actuators.store.checkpoint("press 1")[:2]
+    assert after["watch"]["baseline_version"] == 2
+
+
+@pytest.mark.slow
+def test_other_settings_begin_a_new_baseline(tmp_path):
+    settings = settings_in(tmp_path)
+    served(settings, LINES)
+    file = tmp_path / "monitor.toml"
+    file.write_text(file.read_text().replace("0.02", "0.03"))
+    service, _ = served(read_settings(file))
+    _, state, _ = service.store.checkpoint("press 1")
+    assert (state["watch"]["baseline_version"], state["watch"]["blocks"]) == (2, 41)
+
+
+def test_one_monitor_at_a_time(tmp_path):
+    settings = settings_in(tmp_path)
+    first = Service(settings, once=True)
+    with pytest.raises(InputError, match="must belong to one monitor"):
+        Service(settings)
+    first._hold.close()
+
+
+def test_the_commented_file_is_valid(tmp_path):
+    file = tmp_path / "monitor.toml"
+    file.write_text(TEMPLATE, encoding="utf-8")
+    settings = read_settings(file)
+    assert settings.actuator[0].folder == tmp_path / "press 1"
+    for line in TEMPLATE.splitlines():
+        if line.startswith("# ") and "=" in line and not line.startswith("# ["):
+            assert len(line.split("#")) >= 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("lines = true", "lines = 3"), "lines: Input should be a valid boolean"),
+        (("learn_hours = 0.02", "learn_hours = -1"), "learn_hours: Input should be greater than 0"),
+        (("error_lpm", "eror_lpm"), "eror_lpm: Extra inputs are not permitted"),
+        (('name = "press 2"', 'name = "press 1"'), "names of their own, got 'press 1' twice"),
+        (('name = "press 2"', 'name = "press 2"\ntopic = "a"'), r"needs the table \[mqtt\]"),
+        (("[defaults]", '[page]\nhost = "0.0.0.0"\n[defaults]'), "needs page.token_file"),
+        (("[defaults]", "[defaults"), "must be TOML"),
+    ],
+)
+def test_wrong_settings_are_one_clear_line(tmp_path: Path, change: tuple[str, str], message: str):
+    settings_in(tmp_path)
+    file = tmp_path / "monitor.toml"
+    file.write_text(file.read_text().replace(*change))
+    with pytest.raises(InputError, match=message) as raised:
+        read_settings(file)
+    assert "\n" not in str(raised.value)
+    assert str(file) in str(raised.value)
