@@ -7,6 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.judging.judge import judge
+from sealscope.campaigns.plans.reader import load_plan
+from sealscope.campaigns.results import CampaignResult, prior_knowledge
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.quality import Finding
@@ -85,3 +89,61 @@ def no_verdict():
         quality=(Finding("short", "fatal", None, 0, None, "30 samples"),),
         parts=(Evidence("cannot tell", "", detector="details"),),
     )
+
+
+_PLAN = """
+[campaign]
+name = "single"
+title = "A single size"
+duration = "40 s"
+onset = "20 s"
+rate = "500 Hz"
+false_alarm = 0.1
+detectors = ["volume balance"]
+
+[[records]]
+count = 10
+
+[[records]]
+leak = "0.0042 L/min"
+count = 10
+
+[[records]]
+fault = "pump leak x3"
+count = 6
+"""
+
+
+@pytest.fixture(scope="session")
+def campaign_result(tmp_path_factory):
+    """The result of a campaign: 10 leak-free records, 10 with a leak of a single size, 6 with a pump leak.
+
+    The volume balance raises an alarm in 1, 10 and 5 of them, and calls every leak but the first `piston or pump leak`.
+    """
+    path = tmp_path_factory.mktemp("plan") / "single.toml"
+    path.write_text(_PLAN, encoding="utf-8")
+    plan = load_plan(path)
+
+    def row(number: int, score: float, leak: float = 0.0, fault: str = "", cause: str | None = None) -> CaseRow:
+        verdict = "leak" if score > 3.0 else "no leak"
+        said = Evidence(verdict, "", score, 3.0, cause=cause if verdict == "leak" else None)
+        return CaseRow(
+            id=f"{number:016x}",
+            use="judge",
+            leak_lpm=leak,
+            fault=fault,
+            levels={},
+            replicate=number,
+            flow_lpm=leak,
+            place={},
+            scores={"volume balance": (score, None)},
+            statements={"volume balance": said},
+        )
+
+    either = "piston or pump leak"
+    rows = [row(k, 4.0 if k == 0 else 1.0, cause="piston leak") for k in range(10)]
+    rows += [row(100 + k, 9.0, leak=0.0042, cause=either) for k in range(10)]
+    rows += [row(200 + k, 1.0 if k == 5 else 8.0, fault="pump leak x3", cause=either if k else "piston leak")
+             for k in range(6)]  # fmt: skip
+    judgement = judge(rows, plan.detectors, None, onset_s=plan.onset_s, hours=plan.duration_s / 3600)
+    return CampaignResult(plan, tuple(rows), 0, judgement, known=prior_knowledge(plan))

@@ -24,6 +24,8 @@ _CAUSES = (
     ("sensor", "sensor fault"),
     ("duty", "changed duty"),
 )
+#: A cause that a detector names where no channel tells two apart, and those two.
+_EITHER = {"piston or pump leak": (PISTON_LEAK, "pump leak")}
 #: detector -> (score, None where it cannot tell; onset [s], None where it finds none)
 Scores = Mapping[str, tuple[float | None, float | None]]
 #: The figures of a detector's evidence that a row stores.
@@ -35,6 +37,11 @@ STATED = (
 def cause_of(fault: str) -> str:
     """Return the cause behind a fault as text; a fault that has no cause of its own is its own."""
     return next((cause for beginning, cause in _CAUSES if fault.startswith(beginning)), fault)
+
+
+def covers(named: str, true: str) -> bool:
+    """Return whether a named cause is the true one, or names it with another that no channel tells from it."""
+    return named == true or true in _EITHER.get(named, ())
 
 
 def finite(value: float | None) -> float | None:

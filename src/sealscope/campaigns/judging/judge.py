@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, named_cause
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, covers, named_cause
 from sealscope.campaigns.judging.families import FamilyFinding, family_findings
 from sealscope.campaigns.plans.detectors import Views, plan_detector
 from sealscope.diagnosis.calibration.scorers import scorer
@@ -75,12 +75,17 @@ class CellAlarms:
 
 @dataclass(frozen=True)
 class FaultAlarms:
-    """Alarms of one detector on records with a fault that is no piston leak."""
+    """Alarms of one detector on records with a fault that is no piston leak.
+
+    `named`: alarms that name the fault's cause, alone or with the piston (`piston or pump leak` of a pump leak); None
+    where the detector names no cause.
+    """
 
     detector: str
     fault: str
     alarms: Proportion
     cannot_tell: Proportion
+    named: Proportion | None = None
 
 
 @dataclass(frozen=True)
@@ -108,10 +113,14 @@ class FlowAccuracy:
 
 @dataclass(frozen=True)
 class NamedCauses:
-    """Which cause one detector names for which there is; `none` where nothing leaks and no fault is put in."""
+    """Which cause one detector names for which there is; `none` where nothing leaks and no fault is put in.
+
+    `covered`: records for which it names the true cause, alone or with the one that no channel tells from it.
+    """
 
     detector: str
     confusion: Confusion
+    covered: Proportion
 
 
 @dataclass(frozen=True)
@@ -324,8 +333,22 @@ def _faults(
         for fault, here in by_fault.items():
             given = [{ALWAYS: "leak", NEVER: "no leak"}.get(name) or verdicts[name, row.id] for row in here]
             alarms, unsure = (proportion(given.count(word), len(here), confidence) for word in ("leak", CANNOT_TELL))
-            faults.append(FaultAlarms(name, fault, alarms, unsure))
+            faults.append(FaultAlarms(name, fault, alarms, unsure, _naming(name, here, given, confidence)))
     return faults
+
+
+def _naming(name: str, rows: Sequence[CaseRow], verdicts: Sequence[str], confidence: float) -> Proportion | None:
+    """Return how many alarms on records of a fault name its cause; None where the detector states no cause."""
+    if name in (ALWAYS, NEVER):
+        return None
+    statements = [_statement(row, name) for row in rows]
+    if not any(statements):
+        return None
+    named = [
+        stated is not None and verdict == "leak" and covers(named_cause(stated), cause_of(row.fault))
+        for row, stated, verdict in zip(rows, statements, verdicts, strict=True)
+    ]
+    return proportion(sum(named), len(named), confidence)
 
 
 def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
@@ -409,7 +432,8 @@ def _causes(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float
         statements = [_statement(row, name) for row in single]
         named = [CANNOT_TELL if stated is None else named_cause(stated) for stated in statements]
         others = sorted(set(named) - set(causes) - {CANNOT_TELL})
-        tables.append(NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], confidence)))
+        covered = proportion(sum(map(covers, named, truth)), len(truth), confidence)
+        tables.append(NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], confidence), covered))
     return tables
 
 

@@ -202,9 +202,16 @@ def _causes(judgement: Judgement) -> ResultTable:
 
 
 def _faults(judgement: Judgement) -> ResultTable:
-    columns = ("detector", "fault that is no leak", *_columns("alarms"), *_columns("cannot tell"))
+    columns = (
+        "detector",
+        "fault that is no leak",
+        *_columns("alarms"),
+        *_columns("cannot tell"),
+        *_columns("alarms that name it"),
+    )
     rows = tuple(
-        (fault.detector, fault.fault, *_of(fault.alarms), *_of(fault.cannot_tell)) for fault in judgement.faults
+        (fault.detector, fault.fault, *_of(fault.alarms), *_of(fault.cannot_tell), *_of(fault.named))
+        for fault in judgement.faults
     )
     return ResultTable("faults", columns, rows)
 

@@ -22,12 +22,21 @@ from sealscope.evaluation.roc import Area
 from sealscope.evaluation.table import SummaryRow
 from sealscope.reporting import template
 from sealscope.reporting.campaign.curves import CurvePlot, PlotCurve, draw
-from sealscope.reporting.campaign.tables import cause_tables, family_lines, flow_lines, onset_lines, percent
+from sealscope.reporting.campaign.tables import (
+    cause_tables,
+    family_lines,
+    fault_lines,
+    flow_lines,
+    onset_lines,
+    percent,
+)
 
 PAGE = "report.html"
 #: More sizes than this are shown together: a column for each could not be read.
 _MOST_SIZES = 8
 _CURVE_POINTS = 120
+#: Detectors that the result names in words, the best of them.
+_MOST_SAID = 3
 
 
 @dataclass(frozen=True)
@@ -123,6 +132,30 @@ def _key(size: float) -> str:
 def _heads(result: CampaignResult) -> list[str]:
     sizes = sizes_of(result.judgement)
     return ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
+
+
+def result_text(result: CampaignResult) -> str:
+    """Return what came out in a few sentences: what the best detectors find, at which rate of false alarms."""
+    judgement, unit = result.judgement, result.plan.unit
+    said: list[tuple[float, float, str]] = []
+    for pod in judgement.pods:
+        rows = [row for row in judgement.table if row.detector == pod.detector and row.leak_lpm > 0]
+        if not rows:
+            continue
+        largest = max(rows, key=lambda row: row.leak_lpm)
+        found = f"finds {percent(largest.detection)} of leaks of {largest.leak_lpm:g} {unit}"
+        a90 = math.inf
+        if pod.curve is not None and pod.curve.a90 <= largest.leak_lpm:
+            a90 = pod.curve.a90
+            found = f"finds 9 in 10 leaks of {a90:.2g} {unit}"
+        text = f"{pod.detector} {found} at {percent(largest.false_alarm)} false alarms."
+        said.append((a90, -largest.detection.value, text))
+    said.sort(key=lambda item: item[:2])
+    shown = [text for _, _, text in said[:_MOST_SAID]]
+    more = len(said) - len(shown)
+    rest = f" {more} more detectors are in the table." if more > 1 else " Another detector is in the table."
+    records = f"{judgement.judged} records were judged."
+    return " ".join([*shown, records]) + (rest if more else "")
 
 
 def campaign_text(result: CampaignResult) -> str:
@@ -231,13 +264,11 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
         unit=result.plan.unit,
         lines=lines_of(result),
         given=bool(result.known),
+        result=result_text(result),
         notes=_notes(result),
         facts=_facts(result),
         sections=[_section(pod, judgement, result.plan.unit) for pod in judgement.pods],
-        faults=[
-            (fault.detector, fault.fault, percent(fault.alarms), percent(fault.cannot_tell))
-            for fault in judgement.faults
-        ],
+        faults=fault_lines(judgement),
         families=family_lines(judgement),
         part=result.plan.part if isinstance(result.plan, SimulatedPlan) else "",
         flows=flow_lines(judgement),

@@ -23,14 +23,26 @@ def _p(share: float) -> str:
     )
 
 
+def fault_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str]]:
+    """Return detector, fault, alarms, those of them that name its cause, cannot tell."""
+    return [
+        (fault.detector, fault.fault, percent(fault.alarms), percent(fault.named), percent(fault.cannot_tell))
+        for fault in judgement.faults
+    ]
+
+
 @dataclass(frozen=True)
 class CauseTable:
-    """What one detector names (`columns`) for which cause there is: a name, the records, and the share of each."""
+    """What one detector names (`columns`) for which cause there is: a name, the records, and the share of each.
+
+    `right`: records whose cause is named alone; `covered`: alone or with the one that no channel tells from it.
+    """
 
     detector: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, int, tuple[str, ...]], ...]
     right: str
+    covered: str
 
 
 def onset_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str]]:
@@ -92,7 +104,9 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
             )
             for i in there
         )
-        tables.append(CauseTable(causes.detector, confusion.columns, rows, percent(confusion.accuracy)))
+        tables.append(
+            CauseTable(causes.detector, confusion.columns, rows, percent(confusion.accuracy), percent(causes.covered))
+        )
     return tables
 
 
