@@ -27,6 +27,14 @@ KEYS = {
     "passage": dict | None,
     "chance": float | None,
     "odds": str | None,
+    "summary": str,
+    "start": str | None,
+    "machine": str | None,
+    "about": dict,
+    "rig": dict,
+    "severity": dict | None,
+    "limit": dict,
+    "evidence": dict,
 }
 VERDICTS = {"leak", "no leak", "cannot tell"}
 FOREIGN = ("--map", "p_A=PG_1", "--map", "p_B=PG_2", "--rate", "1000")
@@ -76,9 +84,11 @@ def test_jsonl_is_one_object_a_line_and_nothing_else(call, recordings):
 
 def test_what_detectors_may_assume_is_a_rig_by_name_or_file(call, recordings, tmp_path):
     words = ("diagnose", recordings / "leak.nc", "--format", "jsonl")
-    plain = call(*words)
-    assert call(*words, "--rig", "thesis") == plain
-    assert call("diagnose", "--rig", "thesis", recordings / "leak.nc", "--format", "jsonl") == plain
+    (plain,) = call(*words).objects
+    stated = call(*words, "--rig", "thesis")
+    assert call("diagnose", "--rig", "thesis", recordings / "leak.nc", "--format", "jsonl") == stated
+    assert plain.pop("rig") | {"stated_by": "call"} == stated.objects[0]["rig"]
+    assert plain.items() <= stated.objects[0].items()
     assert "nowhere" in call(*words, "--rig", "nowhere").refused(2)
     assert "absent.toml" in call(*words, "--rig", "absent.toml").refused(2)
     page = tmp_path / "page.html"

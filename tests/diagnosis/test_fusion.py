@@ -104,7 +104,7 @@ def test_no_flow_is_stated_of_a_machine_with_another_geometry() -> None:
         seed=1,
         set={"pump.q_b": "3.9[cm^3/rev]"},
     )
-    found = diagnose(recording)
+    found = diagnose(recording, rig="thesis")
     assert (found.verdict, found.detector) == ("leak", BALANCE)
     assert "the geometry is another" in found.reason
     assert any(own.leak_lpm is not None for own in found.parts)

@@ -74,13 +74,15 @@ def test_against_what_a_healthy_machine_passes() -> None:
 def test_only_what_is_known_to_be_healthy_becomes_a_baseline() -> None:
     sound, worn = machine(1), machine(1, G=WORN)
     advice = "keep this recording as a baseline"
-    unknown, known = diagnose(worn), diagnose(sound, rig=rig(2.0 * PUMP))
+    unknown, known = diagnose(worn, rig="thesis"), diagnose(sound, rig=rig(2.0 * PUMP))
     assert advice not in unknown.next_check
     assert advice in known.next_check
     assert advice in diagnose(sound, [machine(2), machine(3)]).next_check
     for diagnosis in (unknown, known):
         told = diagnosis.as_dict()["passage"]
-        assert set(told) == {"lpm", "interval_lpm", "pressure_Pa", "findable_lpm", "healthy_lpm"}
+        assert set(told) == {
+            "lpm", "interval_lpm", "pressure_Pa", "findable_lpm", "healthy_lpm", "pump_share", "findable_share"
+        }  # fmt: skip
         assert passes(diagnosis) is not None
         assert "pump and piston together" in diagnosis_text(diagnosis)
 

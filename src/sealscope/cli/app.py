@@ -75,6 +75,7 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
     if not arguments or arguments[0] not in ("diagnose", "report", "calibrate"):
         return list(arguments)
     takes_value = {"--format", "--map", "--rate", "--false-alarm", "--output", "-o", "--calibration", "--rig"}
+    takes_value |= {"--area", "--displacement", "--limit", "--fail-on", "--detector"}
     groups: list[list[str]] = []
     plain: list[str] = []
     index, files = 1, 0

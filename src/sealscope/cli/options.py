@@ -51,6 +51,31 @@ AssumeOption = Annotated[
         autocompletion=complete_rigs,
     ),
 ]
+AreaOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--area",
+        metavar="AREA[unit]",
+        help="Area of the piston, e.g. '633 mm^2', which L/min rests on; twice for sides A and B.",
+    ),
+]
+DisplacementOption = Annotated[
+    str | None,
+    typer.Option(
+        "--displacement",
+        metavar="VOLUME[unit]",
+        help="Displacement of the pump, e.g. '4.9 cm^3/rev', which L/min rests on where no area is stated.",
+    ),
+]
+LimitOption = Annotated[
+    str | None,
+    typer.Option(
+        "--limit",
+        metavar="LEAK[unit]",
+        help="Leak from which the machine is to be repaired: a flow, '5 mL/min', or a speed of creep. "
+        "[default: 8 mm/min]",
+    ),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -109,11 +134,27 @@ def progress() -> Iterator[Progress]:
         yield update
 
 
-def assumed_rig(name: str | None) -> Rig | None:
-    """Return the rig of `--rig` that detectors may assume; None where none is given."""
-    from sealscope.parameters import load_rig
+def assumed_rig(name: str | None, area: Sequence[str] | None = None, displacement: str | None = None) -> Rig | None:
+    """Return the rig of `--rig` that detectors may assume, with what `--area` and `--displacement` state.
 
-    return None if name is None else load_rig(name)
+    None where none of them is given.
+    """
+    from sealscope.diagnosis.verdict.machine import unstated
+    from sealscope.parameters import load_rig
+    from sealscope.units import parse_quantity
+
+    rig = None if name is None else load_rig(name)
+    stated: dict[str, float] = {}
+    if area:
+        if len(area) > 2:
+            raise InputError(f"--area must be given once, or twice for sides A and B, got {len(area)} times")
+        sides = [parse_quantity(text, "m^2", name="--area") for text in area]
+        stated |= {"cylinder.A_A": sides[0], "cylinder.A_B": sides[-1]}
+    if displacement is not None:
+        stated["pump.q_b"] = parse_quantity(displacement, "m^3/rev", name="--displacement")
+    if not stated:
+        return rig
+    return (rig or unstated()).with_overrides(stated, source="set by the call (--area, --displacement)")
 
 
 def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:

@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sealscope.cli.options import (
+    AreaOption,
     AssumeOption,
     BaselineOption,
     CalibrationOption,
+    DisplacementOption,
     FalseAlarmOption,
     JoinOption,
+    LimitOption,
     MapOption,
     RateOption,
     assumed_rig,
@@ -95,14 +98,17 @@ def _diagnoses(
     false_alarm: float,
     calibration: Path | None,
     rig: Rig | None,
+    limit: str | None = None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
     """Yield recording and diagnosis of each file, None for one that cannot be read; no file is its own baseline."""
     from sealscope.diagnosis.diagnose import check_probability, diagnose
+    from sealscope.diagnosis.verdict.severity import RepairLimit
 
     check_probability(false_alarm)
+    RepairLimit.of(limit)
     channel_map = channel_map_of(maps)
     if calibration is not None:
-        yield from _calibrated(files, join_them, baseline, channel_map, rate, calibration, rig)
+        yield from _calibrated(files, join_them, baseline, channel_map, rate, calibration, rig, limit)
         return
     for file in files if baseline else ():
         if all(path.resolve() == file.resolve() for path in baseline):
@@ -121,7 +127,9 @@ def _diagnoses(
             complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
             continue
-        work = partial(diagnose, recording, others, false_alarm_probability=false_alarm, file=file, rig=rig or "thesis")
+        work = partial(
+            diagnose, recording, others, false_alarm_probability=false_alarm, file=file, rig=rig, limit=limit
+        )
         diagnosis = attempt(file, work)
         yield None if diagnosis is None else (recording, diagnosis)
 
@@ -134,6 +142,7 @@ def _calibrated(
     rate: float | None,
     calibration: Path,
     rig: Rig | None,
+    limit: str | None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
     """Yield recording and diagnosis of each file by the thresholds of a calibration."""
     from sealscope.diagnosis.calibration.calibrated import diagnose_calibrated
@@ -145,7 +154,7 @@ def _calibrated(
     for file, recording in _read_parts(files, channel_map, rate, join_them):
         diagnosis = None
         if recording is not None:
-            work = partial(diagnose_calibrated, recording, known, file=str(file), rig=rig or "thesis")
+            work = partial(diagnose_calibrated, recording, known, file=str(file), rig=rig, limit=limit)
             diagnosis = attempt(file, work)
         yield None if recording is None or diagnosis is None else (recording, diagnosis)
 
@@ -163,6 +172,9 @@ def diagnose(
     false_alarm: FalseAlarmOption = 0.01,
     calibration: CalibrationOption = None,
     rig: AssumeOption = None,
+    area: AreaOption = None,
+    displacement: DisplacementOption = None,
+    limit: LimitOption = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
     fail_on: Annotated[
         list[Verdict] | None,
@@ -187,7 +199,8 @@ def diagnose(
         rate=rate,
         false_alarm=false_alarm,
         calibration=calibration,
-        rig=assumed_rig(rig),
+        rig=assumed_rig(rig, area, displacement),
+        limit=limit,
     )
     jobs = min(cores(), len(files))
     if join or baseline or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:  # what a baseline costs is spent once
@@ -254,6 +267,9 @@ def report(
     false_alarm: FalseAlarmOption = 0.01,
     calibration: CalibrationOption = None,
     rig: AssumeOption = None,
+    area: AreaOption = None,
+    displacement: DisplacementOption = None,
+    limit: LimitOption = None,
 ) -> None:
     """Diagnose each file and write a self-contained page of it; a folder gets an index, the most severe first."""
     from sealscope.reporting import write_index, write_page
@@ -278,8 +294,8 @@ def report(
         check_folder(check_page(output))
     complete = True
     written: list[tuple[Path, Diagnosis]] = []
-    assumed = assumed_rig(rig)
-    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, calibration, assumed):
+    assumed = assumed_rig(rig, area, displacement)
+    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, calibration, assumed, limit):
         if result is None:
             complete = False
             continue

@@ -19,6 +19,8 @@ from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.verdict.fusion import fuse
+from sealscope.diagnosis.verdict.machine import assumed_rig
+from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
@@ -212,7 +214,8 @@ def diagnose(
     baseline: Recording | Sequence[Recording] = (),
     *,
     false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
-    rig: Rig | str | os.PathLike[str] = "thesis",
+    rig: Rig | str | os.PathLike[str] | None = None,
+    limit: str | None = None,
     file: str | os.PathLike[str] | None = None,
 ) -> Diagnosis:
     """Say whether oil bypasses the piston in a recording.
@@ -231,7 +234,12 @@ def diagnose(
     false_alarm_probability : float, optional
         Probability of `leak` on a leak-free recording, 1e-4 to 0.2.
     rig : Rig, str or path-like, optional
-        What the detectors may assume of the machine: a Rig, the name of a packaged rig or the path of a TOML file.
+        What the detectors may assume of the machine: a Rig, the name of a packaged rig or the path of a TOML file. By
+        default the thesis's: stated for a recording that was simulated with it, else a mere assumption. Then L/min is
+        stated only where displacement over area, measured, is that of this rig.
+    limit : str, optional
+        Leak from which the machine is to be repaired, as a flow (``"5 mL/min"``) or as the speed at which the piston
+        would creep (``"8 mm/min"``, the default).
     file : str or path-like, optional
         Name of the recording in the diagnosis; by default that of the file it was read from.
 
@@ -244,8 +252,8 @@ def diagnose(
     Raises
     ------
     InputError
-        The false-alarm probability is outside 1e-4 to 0.2, `recording` or `baseline` is no Recording, or `rig` cannot
-        be read.
+        The false-alarm probability is outside 1e-4 to 0.2, `recording` or `baseline` is no Recording, `rig` cannot be
+        read, or `limit` is neither a flow nor a speed.
 
     Examples
     --------
@@ -255,10 +263,10 @@ def diagnose(
     >>> diagnosis.verdict, round(diagnosis.onset_s)
     ('leak', 30)
     """
-    from sealscope.parameters import load_rig
-
+    repair = RepairLimit.of(limit)
     check_probability(false_alarm_probability)
     _check_recording("recording", recording)
+    known, machine = assumed_rig(rig, recording)
     baselines = [baseline] if isinstance(baseline, Recording) else _sequence(baseline)
     judged = inspected(recording)
     compared = comparable(judged, baselines)
@@ -266,17 +274,20 @@ def diagnose(
         judged.part,
         compared.parts,
         false_alarm_probability=false_alarm_probability,
-        rig=load_rig(rig),
+        rig=known,
         distrust=judged.distrust,
         no_baseline=compared.refusal,
         share=judged.share,
     ).fused()
-    return Diagnosis(
-        **vars(fused),
-        file=os.fspath(file) if file else str(recording.provenance.get("file", "recording")),
+    return Diagnosis.of(
+        fused,
+        recording,
+        machine,
+        file=os.fspath(file) if file else None,
         false_alarm_probability=false_alarm_probability,
         quality=(*judged.findings, *compared.findings),
         baselines=len(compared.parts),
+        limit=repair,
     )
 
 

@@ -275,6 +275,7 @@ def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] =
         leak_interval_lpm=None,
         cause=other.cause,
         course=None,
+        relative=None,
     )
 
 

@@ -21,6 +21,8 @@ from sealscope.parameters.names import resolve
 from sealscope.units import parse_quantity, to_si
 
 Value = float | int | str
+#: Begins the source of a value that nobody has stated of this machine.
+ASSUMED = "assumed:"
 
 
 class ParameterEntry(NamedTuple):
@@ -134,6 +136,15 @@ class Rig(Part):
     def entry(self, name: str) -> ParameterEntry:
         """Value, unit, source and place of a parameter, as given."""
         return self._given()[resolve(name, declared_names())]
+
+    def states(self, *names: str) -> bool:
+        """Return whether these parameters are stated: a source that begins with `assumed:` states nothing."""
+        return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
+
+    def as_assumed(self, reason: str) -> Rig:
+        """Return the same rig with each value an assumption, for this reason."""
+        entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._given().items()}
+        return Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
 
     def _given(self) -> dict[str, ParameterEntry]:
         if not self._entries:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import floor, isfinite, isnan, log10
 from textwrap import fill
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS
+from sealscope.diagnosis.verdict.severity import Level
 from sealscope.recordings.quality import Finding
 
 ABSENT = "–"
@@ -80,11 +82,66 @@ def how_much(diagnosis: Diagnosis) -> str | None:
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.leak_lpm is None:
-        return f"not stated: {'see the reason' if 'leak_lpm' in diagnosis.refuses else 'the channels do not allow it'}"
+        if "leak_lpm" not in diagnosis.refuses:
+            return "not stated: the channels do not allow it"
+        if diagnosis.machine is None or diagnosis.machine.stated:
+            return "not stated: see the reason"
+        return "L/min not stated: the size of the machine is not known; " + (
+            "state --rig, or the piston's --area" if diagnosis.measured_ratio is not None else "state --rig"
+        )
     text = f"{number(diagnosis.leak_lpm)} L/min"
     if interval is not None:
         text += f", between {number(interval[0])} and {number(interval[1])} L/min"
-    return text
+    basis = rests_on(diagnosis)
+    return text if basis is None else f"{text}; {basis}"
+
+
+def rests_on(diagnosis: Diagnosis) -> str | None:
+    """Return what every L/min of the diagnosis rests on; None where that is not known."""
+    machine = diagnosis.machine
+    if machine is None:
+        return None
+    area = f"{number(1e6 * machine.area)} mm²"
+    displacement = f"{number(1e6 * machine.displacement)} cm³/rev"
+    if machine.stated_by == "recording":
+        return f"piston {area} and pump {displacement} by the recording's own rig, {machine.rig}"
+    if machine.stated:
+        by = f"rig {machine.rig}, as stated" if machine.stated_by == "call" else "as stated"
+        return f"piston {area} and pump {displacement} ({by})"
+    if machine.area_stated:
+        return f"piston {area} (as stated)"
+    if machine.displacement_stated:
+        return f"pump {displacement} (as stated)"
+    return f"assumed, for no rig was stated: piston {area} and pump {displacement} of rig {machine.rig}"
+
+
+#: What a level of severity means.
+_LEVELS: Mapping[Level, str] = {
+    "repair": "over the repair limit",
+    "plan": "it may take half of the repair limit or more",
+    "follow": "under half of the repair limit",
+}
+
+
+def how_bad(diagnosis: Diagnosis) -> str | None:
+    """Return the leak in mL/min, beside the pump's flow, and against the repair limit; None where none is sized."""
+    own = diagnosis.severity
+    if own is None:
+        return None
+    parts = []
+    if own.mL_per_min is not None:
+        parts.append(f"{number(own.mL_per_min[0], 2)} mL/min")
+    if own.pump_share is not None:
+        parts.append(f"{number(100.0 * own.pump_share[0], 2)} % of the pump's flow in this duty")
+    if own.creep_mm_per_min is not None:
+        parts.append(f"as much as a piston that creeps by {number(own.creep_mm_per_min[0], 2)} mm/min")
+    if own.level is not None and own.of_limit is not None:
+        low, high = (number(value, 2) for value in own.of_limit[1:])
+        by = "" if diagnosis.limit.stated else ", the default"
+        parts.append(f"{_LEVELS[own.level]} ({low} to {high} times {diagnosis.limit}{by})")
+    elif diagnosis.limit.stated:
+        parts.append(f"not held against the limit of {diagnosis.limit}, for that needs the machine's area (--area)")
+    return "; ".join(parts)
 
 
 def passes(diagnosis: Diagnosis) -> str | None:
@@ -92,16 +149,26 @@ def passes(diagnosis: Diagnosis) -> str | None:
     own = diagnosis.passage
     if own is None:
         return None
+    pressure = f"at {number(own.pressure / 1e6, 2)} MPa"
+    if own.lpm is None or own.interval_lpm is None:
+        text = f"pump and piston together {_percent(own.pump_share)} of the pump's flow {pressure}"
+        if own.findable_share is not None:
+            text += f"; the smallest step that would have been found is {_percent(own.findable_share)}"
+        return text
     low, high = own.interval_lpm
-    text = (
-        f"pump and piston together {number(own.lpm, 2)} L/min, between {number(low, 2)} and {number(high, 2)}, at "
-        f"{number(own.pressure / 1e6, 2)} MPa"
-    )
+    text = f"pump and piston together {number(own.lpm, 2)} L/min, between {number(low, 2)} and {number(high, 2)}, "
+    text += pressure
+    if diagnosis.verdict != "leak" and (basis := rests_on(diagnosis)) is not None:
+        text += f" ({basis})"
     if own.healthy_lpm is not None:
         text += f"; a healthy machine at most {number(own.healthy_lpm, 2)} L/min"
     if own.findable_lpm is not None:
         text += f"; the smallest step that would have been found is {number(own.findable_lpm, 2)} L/min"
     return text
+
+
+def _percent(share: float | None) -> str:
+    return ABSENT if share is None else f"{number(100.0 * share, 2)} %"
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
@@ -110,6 +177,10 @@ def how_sure(diagnosis: Diagnosis) -> str:
         return "no score was formed"
     odds = "" if diagnosis.odds is None else f"{diagnosis.odds}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
+    other = cause(diagnosis)
+    if diagnosis.verdict != "leak" and other is not None and diagnosis.alarmed:
+        odds = f"that something changed: {odds}"
+        relation = f"for {other}, over"
     text = f"score {number(diagnosis.score)}, {relation} the threshold of {number(diagnosis.threshold)}"
     judge = diagnosis.methods[0].detector if diagnosis.methods else ""
     by = f" of {judge}" if judge else ""
@@ -137,12 +208,29 @@ def _fault(finding: Finding) -> str:
     return f"{name} ({finding.channel})" if finding.channel else name
 
 
+def _after_that(diagnosis: Diagnosis) -> str:
+    """Return what to do about a leak that is confirmed, by its severity."""
+    own = diagnosis.severity
+    level = None if own is None else own.level
+    if level == "repair":
+        return (
+            f"If it is confirmed, change the seal, or the pump, now: the leak is over the repair limit of "
+            f"{diagnosis.limit}."
+        )
+    if level == "follow":
+        return (
+            f"If it is confirmed, follow it in every recording; it is under half of the repair limit of "
+            f"{diagnosis.limit}, and nothing is urgent."
+        )
+    return "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until then."
+
+
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return what to check next, most useful first."""
     trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
     faults = ", ".join(dict.fromkeys(_fault(finding) for finding in trouble))
     repeat = "Repeat the recording with the same command and oil temperature: a worn seal shows again."
-    plan = "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until then."
+    plan = _after_that(diagnosis)
     if diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS):
         steps = [diagnosis.next_check, repeat, plan]
         if diagnosis.verdict != "leak":
@@ -187,6 +275,7 @@ def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     rows = [
         ("since", since(diagnosis)),
         ("how much", how_much(diagnosis)),
+        ("how bad", how_bad(diagnosis)),
         ("passes", passes(diagnosis) if diagnosis.verdict == "no leak" else None),
         ("cause", cause(diagnosis)),
         ("how sure", sure if diagnosis.verdict != "cannot tell" else None),
@@ -195,7 +284,7 @@ def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
         ("next", next_steps(diagnosis)[0]),
     ]
     lines = [_row(label, text, width) for label, text in rows if text]
-    return "\n".join((f"{_printable(diagnosis.file)}: {diagnosis.verdict}", *lines))
+    return "\n".join((f"{_printable(diagnosis.file)}: {diagnosis.summary}", *lines))
 
 
 def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
@@ -203,10 +292,11 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
 
     `width`: columns [1]. Without colours, and without control characters that a file name or header could bring.
     """
-    lines = [f"{_printable(diagnosis.file)}: {diagnosis.verdict}"]
+    lines = [f"{_printable(diagnosis.file)}: {diagnosis.summary}"]
     rows = [
         ("since", since(diagnosis)),
         ("how much", how_much(diagnosis)),
+        ("how bad", how_bad(diagnosis)),
         ("passes", passes(diagnosis)),
         ("cause", cause(diagnosis)),
         ("how sure", how_sure(diagnosis)),
@@ -214,13 +304,10 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     ]
     lines += [_row(label, text, width) for label, text in rows if text]
     for method in diagnosis.methods:
-        figures = f"{method.verdict} (score {number(method.score)}, threshold {number(method.threshold)})"
-        if method.odds is not None:
-            figures = (
-                f"{method.verdict} ({method.odds}; score {number(method.score)}, threshold {number(method.threshold)})"
-            )
+        odds = "" if method.odds is None else f"{method.odds}; "
+        figures = f"{method.summary} ({odds}score {number(method.score)}, threshold {number(method.threshold)})"
         if method.score is None and method.reason:
-            figures = f"{method.verdict} ({method.reason})"
+            figures = f"{method.summary} ({method.reason})"
         lines.append(_row("method", f"{method.detector}: {figures}", width))
     lines += [_row(finding.severity, finding.text, width) for finding in diagnosis.quality]
     lines += [_row("next" if i == 0 else "", step, width) for i, step in enumerate(next_steps(diagnosis)[:2])]

@@ -21,12 +21,12 @@ Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2 a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Figure, LeakCourse
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Figure, LeakCourse, RelativeLeak
 from sealscope.recordings.recording import Array
 
 #: The grid of tau: from this share of the prior's scale to so many times the larger of scale and scatter seen.
@@ -128,13 +128,14 @@ def against_baseline(
     cause: Cause | None,
     course: LeakCourse | None = None,
     refuses: frozenset[Figure] = frozenset(),
+    relative: Callable[[float, tuple[float, float]], RelativeLeak] | None = None,
 ) -> Evidence:
     """Return the evidence of both tests: of a rise `within` the recording, and of its level against the baseline's.
 
     A rise within the recording that is a leak, or has another cause, decides; else the level does. `part`: name of the
     level's test; `flows`: L/min in a unit of the level, by each law that the leak may follow, the first of them for the
     size and all of them for the interval (none where L/min is not stated). `cause`, `course`, `refuses`: of a leak that
-    the level shows.
+    the level shows; `relative`: gives the leak of a rise of the level and of its interval beside the pump's flow.
     """
     if not baseline:
         return incomparable(within, "none has the same duty and follows the model")
@@ -166,6 +167,7 @@ def against_baseline(
         course=course,
         refuses=refuses,
         chance=_of_both(rise.chance),
+        relative=None if relative is None else relative(rise.size, (max(0.0, rise.interval[0]), rise.interval[1])),
     )
 
 

@@ -13,6 +13,8 @@ from sealscope.diagnosis.calibration.thresholds import BY_STROKES, Calibration, 
 from sealscope.diagnosis.rms_change.by_recordings import by_recordings
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
+from sealscope.diagnosis.verdict.machine import assumed_rig
+from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import FEWEST
 from sealscope.recordings.recording import Recording
@@ -70,15 +72,22 @@ def calibrate_on(
 
 
 def diagnose_calibrated(
-    recording: Recording, calibration: Calibration, *, file: str | None = None, rig: Rig | str = "thesis"
+    recording: Recording,
+    calibration: Calibration,
+    *,
+    file: str | None = None,
+    rig: Rig | str | None = None,
+    limit: str | None = None,
 ) -> Diagnosis:
     """Say whether oil bypasses the piston, by the thresholds of a calibration.
 
     The first of the calibration's detectors that judges at the recording's operating point makes the verdict, at its
     false-alarm probability; the others are stated as methods. A recording outside the calibrated operating points, or
     one the data of which cannot be trusted, is `cannot tell`, with the reason. `rig`: what detectors may assume of the
-    machine, the same as for the calibration.
+    machine, the same as for the calibration; `limit`: leak from which the machine is to be repaired (`diagnose`).
     """
+    repair = RepairLimit.of(limit)
+    known, machine = assumed_rig(rig, recording)
     judged = inspected(recording)
     group = judged.defect or calibration.find(Place.of(judged.part))
     probability = calibration.false_alarm_probability
@@ -86,7 +95,7 @@ def diagnose_calibrated(
     if isinstance(group, str):
         methods = [Evidence("cannot tell", group, detector=name) for name in calibration.detectors]
     else:
-        look = look_at(judged.part, calibration.split_share, probability, rig)
+        look = look_at(judged.part, calibration.split_share, probability, known)
         for name in sorted(calibration.detectors, key=lambda name: not group.judges(name)):
             detector, view = split_view(name)
             if name == BY_STROKES and group.leak_free is not None:
@@ -95,11 +104,14 @@ def diagnose_calibrated(
                 continue
             score = scorer(detector).score(look.through(calibration.views[view]) if view else look)
             methods.append(_evidence(name, score, group, probability))
-    return Diagnosis(
-        **vars(replace(methods[0], parts=tuple(methods))),
-        file=file or str(recording.provenance.get("file", "recording")),
+    return Diagnosis.of(
+        replace(methods[0], parts=tuple(methods)),
+        recording,
+        machine,
+        file=file,
         false_alarm_probability=probability,
         quality=judged.findings,
+        limit=repair,
     )
 
 

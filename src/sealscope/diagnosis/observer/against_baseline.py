@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import DayToDay, Level, against_baseline, incomparable
-from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, misfit, within
+from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, misfit, states_flow, within
 from sealscope.diagnosis.observer.model import G_UNIT
 from sealscope.diagnosis.observer.stream import Formulation, formulation_of
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.evidence import NO_RIG, Evidence, without_flow
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -37,7 +37,8 @@ def compare(
 
     A baseline recording can be compared where it has the same formulation, and where the model describes it.
     """
-    inner = within(series, step)
+    states = states_flow(series.formulation, rig)
+    inner = within(series, step, states_flow=states)
     levels: list[Level] = []
     reasons: list[str] = []
     for other in baseline:
@@ -52,17 +53,19 @@ def compare(
     if not levels:
         return incomparable(inner, reasons[0])
     expected = float(np.mean([known.value for known in levels]))
-    return against_baseline(
+    evidence = against_baseline(
         inner,
         level(series),
         levels,
         day_to_day(series.formulation, levels),
         probability,
         part="conductance against the baseline",
-        flows=(G_UNIT * float(np.mean(series.dp)) / LITRE_PER_MINUTE,),
+        flows=(G_UNIT * float(np.mean(series.dp)) / LITRE_PER_MINUTE,) if states else (),
         cause="piston or pump leak",
         course=course(series, step, expected),
     )
+    from_level = evidence.verdict == "leak" and inner.verdict != "leak"
+    return without_flow(evidence, NO_RIG) if from_level and not states else evidence
 
 
 def day_to_day(formulation: Formulation, baseline: Sequence[Level]) -> DayToDay:

@@ -18,7 +18,7 @@ from sealscope.diagnosis.baseline.level import share_of_each
 from sealscope.diagnosis.changepoint.random_walk import FEWEST, WalkStep, find_leak_step
 from sealscope.diagnosis.observer.against_baseline import compare
 from sealscope.diagnosis.observer.estimates import Estimates
-from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, orifice_over_laminar, within
+from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, orifice_over_laminar, states_flow, within
 from sealscope.diagnosis.observer.stream import Formulation, ObserverStream, channels_of, formulation_of, whole
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
@@ -106,7 +106,8 @@ class Observer:
         probability = share_of_each(false_alarm_probability, baseline)
         step = self._step(series, probability)
         if not baseline:
-            return replace(within(series, step), share=series.share)
+            states = states_flow(series.formulation, self.rig)
+            return replace(within(series, step, states_flow=states), share=series.share)
 
         def follow(other: Recording) -> ConductanceSeries:
             return remembered(other, (self.name, self.rig), self.follow)

@@ -12,7 +12,7 @@ from sealscope.diagnosis.observer.estimates import Estimates
 from sealscope.diagnosis.observer.model import G_UNIT, PARAMETERS, STIFFNESS
 from sealscope.diagnosis.observer.stream import Formulation
 from sealscope.diagnosis.observer.volume_filter import VOLUME_STATES
-from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
+from sealscope.diagnosis.verdict.evidence import NO_RIG, Evidence, LeakCourse, without_flow
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -116,8 +116,14 @@ def misfit(estimates: Estimates, formulation: Formulation, rig: Rig) -> str | No
     return None
 
 
-def within(series: ConductanceSeries, step: WalkStep) -> Evidence:
-    """Return the evidence from the step within a recording."""
+def states_flow(formulation: Formulation, rig: Rig) -> bool:
+    """Return whether the rig states what turns a conductance into L/min; the ringing needs the moving mass, too."""
+    geometry = ("cylinder.A_A", "cylinder.A_B", "pump.q_b")
+    return rig.states(*geometry) and (formulation == "volume" or rig.states("cylinder.M_eq"))
+
+
+def within(series: ConductanceSeries, step: WalkStep, *, states_flow: bool = True) -> Evidence:
+    """Return the evidence from the step within a recording; `states_flow`: whether L/min may be stated."""
     from scipy.special import stdtrit
 
     edges = series.instants([step.onset, *step.onset_interval])
@@ -134,10 +140,10 @@ def within(series: ConductanceSeries, step: WalkStep) -> Evidence:
     figures = f"score {step.score:.2f}, threshold {step.threshold:.2f}; {MEANS[series.formulation]}"
     if step.alarm:
         before = series.t < onset - series.block_s
-        return Evidence(
+        by = f" by {lpm:.4f} L/min" if states_flow else ""
+        leak = Evidence(
             "leak",
-            f"what passes between the chambers rose by {lpm:.4f} L/min at {onset:.1f} s ({figures}), past the piston "
-            "or in the pump",
+            f"what passes between the chambers rose{by} at {onset:.1f} s ({figures}), past the piston or in the pump",
             step.score,
             step.threshold,
             onset,
@@ -148,17 +154,15 @@ def within(series: ConductanceSeries, step: WalkStep) -> Evidence:
             course=course(series, step, float(np.mean(series.G[before])) if np.any(before) else 0.0),
             chance=step.chance,
         )
+        return leak if states_flow else without_flow(leak, NO_RIG)
+    drawn = course(series, step, None) if states_flow else None
     if step.score > step.threshold:
         reason = f"what passes between the chambers rose evenly from the beginning on, as in a warm-up ({figures})"
-        return Evidence(
-            "cannot tell", reason, step.score, step.threshold, course=course(series, step, None), chance=step.chance
-        )
+        return Evidence("cannot tell", reason, step.score, step.threshold, course=drawn, chance=step.chance)
     reason = f"what passes between the chambers did not rise within the recording ({figures})"
-    if series.formulation == "volume":
+    if series.formulation == "volume" and states_flow:
         reason += f"; pump and piston together let {float(np.median(series.G)) * unit:.4f} L/min pass"
-    return Evidence(
-        "no leak", reason, step.score, step.threshold, course=course(series, step, None), chance=step.chance
-    )
+    return Evidence("no leak", reason, step.score, step.threshold, course=drawn, chance=step.chance)
 
 
 def course(series: ConductanceSeries, step: WalkStep, level: float | None) -> LeakCourse:

@@ -17,7 +17,7 @@ import numpy as np
 
 from sealscope.diagnosis.baseline.level import DayToDay, against_baseline, incomparable, share_of_each
 from sealscope.diagnosis.changepoint.tails import largest_normal, near_best, seed_of
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse
+from sealscope.diagnosis.verdict.evidence import NO_RIG, Cause, Evidence, LeakCourse, without_flow
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import constant
@@ -58,6 +58,8 @@ class PressureModel:
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
+        # the ringing shows flows beside the moving mass over the area squared
+        self.states_flow = rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
     def usable(self, recording: Recording) -> str | None:
         """Return None where the record has what the model needs, else the reason why not."""
@@ -86,6 +88,8 @@ class PressureModel:
         probability = share_of_each(false_alarm_probability, baseline)
         within = _within(followed, recording, probability)
         within = replace(within, share=followed.share)
+        if not self.states_flow and within.verdict == "leak":
+            within = without_flow(within, NO_RIG)
         if not baseline or within.score is None:
             return within
         if not is_followed(followed):
@@ -98,9 +102,11 @@ class PressureModel:
             DAY_TO_DAY,
             probability,
             part="level of G",
-            flows=(_mean_drop(recording) / LITRE_PER_MINUTE,),
+            flows=(_mean_drop(recording) / LITRE_PER_MINUTE,) if self.states_flow else (),
             cause="piston or pump leak",
         )
+        if not self.states_flow and level.verdict == "leak" and level.onset_s is None:
+            level = without_flow(level, NO_RIG)
         return replace(level, share=followed.share)
 
     def follow(self, recording: Recording) -> Followed | str:

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any
 
 from sealscope.diagnosis.verdict.evidence import RAREST, Cause, Evidence, Passage, Verdict
+from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
+from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
+from sealscope.recordings.recording import Recording
+
+#: What a file may call the name of the machine.
+_MACHINE = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
 
 _CHECKS: Mapping[Cause, str] = {
     "piston leak": (
@@ -84,12 +91,63 @@ class Diagnosis(Evidence):
         Findings on the data.
     baselines : int
         Leak-free recordings that it was compared with.
+    machine : AssumedMachine, optional
+        What was assumed of the machine, and what of it was stated.
+    limit : RepairLimit
+        Leak from which the machine is to be repaired.
+    about : mapping of str to str
+        What the file says of its recording: operator, machine, oil temperature.
+    start : str, optional
+        When the recording began, as ISO 8601, where the file says so.
     """
 
     file: str = "recording"
     false_alarm_probability: float
     quality: tuple[Finding, ...] = ()
     baselines: int = 0
+    machine: AssumedMachine | None = None
+    limit: RepairLimit = field(default_factory=lambda: RepairLimit.of(None))
+    about: Mapping[str, str] = field(default_factory=dict)
+    start: str | None = None
+
+    @classmethod
+    def of(
+        cls, evidence: Evidence, recording: Recording, machine: AssumedMachine, *, file: str | None, **stated: Any
+    ) -> Diagnosis:
+        """Return the diagnosis of a recording by its evidence, with what the file says of itself.
+
+        `file`: name of the recording, by default that of its file; `stated`: the other fields.
+        """
+        if evidence.relative is None:
+            evidence = replace(evidence, relative=beside_the_pump(evidence, recording, machine))
+        start = recording.provenance.get("start")
+        return cls(
+            **vars(evidence),
+            file=file or str(recording.provenance.get("file", "recording")),
+            machine=machine,
+            about=remarks_of(recording.provenance),
+            start=None if start is None else str(start),
+            **stated,
+        )
+
+    @property
+    def severity(self) -> Severity | None:
+        """How bad the leak is; None where there is none, or nothing is known of its size."""
+        return severity(self, self.limit)
+
+    @property
+    def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
+        """Displacement over area as measured, over the assumed one, and its interval; None where not measured."""
+        for own in (self, *self.parts):
+            if own.ratio is not None and own.ratio_interval is not None:
+                return own.ratio, own.ratio_interval
+        return None
+
+    @property
+    def machine_name(self) -> str | None:
+        """What the file calls the machine; None where it does not say."""
+        names = {name.lower(): text for name, text in self.about.items()}
+        return next((names[name] for name in _MACHINE if name in names), None)
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
@@ -151,6 +209,26 @@ class Diagnosis(Evidence):
             "passage": None if self.passage is None else _plain_passage(self.passage),
             "chance": _chance(self),
             "odds": self.odds,
+            "summary": self.summary,
+            "start": self.start,
+            "machine": self.machine_name,
+            "about": dict(self.about),
+            "rig": None if self.machine is None else self.machine.as_dict(),
+            "severity": None if self.severity is None else self.severity.as_dict(),
+            "limit": self.limit.as_dict(),
+            "evidence": self._evidence(),
+        }
+
+    def _evidence(self) -> dict[str, Any]:
+        """Return what the verdict rests on as plain JSON values."""
+        ratio = self.measured_ratio
+        return {
+            "detector": self.detector or None,
+            "share": float(self.share),
+            "baselines": self.baselines,
+            "ratio": None if ratio is None else _plain(ratio[0]),
+            "ratio_interval": None if ratio is None else _pair(ratio[1]),
+            "refuses": sorted(self.refuses),
         }
 
     def __str__(self) -> str:
@@ -197,6 +275,8 @@ def _plain_passage(passage: Passage) -> dict[str, Any]:
         "pressure_Pa": _plain(passage.pressure),
         "findable_lpm": _plain(passage.findable_lpm),
         "healthy_lpm": _plain(passage.healthy_lpm),
+        "pump_share": _plain(passage.pump_share),
+        "findable_share": _plain(passage.findable_share),
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from sealscope.recordings.recording import Array
@@ -19,6 +19,8 @@ Cause = Literal[
     "sensor fault",
     "changed duty",
 ]
+#: Why no flow is stated where it rests on a rig that nobody stated.
+NO_RIG = "L/min is not stated: no rig was stated (--rig)"
 #: Figures that a detector may refuse to state.
 Figure = Literal["onset_s", "leak_lpm"]
 #: The causes for which the verdict is `leak`: piston and pump lie in parallel, and often no channel tells them apart.
@@ -50,26 +52,50 @@ class Passage:
 
     Parameters
     ----------
-    lpm, interval_lpm : float and pair of floats
-        Mean flow, and its 95 % interval [L/min].
+    lpm, interval_lpm : float and pair of floats, or None
+        Mean flow, and its 95 % interval [L/min]; None where the machine's size is not known.
     pressure : float
         Mean size of the pressure difference at which it flows [Pa].
     findable_lpm : float, optional
         Smallest step of that flow that would have been found [L/min]; None where a step was found.
     healthy_lpm : float, optional
         The most that a healthy machine passes at that pressure [L/min], by the rig; None where the rig does not say.
+    pump_share, findable_share : float, optional
+        The flow, and the smallest step, over the pump's mean flow.
     """
 
-    lpm: float
-    interval_lpm: tuple[float, float]
+    lpm: float | None
+    interval_lpm: tuple[float, float] | None
     pressure: float
     findable_lpm: float | None = None
     healthy_lpm: float | None = None
+    pump_share: float | None = None
+    findable_share: float | None = None
 
     @property
     def healthy(self) -> bool:
         """Whether it is surely no more than a healthy machine passes."""
-        return self.healthy_lpm is not None and self.interval_lpm[1] <= self.healthy_lpm
+        known = self.healthy_lpm is not None and self.interval_lpm is not None
+        return known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
+
+
+@dataclass(frozen=True)
+class RelativeLeak:
+    """A leak beside what the recording itself measures: known without area and displacement.
+
+    Parameters
+    ----------
+    pump_share, pump_share_interval : float and pair of floats, optional
+        Leak over the pump's mean flow, and its 95 % interval; None where the pump's motion is not recorded.
+    creep, creep_interval : float and pair of floats, optional
+        Leak over the piston's area: the speed at which the piston would creep with its lines shut [m/s], and its 95 %
+        interval; None where the position has no unit.
+    """
+
+    pump_share: float | None = None
+    pump_share_interval: tuple[float, float] | None = None
+    creep: float | None = None
+    creep_interval: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -110,6 +136,11 @@ class Evidence:
         Probability that a leak-free recording scores as high, by the detector's own null distribution; at most the
         false-alarm probability where the score is over the threshold. None where the detector does not state it. Less
         than `RAREST` is not told apart from it.
+    relative : RelativeLeak, optional
+        The leak beside the pump's flow and as a speed of the piston, where the recording itself measures these; stated
+        also where L/min is refused.
+    ratio, ratio_interval : float and pair of floats, optional
+        Displacement over area as measured, over the assumed one, and its 95 % interval, where the detector measures it.
     """
 
     verdict: Verdict
@@ -129,6 +160,9 @@ class Evidence:
     detector: str = ""
     usable: bool = True
     chance: float | None = None
+    relative: RelativeLeak | None = None
+    ratio: float | None = None
+    ratio_interval: tuple[float, float] | None = None
 
     @property
     def alarmed(self) -> bool:
@@ -141,6 +175,15 @@ class Evidence:
         return self.verdict == "cannot tell" and self.cause is None and not self.alarmed
 
     @property
+    def summary(self) -> str:
+        """The verdict in words; a change with another cause than a leak past piston or pump stands before it."""
+        if self.cause is None or self.cause in LEAKS or self.verdict == "leak":
+            return self.verdict
+        if self.verdict == "cannot tell":
+            return f"cannot tell ({self.cause})"
+        return f"{self.cause} ({'none' if self.cause.endswith('leak') else 'no leak'} across the piston)"
+
+    @property
     def odds(self) -> str | None:
         """How many healthy recordings look like this one, in words; None where that is not stated."""
         if self.chance is None:
@@ -150,6 +193,18 @@ class Evidence:
         if self.chance >= OFTEN:
             return f"more than 1 in {1.0 / OFTEN:.0f} healthy recordings look like this"
         return f"1 in {grouped(1.0 / self.chance)} healthy recordings looks like this"
+
+
+def without_flow(evidence: Evidence, why: str) -> Evidence:
+    """Return the evidence without L/min, which is refused, and with the reason for that."""
+    return replace(
+        evidence,
+        reason=f"{evidence.reason}; {why}",
+        leak_lpm=None,
+        leak_interval_lpm=None,
+        course=None,
+        refuses=evidence.refuses | {"leak_lpm"},
+    )
 
 
 def grouped(value: float) -> str:

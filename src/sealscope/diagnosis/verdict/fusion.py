@@ -35,7 +35,7 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     if judge.verdict == "leak":
         refused = frozenset[Figure]().union(*(own.refuses for own in usable))
         fused, lent = _with_estimates(judge, [own for own in others if own.verdict == "leak"], refused)
-        fused = replace(fused, refuses=refused)
+        fused = replace(fused, refuses=frozenset(name for name in refused if getattr(fused, name) is None))
         reasons += lent
     else:
         fused = replace(judge, onset_s=None, onset_interval_s=None)

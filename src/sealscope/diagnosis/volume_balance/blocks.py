@@ -43,7 +43,8 @@ class BalanceBlocks:
 
     `t` (n,): middles [s]; `gram` (n, c, c): sums of products of the columns beyond offset, slope and stored oil;
     `slope` (n, c): slopes of the columns [1/s] beside the stored oil; `stored` (n, c): their coefficients of dp;
-    `abs_dp`, `root_dp` (n,): means of abs(dp), sqrt(abs(dp)), of dp smoothed; `lift` (n,): the share by which noise
+    `abs_dp`, `root_dp` (n,): means of abs(dp), sqrt(abs(dp)), of dp smoothed; `abs_flow` (n,): mean size of the pump's
+    flow, smoothed, by the assumed displacement [m^3/s]; `lift` (n,): the share by which noise
     lifts that root where dp is not smoothed; `motion` (n,): mean of dp times the piston's velocity; `walk` (n,):
     variance of the conductance, over its square, that the noise of dp makes in the integral; `filled` (n,): by how much
     the sum of both pressures rises from the first tenth of a block to its last; `noise`, `noise_12` (n,):
@@ -56,6 +57,7 @@ class BalanceBlocks:
     stored: Array
     abs_dp: Array
     root_dp: Array
+    abs_flow: Array
     lift: Array
     motion: Array
     walk: Array
@@ -196,11 +198,15 @@ class Geometry:
         Displacement of the pump [m^3/rad].
     unequal : bool
         Whether the areas of the two sides differ.
+    area_stated, displacement_stated : bool
+        Whether they are this machine's, or were merely assumed.
     """
 
     area: float
     displacement: float
     unequal: bool = False
+    area_stated: bool = True
+    displacement_stated: bool = True
 
 
 def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple[Array, Array, Array]:
@@ -284,7 +290,9 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
     rest, slope, stored = _beyond(columns, dp, step)
     noise, root = _noise(dp), np.sqrt(np.abs(smooth)).mean(axis=1)
     abs_dp, root_dp = np.abs(smooth).mean(axis=1), root
+    abs_flow = np.abs(_smooth(columns[:, FLOW], 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)).mean(axis=1)
     if motion is not None:
+        abs_flow = abs_flow * float(np.mean(motion[0]))
         abs_dp, root_dp = _over_rests(everything, *motion, length, rate)[:, :count][:, usable]
     x, both, tenth = columns[:, Y], cut["p_A"] + cut["p_B"], max(1, length // 10)
     return BalanceBlocks(
@@ -294,6 +302,7 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
         stored=stored,
         abs_dp=abs_dp,
         root_dp=root_dp,
+        abs_flow=abs_flow,
         lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root, np.finfo(float).tiny) - 1.0,
         motion=np.sum(0.5 * (dp[:, 1:] + dp[:, :-1]) * np.diff(x, axis=1), axis=1) / (length * step),
         walk=noise * _walk(rest[:, I_AB], step),

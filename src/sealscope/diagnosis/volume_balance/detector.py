@@ -56,7 +56,13 @@ class VolumeBalance:
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         areas = rig.cylinder.A_A, rig.cylinder.A_B
-        self.geometry = Geometry(0.5 * sum(areas), rig.pump.q_b / (2.0 * np.pi), areas[0] != areas[1])
+        self.geometry = Geometry(
+            0.5 * sum(areas),
+            rig.pump.q_b / (2.0 * np.pi),
+            areas[0] != areas[1],
+            rig.states("cylinder.A_A", "cylinder.A_B"),
+            rig.states("pump.q_b"),
+        )
 
     def usable(self, recording: Recording) -> str | None:
         """Return None where the recording has what the balance needs, else the reason why not."""
@@ -121,7 +127,7 @@ class VolumeBalance:
             )
         if not np.all(np.isfinite(blocks.gram)):
             return None, "the balance cannot be computed: values are beyond floating point"
-        fit = fit_balance(blocks, metres=recording.units["x"] == "m", unequal=self.geometry.unequal)
+        fit = fit_balance(blocks, metres=recording.units["x"] == "m", geometry=self.geometry)
         problem = trouble(fit) or _unseen(recording, fit)
         return (fit, "") if problem is None else (None, problem)
 

@@ -7,18 +7,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.baseline.level import DayToDay, Level, against_baseline
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, DriftStep
-from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Figure, LeakCourse, Passage, Verdict
+from sealscope.diagnosis.verdict.evidence import (
+    LEAKS,
+    Cause,
+    Evidence,
+    Figure,
+    LeakCourse,
+    Passage,
+    RelativeLeak,
+    Verdict,
+)
 from sealscope.diagnosis.volume_balance.blocks import FLOW, Y
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, Law, discriminate, findable, search
 from sealscope.diagnosis.volume_balance.growth import grown
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
-#: Displacement over area may differ by this share from the assumed before L/min is not stated.
+#: Displacement over area may differ by this share from that of a stated machine before L/min is not stated.
 GEOMETRY = 0.15
+#: ... and by this share, beside the error of the fit, from that of the default rig, before it is said to be another
+#: machine. Assumed: makers state displacements to some per cent.
+UNSTATED_GEOMETRY = 0.05
 #: Relative deviation of what every L/min is multiplied by: scale of the position, mean pressure difference. The mean
 #: root of the difference is uncertain by the share that noise lifts it, too.
 _RELATIVE = 0.003
@@ -91,22 +104,25 @@ def judge(
     """
     step, growth = search(fit, probability), grown(fit, probability)
     if growth is not None and not (step.alarm and step.size > _WHOLE * growth.size):
-        return replace(describe_leak(fit, growth), passage=passage(fit, None, healthy))
+        return _measured(replace(describe_leak(fit, growth), passage=passage(fit, None, healthy)), fit)
     if step.alarm:
         evidence = describe_leak(fit, step if dated is None else dated(fit, step))
-        return replace(evidence, passage=passage(fit, None, healthy))
+        return _measured(replace(evidence, passage=passage(fit, None, healthy)), fit)
     if window:
         return no_step(fit, step, None, 0.0)
     smallest = findable(fit, probability, step.noise)
     evidence = no_step(fit, step, search(fit, probability, sign=-1), smallest)
-    return _from_the_start(replace(evidence, passage=passage(fit, smallest, healthy)), fit, probability)
+    evidence = replace(evidence, passage=passage(fit, smallest, healthy), refuses=_refused(fit))
+    return _measured(_from_the_start(evidence, fit, probability), fit)
 
 
 def judge_level(fit: BalanceFit, baseline: Sequence[BalanceFit], within: Evidence, probability: float) -> Evidence:
     """Return the evidence of the conductance of the whole recording against that of leak-free recordings."""
     same = [other for other in baseline if abs(other.scale / fit.scale - 1.0) <= _SAME_MACHINE]
     levels = [level(other) for other in same if other.sense == fit.sense]
-    return against_baseline(
+    every = np.ones(len(fit.blocks), dtype=bool)
+    unit = float(fit.unit_flow("laminar").mean())
+    evidence = against_baseline(
         within,
         level(fit),
         levels,
@@ -116,7 +132,9 @@ def judge_level(fit: BalanceFit, baseline: Sequence[BalanceFit], within: Evidenc
         flows=[_mean_flow(fit, law) for law in ("laminar", "orifice")] if states_flow(fit) else (),
         cause="piston or pump leak",
         refuses=_refused(fit),
+        relative=lambda size, limits: _relative(fit, size * unit, (limits[0] * unit, limits[1] * unit), every),
     )
+    return _measured(evidence, fit)
 
 
 def day_to_day(baseline: Sequence[Level]) -> DayToDay:
@@ -155,19 +173,67 @@ def level(fit: BalanceFit) -> Level:
     return Level(mean, float(np.sqrt(np.sum((weight * fit.sd) ** 2) + common @ common + (_LEVEL * mean) ** 2)))
 
 
-def _geometry_fits(fit: BalanceFit) -> bool:
+def _geometry_agrees(fit: BalanceFit) -> bool:
     """Return whether displacement over area is near the assumed one, whichever way the encoders count."""
-    return abs(abs(fit.scale) - 1.0) <= GEOMETRY
+    known = fit.geometry
+    far = GEOMETRY if known.area_stated or known.displacement_stated else UNSTATED_GEOMETRY + 2.0 * fit.scale_sd
+    return abs(abs(fit.scale) - 1.0) <= far
+
+
+def _geometry_fits(fit: BalanceFit) -> bool:
+    """Return whether volumes are known, by what is stated of area and displacement.
+
+    One of the two gives volumes, the piston's or the pump's (`BalanceFit.by_pump`); where the other one is stated, too,
+    their ratio as measured must agree. Where that one is not stated, no ratio tells the size of the machine.
+    """
+    known = fit.geometry
+    if known.area_stated and known.displacement_stated:
+        return _geometry_agrees(fit)
+    if fit.unequal:  # volumes are the pump's, the piston's area joins both sides
+        return known.displacement_stated or (known.area_stated and _geometry_agrees(fit))
+    return known.area_stated or known.displacement_stated
 
 
 def states_flow(fit: BalanceFit) -> bool:
-    """Return whether the balance gives L/min: a position with a unit, and the assumed geometry."""
+    """Return whether the balance gives L/min: a position with a unit, and a geometry that is known."""
     return fit.metres and _geometry_fits(fit)
+
+
+def _no_flow_text(fit: BalanceFit, lpm: float | None = None) -> str:
+    """Return why L/min is not stated; `lpm`: what it would be for a machine of the assumed size."""
+    if not fit.metres:
+        return "L/min is not stated: the position is in counts"
+    ratio = f"displacement over area is {abs(fit.scale):.3g} times"
+    if fit.geometry.area_stated or fit.geometry.displacement_stated:
+        return f"L/min is not stated: {ratio} the assumed one, so the geometry is another"
+    ask = "state --rig, --area or --displacement"
+    if not _geometry_agrees(fit):
+        return f"L/min is not stated: no rig was stated, and {ratio} that of the default rig: another geometry; {ask}"
+    would = "" if lpm is None else f" ({lpm:.2g} L/min if the piston has {1e6 * fit.geometry.area:.4g} mm^2)"
+    return f"L/min is not stated: no rig was stated, and the size of a machine cannot be measured{would}; {ask}"
 
 
 def _refused(fit: BalanceFit) -> frozenset[Figure]:
     """Refuse L/min where the geometry is another: no other detector knows the geometry better."""
     return frozenset({"leak_lpm"}) if fit.metres and not _geometry_fits(fit) else frozenset()
+
+
+def _measured(evidence: Evidence, fit: BalanceFit) -> Evidence:
+    """Return the evidence with displacement over area as measured, over the assumed one."""
+    half = 1.96 * math.hypot(fit.scale_sd, _RELATIVE * fit.scale)
+    ratio = abs(fit.scale)
+    return replace(evidence, ratio=ratio, ratio_interval=(ratio - half, ratio + half)) if fit.metres else evidence
+
+
+def _relative(fit: BalanceFit, leak: float, limits: tuple[float, float], open_: NDArray[np.bool_]) -> RelativeLeak:
+    """Return a leak, its flow counted as `unit_flow` does [m^3/s], beside the pump's flow and as a speed."""
+    piston = abs(fit.scale) if fit.by_pump else 1.0  # volumes of the piston over the assumed area
+    pump = abs(fit.scale) * float(np.mean(fit.blocks.abs_flow[open_]))
+    shares = [piston * flow / max(pump, np.finfo(float).tiny) for flow in (leak, *limits)]
+    speeds = [piston * flow / fit.geometry.area for flow in (leak, *limits)]
+    if not fit.metres:
+        return RelativeLeak(shares[0], (shares[1], shares[2]))
+    return RelativeLeak(shares[0], (shares[1], shares[2]), speeds[0], (speeds[1], speeds[2]))
 
 
 def _mean_flow(fit: BalanceFit, law: Law = "laminar") -> float:
@@ -199,27 +265,42 @@ def _part(step: DriftStep) -> Evidence:
 
 
 def _flow_text(conductance: float, fit: BalanceFit) -> str:
-    """Return a conductance as a flow under the recording's own pressure difference, or as a share without a unit."""
+    """Return a conductance as a flow under the recording's own pressure difference, or as a share of the pump's."""
     if states_flow(fit):
         return f"{conductance * _mean_flow(fit):.2g} L/min"
-    return f"{conductance / max(abs(level(fit).value), np.finfo(float).tiny):.0%} of the conductance"
+    return f"{100.0 * _pump_share(conductance, fit):.2g} % of the pump's flow"
 
 
-def passage(fit: BalanceFit, smallest: float | None, healthy: float | None) -> Passage | None:
-    """Return what pump and piston together pass over the recording, None where L/min cannot be stated.
+def _pump_share(conductance: float, fit: BalanceFit) -> float:
+    """Return the mean flow of a conductance over the pump's mean flow."""
+    flow = conductance * float(fit.unit_flow("laminar").mean())
+    every = np.ones(len(fit.blocks), dtype=bool)
+    return _relative(fit, flow, (flow, flow), every).pump_share or 0.0
+
+
+def passage(fit: BalanceFit, smallest: float | None, healthy: float | None) -> Passage:
+    """Return what pump and piston together pass over the recording, in L/min where that can be stated.
 
     `smallest`: step of the conductance that would have been found; `healthy`: conductance of a healthy machine.
     """
-    if not states_flow(fit):
-        return None
     own, flow = level(fit), _mean_flow(fit)
     flows = (flow, _mean_flow(fit, "orifice"))
     mean, half = own.value + (fit.pump or 0.0), 1.96 * math.hypot(own.error, fit.pump_sd, _UNKNOWN_LAW * own.value)
-    return Passage(
+    smallest = None if smallest is None or not math.isfinite(smallest) else smallest
+    relative = Passage(
+        lpm=None,
+        interval_lpm=None,
+        pressure=float(fit.blocks.abs_dp.mean()),
+        pump_share=_pump_share(max(mean, 0.0), fit),
+        findable_share=None if smallest is None else _pump_share(smallest, fit),
+    )
+    if not states_flow(fit):
+        return relative
+    return replace(
+        relative,
         lpm=max(mean, 0.0) * flow,
         interval_lpm=(max(mean - half, 0.0) * min(flows), max(mean + half, 0.0) * max(flows)),
-        pressure=float(fit.blocks.abs_dp.mean()),
-        findable_lpm=None if smallest is None or not math.isfinite(smallest) else smallest * flow,
+        findable_lpm=None if smallest is None else smallest * flow,
         healthy_lpm=None if healthy is None else healthy * flow,
     )
 
@@ -229,12 +310,16 @@ def _from_the_start(evidence: Evidence, fit: BalanceFit, probability: float) -> 
     passes = evidence.passage
     if evidence.verdict != "no leak" or passes is None or passes.healthy_lpm is None:
         return evidence
+    if passes.lpm is None or passes.interval_lpm is None:
+        return evidence
     own = level(fit)
     score = (own.value + (fit.pump or 0.0) - passes.healthy_lpm / _mean_flow(fit)) / math.hypot(own.error, fit.pump_sd)
     threshold = _normal_quantile(probability)
     if score <= threshold:
         return evidence
     low, high = passes.interval_lpm
+    lpm, interval = passes.lpm - passes.healthy_lpm, (max(low - passes.healthy_lpm, 0.0), high)
+    flow, *limits = (LITRE_PER_MINUTE * value for value in (lpm, *interval))
     return replace(
         evidence,
         verdict="leak",
@@ -245,18 +330,19 @@ def _from_the_start(evidence: Evidence, fit: BalanceFit, probability: float) -> 
         score=score,
         threshold=threshold,
         chance=_normal_tail(score),
-        leak_lpm=passes.lpm - passes.healthy_lpm,
-        leak_interval_lpm=(max(low - passes.healthy_lpm, 0.0), high),
+        leak_lpm=lpm,
+        leak_interval_lpm=interval,
+        relative=_relative(fit, flow, (limits[0], limits[1]), np.ones(len(fit.blocks), dtype=bool)),
         cause="piston or pump leak",
     )
 
 
 def _passes_text(passes: Passage) -> str:
-    low, high = passes.interval_lpm
-    return (
-        f"pump and piston together pass {passes.lpm:.2g} L/min ({low:.2g} to {high:.2g}) at "
-        f"{passes.pressure / 1e6:.2g} MPa"
-    )
+    if passes.lpm is None or passes.interval_lpm is None:
+        flow = f"{100.0 * (passes.pump_share or 0.0):.2g} % of the pump's flow"
+    else:
+        flow = f"{passes.lpm:.2g} L/min ({passes.interval_lpm[0]:.2g} to {passes.interval_lpm[1]:.2g})"
+    return f"pump and piston together pass {flow} at {passes.pressure / 1e6:.2g} MPa"
 
 
 def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: float) -> Evidence:
@@ -293,16 +379,14 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
             f"leak does, and never rises beyond its drift ({_figures(step)})"
         )
     if verdict == "no leak":
-        if (passes := passage(fit, smallest, None)) is not None:
-            reason += f"; {_passes_text(passes)}"
-            if fit.pump is not None:
-                reason += f", the pump {fit.pump * _mean_flow(fit):.2g} L/min of it"
-            reason += ", in which a leak from the start would be hidden"
-        elif _refused(fit):
-            reason += (
-                f"; displacement over area is {abs(fit.scale):.3g} times the assumed one: another geometry, or a leak "
-                "from the start that takes most of the flow"
-            )
+        reason += f"; {_passes_text(passage(fit, smallest, None))}"
+        if fit.pump is not None:
+            reason += f", the pump {_flow_text(fit.pump, fit)} of it"
+        reason += ", in which a leak from the start would be hidden"
+        if _refused(fit):
+            reason += f"; {_no_flow_text(fit)}"
+            if not _geometry_agrees(fit):
+                reason += ", or a leak from the start takes most of the flow"
         if smallest > 0.0:
             reason += f"; the smallest step that would have shown is {_flow_text(smallest, fit)}"
     return Evidence(
@@ -324,15 +408,8 @@ def describe_leak(fit: BalanceFit, step: DriftStep) -> Evidence:
     open_ = shape >= 1.0 if step.rise == 0.0 else shape > 0.0
     size, size_sd = step.size, step.size_sd
     laws, law_text = _laws(near)
-    lpm, interval, course = None, None, None
-    if not fit.metres:
-        by = f" by {_flow_text(size, fit)}; L/min is not stated: the position is in counts"
-    elif not _geometry_fits(fit) or not open_.any():
-        by = (
-            f" by {_flow_text(size, fit)}; L/min is not stated: displacement over area is {abs(fit.scale):.3g} times "
-            "the assumed one, so the geometry is another"
-        )
-    else:
+    lpm, interval, course, relative = None, None, None, None
+    if open_.any():
         flows = [float(np.mean((fit.unit_flow(law) * shape)[open_])) / LITRE_PER_MINUTE for law in laws]
         lift = float(np.mean(np.abs(fit.blocks.lift[open_])))
         halves = [
@@ -344,8 +421,14 @@ def describe_leak(fit: BalanceFit, step: DriftStep) -> Evidence:
             max(0.0, min((size - half) * flow for half, flow in zip(halves, flows, strict=True))),
             max((size + half) * flow for half, flow in zip(halves, flows, strict=True)),
         )
+        low, high = (LITRE_PER_MINUTE * limit for limit in interval)
+        relative = _relative(fit, LITRE_PER_MINUTE * lpm, (low, high), open_)
+    if lpm is not None and interval is not None and states_flow(fit):
         course = _course(fit, step, shape, laws[0])
         by = f" by {lpm:.2g} L/min ({interval[0]:.2g} to {interval[1]:.2g})"
+    else:
+        by = f" by {_flow_text(size, fit)}; {_no_flow_text(fit, lpm)}"
+        lpm, interval = None, None
     grows = f", over {step.rise:.0f} s" if step.rise > 0 else ""
     reason = (
         f"the leakage conductance rises at {step.onset:.1f} s{grows}{by}; {place}{law_text} ({_figures(step)})"
@@ -365,10 +448,11 @@ def describe_leak(fit: BalanceFit, step: DriftStep) -> Evidence:
         course,
         _refused(fit),
         chance=step.chance,
+        relative=relative,
     )
     if evidence.verdict == "leak":
         return evidence
-    return replace(evidence, leak_lpm=None, leak_interval_lpm=None, course=None)
+    return replace(evidence, leak_lpm=None, leak_interval_lpm=None, course=None, relative=None)
 
 
 def _laws(near: dict[str, float]) -> tuple[tuple[Law, ...], str]:

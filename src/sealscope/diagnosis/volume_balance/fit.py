@@ -29,6 +29,7 @@ from sealscope.diagnosis.volume_balance.blocks import (
     Y_PUMP,
     Y_SIDE,
     BalanceBlocks,
+    Geometry,
     Y,
 )
 from sealscope.recordings.recording import Array
@@ -79,7 +80,7 @@ class BalanceFit:
     piston, or of both together [m^3/(s Pa)], positive where oil leaks; `sd` (n,): its deviation, from the residual and
     the noise of dp; `shared` (n, m): deviations common to the blocks, from the shared coefficients; `residual` [m^3]:
     rms; `signal` [m^3]: rms of the volume delivered; `slip` (n,): flow that nothing explains [m^3/s]; `metres`: the
-    position has a unit; `unequal`: the sides' areas differ.
+    position has a unit; `unequal`: the sides' areas differ; `scale_sd`: deviation of `scale`; `geometry`: as assumed.
     """
 
     blocks: BalanceBlocks
@@ -97,6 +98,8 @@ class BalanceFit:
     slip: Array
     metres: bool
     unequal: bool
+    scale_sd: float
+    geometry: Geometry
 
     @property
     def scale(self) -> float:
@@ -108,14 +111,23 @@ class BalanceFit:
         """Lag of the position's reading behind the angle's, tau [s]."""
         return float(-self.beta[1] / self.beta[0]) if self.beta[0] != 0 else float("inf")
 
+    @property
+    def by_pump(self) -> bool:
+        """Whether volumes are counted by the pump's displacement, and not by the piston's area.
+
+        They are where the areas of the piston's sides differ, and it depends on the load which of them counts; and
+        where the displacement is stated and the area is not.
+        """
+        return self.unequal or (self.geometry.displacement_stated and not self.geometry.area_stated)
+
     def unit_flow(self, law: Law) -> Array:
         """Return the mean flow (n,) [m^3/s] over each block of a leak that shows as one unit of conductance there.
 
         A laminar leak has the flow g abs(dp). A leak C sign(dp) sqrt(abs(dp)) through an orifice shows as ``g = C
-        <I_AB, I_root>/<I_AB, I_AB>`` and has the mean flow C sqrt(abs(dp)). Volumes are the piston's; where its sides'
-        areas differ, and it depends on the load which of them counts, they are the pump's.
+        <I_AB, I_root>/<I_AB, I_AB>`` and has the mean flow C sqrt(abs(dp)). Volumes are the piston's, or the pump's
+        (`by_pump`).
         """
-        volume = 1.0 / abs(self.scale) if self.unequal else 1.0
+        volume = 1.0 / abs(self.scale) if self.by_pump else 1.0
         if law == "laminar":
             return volume * self.blocks.abs_dp
         gram = self.blocks.gram
@@ -265,11 +277,11 @@ def _by_lesser_side(blocks: BalanceBlocks) -> BalanceBlocks:
     return replace(blocks, gram=turn @ blocks.gram @ turn.T, slope=blocks.slope @ turn.T, stored=blocks.stored @ turn.T)
 
 
-def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, unequal: bool = False) -> BalanceFit:
+def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometry) -> BalanceFit:
     """Fit the balance; blocks in which the machine stands or is filled, or that do not balance at all, are left out.
 
-    `unequal`: the areas of the piston's sides are known to differ. Needs one block or more; `residual` and `signal`
-    show a fit that means nothing (no motion, encoders that do not belong together).
+    `geometry`: what made volumes of the samples. Needs one block or more; `residual` and `signal` show a fit that means
+    nothing (no motion, encoders that do not belong together).
     """
     blocks = _by_lesser_side(blocks)
     keep = _moving(blocks) & ~_filling(blocks)
@@ -318,7 +330,9 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, unequal: bool = F
         signal=float(abs(beta[0]) * np.sqrt(np.median(used.gram[:, THETA, THETA]) / used.samples)),
         slip=slip,
         metres=metres,
-        unequal=unequal or bool({Y_PUMP, Y_SIDE} & set(shared)),
+        unequal=geometry.unequal or bool({Y_PUMP, Y_SIDE} & set(shared)),
+        scale_sd=float(np.sqrt(max(inverse[0, 0], 0.0) * usual)),
+        geometry=geometry,
     )
 
 

@@ -215,7 +215,7 @@ class SequentialBalance:
         self.state = BalanceState(end, before.blocks + 1, before.refused + (not usable), evidence, alarm, total)
 
     def _judge(self, blocks: BalanceBlocks, metres: bool) -> tuple[Evidence, float | None]:
-        fit = fit_balance(blocks, metres=metres, unequal=self._detector.geometry.unequal)
+        fit = fit_balance(blocks, metres=metres, geometry=self._detector.geometry)
         problem = trouble(fit)
         if problem is not None:
             return Evidence("cannot tell", problem), None

@@ -1,0 +1,169 @@
+"""How bad a leak is: as a flow, beside the pump's flow, as a speed of the piston, and against a repair limit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from sealscope.diagnosis.verdict.evidence import Evidence, RelativeLeak
+from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Recording
+from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+
+#: How much of the limit a leak takes: surely all of it, maybe half of it or more, surely less than half of it.
+Level = Literal["repair", "plan", "follow"]
+#: Share of the limit from which a repair is planned.
+HALF = 0.5
+_ML_PER_MINUTE, _MM_PER_MINUTE = 1e-6 / 60.0, 1e-3 / 60.0
+
+
+@dataclass(frozen=True)
+class RepairLimit:
+    """Leak from which a machine is to be repaired.
+
+    By default 8 mm/min: what a maker of excavators allows a boom cylinder in service, 24 mm in 3 minutes (Caterpillar,
+    330D, 336D and 340D, Testing and Adjusting, Cylinder Drift - Check (Loaded Bucket); new 6 mm, rebuilt 12 mm). As a
+    speed it holds for a piston of any area: 5.1 mL/min for one of 633 mm^2.
+
+    Parameters
+    ----------
+    value : float
+        Flow [m^3/s], or speed at which the piston creeps with its lines shut [m/s].
+    kind : {"flow", "creep"}
+    stated : bool
+        Whether the caller stated it.
+    """
+
+    value: float
+    kind: Literal["flow", "creep"]
+    stated: bool
+
+    @classmethod
+    def of(cls, text: str | None) -> RepairLimit:
+        """Return the limit that a text states as a flow or a speed with its unit, the default one for None."""
+        if text is None:
+            return cls(8.0 * _MM_PER_MINUTE, "creep", stated=False)
+        for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
+            try:
+                value = parse_quantity(text, unit, name="limit")
+            except InputError:
+                continue
+            if not isinstance(text, str) or not any(sign.isalpha() for sign in text) or not value > 0:
+                break
+            return cls(value, kind, stated=True)  # type: ignore[arg-type]
+        raise InputError(f"limit must be a flow or a speed > 0 with its unit, such as 5 mL/min or 8 mm/min, got {text}")
+
+    def __str__(self) -> str:
+        if self.kind == "flow":
+            return f"{self.value / _ML_PER_MINUTE:.3g} mL/min"
+        return f"{self.value / _MM_PER_MINUTE:.3g} mm/min of creep"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the limit as plain JSON values; the one that it does not state is null."""
+        return {
+            "mL_per_min": self.value / _ML_PER_MINUTE if self.kind == "flow" else None,
+            "creep_mm_per_min": self.value / _MM_PER_MINUTE if self.kind == "creep" else None,
+            "stated": self.stated,
+        }
+
+
+@dataclass(frozen=True)
+class Severity:
+    """How bad a leak is, as far as the recording and what is known of the machine tell.
+
+    Each figure is None, where it is not known, or the figure and its 95 % interval.
+
+    Parameters
+    ----------
+    mL_per_min : triple of floats, optional
+        Mean flow while the leak is open [mL/min].
+    pump_share : triple of floats, optional
+        That flow over the pump's mean flow.
+    creep_mm_per_min : triple of floats, optional
+        Speed at which the piston would creep with its lines shut under the same pressure difference [mm/min].
+    of_limit : triple of floats, optional
+        The leak over the repair limit.
+    """
+
+    mL_per_min: tuple[float, float, float] | None
+    pump_share: tuple[float, float, float] | None
+    creep_mm_per_min: tuple[float, float, float] | None
+    of_limit: tuple[float, float, float] | None
+
+    @property
+    def level(self) -> Level | None:
+        """Level by the interval: `repair` where it is all over the limit, `follow` where it is all under half of it.
+
+        Else `plan`; None where the leak cannot be held against the limit.
+        """
+        if self.of_limit is None:
+            return None
+        _, low, high = self.of_limit
+        return "repair" if low > 1.0 else "follow" if high < HALF else "plan"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the severity as plain JSON values: each figure with `_interval` beside it, and the level."""
+        plain: dict[str, Any] = {"level": self.level}
+        for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
+            figure = getattr(self, name)
+            plain[name] = None if figure is None else figure[0]
+            plain[f"{name}_interval"] = None if figure is None else list(figure[1:])
+        return plain
+
+
+def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
+    """Return how bad the leak is that the evidence states; None where it states none, or nothing of its size."""
+    relative = evidence.relative
+    if evidence.verdict != "leak" or (evidence.leak_lpm is None and relative is None):
+        return None
+    flow = _triple(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)
+    creep = None if relative is None else _triple(relative.creep, relative.creep_interval, 1.0)
+    share = None if relative is None else _triple(relative.pump_share, relative.pump_share_interval, 1.0)
+    held = flow if limit.kind == "flow" else creep
+    return Severity(
+        mL_per_min=_over(flow, _ML_PER_MINUTE),
+        pump_share=share,
+        creep_mm_per_min=_over(creep, _MM_PER_MINUTE),
+        of_limit=_over(held, limit.value),
+    )
+
+
+def beside_the_pump(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
+    """Return a leak of a stated L/min beside the flow of the assumed pump, and as a speed of the assumed piston.
+
+    None where no L/min is stated; without the share of the pump where neither its speed nor its angle is recorded.
+    """
+    if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
+        return None
+    leak, low, high = (LITRE_PER_MINUTE * value for value in (evidence.leak_lpm, *evidence.leak_interval_lpm))
+    creep = leak / machine.area, (low / machine.area, high / machine.area)
+    pump = _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
+    if not pump > 0.0:
+        return RelativeLeak(None, None, *creep)
+    return RelativeLeak(leak / pump, (low / pump, high / pump), *creep)
+
+
+def _mean_speed(recording: Recording) -> float:
+    """Return the mean size of the pump's speed [rad/s], 0 where it is not recorded in its unit."""
+    if "omega" in recording and recording.units["omega"] == "rad/s":
+        return float(np.nanmean(np.abs(recording["omega"])))
+    if "theta" in recording and recording.units["theta"] == "rad" and len(recording) > 1:
+        return float(np.nanmean(np.abs(np.diff(recording["theta"])))) * recording.rate
+    return 0.0
+
+
+def _triple(
+    value: float | None, interval: tuple[float, float] | None, factor: float
+) -> tuple[float, float, float] | None:
+    """Return a figure with its interval, without one where the interval is not stated."""
+    if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
+        return None
+    return factor * value, factor * interval[0], factor * interval[1]
+
+
+def _over(figure: tuple[float, float, float] | None, unit: float) -> tuple[float, float, float] | None:
+    return None if figure is None else (figure[0] / unit, figure[1] / unit, figure[2] / unit)

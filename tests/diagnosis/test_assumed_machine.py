@@ -1,0 +1,165 @@
+"""What L/min rests on: the machine that was stated, or none; how bad a leak is without it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.pressure_model.detector import PressureModel
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.machine import assumed_rig, unstated
+from sealscope.diagnosis.verdict.severity import RepairLimit, severity
+from sealscope.errors import InputError
+from sealscope.parameters import Rig
+from sealscope.recordings.recording import Recording
+from sealscope.reporting.messages import how_bad, how_much, next_steps, short_text
+from sealscope.simulation.simulate import simulate
+
+from .balance_machine import AREA, machine, step
+
+LPM = 6.0e4
+LEAK = 3.0e-13
+
+
+@pytest.fixture(scope="module")
+def foreign() -> Recording:
+    """A leak past the piston of a machine that nobody has stated."""
+    return machine(1, G=step(0.0, LEAK))
+
+
+def stated(**values: str) -> Rig:
+    names = {"area": ("cylinder.A_A", "cylinder.A_B"), "displacement": ("pump.q_b",)}
+    return unstated().with_overrides({name: text for key, text in values.items() for name in names[key]})
+
+
+def flow(recording: Recording, share: float = 1.0) -> float:
+    return share * LEAK * float(np.mean(np.abs(recording["p_A"] - recording["p_B"])[recording.t > 60.0])) * LPM
+
+
+def test_a_machine_five_times_as_large_gives_the_same_recording_and_no_flow(foreign: Recording) -> None:
+    """Displacement, area and leak five times as large: 0.021 L/min was stated as 0.0043."""
+    found = diagnose(foreign)
+    assert found.verdict == "leak"
+    assert found.leak_lpm is found.leak_interval_lpm is None
+    assert found.refuses == {"leak_lpm"}
+    assert "state --rig, or the piston's --area" in str(how_much(found))
+    assert found.measured_ratio == (pytest.approx(1.0, abs=0.01), pytest.approx((1.0, 1.0), abs=0.02))
+    small = diagnose(foreign, rig=stated(area=f"{AREA} m^2"))
+    large = diagnose(foreign, rig=stated(area=f"{5 * AREA} m^2"))
+    assert small.leak_lpm == pytest.approx(flow(foreign), rel=0.05)
+    assert large.leak_lpm == pytest.approx(5.0 * small.leak_lpm, rel=1e-6)
+    for other in (small, large):
+        assert other.refuses == frozenset()
+        assert found.severity is not None and other.severity is not None
+        assert other.severity.pump_share == pytest.approx(found.severity.pump_share)
+        assert other.severity.creep_mm_per_min == pytest.approx(found.severity.creep_mm_per_min)
+        assert "as stated" in str(how_much(other))
+
+
+def test_pump_share_and_creep_are_those_of_the_machine(foreign: Recording) -> None:
+    found = diagnose(foreign).severity
+    assert found is not None and found.pump_share is not None and found.creep_mm_per_min is not None
+    assert found.mL_per_min is None
+    pump = 4.9e-6 / (2.0 * np.pi) * 12.0 * 2.0 / np.pi * LPM  # mean of the size of 12 sin(4 t) rad/s
+    assert found.pump_share[0] == pytest.approx(flow(foreign) / pump, rel=0.05)
+    assert found.creep_mm_per_min[0] == pytest.approx(flow(foreign) / LPM / AREA * 6.0e4, rel=0.05)
+
+
+@pytest.mark.parametrize("ratio", [0.5, 1.4])
+def test_area_or_displacement_alone_gives_the_flow_whatever_the_other_is(ratio: float) -> None:
+    recording = machine(1, G=step(0.0, LEAK), ratio=ratio)
+    by_area = diagnose(recording, rig=stated(area=f"{AREA} m^2"))
+    by_pump = diagnose(recording, rig=stated(displacement=f"{ratio * 4.9} cm^3/rev"))
+    both = diagnose(recording, rig="thesis")
+    assert by_area.leak_lpm == pytest.approx(flow(recording), rel=0.06)
+    assert by_pump.leak_lpm == pytest.approx(by_area.leak_lpm, rel=0.01)
+    assert both.leak_lpm is None
+    assert f"displacement over area is {ratio:.3g} times the assumed one" in both.reason
+    assert f"{ratio:.3g} times that of the default rig: another geometry" in diagnose(recording).reason
+
+
+def test_pressures_alone_state_no_flow_without_a_rig() -> None:
+    own = simulate(command="3 sin(4t)", leak="0.02 L/min from 40 s", duration="80 s", seed=1)
+    pressures = own.only(["u", "p_A", "p_B"])
+    foreign = diagnose(replace(pressures, provenance={}))
+    known = PressureModel(assumed_rig(None, pressures)[0]).examine(pressures, [], 0.01)
+    assert known.leak_lpm == pytest.approx(0.02, rel=0.5)
+    assert (known.verdict, known.score) == (foreign.verdict, foreign.score)
+    assert foreign.leak_lpm is None and foreign.severity is None
+    assert "no rig was stated" in foreign.reason and "L/min," not in foreign.reason
+    assert all(own.leak_lpm is None and own.course is None for own in foreign.parts)
+    assert not PressureModel(stated(area=f"{AREA} m^2")).states_flow  # the ringing needs the moving mass, too
+
+
+def test_who_states_the_machine() -> None:
+    own = simulate(command="3 sin(4t)", duration="5 s", seed=1)
+    other = simulate(command="3 sin(4t)", duration="5 s", seed=1, set={"pump.q_b": "3.9[cm^3/rev]"})
+    for recording, rig, who in (
+        (own, None, "recording"),
+        (other, None, "nobody"),
+        (replace(own, provenance={}), None, "nobody"),
+        (own, "thesis", "call"),
+        (other, stated(area="9 cm^2"), "nobody"),
+    ):
+        known, assumed = assumed_rig(rig, recording)
+        assert assumed.stated_by == who
+        assert known.states("cylinder.M_eq") == (who != "nobody")
+    assert (assumed.area_stated, assumed.displacement_stated, assumed.stated) == (True, False, False)
+    assert assumed.area == pytest.approx(9e-4)
+
+
+def test_no_leak_passes_a_share_of_the_pumps_flow() -> None:
+    found = diagnose(machine(1))
+    assert found.verdict == "no leak"
+    assert found.passage is not None and found.passage.lpm is None
+    pump = 4.9e-6 / (2.0 * np.pi) * 12.0 * 2.0 / np.pi
+    own = 2.4e-13 * found.passage.pressure / pump
+    assert found.passage.pump_share == pytest.approx(own, rel=0.2)
+    text = " ".join(short_text(found).split())
+    assert "% of the pump's flow at 0.11 MPa; the smallest step that would have been found" in text
+    assert "L/min" not in text
+
+
+def leak(lpm: float, low: float, high: float, **changed: object) -> Diagnosis:
+    """A leak of a machine whose rig is stated."""
+    recording = Recording(np.arange(10.0), {"omega": np.full(10, 2 * np.pi)}, {"omega": "rad/s"}, 1.0)
+    base = Diagnosis("leak", "r", 9.0, 3.0, leak_lpm=lpm, leak_interval_lpm=(low, high), false_alarm_probability=0.01)
+    values = {name: value for name, value in vars(base).items() if name in Diagnosis.__mro__[1].__dataclass_fields__}
+    evidence = Diagnosis.__mro__[1](**values)
+    return Diagnosis.of(
+        evidence, recording, assumed_rig("thesis", recording)[1], file="f", false_alarm_probability=0.01, **changed
+    )
+
+
+@pytest.mark.parametrize(
+    ("interval", "level", "step_"),
+    [((0.0055, 0.007), "repair", "now"), ((0.002, 0.003), "plan", "plan the"), ((0.001, 0.002), "follow", "urgent")],
+)
+def test_levels_by_the_interval(interval: tuple[float, float], level: str, step_: str) -> None:
+    """8 mm/min of a piston of 633 mm^2 are 5.06 mL/min."""
+    found = leak(sum(interval) / 2, *interval)
+    assert found.severity is not None
+    assert found.severity.level == level
+    assert found.severity.pump_share is not None
+    assert found.severity.pump_share[0] == pytest.approx(sum(interval) / 2 / 1000.0 / (60 * 4.9e-6))
+    assert any(step_ in text for text in next_steps(found))
+    assert "8 mm/min of creep, the default" in str(how_bad(found))
+
+
+def test_a_limit_as_a_flow() -> None:
+    found = leak(0.006, 0.0055, 0.007, limit=RepairLimit.of("20 mL/min"))
+    assert found.severity is not None and found.severity.of_limit is not None
+    assert found.severity.of_limit[0] == pytest.approx(0.3)
+    assert found.severity.level == "follow"
+    assert found.as_dict()["limit"] == {"mL_per_min": pytest.approx(20.0), "creep_mm_per_min": None, "stated": True}
+    unknown = severity(replace(found, leak_lpm=None, leak_interval_lpm=None), found.limit)
+    assert unknown is not None and unknown.level is None
+
+
+@pytest.mark.parametrize("text", ["5", "5 bar", "-1 mL/min", "0 mm/min", "much", "5 mL", ""])
+def test_a_limit_that_is_none(text: str, foreign: Recording) -> None:
+    with pytest.raises(InputError, match=r"^limit must be a flow or a speed > 0 with its unit, such as 5 mL/min"):
+        diagnose(foreign, limit=text)
