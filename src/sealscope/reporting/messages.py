@@ -92,8 +92,13 @@ def how_much(diagnosis: Diagnosis) -> str | None:
     text = f"{number(diagnosis.leak_lpm)} L/min"
     if interval is not None:
         text += f", between {number(interval[0])} and {number(interval[1])} L/min"
-    basis = rests_on(diagnosis)
-    return text if basis is None else f"{text}; {basis}"
+    return text
+
+
+def _how_much_by_what(diagnosis: Diagnosis) -> str | None:
+    """Return how much oil leaks, with what the figure rests on."""
+    text, basis = how_much(diagnosis), rests_on(diagnosis)
+    return text if text is None or basis is None or diagnosis.leak_lpm is None else f"{text}; {basis}"
 
 
 def rests_on(diagnosis: Diagnosis) -> str | None:
@@ -274,7 +279,7 @@ def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     sure = in_short(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
         ("since", since(diagnosis)),
-        ("how much", how_much(diagnosis)),
+        ("how much", _how_much_by_what(diagnosis)),
         ("how bad", how_bad(diagnosis)),
         ("passes", passes(diagnosis) if diagnosis.verdict == "no leak" else None),
         ("cause", cause(diagnosis)),
@@ -295,7 +300,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     lines = [f"{_printable(diagnosis.file)}: {diagnosis.summary}"]
     rows = [
         ("since", since(diagnosis)),
-        ("how much", how_much(diagnosis)),
+        ("how much", _how_much_by_what(diagnosis)),
         ("how bad", how_bad(diagnosis)),
         ("passes", passes(diagnosis)),
         ("cause", cause(diagnosis)),

@@ -158,7 +158,6 @@ def render_page(
         notes=[note for _, note in details if note],
         schematic=Markup(schematic(recording, diagnosis, circuit)),
         machine=_machine(circuit, known_rig),
-        assumed=_assumed(circuit, known_rig),
         columns=columns_of(recording),
         recording=recording,
         channels=[_summary(recording, name, pressure_unit) for name in recording.channels],
@@ -182,13 +181,6 @@ def _script_json(value: Any) -> str:
 def _areas(circuit: Circuit) -> str:
     at_A, at_B = circuit.values["A_A"], circuit.values["A_B"]
     return at_A if at_A == at_B else f"{at_A} at A and {at_B} at B"
-
-
-def _assumed(circuit: Circuit, rig: Rig | None) -> str:
-    """Return what L/min rests on; "" where no rig was given."""
-    if rig is None:
-        return ""
-    return f"{rig.title or rig.name}: piston area {_areas(circuit)}, pump {circuit.values['q_b']}"
 
 
 def _machine(circuit: Circuit, rig: Rig | None) -> list[tuple[str, str]]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, find_step
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.volume_balance.blocks import BalanceBlocks
+from sealscope.diagnosis.volume_balance.blocks import BalanceBlocks, Geometry
 from sealscope.diagnosis.volume_balance.evidence import judge, trouble
 from sealscope.diagnosis.volume_balance.fit import fit_balance
 from sealscope.diagnosis.volume_balance.growth import WARMEST
@@ -100,7 +100,7 @@ def worth_a_search(g: Array) -> bool:
 
 
 def step_of(
-    blocks: BalanceBlocks, g: Array, probability: float, unequal: bool, *, again: bool = False
+    blocks: BalanceBlocks, g: Array, probability: float, geometry: Geometry, *, again: bool = False
 ) -> tuple[ConductanceRise | None, str | None]:
     """Return the rise that the last blocks show, and what else was seen that forbids to compare them, in one line.
 
@@ -108,7 +108,7 @@ def step_of(
     """
     if len(blocks) < FEWEST or not (again or worth_a_search(g)):
         return None, None
-    fit = fit_balance(blocks, metres=True, unequal=unequal)
+    fit = fit_balance(blocks, metres=True, geometry=geometry)
     problem = trouble(fit)
     if problem is not None:
         return None, problem

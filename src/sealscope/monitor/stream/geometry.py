@@ -64,7 +64,7 @@ class FrozenBalance:
             else:
                 weights[column] -= beta
         offset = float(np.sqrt(np.mean(np.sum(fit.shared**2, axis=1))))
-        volume = 1.0 / abs(fit.scale) if fit.unequal else 1.0
+        volume = 1.0 / abs(fit.scale) if fit.by_pump else 1.0
         return cls(weights, fit.sense, fit.residual, volume, offset, states_flow(fit))
 
     def conductances(self, blocks: BalanceBlocks) -> tuple[Array, Array]:

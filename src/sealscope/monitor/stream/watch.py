@@ -262,7 +262,7 @@ class Watch:
         window = self._append(cut)
         if len(window) < min(_FIT_BLOCKS, max(FEWEST, self._to_learn)):
             return BlockEstimate(self.blocks, end, "learning")
-        fit = fit_balance(window, metres=True, unequal=self._geometry.unequal)
+        fit = fit_balance(window, metres=True, geometry=self._geometry)
         problem = trouble(fit)
         if problem is not None:
             self._samples.count("blocks: no balance can be fitted", len(window) // 2)
@@ -312,7 +312,7 @@ class Watch:
         if leak is not None and not again:
             return
         probability = probability_of("step", self.false_alarms_per_1000_h, self._seconds)
-        rise, other = step_of(window, g, probability, self._geometry.unequal, again=again)
+        rise, other = step_of(window, g, probability, self._geometry, again=again)
         if other is not None and leak is None:
             self._samples.count(f"blocks not compared: {other}"[:120])
             if other in ("changed duty", "sensor fault"):
