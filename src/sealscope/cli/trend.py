@@ -117,7 +117,9 @@ def trend(
     Exit status 1 where a file could not be read.
     """
     from sealscope.diagnosis.trend.trend import trend_of
+    from sealscope.parameters import load_rig
     from sealscope.recordings.formats.columns import check_call
+    from sealscope.reporting.trend.page import write_trend_page
     from sealscope.reporting.trend.text import trend_csv, trend_text
     from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
@@ -146,7 +148,13 @@ def trend(
     }
     say(texts[output_format.value]())
     if output is not None:
-        _write(output, texts[output.suffix[1:].lower()]() + "\n")
+        kind = output.suffix[1:].lower()
+        if kind in texts:
+            _write(output, texts[kind]() + "\n")
+        else:
+            known = assumed_rig(rig) or load_rig("thesis")
+            stated = f"The machine is taken for {known.title or known.name}{'' if rig else ', as no --rig was given'}."
+            write_trend_page(output, result, title=files[0].resolve().name if files[0].is_dir() else "", rig=stated)
     failed = result.verdict in (fail_on or ())
     if failed or len(readings) < len(read):
         raise typer.Exit(_FAILED_ON if failed else 1)
@@ -154,7 +162,9 @@ def trend(
 
 def _check_output(output: Path, files: Sequence[Path]) -> None:
     if output.suffix.lower() not in (".json", ".csv"):
-        raise InputError(f"a trend must be written as .json or .csv, got {output}")
+        from sealscope.reporting.trend.page import check_trend_page
+
+        check_trend_page(output)
     if output.resolve() in {file.resolve() for file in files}:
         raise InputError(f"a trend must not replace a recording, got {output}")
     check_folder(output)

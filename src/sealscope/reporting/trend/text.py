@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from sealscope.diagnosis.trend.timeline import DAY
-from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.trend import Trend, TrendPoint
 from sealscope.diagnosis.trend.wear import MONTH, Interval
 from sealscope.reporting.messages import number
 
@@ -43,15 +43,52 @@ def figure(interval: Interval, unit: str, digits: int = 2) -> str:
     return f"{number(interval.value, digits)} {unit} ({' to '.join(ends)})"
 
 
+def since(trend: Trend) -> str | None:
+    """Return since when the level is not that of before, with its interval; None where it did not change."""
+    wear = trend.wear
+    if wear is None or wear.onset is None:
+        return None
+    onset = wear.onset
+    return f"{moment(trend, onset.value)} ({moment(trend, onset.low)} to {moment(trend, onset.high)})"
+
+
 def headline(trend: Trend) -> str:
     """Return verdict and what it rests on, in one line."""
-    count, wear = len(trend.points), trend.wear
+    count = len(trend.points)
     span = f", {moment(trend, trend.points[0].day)} to {moment(trend, trend.points[-1].day)}" if count else ""
-    text = f"{trend.verdict} in {count} recording{'' if count == 1 else 's'}{span}"
-    if wear is not None and wear.onset is not None:
-        onset = wear.onset
-        text += f", since {moment(trend, onset.value)} ({moment(trend, onset.low)} to {moment(trend, onset.high)})"
-    return text
+    own = since(trend)
+    return f"{trend.verdict} in {count} recording{'' if count == 1 else 's'}{span}{f', since {own}' if own else ''}"
+
+
+def sentence(trend: Trend) -> str:
+    """Return the verdict as a sentence."""
+    wear = trend.wear
+    if trend.verdict == "no leak":
+        return "The leakage does not grow"
+    if trend.verdict == "leak" and wear is not None and trend.alarm is not None:
+        return "The leakage grows" if wear.step is None else "The leakage stepped up"
+    if trend.verdict == "leak":
+        return "The leakage is over the limit"
+    if trend.alarm is not None:
+        return "The ringing of the pressures changed; a leak cannot be told from other causes"
+    return "Cannot tell"
+
+
+def level_now(trend: Trend) -> str | None:
+    """Return the present level, None where there is none."""
+    wear = trend.wear
+    if wear is None:
+        return None
+    at = "" if trend.pressure is None else f" at {number(trend.pressure / 1e6, 2)} MPa"
+    return f"{figure(wear.now, trend.unit)}{at}"
+
+
+def healthy(trend: Trend) -> str | None:
+    """Return where a recording of the healthy machine lies, None where no level is known."""
+    wear = trend.wear
+    if wear is None:
+        return None
+    return f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)} {trend.unit}, 95 of 100 recordings"
 
 
 def level(trend: Trend) -> str | None:
@@ -59,9 +96,24 @@ def level(trend: Trend) -> str | None:
     wear = trend.wear
     if wear is None or trend.basis is None:
         return None
-    at = "" if trend.pressure is None else f" at {number(trend.pressure / 1e6, 2)} MPa"
     band = f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)}"
-    return f"{figure(wear.now, trend.unit)}{at}; healthy {band}; {_BASES[trend.basis]}"
+    return f"{level_now(trend)}; healthy {band}; {_BASES[trend.basis]}"
+
+
+def assumed(trend: Trend) -> str:
+    """Return what the levels rest on."""
+    first = "The first recording is" if trend.healthy == 1 else f"The first {trend.healthy} recordings are"
+    basis = "" if trend.basis is None else f"Levels {_BASES[trend.basis]}. "
+    if trend.basis == "ringing":
+        basis = f"Levels: {_BASES[trend.basis]}. "
+    temperature = any(point.temperature is not None for point in trend.points)
+    oil = "The oil's temperature is taken out. " if temperature else "The oil's temperature is not known. "
+    return f"{basis}{oil}{first} taken to be of a healthy machine."
+
+
+def group_note(trend: Trend, point: TrendPoint) -> str:
+    """Return what sets a recording's group apart from the first one."""
+    return trend.groups[point.group] if point.group > 0 else ""
 
 
 def growth(trend: Trend) -> str | None:

@@ -1,0 +1,105 @@
+"""The page of a trend: what it shows of a life with an alarm, a repair, another duty and a recording left out."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.baseline.level import Level
+from sealscope.diagnosis.baseline.operating_point import OperatingPoint
+from sealscope.diagnosis.trend.reading import LeakReading
+from sealscope.diagnosis.trend.trend import Trend, trend_of
+from sealscope.errors import InputError
+from sealscope.reporting.trend.chart import chart_of
+from sealscope.reporting.trend.page import render_trend_page, write_trend_page
+from sealscope.reporting.trend.text import trend_text
+
+POINT = OperatingPoint(0, 11.0, 500.0, ("Pa", "Pa"), ("p_A", "p_B"), 2.1, 1.57)
+
+
+@pytest.fixture(scope="module")
+def trend() -> Trend:
+    """40 days: wear from day 10 on, a repair on day 30; days 20 to 22 of another duty; day 5 states nothing."""
+    random = np.random.default_rng(2)
+    days = []
+    for k in range(40):
+        level = 6.7e-13 * (1.0 + 0.05 * random.standard_normal() + (0.08 * (k - 10) if 10 < k < 30 else 0.0))
+        point = replace(POINT, command_rms=4.0) if 20 <= k <= 22 else POINT
+        days.append(
+            LeakReading(
+                f"<day> {k}.csv",
+                1.7e9 + 86400.0 * k,
+                60.0,
+                None if k == 5 else "volume balance",
+                Level(level, 1.3e-14),
+                1.1e5,
+                1.0,
+                None,
+                1.0,
+                point,
+                bytes([k]),
+                "needs theta" if k == 5 else "",
+            )
+        )
+    return trend_of(days, healthy=5, limit=0.02)
+
+
+class Tags(HTMLParser):
+    """Open tags that are not closed, and every tag seen."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.append((tag, dict(attrs)))
+        if tag not in ("meta", "path", "rect", "circle", "link"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if self.open and self.open[-1] == tag:
+            self.open.pop()
+
+
+def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
+    page = render_trend_page(trend, title="press 4")
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == []
+    assert page.count("<script") == 0 and "http" not in page.split("</style>")[1]
+    assert "<day>" not in page and "&lt;day&gt; 5.csv" in page
+    for words in ("press 4", "the level fell", "another command", "needs theta", "The leakage does not grow", "95 %"):
+        assert words in page, words
+    wide = page[page.index('class="trend wide"') : page.index('class="trend narrow"')]
+    assert wide.count('class="point other"') == 3 and wide.count('class="absent"') == 1
+    assert wide.count("<circle") == 39 and wide.count('class="course"') == len(trend.episodes) == 2
+
+
+def test_the_chart_stands_within_its_frame(trend: Trend) -> None:
+    for size in ("wide", "narrow"):
+        chart = chart_of(trend, size)
+        assert chart is not None
+        for point in chart["points"]:
+            assert chart["left"] <= point["x"] <= chart["right"]
+            assert chart["top"] <= point["high"] <= point["y"] <= point["low"] <= chart["bottom"]
+        numbers = [float(x) for d in chart["course"] for x in re.findall(r"[\d.]+", d)]
+        assert min(numbers) >= 0.0 and max(numbers) <= max(chart["width"], chart["height"])
+
+
+def test_without_a_level_there_is_a_page_without_a_chart(tmp_path: Path) -> None:
+    only = LeakReading("a.csv", 1.7e9, 1.0, None, Level(np.nan, np.nan), np.nan, None, None, None, None, b"", "no x")
+    trend = trend_of([only])
+    page = write_trend_page(tmp_path / "page.html", trend).read_text()
+    assert "Cannot tell" in page and 'class="point' not in page and "no x" in trend_text(trend)
+
+
+def test_another_kind_of_file_is_refused(trend: Trend, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"\.html, \.htm, \.pdf, got .*page\.png"):
+        write_trend_page(tmp_path / "page.png", trend)
+    assert list(tmp_path.iterdir()) == []
