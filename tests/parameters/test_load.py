@@ -14,6 +14,8 @@ THESIS = (Path(sealscope.parameters.__file__).parent / "rigs" / "thesis.toml").r
 EXTENDS = '[rig]\nextends = "thesis"\n'
 GOOD = 'V_1 = { value = 50, unit = "cm^3", source = "measured" }\n'
 
+PACKAGED = "single-rod-eha, thesis, thesis-calibrated, thesis-closed-loop"
+
 
 def write(folder: Path, text: str, name: str = "lab.toml") -> Path:
     path = folder / name
@@ -122,12 +124,12 @@ def test_a_rule_across_values_names_the_file_that_was_asked_for(tmp_path: Path) 
         ("[rig]\nname = 3", "rig.name must be a text, got 3"),
         (
             '[rig]\nextends = "thesys"',
-            "extends must be a packaged rig (single-rod-eha, thesis, thesis-calibrated) or a .toml file, got 'thesys'",
+            f"extends must be a packaged rig ({PACKAGED}) or a .toml file, got 'thesys'",
         ),
         ('[rig]\nextends = "lab.toml"', "extends must end at a rig of its own, got a circle"),
         (
             '[rig]\nextends = "a\\u0000b.toml"',
-            "extends must be a packaged rig (single-rod-eha, thesis, thesis-calibrated) or a .toml file, got ",
+            f"extends must be a packaged rig ({PACKAGED}) or a .toml file, got ",
         ),
         ('[rig]\nextends = "none.toml"', "a rig file must be readable, got: No such file or directory"),
         ("[valve]\nk = 3", "valve.k is not a parameter"),
@@ -153,8 +155,7 @@ def test_what_is_no_text_file(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_lists_the_rigs() -> None:
-    packaged = "(single-rod-eha, thesis, thesis-calibrated)"
-    assert refused("thesys") == f"'thesys' is no packaged rig {packaged} and no .toml file; did you mean thesis?"
+    assert refused("thesys") == f"'thesys' is no packaged rig ({PACKAGED}) and no .toml file; did you mean thesis?"
     assert refused("").startswith("'' is no packaged rig")
     assert "is no packaged rig" in refused("a\0b.toml")
 

@@ -35,8 +35,17 @@ def simulate(
     output: Annotated[Path, typer.Option("--output", "-o", help="Recording to write (.nc, .h5, .csv, .parquet).")],
     rig: RigOption = "thesis",
     command: Annotated[
-        str, typer.Option("--command", help="Command, e.g. '3 sin(4t)', 'chirp 3 from 0.1 Hz to 5 Hz over 60 s'.")
+        str,
+        typer.Option(
+            "--command",
+            help="Command, e.g. '3 sin(4t)', 'chirp 3 from 0.1 Hz to 5 Hz over 60 s'; or a target for the piston: "
+            "'position 50 mm sin(2t)'.",
+        ),
     ] = "3 sin(4t)",
+    load: Annotated[
+        str | None,
+        typer.Option("--load", help="Force against +x beside the rig's own, e.g. '2 kN', 'step 500 N at 3 s'."),
+    ] = None,
     leak: Annotated[
         list[str] | None, typer.Option("--leak", help="Leak, e.g. '0.0042 L/min from 90 s'; repeat to combine.")
     ] = None,
@@ -89,6 +98,7 @@ def simulate(
     experiment = Experiment.of(
         rig=rig_with(rig, overrides),
         command=command,
+        load=load,
         leak=leak,
         fault=fault,
         duration=duration,

@@ -56,8 +56,8 @@ def rest_pressures(rig: Rig, force: float) -> tuple[float, float]:
     return p_A, p_B
 
 
-def initial_state(rig: Rig, x_0: float) -> np.ndarray:
-    """State (12,) at rest with the piston at x_0 [m] from mid-stroke.
+def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
+    """State (12,) at rest with the piston at x_0 [m] from mid-stroke, under `push` [N] beside the rig's own load.
 
     The pressures carry the load (`rest_pressures`), the motor holds the pump against them: i = T_load/C_m, with the
     speed controller's integral at R_c i/K_i, which gives that current. A machine that leaks creeps from there. Without
@@ -68,7 +68,7 @@ def initial_state(rig: Rig, x_0: float) -> np.ndarray:
     c, m = rig.cylinder, rig.motor
     y = np.zeros(len(STATES))
     y[POSITION] = x_0
-    force = carried_at_rest(x_0, c.F_l, c.k_load, c.L, c.k_stop, c.d_stop)
+    force = carried_at_rest(x_0, c.F_l, c.k_load, c.L, c.k_stop, c.d_stop) + push
     p_A, p_B = rest_pressures(rig, force)
     y[[P_A, P_1]], y[[P_B, P_2]] = p_A, p_B
     y[CURRENT] = holding_current(p_A - p_B, rig.pump.q_b, m.C_m)

@@ -92,10 +92,11 @@ _CHOICES = {
 NUMBERS = (*_PARAMETERS, "c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B")
 #: Laws that most rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out. Air
 #: in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has bristles, that differs
-#: between the directions; check valves with pilots, relief valves, an accumulator that exchanges little heat; a damper.
+#: between the directions; check valves with pilots, relief valves, an accumulator that exchanges little heat; a damper,
+#: a load that changes with time (of a run, not of a rig).
 LAWS = (
     *("aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
-    *("piloted", "relieved", "polytropic", "damped"),
+    *("piloted", "relieved", "polytropic", "damped", "pushed"),
 )
 #: The choices: truth values, and the laws.
 CHOICES = (*_CHOICES, "made_up", *LAWS)
@@ -121,6 +122,7 @@ if TYPE_CHECKING:
         relieved: tuple[bool, ...]
         polytropic: tuple[bool, ...]
         damped: tuple[bool, ...]
+        pushed: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> float: ...
@@ -164,6 +166,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "relieved": rig.makeup.G_relief > 0,
         "polytropic": choices["made_up"] and rig.makeup.n_gas != 1.0,
         "damped": rig.cylinder.d_load > 0,
+        "pushed": False,
     }
     return RigNumbers(
         *(attrgetter(name)(rig) for name in _PARAMETERS.values()),
@@ -328,8 +331,8 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 
 
 @contracted
-def rates_without_throttles(y: State, u: float, G: float, C: float, p: RigNumbers) -> State:
-    """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients."""
+def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
+    """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients, `F` [N] load."""
     p_A, p_B, x, v = y[P_A], y[P_B], y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
         v = stuck_velocity(v, p.v_th)
@@ -342,6 +345,8 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, p: RigNumber
     load = load_force(x, p.F_l, p.k_load)
     if len(p.damped) > 0:
         load = load + p.d_load * v
+    if len(p.pushed) > 0:
+        load = load + F
     friction, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
     push = piston_acceleration(p_A, p_B, friction, load, stop, p.A_A, p.A_B, p.M_eq)
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
@@ -369,9 +374,9 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, p: RigNumber
 
 
 @contracted
-def rates(y: State, u: float, G: float, C: float, p: RigNumbers) -> State:
+def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
     """dy/dt of the whole rig."""
-    dy = rates_without_throttles(y, u, G, C, p)
+    dy = rates_without_throttles(y, u, G, C, F, p)
     if p.throttled:
         Q_A, Q_B = throttle_flows(y, p)
         dy = pressures_moved(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))

@@ -7,7 +7,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -17,10 +17,12 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Effect, ParameterDrift, Readings
 from sealscope.simulation.commands import Command, Sine, check_command, parse_command
+from sealscope.simulation.courses import Force, Position, parse_force, parse_position
 from sealscope.simulation.faults import Fault, Leak, parse_fault, parse_leak
 from sealscope.units import parse_quantity
 
 if TYPE_CHECKING:
+    from sealscope.control import Controller
     from sealscope.parameters import Rig
 
 #: Most samples a recording may have (about 1.4 GB of channels), so that a slip of the unit cannot fill the memory.
@@ -48,6 +50,18 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
     return method
 
 
+def check_target(target: Position, t: Array, half: float) -> None:
+    """Raise InputError where a target leaves the stroke, +-`half` [m], at any of the times `t` [s]."""
+    x = np.broadcast_to(target.at(t), t.shape)
+    bad = ~(np.abs(x) <= half)
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise InputError(
+            f"position must stay within the stroke, +-{1e3 * half:g} mm, got {1e3 * x[k]:.4g} mm at t = {t[k]:.4g} s "
+            f"({target})"
+        )
+
+
 def check_circuit(rig: Rig) -> None:
     """Raise InputError for a single-rod cylinder in a circuit from which its rod cannot displace oil."""
     c, m = rig.cylinder, rig.makeup
@@ -71,7 +85,7 @@ class Experiment:
     """
 
     rig: Rig
-    command: Command = field(default_factory=lambda: Sine(3.0, 4.0))
+    command: Command | Position = field(default_factory=lambda: Sine(3.0, 4.0))
     duration: float = 180.0
     leaks: tuple[Leak, ...] = ()
     seed: int = 0
@@ -82,6 +96,8 @@ class Experiment:
     faults: tuple[Fault, ...] = ()
     drifts: tuple[ParameterDrift, ...] = ()
     error: float | None = None
+    load: Force | None = None
+    controller: Controller | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.duration) and self.duration > 0):
@@ -109,12 +125,22 @@ class Experiment:
             )
         choose_method(self.rig, self.method)
         check_circuit(self.rig)
-        command, u_max = self.commanded, self.rig.daq.u_max
-        if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
-            check_command(command, self.sample_times(), u_max)
+        if self.target is not None:
+            check_target(self.target, self.sample_times(), half)
+        elif self.controller is not None:
+            raise InputError(
+                f"a controller must have a target to follow ('position 50 mm sin(2t)'), got {self.command}"
+            )
+        else:
+            self._check_command()
         for drift in self.drifts:
             drift.check(np.linspace(0.0, self.duration, 2001))
         self.effects()
+
+    def _check_command(self) -> None:
+        command, u_max = self.commanded, self.rig.daq.u_max
+        if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
+            check_command(command, self.sample_times(), u_max)
 
     @classmethod
     @checked_call
@@ -122,7 +148,7 @@ class Experiment:
         cls,
         *,
         rig: Rig | str | os.PathLike[str] = "thesis",
-        command: Command | str = "3 sin(4t)",
+        command: Command | Position | str = "3 sin(4t)",
         leak: Leak | str | Iterable[Leak | str] | None = None,
         fault: Fault | str | Iterable[Fault | str] | None = None,
         drifts: Iterable[ParameterDrift] = (),
@@ -135,6 +161,8 @@ class Experiment:
         step: float | str | None = None,
         error: float | str | None = None,
         allow_unresolved: bool = False,
+        load: Force | str | None = None,
+        controller: Controller | None = None,
     ) -> Experiment:
         """Make an experiment of numbers in SI units and texts with units; the arguments are those of `simulate`.
 
@@ -155,13 +183,17 @@ class Experiment:
         if rate is not None:
             overrides["daq.sample_rate"] = parse_quantity(rate, "Hz", name="rate")
         loaded = load_rig(rig)
-        if not isinstance(command, str) and not hasattr(command, "volts"):
+        if isinstance(command, str):
+            command = parse_position(command) or parse_command(command)
+        if not (hasattr(command, "volts") or isinstance(command, Position)):
             raise InputError(f"command must be a text or a Command, got {command!r}")
+        if not isinstance(load, str | Force | None):
+            raise InputError(f"load must be a text or a Force, got {load!r}")
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
             raise InputError(f"seed must be a whole number, got {seed!r}")
         return cls(
             rig=loaded.with_overrides(overrides) if overrides else loaded,
-            command=parse_command(command) if isinstance(command, str) else command,
+            command=command,
             duration=parse_quantity(duration, "s", name="duration", finite=False),
             leaks=_each(leak, Leak, parse_leak, "leak"),
             seed=int(seed),
@@ -172,20 +204,43 @@ class Experiment:
             faults=_each(fault, Fault, parse_fault, "fault"),
             drifts=tuple(drifts),
             error=None if error is None else parse_quantity(error, "Pa", name="error", finite=False),
+            load=parse_force(load) if isinstance(load, str) else load,
+            controller=controller,
         )
 
     def __repr__(self) -> str:
         parts = [f"rig {self.rig.name}", str(self.command), f"{self.duration:g} s at {self.rate:g} Hz"]
+        parts += [] if self.load is None else [str(self.load)]
         parts += [str(change) for change in (*self.leaks, *self.faults, *self.drifts)]
         return f"<Experiment: {', '.join(parts)}, seed {self.seed}>"
 
     @property
     def commanded(self) -> Command:
-        """The command that the rig gets: `command` as the faults of the duty leave it."""
-        command = self.command
+        """The command that the rig gets: `command` as the faults of the duty leave it; InputError for a target."""
+        if isinstance(self.command, Position):
+            raise InputError(f"what a controller sends is known after its run only, got {self.command}")
+        return self._changed(self.command)
+
+    @property
+    def target(self) -> Position | None:
+        """The target of the controller, as the faults of the duty leave it; None where there is a command."""
+        if not isinstance(self.command, Position):
+            return None
+        return replace(self.command, course=self._changed(self.command.course))
+
+    def _changed(self, command: Command) -> Command:
         for fault in self.faults:
             command = fault.commanded(command)
         return command
+
+    @property
+    def controlled(self) -> Controller | None:
+        """The controller that follows the target: its own, or the one that knows the rig; None for a command."""
+        if not isinstance(self.command, Position):
+            return None
+        from sealscope.control import PositionPI
+
+        return self.controller or PositionPI.of(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
         """Return what changes in the machine within the run."""
@@ -234,6 +289,8 @@ class Experiment:
             "sample_rate_hz": self.rate,
             "seed": self.seed,
             "x_0_m": self.x_0,
+            **({} if self.load is None else {"load": self.load.words}),
+            **({} if self.controlled is None else {"controller": repr(self.controlled)}),
         }
 
     def key(self) -> str:
@@ -243,6 +300,7 @@ class Experiment:
         inputs += [exact(change) for change in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
         solver += [] if self.error is None else [self.error]
+        inputs += [exact(added) for added in (self.load, self.controlled) if added is not None]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -19,7 +19,9 @@ from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Effect, Schedule
+from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
+from sealscope.simulation.courses import Force
 from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment, Method, choose_method
 from sealscope.simulation.faults import Leak
 from sealscope.simulation.instruments import FILTER_REACH
@@ -54,7 +56,8 @@ _OVERSAMPLING = 4
 class Trajectory:
     """Result of an integration: (n,) times [s] and (n, 19) outputs in the order of `sealscope.physics.state.OUTPUTS`.
 
-    `error`: the estimated rms error [Pa] of the pressures, NaN where it was not checked.
+    `error`: the estimated rms error [Pa] of the pressures, NaN where it was not checked. `volts`: (n,) a controller's
+    voltages [V], None where the command is known beforehand.
     """
 
     t: Array
@@ -62,6 +65,7 @@ class Trajectory:
     method: str
     step: float
     error: float = math.nan
+    volts: Array | None = None
 
     def __getitem__(self, name: str) -> Array:
         from sealscope.physics.state import OUTPUTS
@@ -124,7 +128,9 @@ class RunInputs:
     """Command and leakage of an experiment; `leaks` have their coefficients."""
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
-        self._leaks, self._command = leaks, experiment.commanded
+        self._leaks = leaks
+        # of a target, the controller's voltage takes the place of this (`Feedback`)
+        self._command = experiment.commanded if experiment.target is None else Sine(0.0, 0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
         self._zero = np.zeros((0, 0))
         command = self._command
@@ -171,7 +177,9 @@ class RunInputs:
 def oversampling(experiment: Experiment) -> int:
     """Return the outputs per sample: enough for the anti-alias filter, no more than the solver has steps."""
     longest = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
-    return oversampling_of(experiment.rate, longest)
+    least = oversampling_of(experiment.rate, longest)
+    controller = experiment.controlled
+    return least if controller is None else outputs_per_sample(experiment.rate, controller.rate, least)
 
 
 def oversampling_of(rate: float, step: float) -> int:
@@ -192,11 +200,18 @@ def trajectory(
     `leaks` take the place of the experiment's and have coefficients; `step` [s], if given, that of its own step, and is
     not checked: the caller compares runs.
     """
+    duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
+    rate, target, controller = experiment.rate * oversampling(experiment), experiment.target, experiment.controlled
+    feedback = None
+    if target is not None and controller is not None:
+        feedback = Feedback(experiment.rig, target, controller, (duration, rate), experiment.seed)
     return integrate(
         experiment.rig,
         RunInputs(experiment, leaks),
-        (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate,
-        experiment.rate * oversampling(experiment),
+        duration,
+        rate,
+        load=experiment.load,
+        feedback=feedback,
         x_0=experiment.x_0,
         method=experiment.method,
         step=step or experiment.step,
@@ -220,6 +235,8 @@ def integrate(
     allow_unresolved: bool = False,
     progress: Progress | None = None,
     effects: Sequence[Effect] = (),
+    load: Force | None = None,
+    feedback: Feedback | None = None,
 ) -> Trajectory:
     """Integrate from rest over `duration` [s] and report the outputs at `rate` [Hz].
 
@@ -229,7 +246,8 @@ def integrate(
     0.1 % (`Judge`). The finest step is taken whatever the check says; `Trajectory.error` is what it found. `error` None
     leaves the check of a given step out. Inputs may jump at a step's boundary: the step's
     first and last node are looked up just inside it. `effects` are numbers of the rig that change within the run, held
-    over short blocks (`Schedule`). `progress` is called with the time reached [s].
+    over short blocks (`Schedule`). `load` acts beside the rig's own, `feedback` gives the command in place of `inputs`.
+    `progress` is called with the time reached [s].
 
     Raises InputError for a step or an error that is not positive; SimulationFailed when the step cannot resolve the
     rig, the leak or a stop that was hit, when a given step does not pass the check, when a state is not finite, or when
@@ -240,14 +258,16 @@ def integrate(
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
+    base = rig_numbers(rig) if load is None else rig_numbers(rig)._replace(pushed=(True,))
+    start_state = initial_state(rig, x_0, 0.0 if load is None else float(load.at(np.zeros(()))))
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
     if error is not None and not (math.isfinite(error) and error > 0):
         raise InputError(f"error must be > 0 Pa, got {error}")
     n_out = round(duration * rate)
-    schedule = Schedule(effects, rig_numbers(rig), n_out, rate)
+    schedule = Schedule(effects, base, n_out, rate)
     euler = rig.motor.integrator == "euler"
-    run = _Run(inputs, schedule, rate, choose_method(rig, method), euler, allow_unresolved, progress)
+    run = _Run(inputs, schedule, rate, choose_method(rig, method), euler, allow_unresolved, progress, load, feedback)
     checks = [] if error is None else windows(n_out, rate)
     bounds, finest = {0, n_out}, steps_per_output(rate, LONGEST_STEP / FINEST)
     if step is None:  # checked window by window, and given up at the first that fails
@@ -262,7 +282,9 @@ def integrate(
         run.refuse_unresolved(every)
         judge = Judge(rig, rate, error or PRESSURE_TOLERANCE)
         times = 0.0
-        rows, y = np.empty((n_out, len(OUTPUTS))), initial_state(rig, x_0)
+        rows, y = np.empty((n_out, len(OUTPUTS))), start_state.copy()
+        if feedback is not None:
+            feedback.restart()
         for start, stop in itertools.pairwise(sorted(bounds)):
             run.advance(y, start, stop, every, rows)
             for first, end in checks:
@@ -274,7 +296,8 @@ def integrate(
                 break
         h = 1.0 / (rate * every)
         if times <= 1.0 or every >= finest or (step is not None and allow_unresolved):
-            return Trajectory(np.arange(n_out) / rate, rows, run.method, h, judge.moved if checks else math.nan)
+            volts = None if feedback is None else feedback.volts(n_out)
+            return Trajectory(np.arange(n_out) / rate, rows, run.method, h, judge.moved if checks else math.nan, volts)
         if step is not None:
             raise SimulationFailed(
                 f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves {judge.worst()}; take "
@@ -296,6 +319,8 @@ class _Run:
     euler: bool
     allow_unresolved: bool
     progress: Progress | None
+    load: Force | None = None
+    feedback: Feedback | None = None
     reached: float = 0.0
 
     def refuse_unresolved(self, every: int) -> None:
@@ -309,16 +334,25 @@ class _Run:
         from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
         from sealscope.physics.solvers.limits import longest_step, longest_step_on_stop
         from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
-        from sealscope.physics.state import survey
+        from sealscope.physics.state import P_A, P_B, POSITION, survey
 
+        feedback, unloaded = self.feedback, np.zeros((0, 0))
         h = 1.0 / (self.rate * every)
         nodes = np.array(IMEX_NODES if self.method == "imex" else RK4_NODES)
         nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
         block = max(1, _BLOCK_STEPS // every)
-        for first in range(start, stop, block):
-            last = min(first + block, stop)
+        last = start
+        while last < stop:
+            first, last = last, min(last + block, stop)
+            if feedback is not None:  # up to the controller's next sample
+                last = min((first // feedback.apart + 1) * feedback.apart, stop)
+                if first % feedback.apart == 0:
+                    feedback.sample(first, y[POSITION], y[P_A], y[P_B])
             steps = np.arange(first * every, last * every, dtype=np.float64)
             u, G, C = self.inputs.at_nodes(steps * h, nodes * h)
+            if feedback is not None:
+                u = np.full(u.shape, feedback.held(first))
+            F = unloaded if self.load is None else np.ascontiguousarray(self.load.at(steps[:, None] * h + nodes * h))
             worst = float(G.max()), float(C.max())
             for k, end, p in self.schedule.within(first, last):
                 if not self.allow_unresolved and max(worst) > 0.0:
@@ -326,9 +360,9 @@ class _Run:
                 part = slice((k - first) * every, (end - first) * every)
                 out = rows[k - origin : end - origin]
                 if self.method == "imex":
-                    advance_imex(y, h, u[part], G[part], C[part], p, every, out)
+                    advance_imex(y, h, u[part], G[part], C[part], F[part], p, every, out)
                 else:
-                    advance_rk4(y, h, u[part], G[part], C[part], p, self.euler, every, out)
+                    advance_rk4(y, h, u[part], G[part], C[part], F[part], p, self.euler, every, out)
             done = rows[first - origin : last - origin]
             finite, reach, least = survey(done)
             if not (self.allow_unresolved or reach <= 0.5 * p.L):

@@ -25,8 +25,10 @@ from sealscope.storage.atomic import atomic_write
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
+    from sealscope.control import Controller
     from sealscope.parameters import Rig
     from sealscope.simulation.commands import Command
+    from sealscope.simulation.courses import Force, Position
 
 #: Called with what is being done and how far it is, 0..1.
 Progress = Callable[[str, float], None]
@@ -165,7 +167,7 @@ def simulate_with_truth(experiment: Experiment, progress: Progress | None = None
             )
     n, factor = round(experiment.duration * experiment.rate), oversampling(experiment)
     times = experiment.sample_times()
-    volts = experiment.commanded.volts(times)
+    volts = experiment.commanded.volts(times) if path.volts is None else path.volts[: n * factor : factor]
     recorded = record(experiment.rig, path, volts, factor, experiment.seed, experiment.readings())
     solver = {"method": path.method, "step_s": path.step, "allow_unresolved": experiment.allow_unresolved}
     if experiment.step is None:
@@ -286,7 +288,7 @@ def _drift_of(drift: ParameterDrift, t: Array) -> dict[str, Any]:
 def simulate(
     *,
     rig: Rig | str | os.PathLike[str] = "thesis",
-    command: Command | str = "3 sin(4t)",
+    command: Command | Position | str = "3 sin(4t)",
     leak: Leak | str | Iterable[Leak | str] | None = None,
     fault: Fault | str | Iterable[Fault | str] | None = None,
     drifts: Iterable[ParameterDrift] = (),
@@ -299,6 +301,8 @@ def simulate(
     step: float | str | None = None,
     error: float | str | None = None,
     allow_unresolved: bool = False,
+    load: Force | str | None = None,
+    controller: Controller | None = None,
 ) -> Recording:
     """Simulate a rig under a command and record it as its instruments would.
 
@@ -312,6 +316,7 @@ def simulate(
     command : str or Command, optional
         Voltage sent to the servo drive: ``"3 sin(4t)"``, ``"step 5 at 1 s"``, ``"ramp 5 from 1 s to 3 s"``, ``"chirp 3
         from 0.1 Hz to 5 Hz over 60 s"``, ``"prbs 2 every 0.5 s seed 1"``, or ``"file LOG"`` (channel u of a recording).
+        Or a target for the piston, from mid-stroke, that a controller follows: ``"position 50 mm sin(2t)"``.
     leak : str, Leak or several of them, optional
         Leakage across the piston: ``"0.0042 L/min from 90 s"`` (mean flow while open), ``"0.01[L/min] orifice growing
         from 1 min to 2 min"``, ``"G = 6.1e-13 from 90 s"``, ``"C = 2e-10"``, ``"table LEAK.csv"`` or ``"none"``.
@@ -339,6 +344,11 @@ def simulate(
         Error that a pressure may have [Pa rms], 100 Pa by default; the step is chosen by it.
     allow_unresolved : bool, optional
         Let an unstable or under-resolved run through, marked in the provenance.
+    load : str or Force, optional
+        Force against +x beside the rig's own (``cylinder.F_l``), in a command's words: ``"2 kN"``, ``"500 N sin(2t)"``,
+        ``"step 2 kN at 3 s"``.
+    controller : Controller, optional
+        What follows a target; by default `sealscope.control.PositionPI`, which assumes the rig as it is.
 
     Returns
     -------
@@ -361,6 +371,7 @@ def simulate(
     """
     experiment = Experiment.of(
         rig=rig, command=command, leak=leak, fault=fault, drifts=drifts, set=set, duration=duration, rate=rate, x_0=x_0,
-        seed=seed, method=method, step=step, error=error, allow_unresolved=allow_unresolved,
+        seed=seed, method=method, step=step, error=error, allow_unresolved=allow_unresolved, load=load,
+        controller=controller,
     )  # fmt: skip
     return simulate_with_truth(experiment).recording

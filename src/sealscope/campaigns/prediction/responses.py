@@ -94,7 +94,7 @@ def instrument_noise(experiment: Experiment, records: int, seed: int) -> Array:
     whole = {f"sensors.{name}.{fault}_rate": 0.0 for name in CHAMBERS for fault in ("stuck", "drop")}
     rig = experiment.rig.with_overrides(whole, source="varied for a prediction")
     times = experiment.sample_times()
-    path, u = _filtered(experiment), experiment.command.volts(times)
+    path, u = _filtered(experiment), experiment.commanded.volts(times)
     clean = np.stack([path[name] for name in CHAMBERS])
     noise = []
     for state in np.random.SeedSequence(seed).generate_state(records, np.uint32):

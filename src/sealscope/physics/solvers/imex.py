@@ -102,27 +102,27 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 
 
 @contracted
-def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, p: RigNumbers) -> State:
-    """Return the state a step of h [s] later; `u`, `G`, `C` at the nodes of the step."""
+def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers) -> State:
+    """Return the state a step of h [s] later; `u`, `G`, `C` and the load `F` at the nodes of the step."""
     Q_A, Q_B = throttle_flows(y, p)
     s1 = throttle_rates(y, Q_A, Q_B, p)
-    f1 = rates_without_throttles(y, u[0], G[0], C[0], p)
+    f1 = rates_without_throttles(y, u[0], G[0], C[0], F[0], p)
     z, s2 = _solved(_after(y, h, E_2[0], f1, I_2[0], s1), h, p)
-    f2 = rates_without_throttles(z, u[1], G[1], C[1], p)
+    f2 = rates_without_throttles(z, u[1], G[1], C[1], F[1], p)
     z = _after(_after(y, h, E_3[0], f1, I_3[0], s1), h, E_3[1], f2, I_3[1], s2)
     z, s3 = _solved(z, h, p)
-    f3 = rates_without_throttles(z, u[2], G[2], C[2], p)
+    f3 = rates_without_throttles(z, u[2], G[2], C[2], F[2], p)
     z = _after(_after(y, h, E_4[0], f1, I_4[0], s1), h, E_4[1], f2, I_4[1], s2)
     z, s4 = _solved(_after(z, h, E_4[2], f3, I_4[2], s3), h, p)
-    f4 = rates_without_throttles(z, u[3], G[3], C[3], p)
+    f4 = rates_without_throttles(z, u[3], G[3], C[3], F[3], p)
     z = _after(_after(y, h, E_5[0], f1, I_5[0], s1), h, E_5[1], f2, I_5[1], s2)
     z = _after(_after(z, h, E_5[2], f3, I_5[2], s3), h, E_5[3], f4, I_5[3], s4)
     z, s5 = _solved(z, h, p)
-    f5 = rates_without_throttles(z, u[4], G[4], C[4], p)
+    f5 = rates_without_throttles(z, u[4], G[4], C[4], F[4], p)
     z = _after(_after(y, h, E_6[0], f1, W[0], s1), h, E_6[2], f3, W[2], s3)
     z = _after(_after(moved(z, h * E_6[1], f2), h, E_6[3], f4, W[3], s4), h, E_6[4], f5, W[4], s5)
     z, s6 = _solved(z, h, p)
-    f6 = rates_without_throttles(z, u[5], G[5], C[5], p)
+    f6 = rates_without_throttles(z, u[5], G[5], C[5], F[5], p)
     z = _after(_after(y, h, W[0], f1, W[0], s1), h, W[2], f3, W[2], s3)
     z = _after(_after(_after(z, h, W[3], f4, W[3], s4), h, W[4], f5, W[4], s5), h, W[5], f6, W[5], s6)
     return within_limits(z, p)
@@ -135,6 +135,7 @@ def advance_imex(
     u: np.ndarray,
     G: np.ndarray,
     C: np.ndarray,
+    F: np.ndarray,
     p: RigNumbers,
     every: int,
     rows: np.ndarray,
@@ -142,6 +143,7 @@ def advance_imex(
     """Advance `y` (12,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
     `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 19).
+    `F`: (n, 6) load [N] beside the rig's own, (0, 0) without one.
     """
     z = state_of(y)
     for step in range(u.shape[0]):
@@ -150,6 +152,9 @@ def advance_imex(
         volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
         laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])
         orifice = (C[step, 0], C[step, 1], C[step, 2], C[step, 3], C[step, 4], C[step, 5])
-        z = imex_step(z, h, volts, laminar, orifice, p)
+        load = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        if len(p.pushed) > 0:
+            load = (F[step, 0], F[step, 1], F[step, 2], F[step, 3], F[step, 4], F[step, 5])
+        z = imex_step(z, h, volts, laminar, orifice, load, p)
     for m in range(len(z)):
         y[m] = z[m]

@@ -24,13 +24,13 @@ def held_integral(dy: State, euler_integral: bool) -> State:
 
 
 @contracted
-def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, p: RigNumbers, euler_integral: bool) -> State:
-    """Return the state a step of h [s] later; `u`, `G`, `C` at the nodes of the step."""
-    first = rates(y, u[0], G[0], C[0], p)
+def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers, euler_integral: bool) -> State:
+    """Return the state a step of h [s] later; `u`, `G`, `C` and the load `F` at the nodes of the step."""
+    first = rates(y, u[0], G[0], C[0], F[0], p)
     k1 = held_integral(first, euler_integral)
-    k2 = held_integral(rates(moved(y, 0.5 * h, k1), u[1], G[1], C[1], p), euler_integral)
-    k3 = held_integral(rates(moved(y, 0.5 * h, k2), u[1], G[1], C[1], p), euler_integral)
-    k4 = held_integral(rates(moved(y, h, k3), u[2], G[2], C[2], p), euler_integral)
+    k2 = held_integral(rates(moved(y, 0.5 * h, k1), u[1], G[1], C[1], F[1], p), euler_integral)
+    k3 = held_integral(rates(moved(y, 0.5 * h, k2), u[1], G[1], C[1], F[1], p), euler_integral)
+    k4 = held_integral(rates(moved(y, h, k3), u[2], G[2], C[2], F[2], p), euler_integral)
     total = moved(moved(moved(k1, 2.0, k2), 2.0, k3), 1.0, k4)
     z = within_limits(moved(y, h / 6.0, total), p)
     integral = y[0] + h * first[0] if euler_integral else z[0]  # eq. (4.2)
@@ -44,6 +44,7 @@ def advance_rk4(
     u: np.ndarray,
     G: np.ndarray,
     C: np.ndarray,
+    F: np.ndarray,
     p: RigNumbers,
     euler_integral: bool,
     every: int,
@@ -51,9 +52,9 @@ def advance_rk4(
 ) -> None:
     """Advance `y` (12,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
-    `u`, `G`, `C`: (n, 3) command [V] and leakage coefficients at t, t + h/2 and t + h of each step; `rows`: (n //
-    every, 19). `euler_integral` takes eq. (4.2) literally: I is held within the step and grows by h (omega_d - omega)
-    once after it.
+    `u`, `G`, `C`: (n, 3) command [V] and leakage coefficients at t, t + h/2 and t + h of each step; `F`: (n, 3) load
+    [N] beside the rig's own, (0, 0) without one; `rows`: (n // every, 19). `euler_integral` takes eq. (4.2) literally:
+    I is held within the step and grows by h (omega_d - omega) once after it.
     """
     n = u.shape[0]
     z = state_of(y)
@@ -62,6 +63,7 @@ def advance_rk4(
             observe(z, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
         volts = (u[step, 0], u[step, 1], u[step, 2])
         laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])
-        z = rk4_step(z, h, volts, laminar, orifice, p, euler_integral)
+        load = (F[step, 0], F[step, 1], F[step, 2]) if len(p.pushed) > 0 else (0.0, 0.0, 0.0)
+        z = rk4_step(z, h, volts, laminar, orifice, load, p, euler_integral)
     for m in range(len(z)):
         y[m] = z[m]

@@ -87,7 +87,7 @@ def _rk4(
     s = (opening(leak, t + nodes[0]), opening(leak, t + nodes[1]), opening(leak, t + nodes[2]))
     G = (leak[0] * s[0], leak[0] * s[1], leak[0] * s[2])
     C = (leak[1] * s[0], leak[1] * s[1], leak[1] * s[2])
-    return rk4_step(z, h, u, G, C, q, False)
+    return rk4_step(z, h, u, G, C, (0.0, 0.0, 0.0), q, False)
 
 
 @contracted
@@ -106,7 +106,7 @@ def _imex(
     s_3, s_4, s_5 = opening(leak, t + nodes[3]), opening(leak, t + nodes[4]), opening(leak, t + nodes[5])
     G = (leak[0] * s_0, leak[0] * s_1, leak[0] * s_2, leak[0] * s_3, leak[0] * s_4, leak[0] * s_5)
     C = (leak[1] * s_0, leak[1] * s_1, leak[1] * s_2, leak[1] * s_3, leak[1] * s_4, leak[1] * s_5)
-    return imex_step(z, h, u, G, C, q)
+    return imex_step(z, h, u, G, C, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), q)
 
 
 @contracted

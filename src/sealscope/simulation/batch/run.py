@@ -86,6 +86,10 @@ def refuse(experiment: Experiment, place: int) -> None:
     def no(what: str) -> InputError:
         return InputError(f"a run of a batch must have {what} (run {place}); simulate it by itself")
 
+    if experiment.controlled is not None:
+        raise no(f"a command, got a target for a controller ({experiment.command})")
+    if experiment.load is not None:
+        raise no(f"no load that changes with time, got {experiment.load}")
     if len(experiment.leaks) > 1:
         raise no(f"at most one leak, got {len(experiment.leaks)}")
     if experiment.leaks and not isinstance(experiment.leaks[0].opening, From | Growing):

@@ -142,7 +142,7 @@ def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
     from sealscope.simulation.instruments import record
     from sealscope.simulation.integrate import oversampling
 
-    volts = experiment.command.volts(experiment.sample_times())
+    volts = experiment.commanded.volts(experiment.sample_times())
     return record(experiment.rig, path, volts, oversampling(experiment), experiment.seed)
 
 

@@ -1,0 +1,61 @@
+"""What a controller is: started with a run, it turns each sample of its measurements into a voltage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+
+class Measured(NamedTuple):
+    """What a controller knows at a sample.
+
+    Time [s]; target [m]; mean speed of the target [m/s] while the voltage will act; measured position [m] from
+    mid-stroke; measured pressures of the chambers [Pa].
+    """
+
+    t: float
+    target: float
+    target_speed: float
+    x: float
+    p_A: float
+    p_B: float
+
+
+class Controller(Protocol):
+    """A sampled controller of the piston's position.
+
+    `rate` [Hz]: a whole multiple of, or a whole fraction of, the rig's sampling rate; `delay`: whole samples from a
+    measurement to the voltage that it leads to. A run calls `start` and then the function that it returns once a
+    sample; what that function remembers belongs to the run alone, so that a run can be begun anew. The voltage is held
+    until the next, and held within the converter's range by the rig. A frozen dataclass tells runs apart by its fields.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> import sealscope as ss
+    >>> @dataclass(frozen=True)
+    ... class Proportional:
+    ...     gain: float  # [V/m]
+    ...     rate: float = 500.0
+    ...     delay: int = 1
+    ...
+    ...     def start(self):
+    ...         return lambda measured: self.gain * (measured.target - measured.x)
+    >>> recording = ss.simulate(command="position step 10 mm at 0.1 s", controller=Proportional(200.0), duration=1.0)
+    >>> bool(recording["x"][-1] > 0.008)
+    True
+    """
+
+    @property
+    def rate(self) -> float:
+        """Samples of the controller a second [Hz]."""
+        ...
+
+    @property
+    def delay(self) -> int:
+        """Whole samples from a measurement to its voltage."""
+        ...
+
+    def start(self) -> Callable[[Measured], float]:
+        """Return a function from what is measured to the voltage [V], for one run from its beginning."""
+        ...

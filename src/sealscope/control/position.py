@@ -1,0 +1,94 @@
+"""Proportional-integral control of the piston's position, with the target's velocity fed forward."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+from sealscope.control.controller import Measured
+from sealscope.errors import InputError
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Time [s] over which the pressures that tell the carrying side are averaged.
+_PRESSURE_LAG = 0.02
+
+
+@dataclass(frozen=True)
+class PositionPI:
+    """A PI controller of the position with feed-forward of velocity, and what it assumes of machine and drive.
+
+    v_c = v_target + k_v e + k_i integral of e, e = target - x; omega_c = v_c A/D with the area A of the side that
+    carries the load (the higher pressure) and the pump's displacement D [m^3/rad]; u = omega_d/omega_per_volt, where
+    omega_d = omega_c + (C_e/k_p) s/(s + K_i/k_p) omega_c makes good what the drive's own speed loop falls short of
+    without a load (eqs. (4.2)-(4.4): omega/omega_d = (k_p s + K_i)/((k_p + C_e) s + K_i)).
+
+    Within `dead_band` [m] of the target the integral stands still, so that it does not hunt a piston at rest about its
+    friction or between two counts of its encoder; so it does where the voltage is at its limit `u_max` [V].
+
+    `rate` [Hz], `delay` in whole samples; `k_v` [1/s], `k_i` [1/s^2]; `area_A`, `area_B` [m^2].
+    """
+
+    area_A: float
+    area_B: float
+    displacement: float
+    omega_per_volt: float
+    drive_shortfall: float
+    drive_corner: float
+    u_max: float
+    k_v: float = 12.0
+    k_i: float = 24.0
+    dead_band: float = 30e-6
+    rate: float = 500.0
+    delay: int = 1
+
+    def __post_init__(self) -> None:
+        positive = ("area_A", "area_B", "displacement", "omega_per_volt", "u_max", "rate")
+        for name in positive:
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"{name} of the controller must be > 0, got {getattr(self, name)}")
+        for name in ("drive_shortfall", "drive_corner", "k_v", "k_i", "dead_band", "delay"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise InputError(f"{name} of the controller must be >= 0, got {getattr(self, name)}")
+
+    @classmethod
+    def of(cls, rig: Rig, **gains: float) -> Self:
+        """Return the controller for what a rig is said to be; `gains` are further fields."""
+        motor, cylinder = rig.motor, rig.cylinder
+        gains.setdefault("dead_band", 1.5 * rig.sensors.x.resolution)
+        return cls(
+            cylinder.A_A,
+            cylinder.A_B,
+            rig.pump.q_b / (2.0 * math.pi),
+            motor.omega_per_volt,
+            motor.C_e / motor.k_p if motor.k_p > 0 else 0.0,
+            motor.K_i / motor.k_p if motor.k_p > 0 else 0.0,
+            rig.daq.u_max,
+            **gains,  # type: ignore[arg-type]
+        )
+
+    def start(self) -> Callable[[Measured], float]:
+        """Return a function from what is measured to the voltage [V], for one run from its beginning."""
+        T = 1.0 / self.rate
+        fading = math.exp(-self.drive_corner * T)
+        averaged = 1.0 - math.exp(-T / _PRESSURE_LAG)
+        integral = omega_before = quick = dp = 0.0
+
+        def voltage(measured: Measured) -> float:
+            nonlocal integral, omega_before, quick, dp
+            dp += averaged * (measured.p_A - measured.p_B - dp)
+            error = measured.target - measured.x
+            velocity = measured.target_speed + self.k_v * error + integral
+            omega = velocity * (self.area_A if dp > 0.0 else self.area_B) / self.displacement
+            quick = fading * (quick + omega - omega_before)
+            omega_before = omega
+            u = (omega + self.drive_shortfall * quick) / self.omega_per_volt
+            within = abs(error) <= self.dead_band
+            if not within and (abs(u) < self.u_max or u * error < 0.0):
+                integral += self.k_i * T * error
+            return min(max(u, -self.u_max), self.u_max)
+
+        return voltage

@@ -1,0 +1,90 @@
+"""A controller around the rig: it samples, and the voltage that it gives is held until its next output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sealscope.control.controller import Controller, Measured
+from sealscope.errors import InputError, SimulationFailed
+from sealscope.parameters import Rig
+from sealscope.recordings.recording import Array
+from sealscope.simulation.courses import Position
+
+#: Most outputs of the solver to a sample of the recording that a controller's rate may ask for.
+_MOST_OUTPUTS = 64
+
+
+def outputs_per_sample(rate: float, controller_rate: float, least: int) -> int:
+    """Return the outputs per sample of a recording at `rate` [Hz], `least` or more, that a controller can sample.
+
+    Raises InputError where no whole number does.
+    """
+    for outputs in range(least, _MOST_OUTPUTS + 1):
+        apart = rate * outputs / controller_rate
+        if apart >= 1.0 - 1e-9 and abs(apart - round(apart)) < 1e-9 * apart:
+            return outputs
+    raise InputError(
+        f"rate of the controller must be a whole multiple or a whole fraction of the sampling rate, {rate:g} Hz, got "
+        f"{controller_rate:g} Hz"
+    )
+
+
+class Feedback:
+    """The voltage of a controller over a run, sample after sample.
+
+    Position and pressures are read as the rig's encoder and transducers do: whole counts, and the transducer's own
+    noise, from `seed`. `apart`: outputs of the solver between two samples of the controller.
+    """
+
+    def __init__(
+        self, rig: Rig, target: Position, controller: Controller, outputs: tuple[float, float], seed: int
+    ) -> None:
+        """Begin a run; `outputs`: duration [s] of it, and rate [Hz] of the solver's outputs."""
+        duration, rate = outputs
+        self._controller, self._rig = controller, rig
+        self.apart = round(rate / controller.rate)
+        samples = round(duration * rate) // self.apart + 1
+        t = np.arange(samples + 1) / controller.rate
+        self._t = t
+        self._target = np.broadcast_to(target.at(t), t.shape)
+        # the voltage of a sample acts from `delay` to `delay + 1` samples later
+        ahead = target.at(t + controller.delay / controller.rate)
+        self._speed = np.diff(np.broadcast_to(ahead, t.shape)) * controller.rate
+        random = np.random.default_rng([seed, 2])
+        sensors = rig.sensors
+        self._noise = random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)
+        self._voltage: Callable[[Measured], float]
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin the run anew."""
+        self._voltage = self._controller.start()
+        self._volts = np.zeros(self._t.size + self._controller.delay)
+        self._sampled = 0
+
+    def sample(self, output: int, x: float, p_A: float, p_B: float) -> None:
+        """Let the controller see the state at an output of the solver, unless it has."""
+        k = output // self.apart
+        if k < self._sampled:
+            return
+        counts = self._rig.sensors.x.resolution
+        seen = np.floor(x / counts) * counts if counts > 0 else x
+        noise = self._noise[k]
+        aim = float(self._target[k]), float(self._speed[k])
+        measured = Measured(float(self._t[k]), *aim, float(seen), float(p_A + noise[0]), float(p_B + noise[1]))
+        volts = float(self._voltage(measured))
+        if not np.isfinite(volts):
+            raise SimulationFailed(f"the controller must give a finite voltage, got {volts} at t = {self._t[k]:.4g} s")
+        limit = self._rig.daq.u_max
+        self._volts[k + self._controller.delay] = min(max(volts, -limit), limit)
+        self._sampled = k + 1
+
+    def held(self, output: int) -> float:
+        """Return the voltage [V] that acts from an output of the solver to the controller's next sample."""
+        return float(self._volts[output // self.apart])
+
+    def volts(self, outputs: int) -> Array:
+        """Return the voltages [V], (n,), at the first outputs of the solver."""
+        return np.asarray(self._volts[np.arange(outputs) // self.apart])

@@ -1,0 +1,80 @@
+"""Courses over time of what is no voltage: the position that a piston is to take, the force of a load."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Sine, parse_command, plain_text
+
+_LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_FORCES = {"N": 1.0, "kN": 1e3}
+
+
+@dataclass(frozen=True)
+class Position:
+    """A target for the piston: x = course(t) [m] from mid-stroke, followed by a controller; `words` as it was given."""
+
+    course: Command
+    words: str
+
+    def at(self, t: Array) -> Array:
+        """Return the target [m] at times t [s]."""
+        return self.course.volts(t)
+
+    def __str__(self) -> str:
+        return f"position {self.words}"
+
+
+@dataclass(frozen=True)
+class Force:
+    """A load beside the rig's own: F = course(t) [N] against +x; `words` as it was given."""
+
+    course: Command
+    words: str
+
+    def at(self, t: Array) -> Array:
+        """Return the force [N] at times t [s]."""
+        return self.course.volts(t)
+
+    def __str__(self) -> str:
+        return f"load {self.words}"
+
+
+def _course(words: str, units: Mapping[str, float], what: str) -> Command:
+    """Return the words of a command whose size has one of `units` as a command in SI."""
+    names = "|".join(sorted(units, key=len, reverse=True))
+    sized = re.compile(rf"({UNSIGNED})\s*\[?({names})\b\]?")
+    if not sized.search(words):
+        example = f"step 100 {next(iter(units))}"
+        raise InputError(f"{what} must have its unit ({', '.join(units)}), such as '{example}', got {words!r}")
+    plain = sized.sub(lambda match: repr(float(match[1]) * units[match[2]]), words)
+    if re.fullmatch(NUMBER, plain.strip()):
+        return Sine(0.0, 0.0, 0.0, float(plain))
+    try:
+        return parse_command(plain)
+    except InputError as error:
+        raise InputError(
+            str(error).replace("command must be", f"{what} must be").replace(repr(plain), repr(words))
+        ) from None
+
+
+def parse_position(text: str) -> Position | None:
+    """Read a target such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``.
+
+    The words are those of `parse_command`, with a length in mm, cm or m. None where the text is no target.
+    """
+    words = plain_text(text, "command")
+    if not words.lower().startswith("position "):
+        return None
+    words = words[len("position ") :]
+    return Position(_course(words, _LENGTHS, "position"), words)
+
+
+def parse_force(text: str) -> Force:
+    """Read a load such as ``2 kN``, ``500 N sin(2t) + 100 N``, ``step 2 kN at 3 s`` in the words of `parse_command`."""
+    words = plain_text(text, "load")
+    return Force(_course(words, _FORCES, "load"), words)
