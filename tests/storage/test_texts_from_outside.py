@@ -97,6 +97,17 @@ LONG = 200_000
 
 
 @pytest.mark.parametrize(
+    "key", ["a." * LONG + "a = 1", "[" + "a." * LONG + "a]", "x = { " + '"a" . ' * LONG + "a = 1 }"]
+)
+def test_a_key_of_many_dots_is_refused_soon(key: str, tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(key)
+    start = time.process_time()
+    with pytest.raises(InputError, match=r"(a dotted key must have at most 30 dots|must be at most 1000000 bytes)"):
+        load_rig(tmp_path / "rig.toml")
+    assert time.process_time() - start < 1.0
+
+
+@pytest.mark.parametrize(
     "read",
     [
         lambda: parse_leak("1" * LONG),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,16 @@ from sealscope.storage.plain_values import LARGEST_WHOLE
 
 #: Largest file read [bytes]; what is larger is no file of settings.
 LARGEST = 1_000_000
+#: Most dots in a key: tomllib takes a time that goes with their square. What stands between keys.
+_MOST_DOTS = 30
+_NO_KEY = re.compile(r"[^\w.\"'\s-]+|\n")
 
 
 def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
     """Return the tables of the TOML file `path`; `what` it is ("a rig file") and its `place` stand in the errors.
 
     Raises InputError where it cannot be read, is larger than `LARGEST`, is not UTF-8 or not TOML, or holds a whole
-    number beyond 2^53, which doubles do not hold.
+    number beyond 2^53, which doubles do not hold, or a key of more than 30 dots.
     """
     try:
         with open_regular(path, what) as file:
@@ -31,7 +35,10 @@ def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
     if len(data) > LARGEST:
         raise InputError(f"{what} must be at most {LARGEST} bytes, got more ({place})")
     try:
-        tree = tomllib.loads(data.decode("utf-8-sig"))
+        text = data.decode("utf-8-sig")
+        if any(part.count(".") > _MOST_DOTS for part in _NO_KEY.split(text)):
+            raise ValueError(f"a dotted key must have at most {_MOST_DOTS} dots")
+        tree = tomllib.loads(text)
         _check_whole_numbers(tree)
     except UnicodeDecodeError as error:
         raise InputError(f"{what} must be UTF-8 text, got byte {data[error.start]:#04x} ({place})") from None
