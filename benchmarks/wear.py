@@ -259,9 +259,7 @@ def growths(folder: Path) -> None:
         values, held, count = [], 0, 0
         for days in machines_of(folder, view):
             levels, unit = levels_of(days, basis)
-            own = episodes(
-                levels, prior_of(basis, levels, HEALTHY_DAYS, unit), years=YEARS, known=HEALTHY_DAYS, limit=None
-            )[-1]
+            own = episodes(levels, prior_of(basis, levels, HEALTHY_DAYS, unit), years=YEARS, known=HEALTHY_DAYS)[-1]
             count += 1
             if own.alarm is not None:
                 values.append(own.wear.growth.value)

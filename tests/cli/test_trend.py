@@ -22,7 +22,7 @@ def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k in range(1, DAYS + 1):
         leak = "0.01 L/min from 0 s" if k >= 6 else None
         day = ss.simulate(duration="20 s", rate=100.0, seed=k, leak=leak, set={"pump.G_pump": 2.4e-13})
-        ss.write(replace(day, provenance={"start": f"2024-05-{k:02d}T08:00"}), folder / f"day_{k}.nc")
+        ss.write(replace(day, provenance={**day.provenance, "start": f"2024-05-{k:02d}T08:00"}), folder / f"day_{k}.nc")
     return folder
 
 
@@ -69,7 +69,7 @@ def test_files_without_a_time_ask_for_every(call, days: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("--limit", "5 bar"), "--limit"),
+        (("--limit", "5 bar"), "limit must be a flow or a speed"),
         (("--every", "-1d"), "every must be > 0"),
         (("--healthy", "0"), "healthy recordings must be 1 or more"),
         (("--years", "0"), "machine-years"),

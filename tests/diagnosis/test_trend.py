@@ -39,7 +39,9 @@ def reading(day: float, level: float = HEALTHY, *, number: int | None = None, **
         "basis": "volume balance",
         "level": Level(level, 0.02 * HEALTHY),
         "pressure": PRESSURE,
-        "delivery": 1.0,
+        "states_flow": True,
+        "area": 633e-6,
+        "machine": None,
         "temperature": None,
         "scale": 1.0,
         "point": POINT,
@@ -157,7 +159,7 @@ def test_faster_wear_alarms_earlier_and_before_it_has_doubled_the_level() -> Non
 
 
 def test_growth_and_limit_hold_the_truth() -> None:
-    trend = trend_of(life(60, wears=0.006, since=15.0), healthy=5, limit=0.02)
+    trend = trend_of(life(60, wears=0.006, since=15.0), healthy=5, limit="15.6 mL/min")
     own = trend.wear
     assert (trend.verdict, trend.unit, trend.basis) == ("leak", "L/min", "volume balance")
     assert own is not None and own.step is None and own.onset is not None and own.reach is not None
@@ -165,7 +167,7 @@ def test_growth_and_limit_hold_the_truth() -> None:
     assert own.onset.low <= 15.0 <= own.onset.high
     truth = flow(HEALTHY) + 0.006 * (59.0 - 15.0) / MONTH
     assert own.now.low < truth < own.now.high
-    assert own.reach.low < (0.02 - truth) / 0.006 * MONTH < own.reach.high
+    assert own.reach.low < (0.0156 + flow(HEALTHY) - truth) / 0.006 * MONTH < own.reach.high
     assert own.healthy.low < flow(HEALTHY) < own.healthy.high
 
 
@@ -173,7 +175,7 @@ def test_a_healthy_machine_is_no_leak_and_its_growth_is_about_none() -> None:
     trend = trend_of(life(40), healthy=5)
     assert trend.verdict == "no leak" and trend.alarm is None and trend.wear is not None
     assert trend.wear.growth.low < 0.0 < trend.wear.growth.high < 0.001
-    assert trend.limit == pytest.approx(0.05) and "5 %" in trend.limit_source
+    assert trend.limit == pytest.approx(trend.wear.healthy.value + 8e-3 * 633e-6 * 1e3)  # 8 mm/min, in L/min
 
 
 def test_a_few_recordings_do_not_show_that_nothing_grows() -> None:
@@ -285,9 +287,9 @@ def test_files_without_a_time_are_refused_or_spaced() -> None:
     assert [point.day for point in trend.points] == list(range(12))
 
 
-@pytest.mark.parametrize("wrong", [{"healthy": 0}, {"years": 0.0}, {"limit": -1.0}, {"every": math.nan}])
+@pytest.mark.parametrize("wrong", [{"healthy": 0}, {"years": 0.0}, {"limit": "-1 L/min"}, {"every": math.nan}])
 def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="got"):
+    with pytest.raises(InputError, match=r"got|must be"):
         trend_of(life(3), **wrong)  # type: ignore[arg-type]
 
 
@@ -312,7 +314,9 @@ def simulated() -> Trend:
         for k, leak in enumerate([None] * 4 + [f"{0.004 * k} L/min from 0 s" for k in (1, 2, 3)])
     ]
     return ss.trend(
-        [replace(own, provenance={"start": f"2024-05-0{k + 1}T08:00"}) for k, own in enumerate(days)], healthy=4
+        [replace(own, provenance={"start": f"2024-05-0{k + 1}T08:00"}) for k, own in enumerate(days)],
+        healthy=4,
+        rig="thesis",
     )
 
 
@@ -327,7 +331,7 @@ def test_a_recording_that_states_nothing_is_left_out() -> None:
     still = ss.Recording(
         np.arange(400) / 100.0, {"p_A": np.ones(400), "p_B": np.ones(400)}, {"p_A": "Pa", "p_B": "Pa"}, 100.0
     )
-    own = reading_of(still, ss.load_rig("thesis"), "still.csv")
+    own = reading_of(still, file="still.csv")
     assert own.basis is None and "constant" in own.problem
     trend = trend_of([replace(own, start=1.704e9), *life(5)])
     assert trend.points[0].value is None or trend.points[1].value is None
@@ -336,5 +340,15 @@ def test_a_recording_that_states_nothing_is_left_out() -> None:
 
 def test_each_stretch_counts_its_own_false_alarms() -> None:
     levels = Levels.of(np.arange(10.0), np.zeros(10), 0.1)
-    (only,) = episodes(levels, PRIOR, years=10.0, limit=None)
+    (only,) = episodes(levels, PRIOR, years=10.0)
     assert (only.begin, only.end, only.alarm, only.fell) == (0, 10, None, False)
+
+
+def test_without_a_stated_machine_levels_are_relative_and_a_creep_is_still_a_limit() -> None:
+    days = [replace(own, states_flow=False) for own in life(30, wears=0.01, since=10.0)]
+    trend = trend_of(days, healthy=5)
+    assert trend.verdict == "leak" and trend.unit == "%" and trend.pressure is None
+    known = trend_of([replace(own, states_flow=True) for own in days], healthy=5)
+    assert trend.wear is not None and known.wear is not None and trend.limit is not None and known.limit is not None
+    assert trend.wear.now.value / trend.limit == pytest.approx(known.wear.now.value / known.limit, rel=1e-6)
+    assert trend_of(days, healthy=5, limit="5 mL/min").limit is None

@@ -37,16 +37,18 @@ def trend() -> Trend:
                 60.0,
                 None if k == 5 else "volume balance",
                 Level(level, 1.3e-14),
+                True,
+                633e-6,
                 1.1e5,
-                1.0,
                 None,
                 1.0,
+                None,
                 point,
                 bytes([k]),
                 "needs theta" if k == 5 else "",
             )
         )
-    return trend_of(days, healthy=5, limit=0.02)
+    return trend_of(days, healthy=5, limit="15 mL/min")
 
 
 class Tags(HTMLParser):
@@ -93,7 +95,9 @@ def test_the_chart_stands_within_its_frame(trend: Trend) -> None:
 
 
 def test_without_a_level_there_is_a_page_without_a_chart(tmp_path: Path) -> None:
-    only = LeakReading("a.csv", 1.7e9, 1.0, None, Level(np.nan, np.nan), np.nan, None, None, None, None, b"", "no x")
+    only = LeakReading(
+        "a.csv", 1.7e9, 1.0, None, Level(np.nan, np.nan), False, None, np.nan, None, None, None, None, b"", "no x"
+    )
     trend = trend_of([only])
     page = write_trend_page(tmp_path / "page.html", trend).read_text()
     assert "Cannot tell" in page and 'class="point' not in page and "no x" in trend_text(trend)

@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sealscope.cli.options import (
+    AreaOption,
     AssumeOption,
+    DisplacementOption,
+    LimitOption,
     MapOption,
     RateOption,
     assumed_rig,
@@ -60,16 +63,14 @@ def _readings(
 ) -> Iterator[LeakReading | None]:
     """Yield what each file states of the leakage, None for one that cannot be read."""
     from sealscope.diagnosis.trend.reading import reading_of
-    from sealscope.parameters import load_rig
     from sealscope.recordings import read
 
-    assumed = rig or load_rig("thesis")
     with progress() as update:
         for k, file in enumerate(files):
             recording = attempt(file, partial(read, file, channel_map=channel_map or None, rate=rate))
             reading = None
             if recording is not None:
-                reading = attempt(file, partial(reading_of, recording, assumed, file.name))
+                reading = attempt(file, partial(reading_of, recording, rig, file.name))
             yield reading
             update("recordings", (k + 1) / len(files))
 
@@ -88,14 +89,7 @@ def trend(
     healthy: Annotated[
         int, typer.Option("--healthy", help="How many of the first recordings are known to be of a healthy machine.")
     ] = 1,
-    limit: Annotated[
-        str | None,
-        typer.Option(
-            "--limit",
-            metavar="L/min",
-            help="Flow past pump and piston at which a repair is due; by default 5 % of the pump's flow.",
-        ),
-    ] = None,
+    limit: LimitOption = None,
     years: Annotated[
         float, typer.Option("--years", help="Machine-years in which a healthy machine has one false alarm.")
     ] = 10.0,
@@ -108,6 +102,8 @@ def trend(
     maps: MapOption = None,
     rate: RateOption = None,
     rig: AssumeOption = None,
+    area: AreaOption = None,
+    displacement: DisplacementOption = None,
     fail_on: Annotated[
         list[str] | None, typer.Option("--fail-on", help="End with status 3 on this verdict; repeat.")
     ] = None,
@@ -117,29 +113,26 @@ def trend(
     Exit status 1 where a file could not be read.
     """
     from sealscope.diagnosis.trend.trend import trend_of
-    from sealscope.parameters import load_rig
+    from sealscope.diagnosis.verdict.severity import RepairLimit
     from sealscope.recordings.formats.columns import check_call
     from sealscope.reporting.trend.page import write_trend_page
     from sealscope.reporting.trend.text import trend_csv, trend_text
-    from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+    from sealscope.units import parse_quantity
 
     if wrong := [verdict for verdict in fail_on or () if verdict not in ("leak", "no leak", "cannot tell")]:
         raise InputError(f"--fail-on must be leak, no leak or cannot tell, got {wrong[0]!r}")
     channel_map = channel_map_of(maps)
     check_call(channel_map, rate)
-    lpm = None
-    if limit is not None:
-        bare = limit.replace(".", "", 1).replace("e-", "").isdigit()
-        lpm = parse_quantity(f"{limit} L/min" if bare else limit, "m^3/s", name="--limit") / LITRE_PER_MINUTE
+    RepairLimit.of(limit)
     spacing = None if every is None else parse_quantity(every, "s", name="--every")
     if output is not None:
         _check_output(output, files)
     paths = _files(files)
-    read = list(_readings(paths, channel_map, rate, assumed_rig(rig)))
+    read = list(_readings(paths, channel_map, rate, assumed_rig(rig, area, displacement)))
     readings = [reading for reading in read if reading is not None]
     if not readings:
         raise UnreadableFile("no recording could be read, so there is no trend")
-    result = trend_of(readings, healthy=healthy, limit=lpm, years=years, every=spacing)
+    result = trend_of(readings, healthy=healthy, limit=limit, years=years, every=spacing)
     whole = bool(context.find_root().params.get("verbose"))
     texts = {
         "text": lambda: trend_text(result, whole=whole),
@@ -152,9 +145,7 @@ def trend(
         if kind in texts:
             _write(output, texts[kind]() + "\n")
         else:
-            known = assumed_rig(rig) or load_rig("thesis")
-            stated = f"The machine is taken for {known.title or known.name}{'' if rig else ', as no --rig was given'}."
-            write_trend_page(output, result, title=files[0].resolve().name if files[0].is_dir() else "", rig=stated)
+            write_trend_page(output, result, title=files[0].resolve().name if files[0].is_dir() else "")
     failed = result.verdict in (fail_on or ())
     if failed or len(readings) < len(read):
         raise typer.Exit(_FAILED_ON if failed else 1)

@@ -8,6 +8,7 @@ from textwrap import fill
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS
+from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import Level
 from sealscope.recordings.quality import Finding
 
@@ -103,9 +104,11 @@ def _how_much_by_what(diagnosis: Diagnosis) -> str | None:
 
 def rests_on(diagnosis: Diagnosis) -> str | None:
     """Return what every L/min of the diagnosis rests on; None where that is not known."""
-    machine = diagnosis.machine
-    if machine is None:
-        return None
+    return None if diagnosis.machine is None else machine_text(diagnosis.machine)
+
+
+def machine_text(machine: AssumedMachine) -> str:
+    """Return area and displacement that a flow rests on, and who stated them."""
     area = f"{number(1e6 * machine.area)} mm²"
     displacement = f"{number(1e6 * machine.displacement)} cm³/rev"
     if machine.stated_by == "recording":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from typing import Literal
@@ -16,9 +17,11 @@ from sealscope.diagnosis.detector import unusable
 from sealscope.diagnosis.observer.against_baseline import level as observer_level
 from sealscope.diagnosis.observer.detector import Observer
 from sealscope.diagnosis.observer.evidence import misfit
+from sealscope.diagnosis.observer.evidence import states_flow as observer_states_flow
 from sealscope.diagnosis.observer.model import G_UNIT
 from sealscope.diagnosis.pressure_model.detector import DAY_TO_DAY, PressureModel, is_followed
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole_log_rms
+from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.diagnosis.volume_balance.evidence import level as balance_level
 from sealscope.diagnosis.volume_balance.evidence import states_flow
@@ -26,14 +29,11 @@ from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.recording import Recording
-from sealscope.units import LITRE_PER_MINUTE
 
-#: What a level rests on, the most specific first. `conductance` is a volume balance without a unit of flow: a position
-#: in counts, or another geometry than the assumed one; `ringing` is the damping of the pressures' details.
-Basis = Literal["volume balance", "conductance", "pressure model", "observer", "ringing"]
-BASES: tuple[Basis, ...] = ("volume balance", "conductance", "pressure model", "observer", "ringing")
-#: Bases whose level is a conductance in m^3/(s Pa).
-FLOWS: tuple[Basis, ...] = ("volume balance", "pressure model", "observer")
+#: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
+#: details.
+Basis = Literal["volume balance", "pressure model", "observer", "ringing"]
+BASES: tuple[Basis, ...] = ("volume balance", "pressure model", "observer", "ringing")
 #: From day to day a level moves by this share of itself, or by this much; both known as from five recordings. Those of
 #: the conductances are what `diagnose` assumes; that of the ringing is `rms change`'s between sessions.
 _SHARE, _BY_RINGING, _RINGING, _FREEDOM = 0.1, 0.6 * G_UNIT, 0.11, 4.0
@@ -52,9 +52,10 @@ class LeakReading:
 
     `start`: of its first sample [s since 1970], None where not known, and `duration` [s]; `basis`, None where nothing
     can be stated, and `problem`: why; `level`: conductance of pump and piston together [m^3/(s Pa)], or a relative
-    index; `pressure`: mean |p_A - p_B|, `delivery`: mean flow of the pump [L/min] where it is known; `temperature` of
-    the oil [deg C], None where the file does not say; `scale`: displacement over area, over the assumed one; `point`:
-    operating point; `digest`: equal for copies.
+    index; `states_flow`: whether L/min can be stated of it, and `area` [m^2] of the piston by which a speed of creep is
+    a flow in the level's unit, None where it is in none; `pressure`: mean |p_A - p_B|; `temperature` of the oil
+    [deg C], None where the file does not say; `scale`: displacement over area, over the assumed one; `machine`: what
+    was assumed; `point`: operating point; `digest`: equal for copies.
     """
 
     file: str
@@ -62,88 +63,93 @@ class LeakReading:
     duration: float
     basis: Basis | None
     level: Level
+    states_flow: bool
+    area: float | None
     pressure: float
-    delivery: float | None
     temperature: float | None
     scale: float | None
+    machine: AssumedMachine | None
     point: OperatingPoint | None
     digest: bytes
     problem: str = ""
 
 
-def reading_of(recording: Recording, rig: Rig, file: str = "") -> LeakReading:
-    """Return what a recording states of the leakage; `rig`: what may be assumed of the machine."""
+@dataclass(frozen=True)
+class _Stated:
+    """What a detector states: a level on a basis, and which of its figures have a unit."""
+
+    basis: Basis | None
+    level: Level
+    states_flow: bool = False
+    in_metres: bool = False
+    scale: float | None = None
+
+
+_NOTHING = _Stated(None, Level(float("nan"), float("nan")))
+
+
+def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = "") -> LeakReading:
+    """Return what a recording states of the leakage.
+
+    `rig`: what may be assumed of the machine; None: as for `diagnose`, L/min only where the machine is known.
+    """
+    known, machine = assumed_rig(rig, recording)
     inspection = inspected(recording)
     part, problem = inspection.part, inspection.defect
-    basis: Basis | None = None
-    level, scale = Level(float("nan"), float("nan")), None
+    stated = _NOTHING
     if problem is None:
         with np.errstate(all="ignore"):
-            basis, level, scale = _level(part, rig)
-        if basis is None:
-            problem = "no detector states a level: " + _reasons(part, rig)
-    chambers = chambers_of(part)
-    both = len(chambers) == len(CHAMBERS) and len(part) > 0
+            stated = _stated(part, known)
+        if stated.basis is None:
+            problem = "no detector states a level: " + _reasons(part, known)
+    both = len(chambers_of(part)) == len(CHAMBERS) and len(part) > 0
     return LeakReading(
         file=file or str(recording.provenance.get("file", "recording")),
         start=start_seconds(recording),
         duration=recording.duration,
-        basis=basis,
-        level=level,
+        basis=stated.basis,
+        level=stated.level,
+        states_flow=stated.states_flow,
+        area=machine.area if stated.states_flow or stated.in_metres else None,
         pressure=float(np.mean(np.abs(part["p_A"] - part["p_B"]))) if both else float("nan"),
-        delivery=_delivery(part, rig) if problem is None else None,
         temperature=oil_temperature(recording),
-        scale=scale,
+        scale=stated.scale,
+        machine=machine,
         point=inspection.point if problem is None else None,
         digest=inspection.digest,
         problem=problem or "",
     )
 
 
-def _level(part: Recording, rig: Rig) -> tuple[Basis | None, Level, float | None]:
-    """Return the most specific level that a recording without a defect allows, and displacement over area."""
+def _stated(part: Recording, rig: Rig) -> _Stated:
+    """Return the most specific level that a recording without a defect allows."""
     balance = VolumeBalance(rig)
     if unusable(balance, part) is None:
         fit, _ = balance.fit(part)
         if fit is not None:
             own = balance_level(fit)
             total = Level(own.value + (fit.pump or 0.0), float(np.hypot(own.error, fit.pump_sd)))
-            return ("volume balance" if states_flow(fit) else "conductance"), total, abs(fit.scale)
+            return _Stated("volume balance", total, states_flow(fit), fit.metres, abs(fit.scale))
     model = PressureModel(rig)
     if unusable(model, part) is None:
         followed = model.follow(part)
         if not isinstance(followed, str) and is_followed(followed):
-            return "pressure model", followed.level, None
+            return _Stated("pressure model", followed.level, model.states_flow)
     observer = Observer(rig)
     if unusable(observer, part) is None:
         series = observer.follow(part)
         if series.G.size > 1 and misfit(series.estimates, series.formulation, rig) is None:
             own = observer_level(series)
-            return "observer", Level(own.value * G_UNIT, own.error * G_UNIT), None
+            flows = observer_states_flow(series.formulation, rig)
+            return _Stated("observer", Level(own.value * G_UNIT, own.error * G_UNIT), flows)
     log_rms = whole_log_rms(part).reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
-    if np.isfinite(ringing):
-        return "ringing", Level(ringing, _RINGING_ERROR), None
-    return None, Level(float("nan"), float("nan")), None
+    return _Stated("ringing", Level(ringing, _RINGING_ERROR)) if np.isfinite(ringing) else _NOTHING
 
 
 def _reasons(part: Recording, rig: Rig) -> str:
     reasons = (unusable(detector(rig), part) for detector in (VolumeBalance, PressureModel, Observer))
     return "; ".join(dict.fromkeys(reason for reason in reasons if reason)) or "the pressures do not ring"
-
-
-def _delivery(part: Recording, rig: Rig) -> float | None:
-    """Return the mean flow that the pump delivers [L/min], from its angle, its speed or its command."""
-    if "theta" in part and part.units["theta"] == "rad":
-        theta = part["theta"][np.isfinite(part["theta"])]
-        speed = float(np.abs(np.diff(theta)).sum()) / max(part.duration, 1e-9)
-    elif "omega" in part and part.units["omega"] == "rad/s":
-        speed = float(np.nanmean(np.abs(part["omega"])))
-    elif "u" in part and part.units["u"] == "V":
-        speed = float(np.nanmean(np.abs(part["u"]))) * rig.motor.omega_per_volt
-    else:
-        return None
-    return rig.pump.q_b / (2.0 * np.pi) * speed / LITRE_PER_MINUTE
 
 
 def oil_temperature(recording: Recording) -> float | None:
@@ -164,7 +170,7 @@ def oil_temperature(recording: Recording) -> float | None:
 
 def scatter_of(basis: Basis, usual: float) -> DayToDay:
     """Return the prior on the scatter of a level from day to day, for a machine of that usual level."""
-    if basis in ("volume balance", "conductance"):
+    if basis == "volume balance":
         return DayToDay(max(_SHARE * abs(usual), float(np.finfo(float).tiny)), _FREEDOM)
     if basis == "pressure model":
         return DAY_TO_DAY

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.trend.reading import FLOWS, Basis, LeakReading, reading_of, scatter_of
+from sealscope.diagnosis.trend.reading import Basis, LeakReading, reading_of, scatter_of
 from sealscope.diagnosis.trend.timeline import DAY, Timeline, spaced, timeline
 from sealscope.diagnosis.trend.wear import Episode, Interval, Levels, Wear, WearPrior, episodes, merged, single_outliers
 from sealscope.diagnosis.verdict.diagnosis import next_check
 from sealscope.diagnosis.verdict.evidence import Verdict
+from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
@@ -27,11 +29,6 @@ if TYPE_CHECKING:
 #: Machine-years in which a healthy machine has one false alarm, unless the caller asks for another number.
 YEARS = 10.0
 _YEARS = (0.1, 1000.0)
-#: Share of the pump's flow that pump and piston may pass together before a repair is due, where no limit is given.
-LIMIT_SHARE = 0.05
-#: Source: hydrostatic-transmission.com, Hydraulic motor case drain test (5 % of the theoretical flow where the maker
-#: states no limit), read in 2026.
-LIMIT_SOURCE = "5 % of the pump's flow, service practice where the maker states none"
 #: A laminar leak goes with 1/viscosity: ISO VG 46 of viscosity index 100 has 117 mm^2/s at 20 deg C and 30 at 50
 #: (ISO 3448), 4.5 % a kelvin; what the oil's sensor sees is not what the gap does. Mean and deviation [1/K].
 _PER_KELVIN, _PER_KELVIN_SD = 0.04, 0.015
@@ -73,9 +70,9 @@ class Trend:
     reason : str
         Why, in one line.
     basis : str or None
-        What the levels rest on: volume balance, pressure model or observer (L/min), conductance or ringing (relative).
+        What the levels rest on: volume balance, pressure model, observer, or the damping of the pressures' ringing.
     unit : str
-        Unit of the levels: ``L/min``, or ``%`` of the first recordings.
+        Unit of the levels: ``L/min``, or ``%`` of the first recordings where the machine's size is not known.
     pressure : float or None
         Pressure difference for which L/min are stated [Pa].
     points : tuple of TrendPoint
@@ -87,10 +84,10 @@ class Trend:
         recording.
     rows : tuple of int
         Numbers of the points that the episodes count.
-    limit : float or None
-        Level at which a repair is due; `limit_source` says whose.
-    limit_source : str
-        Where the limit comes from.
+    repair : RepairLimit
+        Leak beyond the healthy level at which a repair is due; `limit` is that level.
+    machine : AssumedMachine or None
+        What was assumed of the machine, and who stated it.
     findings : tuple of Finding
         What is left out, not comparable or missing, and why.
     years : float
@@ -110,8 +107,8 @@ class Trend:
     groups: tuple[str, ...]
     episodes: tuple[Episode, ...]
     rows: tuple[int, ...]
-    limit: float | None
-    limit_source: str
+    repair: RepairLimit
+    machine: AssumedMachine | None
     findings: tuple[Finding, ...]
     years: float
     healthy: int
@@ -121,6 +118,11 @@ class Trend:
     def wear(self) -> Wear | None:
         """What the last stretch says, None where there is no level."""
         return self.episodes[-1].wear if self.episodes else None
+
+    @property
+    def limit(self) -> float | None:
+        """Level at which a repair is due, None where the limit cannot be stated in the levels' unit."""
+        return None if self.wear is None else self.wear.limit
 
     @property
     def alarm(self) -> TrendPoint | None:
@@ -166,10 +168,11 @@ class Trend:
             "alarm": None if alarm is None else {"file": alarm.file, "time": self._moment(alarm.day)},
             "repairs": [{"file": point.file, "time": self._moment(point.day)} for point in self.repairs],
             "limit": _plain(self.limit),
-            "limit_source": self.limit_source,
+            "repair_limit": self.repair.as_dict(),
             "days_to_limit": None if wear is None or wear.reach is None else _interval(wear.reach),
             "false_alarm_years": self.years,
             "healthy_recordings": self.healthy,
+            "rig": None if self.machine is None else self.machine.as_dict(),
             "groups": list(self.groups),
             "points": [
                 {
@@ -216,9 +219,9 @@ def _interval(interval: Interval) -> dict[str, float | None]:
 def trend(
     recordings: Iterable[Recording],
     *,
-    rig: Rig | str | os.PathLike[str] = "thesis",
+    rig: Rig | str | os.PathLike[str] | None = None,
     healthy: int = 1,
-    limit: float | None = None,
+    limit: str | None = None,
     years: float = YEARS,
     every: float | None = None,
 ) -> Trend:
@@ -229,11 +232,13 @@ def trend(
     recordings : iterable of Recording
         Recordings of the machine, in any order; copies count once.
     rig : Rig, str or path-like, optional
-        What may be assumed of the machine: a Rig, the name of a packaged rig or the path of a TOML file.
+        What may be assumed of the machine, as for `diagnose`; without it, and where the recordings do not tell, levels
+        are relative.
     healthy : int, optional
         How many of the first recordings are known to be of a healthy machine.
-    limit : float, optional
-        Flow past pump and piston at which a repair is due [L/min]; by default 5 % of the pump's flow.
+    limit : str, optional
+        Leak beyond the healthy level at which a repair is due, as a flow (``"5 mL/min"``) or as a speed of creep
+        (``"8 mm/min"``, the default).
     years : float, optional
         Machine-years in which a healthy machine has one false alarm, 0.1 to 1000.
     every : float, optional
@@ -258,10 +263,7 @@ def trend(
     >>> ss.trend(days).verdict
     'no leak'
     """
-    from sealscope.parameters import load_rig
-
-    known = load_rig(rig)
-    readings = [reading_of(recording, known) for recording in recordings]
+    readings = [reading_of(recording, rig) for recording in recordings]
     return trend_of(readings, healthy=healthy, limit=limit, years=years, every=every)
 
 
@@ -269,7 +271,7 @@ def trend_of(
     readings: Sequence[LeakReading],
     *,
     healthy: int = 1,
-    limit: float | None = None,
+    limit: str | None = None,
     years: float = YEARS,
     every: float | None = None,
 ) -> Trend:
@@ -278,25 +280,18 @@ def trend_of(
         raise InputError(f"the number of healthy recordings must be 1 or more, got {healthy!r}")
     if not _YEARS[0] <= years <= _YEARS[1]:
         raise InputError(f"machine-years to a false alarm must be {_YEARS[0]:g} to {_YEARS[1]:g}, got {years!r}")
-    for name, number in (("limit", limit), ("every", every)):
-        if number is not None and not (math.isfinite(number) and number > 0.0):
-            raise InputError(f"{name} must be > 0, got {number!r}")
+    if every is not None and not (math.isfinite(every) and every > 0.0):
+        raise InputError(f"every must be > 0 s, got {every!r}")
+    repair = RepairLimit.of(limit)
     line = timeline(readings if every is None else spaced(readings, every))
-    return _trend(line, healthy=healthy, limit=limit, years=years, dated=every is None)
+    return _trend(line, healthy=healthy, repair=repair, years=years, dated=every is None)
 
 
-def _trend(line: Timeline, *, healthy: int, limit: float | None, years: float, dated: bool) -> Trend:
+def _trend(line: Timeline, *, healthy: int, repair: RepairLimit, years: float, dated: bool) -> Trend:
     every = [*line.readings, *(reading for reading, _ in line.left_out)]
     first = min((reading.start or 0.0 for reading in every), default=0.0)
-    series = _series(line, first, healthy)
+    series = _series(line, first, healthy, repair)
     findings = list(line.findings)
-    source = "given" if limit is not None else ""
-    if line.basis not in FLOWS:
-        limit, source = None, ""
-    elif limit is None:
-        deliveries = [reading.delivery for reading in line.readings if reading.delivery]
-        if deliveries:
-            limit, source = LIMIT_SHARE * float(np.median(deliveries)), LIMIT_SOURCE
     stretches: tuple[Episode, ...] = ()
     rows: tuple[int, ...] = ()
     notes: dict[int, str] = {}
@@ -313,21 +308,21 @@ def _trend(line: Timeline, *, healthy: int, limit: float | None, years: float, d
         known = max(1, int(np.count_nonzero(kept < healthy)))
         if len(few) < len(whole):
             known = max(1, round(known * len(few) / len(whole)))
-        stretches = tuple(episodes(few, series.prior, years=years, known=known, limit=limit))
+        stretches = tuple(episodes(few, series.prior, years=years, known=known, allowed=series.allowed))
         rows = tuple(int(kept[np.argmin(np.abs(whole.t - t))]) for t in few.t)
     points, places = _points(line, series, notes, first)
     trend = Trend(
         verdict="cannot tell",
         reason="",
         basis=line.basis,
-        unit="L/min" if line.basis in FLOWS else "%",
-        pressure=None if series is None or line.basis not in FLOWS else series.pressure,
+        unit="L/min" if series is not None and series.states_flow else "%",
+        pressure=series.pressure if series is not None and series.states_flow else None,
         points=points,
         groups=line.groups,
         episodes=stretches,
         rows=tuple(places[row] for row in rows),
-        limit=limit,
-        limit_source=source,
+        repair=repair,
+        machine=every[0].machine if every else None,
         findings=tuple(findings),
         years=years,
         healthy=healthy,
@@ -339,14 +334,20 @@ def _trend(line: Timeline, *, healthy: int, limit: float | None, years: float, d
 
 @dataclass(frozen=True, eq=False)
 class _Series:
-    """Levels of readings in the trend's unit, their prior, and the pressure [Pa] for which L/min are stated."""
+    """Levels of readings in the trend's unit, and their prior.
+
+    `states_flow`: whether the unit is L/min, at the `pressure` [Pa]; `allowed`: rise at which a repair is due, None
+    where it cannot be stated in the unit.
+    """
 
     levels: Levels
     prior: WearPrior
+    states_flow: bool
     pressure: float
+    allowed: float | None
 
 
-def _series(line: Timeline, first: float, healthy: int) -> _Series | None:
+def _series(line: Timeline, first: float, healthy: int, repair: RepairLimit) -> _Series | None:
     if line.basis is None:
         return None
     readings = line.readings
@@ -363,16 +364,19 @@ def _series(line: Timeline, first: float, healthy: int) -> _Series | None:
         factor = np.exp(-_PER_KELVIN * warmer)
         value, error = value * factor, error * factor
         covariate, slope_sd = warmer, _PER_KELVIN_SD * abs(usual)
-    if line.basis in FLOWS:
-        unit = pressure / LITRE_PER_MINUTE
-    elif line.basis == "conductance":
-        unit = 100.0 / max(abs(usual), float(np.finfo(float).tiny))
-    else:
+    flows = all(reading.states_flow for reading in readings)
+    unit = pressure / LITRE_PER_MINUTE if flows else 100.0 / max(abs(usual), float(np.finfo(float).tiny))
+    if line.basis == "ringing":
         unit, value = 100.0, value - usual
+    allowed = None
+    if repair.kind == "flow" and flows:
+        allowed = repair.value / LITRE_PER_MINUTE
+    elif repair.kind == "creep" and readings[0].area is not None:
+        allowed = repair.value * readings[0].area / pressure * unit
     levels = Levels(t, value * unit, error * unit, line.group, covariate, slope_sd * unit)
     lasting = _WEEK if t.size and float(np.ptp(t)) > _SESSION else _HOUR
     prior = WearPrior(replace(scatter, scale=scatter.scale * unit), lasting)
-    return _Series(levels, prior, pressure)
+    return _Series(levels, prior, flows, pressure, allowed)
 
 
 def _points(
@@ -428,8 +432,6 @@ def _verdict(trend: Trend) -> tuple[Verdict, str]:
         return "leak", (
             f"the leakage {shape} beyond the machine's own scatter ({rate}); pump and piston are not told apart"
         )
-    if trend.limit is not None and wear.now.low > trend.limit:
-        return "leak", "pump and piston pass more than the limit, from the first recording on"
     count = last.end - last.begin
     if count < _FEWEST:
         return "cannot tell", f"{count} comparable recordings are too few, {_FEWEST} are needed"

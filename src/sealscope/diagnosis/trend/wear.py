@@ -154,17 +154,19 @@ class Wear:
 
     `now`: level after the last recording, without the day's own scatter; `growth`: by a month; `step`: size of a step,
     None where a growth is likelier, or nothing changed; `onset`: time of the change [days], None where there is none;
-    `reach`: days from the last recording until the level reaches the limit, infinite where it does not; `healthy`:
-    where a recording of the machine before the change lies, in 95 of 100; `scatter`: deviation from day to day.
+    `healthy`: where a recording of the machine before the change lies, in 95 of 100, about its mean; `scatter`:
+    deviation from day to day; `limit`: the mean before the change and the rise that is allowed, None where none is
+    stated; `reach`: days from the last recording until the level reaches it, infinite where it does not.
     """
 
     now: Interval
     growth: Interval
     step: Interval | None
     onset: Interval | None
-    reach: Interval | None
     healthy: Interval
     scatter: float
+    limit: float | None
+    reach: Interval | None
 
 
 def usual_scatter(levels: Levels, prior: WearPrior) -> float:
@@ -375,11 +377,12 @@ def search(levels: Levels, prior: WearPrior, known: int = 1, *, falls: bool = Fa
     return Path(np.logaddexp.reduce(terms, axis=1), terms[-1], changes.begin)
 
 
-def describe(levels: Levels, prior: WearPrior, limit: float | None, alarmed: int | None) -> Wear:
+def describe(levels: Levels, prior: WearPrior, allowed: float | None, alarmed: int | None) -> Wear:
     """Return level, growth and time to a limit after the last recording.
 
-    `alarmed`: first recording that shows the change, as the test sees it; None where it did not alarm: then the even
-    growth over all recordings is estimated, of either sign and with a flat prior.
+    `allowed`: rise of the level at which a repair is due, None where none is stated; `alarmed`: first recording that
+    shows the change, as the test sees it; None where it did not alarm: then the even growth over all recordings is
+    estimated, of either sign and with a flat prior.
     """
     from scipy.special import ndtr, ndtri
 
@@ -416,20 +419,22 @@ def describe(levels: Levels, prior: WearPrior, limit: float | None, alarmed: int
     grows = changes.grows[column]
     slope, growing = np.where(grows, size, 0.0), float(np.mean(grows)) >= 0.5
     unknown = Interval(math.nan, -math.inf, math.inf)
-    reach = None
-    if limit is not None:
+    healthy, scatter = _healthy(levels.part(slice(0, alarmed)), prior, int(levels.group[-1]))
+    limit = reach = None
+    if allowed is not None:
+        limit = healthy.value + allowed
         with np.errstate(divide="ignore", invalid="ignore"):
             wait = np.where(slope > 0.0, (limit - now) / slope, math.inf) * MONTH
         reach = _interval(np.where(now >= limit, 0.0, wait)) if told else replace(unknown, low=0.0)
-    healthy, scatter = _healthy(levels.part(slice(0, alarmed)), prior, int(levels.group[-1]))
     return Wear(
         now=_interval(now),
         growth=_interval(slope[grows] if growing else slope) if told else unknown,
         step=None if growing else _interval(size[~grows]),
         onset=None if alarmed is None else _interval(levels.t[changes.begin[column]]),
-        reach=reach,
         healthy=healthy,
         scatter=scatter,
+        limit=limit,
+        reach=reach,
     )
 
 
@@ -475,12 +480,14 @@ class Episode:
     fell: bool
 
 
-def episodes(levels: Levels, prior: WearPrior, *, years: float, known: int = 1, limit: float | None) -> list[Episode]:
+def episodes(
+    levels: Levels, prior: WearPrior, *, years: float, known: int = 1, allowed: float | None = None
+) -> list[Episode]:
     """Return the stretches between repairs, each with its alarm.
 
     `years`: a healthy machine has one false alarm in so many, on average or less often; `known`: how many of the first
-    recordings are of a healthy machine. A repair is a fall of the level that the same test finds; the level starts anew
-    there, and the scatter seen before is kept in the prior.
+    recordings are of a healthy machine; `allowed`: rise at which a repair is due. A repair is a fall of the level that
+    the same test finds; the level starts anew there, and the scatter seen before is kept in the prior.
     """
     threshold = years * 365.25
     result: list[Episode] = []
@@ -502,7 +509,7 @@ def episodes(levels: Levels, prior: WearPrior, *, years: float, known: int = 1, 
         end = len(part) if cut is None else max(cut, 1)
         own = part.part(slice(0, end))
         alarm = alarm if alarm is not None and alarm < end else None
-        wear = describe(own, prior, limit, None if alarm is None else search(own, prior, known).likeliest)
+        wear = describe(own, prior, allowed, None if alarm is None else search(own, prior, known).likeliest)
         result.append(Episode(begin, begin + end, None if alarm is None else begin + alarm, wear, fell))
         if cut is None:
             break

@@ -21,12 +21,12 @@ def check_trend_page(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def write_trend_page(path: str | os.PathLike[str], trend: Trend, *, title: str = "", rig: str = "") -> Path:
-    """Write the page of a trend, whole or not at all; `rig`: what was assumed of the machine, in words."""
-    return template.write(check_trend_page(path), render_trend_page(trend, title=title, rig=rig))
+def write_trend_page(path: str | os.PathLike[str], trend: Trend, *, title: str = "") -> Path:
+    """Write the page of a trend, whole or not at all."""
+    return template.write(check_trend_page(path), render_trend_page(trend, title=title))
 
 
-def render_trend_page(trend: Trend, *, title: str = "", rig: str = "") -> str:
+def render_trend_page(trend: Trend, *, title: str = "") -> str:
     """Return the page of a trend as HTML."""
     count = len(trend.points)
     span = f", {text.moment(trend, trend.points[0].day)} to {text.moment(trend, trend.points[-1].day)}" if count else ""
@@ -37,6 +37,5 @@ def render_trend_page(trend: Trend, *, title: str = "", rig: str = "") -> str:
         title=title or "Trend of a machine",
         subtitle=f"{count} recording{'' if count == 1 else 's'}{span}",
         n=messages.number,
-        rig=rig,
         charts=[(size, chart) for size in SIZES if (chart := chart_of(trend, size)) is not None],
     )

@@ -11,7 +11,7 @@ import numpy as np
 from sealscope.diagnosis.trend.timeline import DAY
 from sealscope.diagnosis.trend.trend import Trend, TrendPoint
 from sealscope.diagnosis.trend.wear import MONTH, Interval
-from sealscope.reporting.messages import number
+from sealscope.reporting.messages import machine_text, number
 
 #: Times are shown to the minute where all recordings lie within so many days.
 _WITHIN_DAYS = 3.0
@@ -21,7 +21,6 @@ _BASES = {
     "volume balance": "by the volume balance",
     "pressure model": "by the pressure model",
     "observer": "by the observer",
-    "conductance": "by the volume balance, relative: geometry or unit of the position do not give L/min",
     "ringing": "the damping of the pressures' ringing, relative: no L/min",
 }
 
@@ -67,8 +66,6 @@ def sentence(trend: Trend) -> str:
         return "The leakage does not grow"
     if trend.verdict == "leak" and wear is not None and trend.alarm is not None:
         return "The leakage grows" if wear.step is None else "The leakage stepped up"
-    if trend.verdict == "leak":
-        return "The leakage is over the limit"
     if trend.alarm is not None:
         return "The ringing of the pressures changed; a leak cannot be told from other causes"
     return "Cannot tell"
@@ -97,7 +94,8 @@ def level(trend: Trend) -> str | None:
     if wear is None or trend.basis is None:
         return None
     band = f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)}"
-    return f"{level_now(trend)}; healthy {band}; {_BASES[trend.basis]}"
+    relative = "" if trend.unit == "L/min" or trend.basis == "ringing" else ", beside the first; no rig was stated"
+    return f"{level_now(trend)}; healthy {band}; {_BASES[trend.basis]}{relative}"
 
 
 def assumed(trend: Trend) -> str:
@@ -108,7 +106,12 @@ def assumed(trend: Trend) -> str:
         basis = f"Levels: {_BASES[trend.basis]}. "
     temperature = any(point.temperature is not None for point in trend.points)
     oil = "The oil's temperature is taken out. " if temperature else "The oil's temperature is not known. "
-    return f"{basis}{oil}{first} taken to be of a healthy machine."
+    machine = ""
+    if trend.machine is not None and trend.basis is not None:
+        machine = f"L/min rest on {machine_text(trend.machine)}. "
+        if trend.unit != "L/min":
+            machine = "No L/min: area and displacement of this machine are not stated (--rig, --area, --displacement). "
+    return f"{basis}{machine}{oil}{first} taken to be of a healthy machine."
 
 
 def group_note(trend: Trend, point: TrendPoint) -> str:
@@ -148,7 +151,10 @@ def reach(trend: Trend) -> str | None:
         text = f"{limit} not before {_wait(own.low)}" if own.low / MONTH <= _FURTHEST else f"{limit} not in sight"
     else:
         text = f"{limit} in {_wait(own.value)} ({_wait(own.low)} to {_wait(own.high)}) if it goes on so"
-    return f"{text}; the limit is {trend.limit_source}"
+    limit_text = f"{trend.repair} beyond the healthy level"
+    if not trend.repair.stated:
+        limit_text += ", what a maker of excavators allows a cylinder in service"
+    return f"{text}; the limit is {limit_text}"
 
 
 def events(trend: Trend) -> list[str]:
