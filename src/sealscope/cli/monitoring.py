@@ -6,9 +6,12 @@ import logging
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from sealscope.monitor.service import Service
 
 #: Words after `monitor` that are no file of settings.
 COMMANDS = ("init", "run", "demo", "-h", "--help")
@@ -50,7 +53,36 @@ def run(
 
     if not logging.getLogger("sealscope").handlers:
         logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
-    service = Service(read_settings(file), once=once)
+    _serve(Service(read_settings(file), once=once))
+
+
+@monitor.command()
+def demo(
+    folder: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Where the database is kept.")
+    ] = None,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page.")] = 8765,
+    speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000.0, help="Times real time.")] = 20.0,
+) -> None:
+    """Watch three simulated actuators at 20 times real time; one begins to leak after two minutes of theirs."""
+    import tempfile
+
+    from sealscope.live_demo import live_demo
+    from sealscope.storage.folders import make_folder
+
+    def say(text: str) -> None:
+        typer.echo(text, err=True)
+
+    with tempfile.TemporaryDirectory() as temporary:
+        place = Path(temporary) if folder is None else folder
+        make_folder(place)
+        _serve(live_demo(place, port, speed, say))
+
+
+def _serve(service: Service) -> None:
+    """Run a service until it ends, or a signal ends it."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
+    if service.page is not None:
+        typer.echo(f"page: {service.page.address}", err=True)
     service.run()

@@ -46,6 +46,7 @@ class WatchedActuators:
         self.counters: dict[str, int] = {}
         self.changes = threading.Condition()
         self.changed = 0
+        self.closed = False
         self._lock = threading.RLock()
         self._settings = {each.name: each for each in settings}
         self._actuators = {name: self._restored(each) for name, each in self._settings.items()}

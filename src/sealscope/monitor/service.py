@@ -17,6 +17,7 @@ from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.outputs.lines import EventLines
+from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import MonitorSettings
 from sealscope.monitor.sources.folder import WatchedFolder
 from sealscope.monitor.sources.lines import blocks_of_lines
@@ -65,6 +66,8 @@ class Service:
         self._sources = [*sources]
         self._hold = ExitStack()
         if "://" not in settings.database:
+            if not Path(settings.database).parent.is_dir():
+                raise InputError(f"the monitor's database must be in a folder that exists, got {settings.database}")
             busy = f"the database must belong to one monitor, got another at work ({settings.database})"
             self._hold.enter_context(locked(Path(settings.database + ".lock"), busy))
         try:
@@ -74,6 +77,13 @@ class Service:
             self._hold.close()
             raise
         self._lines = EventLines(self.store, self._stdout)
+        self.page: PageServer | None = None
+        if settings.page is not None and not once:
+            try:
+                self.page = PageServer(self.actuators, settings.page)
+            except BaseException:
+                self._hold.close()
+                raise
 
     def hand(self, block: SourceBlock | InputError) -> None:
         """Give the service a block, or the error of a message that holds none; waits while too many wait."""
@@ -89,7 +99,7 @@ class Service:
                 continue
 
     def run(self) -> None:
-        """Take blocks until the sources have ended, or `stop` is called."""
+        """Take blocks until the sources have ended and there is no page, or `stop` is called."""
         sources = [*self._sources]
         if self.settings.lines:
             sources.append(_lines_of(self._stdin))
@@ -117,8 +127,12 @@ class Service:
                     if self._queue.empty():
                         self._pass_on()
             self._pass_on()
+            while self.page is not None and not self.stopping.wait(0.5):
+                self._pass_on()
         finally:
             self.stop()
+            if self.page is not None:
+                self.page.close()
             self._hold.close()
 
     def stop(self) -> None:

@@ -32,7 +32,7 @@ _SPOILT, _UNBALANCED = 5.0, 0.05
 #: Displacement over area is known to this share: a change of it passes for a conductance.
 _SCALE_KNOWN = 5e-4
 #: Relative deviation of a conductance from what is not modelled.
-_LEVEL = 0.02
+LEVEL = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class FrozenBalance:
         own = np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
         leaning = np.abs(self.weights[THETA] * blocks.gram[:, I_AB, THETA]) / own
         g, _ = self.conductances(blocks)
-        return np.asarray(np.sqrt(self.offset_sd**2 + (_SCALE_KNOWN * leaning) ** 2 + (_LEVEL * g) ** 2))
+        return np.asarray(np.sqrt(self.offset_sd**2 + (_SCALE_KNOWN * leaning) ** 2 + (LEVEL * g) ** 2))
 
     def flow(self, blocks: BalanceBlocks) -> Array:
         """Return the mean flow (n,) of one unit of conductance over each block [L/min]."""

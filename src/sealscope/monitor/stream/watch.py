@@ -34,7 +34,7 @@ from sealscope.monitor.stream.decisions import (
     slow_rise_of,
     step_of,
 )
-from sealscope.monitor.stream.geometry import FrozenBalance, duty_of, in_motion
+from sealscope.monitor.stream.geometry import LEVEL, FrozenBalance, duty_of, in_motion
 from sealscope.monitor.stream.joining import SampleJoiner
 from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.recordings.recording import Array, Recording
@@ -358,7 +358,8 @@ class Watch:
     def _raise(self, rise: ConductanceRise, raised: float, before: float, flow: float) -> None:
         balance = self._balance
         assert balance is not None
-        size, half = rise.size * flow, 1.96 * rise.size_sd * flow
+        size = rise.size * flow
+        half = 1.96 * math.hypot(rise.size_sd, LEVEL * rise.size) * flow
         lpm, interval = (size, (max(0.0, size - half), size + half)) if balance.litres else (None, None)
         self.leak = WatchedLeak(
             raised,
@@ -387,7 +388,9 @@ class Watch:
             now = float(recent.mean())
             warmed = WARMEST ** min(1.0, max(0.0, end - self.leak.onset_s) / (_SHIFT_HOURS * 3600.0))
             before = max(self.leak.before, 0.0)
-            spread = 1.96 * math.hypot(sd / math.sqrt(recent.size), self.leak.before_sd)
+            spread = 1.96 * math.hypot(
+                sd / math.sqrt(recent.size), self.leak.before_sd, LEVEL * (now - self.leak.before)
+            )
             beyond = now - self.leak.before, now - before * warmed - spread, now - before / warmed + spread
         elif self.baseline is not None:
             base = self.baseline

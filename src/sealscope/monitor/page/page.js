@@ -1,0 +1,259 @@
+// The page of a monitor. Whatever comes from the wire goes into the document as text, never as markup.
+"use strict";
+
+const byId = (id) => document.getElementById(id);
+let chosen = decodeURIComponent(location.hash.slice(1)) || null;
+let hours = "";
+let chart = null;
+let shown = "";
+
+function element(kind, className, text) {
+  const made = document.createElement(kind);
+  if (className) made.className = className;
+  if (text !== undefined) made.textContent = text;
+  return made;
+}
+
+const litres = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(2)).toString());
+
+function flow(value, interval) {
+  if (value === null || value === undefined) return "no L/min";
+  const range = interval ? ` (${litres(interval[0])} to ${litres(interval[1])})` : "";
+  return `${litres(Math.max(value, 0))}${range} L/min`;
+}
+
+// clocks beyond 1973 are dates, others seconds since the beginning
+function clock(t) {
+  if (t === null || t === undefined) return "";
+  if (t > 1e8) return new Date(t * 1000).toLocaleString();
+  const whole = Math.floor(t);
+  const parts = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
+  return parts.map((part) => String(part).padStart(2, "0")).join(":");
+}
+
+async function asked(address, options) {
+  const answer = await fetch(address, options);
+  if (answer.status === 401) location.href = "/login";
+  return answer.json();
+}
+
+function stateOf(row) {
+  if (!row.alarm) return row.status;
+  return `${row.alarm.level}, ${row.alarm.state}, since ${clock(row.alarm.onset_s)}`;
+}
+
+function showFleet(fleet) {
+  const list = byId("fleet");
+  const focused = document.activeElement && document.activeElement.dataset.name;
+  list.replaceChildren();
+  let alarms = 0;
+  for (const row of fleet.actuators) {
+    const button = element("button");
+    button.type = "button";
+    button.dataset.name = row.name;
+    if (row.alarm) {
+      alarms += 1;
+      button.classList.add(row.alarm.level);
+    } else if (row.t === null) button.classList.add("waiting");
+    if (row.name === chosen) button.setAttribute("aria-current", "true");
+    button.append(element("span", "name", row.name));
+    button.append(element("span", "figure", row.leak_lpm === null ? "" : `${litres(Math.max(row.leak_lpm, 0))} L/min`));
+    button.append(element("span", "state", stateOf(row)));
+    button.addEventListener("click", () => choose(row.name));
+    const item = element("li");
+    item.append(button);
+    list.append(item);
+    if (row.name === focused) button.focus();
+  }
+  const count = fleet.actuators.length;
+  byId("overall").textContent =
+    `${count} actuator${count === 1 ? "" : "s"}, ${alarms === 0 ? "no alarm" : alarms === 1 ? "1 alarm" : alarms + " alarms"}`;
+  const dropped = Object.entries(fleet.counters).map(([reason, number]) => `${number} ${reason}`);
+  byId("dropped").textContent = dropped.length ? `Since the start: ${dropped.join("; ")}` : "";
+}
+
+function facts(alarm) {
+  const list = byId("alarm-facts");
+  list.replaceChildren();
+  const rows = [
+    ["Leak", flow(alarm.leak_lpm, alarm.leak_interval_lpm)],
+    ["Since", `${clock(alarm.onset_s)} (${clock(alarm.onset_interval_s[0])} to ${clock(alarm.onset_interval_s[1])})`],
+    ["Raised", clock(alarm.raised_s)],
+    ["Cause", alarm.cause],
+    ["Evidence", alarm.evidence],
+    ["Next check", alarm.next_check],
+    ["Number", `${alarm.diagnostic_number}, baseline ${alarm.baseline}`],
+  ];
+  for (const [name, value] of rows) list.append(element("dt", "", name), element("dd", "", value));
+}
+
+const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+function draw(course, events) {
+  const place = byId("chart");
+  const column = (name) => course.map((row) => row[name]);
+  const data = [column("t"), column("leak_low_lpm"), column("leak_high_lpm"), column("leak_lpm"), column("total_lpm")];
+  if (chart) chart.destroy();
+  place.replaceChildren();
+  if (!course.length) {
+    place.append(element("p", "quiet", "No block yet."));
+    return;
+  }
+  const dated = course[0].t > 1e8;
+  const grid = { stroke: colour("--line"), width: 1 };
+  const flowText = (plot, value) => (value === null || value === undefined ? "–" : `${litres(value)} L/min`);
+  const edge = { stroke: colour("--band"), width: 1, points: { show: false }, value: flowText };
+  const marks = events.filter((event) => event.event !== "comment");
+  chart = new uPlot(
+    {
+      width: Math.max(280, place.clientWidth),
+      height: 320,
+      scales: { x: { time: dated } },
+      bands: [{ series: [2, 1], fill: colour("--band") }],
+      axes: [
+        { stroke: colour("--quiet"), grid, space: 80, ...(dated ? {} : { values: (plot, at) => at.map(clock) }) },
+        { stroke: colour("--quiet"), grid, size: 70, label: "L/min", values: (plot, at) => at.map(litres) },
+      ],
+      series: [
+        { value: (plot, at) => (at === null ? "–" : clock(at)), label: "clock" },
+        { ...edge, label: "from" },
+        { ...edge, label: "to" },
+        { label: "leak", stroke: colour("--leak"), width: 2, value: flowText },
+        { label: "pump and piston", stroke: colour("--total"), width: 1, value: flowText },
+      ],
+      hooks: {
+        draw: [
+          (plot) => {
+            const context = plot.ctx;
+            context.save();
+            context.strokeStyle = colour("--quiet");
+            context.fillStyle = colour("--ink");
+            context.font = `${11 * devicePixelRatio}px system-ui`;
+            context.textAlign = "left";
+            context.setLineDash([4, 4]);
+            marks.forEach((event, k) => {
+              const x = plot.valToPos(event.t, "x", true);
+              if (x < plot.bbox.left || x > plot.bbox.left + plot.bbox.width) return;
+              context.beginPath();
+              context.moveTo(x, plot.bbox.top);
+              context.lineTo(x, plot.bbox.top + plot.bbox.height);
+              context.stroke();
+              context.fillText(event.event, x + 4, plot.bbox.top + (12 + 12 * (k % 4)) * devicePixelRatio);
+            });
+            context.restore();
+          },
+        ],
+      },
+    },
+    data,
+    place,
+  );
+}
+
+function showLife(life) {
+  if (life.error) {
+    byId("life").hidden = true;
+    return;
+  }
+  byId("life").hidden = false;
+  byId("life-title").textContent = life.name;
+  const now = life.summary;
+  const base = now.baseline;
+  const learned = base ? `; baseline ${base.version}, ${base.hours.toPrecision(2)} h` +
+    (base.lpm === null ? "" : `, ${litres(Math.max(base.lpm, 0))} L/min`) : "; the baseline is being learned";
+  byId("now").textContent =
+    `${clock(now.t)}: ${now.status}; pump and piston pass ${flow(now.total_lpm)}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${learned}`;
+  const alarm = life.alarms.find((each) => each.state !== "normal");
+  byId("alarm").hidden = !alarm;
+  if (alarm) {
+    byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}`;
+    facts(alarm);
+  }
+  const list = byId("events");
+  list.replaceChildren();
+  for (const event of life.events) {
+    const item = element("li");
+    item.append(element("time", "", clock(event.t)), element("span", "", `${event.alarm.id}: ${event.event}`));
+    if (event.alarm.leak_lpm !== null) item.append(element("span", "quiet", ` ${flow(event.alarm.leak_lpm)}`));
+    if (event.by) item.append(element("span", "", ` by ${event.by}`));
+    if (event.text) item.append(element("span", "", `: ${event.text}`));
+    list.append(item);
+  }
+  if (!life.events.length) list.append(element("li", "quiet", "Nothing yet."));
+  const passed = Object.entries(now.counters).map(([reason, number]) => `${number} ${reason}`);
+  byId("counters").textContent = passed.length ? passed.join("; ") : "none";
+  draw(life.course, life.events);
+}
+
+async function refresh() {
+  const fleet = await asked("/api/fleet");
+  if (chosen === null && fleet.actuators.length) chosen = fleet.actuators[0].name;
+  showFleet(fleet);
+  if (chosen === null) return;
+  const query = hours ? `?hours=${hours}` : "";
+  showLife(await asked(`/api/actuator/${encodeURIComponent(chosen)}${query}`));
+}
+
+function choose(name) {
+  chosen = name;
+  history.replaceState(null, "", `#${encodeURIComponent(name)}`);
+  byId("mark-answer").textContent = "";
+  refresh().then(() => {
+    if (matchMedia("(max-width: 60rem)").matches) byId("life").scrollIntoView();
+  });
+}
+
+byId("marks").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const mark = event.submitter ? event.submitter.value : "comment";
+  const answer = await asked(`/api/actuator/${encodeURIComponent(chosen)}/mark`, {
+    method: "POST",
+    headers: { "Content-Type": "application/json", "X-Sealscope": "mark" },
+    body: JSON.stringify({ mark, text: byId("comment").value }),
+  });
+  byId("mark-answer").textContent = answer.error || `${answer.id}: ${mark}`;
+  if (!answer.error) byId("comment").value = "";
+  refresh();
+});
+
+for (const button of document.querySelectorAll(".spans button")) {
+  button.addEventListener("click", () => {
+    hours = button.dataset.hours;
+    for (const other of document.querySelectorAll(".spans button")) {
+      other.setAttribute("aria-pressed", String(other === button));
+    }
+    refresh();
+  });
+}
+
+let busy = false;
+let again = false;
+async function soon() {
+  if (busy) {
+    again = true;
+    return;
+  }
+  busy = true;
+  try {
+    await refresh();
+    byId("overall").classList.remove("lost");
+  } catch (error) {
+    byId("overall").textContent = "the monitor does not answer";
+  }
+  setTimeout(() => {
+    busy = false;
+    if (again) {
+      again = false;
+      soon();
+    }
+  }, 500);
+}
+
+const news = new EventSource("/api/changes");
+news.onmessage = soon;
+news.onerror = () => {
+  byId("overall").textContent = "the monitor does not answer";
+};
+addEventListener("resize", soon);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", soon);
+soon();

@@ -1,0 +1,32 @@
+"""The fleet in the order in which a person should look at it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sealscope.monitor.alarms.alarm import ERROR_BIT, UNSEEN_BIT, WARNING_BIT
+
+
+def ranked(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the actuators with their open alarm: errors, warnings, what nobody has seen, then by leak.
+
+    Among equals, the one whose leak is larger for sure (the lower end of its interval) comes first, then the larger
+    leak, then the name. `alarms`: those that are not normal.
+    """
+    by_actuator = {alarm["actuator"]: alarm for alarm in alarms}
+    rows = [{"name": name, **summary, "alarm": by_actuator.get(name)} for name, summary in summaries.items()]
+    return sorted(rows, key=_order)
+
+
+def _order(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    word = int(row["status_word"])
+    low = (row["leak_interval_lpm"] or (0.0, 0.0))[0]
+    return (
+        -(word & ERROR_BIT),
+        -(word & WARNING_BIT),
+        -(word & UNSEEN_BIT),
+        -low,
+        -(row["leak_lpm"] or 0.0),
+        row["name"],
+    )

@@ -1,0 +1,38 @@
+"""`sealscope monitor`: its file of settings, and its complaints."""
+
+from __future__ import annotations
+
+import json
+
+from ..diagnosis.balance_machine import machine, step
+from ..monitor.plant import write_files
+
+
+def test_files_of_a_folder_end_in_one_alarm(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_files(tmp_path / "press 1", machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=130.0, rate=50.0), 130.0)
+    first = call("monitor", "init")
+    assert (first.status, first.out) == (0, "monitor.toml: written; sealscope monitor monitor.toml\n")
+    file = tmp_path / "monitor.toml"
+    file.write_text(file.read_text().replace("learn_hours = 8.0 ", "learn_hours = 0.02"))
+    again = call("monitor", "monitor.toml", "--once")
+    assert (again.status, again.err) == (0, "")
+    (event,) = [json.loads(line) for line in again.out.splitlines()]
+    assert (event["event"], event["alarm"]["actuator"]) == ("raised", "press 1")
+    assert (tmp_path / "monitor.db").exists()
+
+
+def test_what_exists_is_not_overwritten(call, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text("mine")
+    assert "must not exist yet" in call("monitor", "init", file).refused()
+    assert file.read_text() == "mine"
+
+
+def test_wrong_settings_are_one_line(call, tmp_path):
+    file = tmp_path / "monitor.toml"
+    assert "must be readable" in call("monitor", file).refused()
+    file.write_text("[[actuator]]\nname = 3\n")
+    assert call("monitor", file).refused().startswith("actuator.0.name: Input should be a valid string, got '3'")
+    file.write_text('database = "nowhere/monitor.db"\n[[actuator]]\nname = "a"\n')
+    assert "nowhere" in call("monitor", file, "--once").refused()

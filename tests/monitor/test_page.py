@@ -1,0 +1,183 @@
+"""The page: what it serves, whom it serves, what a person can say on it; driven in a browser."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from starlette.testclient import TestClient
+
+from sealscope.errors import InputError
+from sealscope.monitor.page.ranking import ranked
+from sealscope.monitor.page.site import PageServer, site
+from sealscope.monitor.service import Service
+from sealscope.monitor.settings import MonitorSettings, PageSettings
+
+from .plant import lines_of
+from .test_service import SOUND, WORN
+
+HOSTILE = '<img src=x onerror="document.title=1">\\ \n&amp;'
+PAGES = ("/", "/page.js", "/page.css", "/uPlot.js", "/uPlot.css", "/metrics", "/api/fleet", "/login")
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A monitor that has seen a leak in an actuator whose name is markup."""
+    settings = MonitorSettings.model_validate(
+        {
+            "database": str(tmp_path_factory.mktemp("page") / "monitor.db"),
+            "lines": True,
+            "defaults": {"learn_hours": 0.02, "warning_lpm": 0.0005},
+            "actuator": [{"name": "a sound one"}, {"name": HOSTILE}],
+        }
+    )
+    lines = lines_of({HOSTILE: WORN, "a sound one": SOUND}, 500)
+    service = Service(settings, once=True, stdin=io.BytesIO(lines), stdout=io.StringIO())
+    service.run()
+    return service
+
+
+@pytest.fixture
+def page(service: Service) -> TestClient:
+    return TestClient(site(service.actuators, PageSettings(), None))
+
+
+def of(name: str) -> str:
+    from urllib.parse import quote
+
+    return f"/api/actuator/{quote(name, safe='')}"
+
+
+def test_everything_is_served_and_nothing_comes_from_elsewhere(page: TestClient):
+    for address in PAGES:
+        answer = page.get(address)
+        assert answer.status_code == 200
+        assert answer.headers["content-security-policy"].startswith("default-src 'none'; script-src 'self'")
+        if address in ("/", "/page.js", "/page.css"):
+            assert "http://" not in answer.text and "https://" not in answer.text
+    assert "innerHTML" not in page.get("/page.js").text
+
+
+def test_the_leaking_one_comes_first_with_its_life(page: TestClient):
+    rows = page.get("/api/fleet").json()["actuators"]
+    assert [row["name"] for row in rows] == [HOSTILE, "a sound one"]
+    assert rows[0]["alarm"]["level"] == "warning"
+    life = page.get(of(HOSTILE)).json()
+    assert life["name"] == HOSTILE
+    assert life["events"][-1]["event"] == "raised"
+    assert len(life["course"]) == 41
+    assert 0 < len(page.get(of(HOSTILE), params={"hours": "0.01"}).json()["course"]) < 20
+    assert page.get(of("no such")).status_code == 404
+
+
+def test_a_course_of_many_blocks_is_means(service: Service):
+    whole = service.store.course("a sound one")
+    few = service.store.course("a sound one", most=10)
+    assert len(few) <= 11
+    assert few[5]["total_lpm"] == pytest.approx(sum(row["total_lpm"] for row in whole[24:29]) / 5, rel=0.05)
+
+
+def test_a_mark_needs_the_page_and_an_alarm(page: TestClient):
+    address, header = f"{of('a sound one')}/mark", {"X-Sealscope": "mark"}
+    assert page.post(address, json={"mark": "acknowledged"}).status_code == 403
+    answer = page.post(address, json={"mark": "acknowledged"}, headers=header)
+    assert (answer.status_code, answer.json()) == (
+        400,
+        {"error": "a sound one must have an alarm to be acknowledged, got none"},
+    )
+    for body in (b"{", b"[]", b'{"mark": 3}', b'{"mark": "' + b"x" * 20_000 + b'"}', b'{"mark": "away"}'):
+        assert page.post(address, content=body, headers=header).status_code == 400
+    comment = {"mark": "comment", "text": "<script>alert(1)</script>", "by": "Ada"}
+    assert page.post(f"{of(HOSTILE)}/mark", json=comment, headers=header).status_code == 200
+    assert page.get(of(HOSTILE)).json()["events"][0]["text"] == comment["text"]
+
+
+def test_other_sites_names_for_this_machine_are_refused(page: TestClient):
+    assert page.get("/api/fleet", headers={"Host": "evil.example"}).status_code == 400
+
+
+def test_beyond_this_machine_a_token_opens(service: Service, tmp_path: Path):
+    page = TestClient(site(service.actuators, PageSettings(host="0.0.0.0", token_file=tmp_path), "s3cret"))
+    for address in ("/api/fleet", "/metrics", "/page.js", of(HOSTILE)):
+        assert page.get(address).status_code == 401
+    assert page.get("/", follow_redirects=False).headers["location"] == "/login"
+    assert page.get("/api/fleet", headers={"Authorization": "Bearer s3cret"}).status_code == 200
+    assert page.get("/api/fleet", headers={"Authorization": "Bearer s3cres"}).status_code == 401
+    assert page.post("/login", data={"token": "guess"}).status_code == 401
+    answer = page.post("/login", data={"token": "s3cret"}, follow_redirects=False)
+    cookie = answer.headers["set-cookie"]
+    assert answer.status_code == 303
+    assert "HttpOnly" in cookie and "SameSite=strict" in cookie and "s3cret" not in cookie
+    assert page.get("/api/fleet").status_code == 200
+
+
+def test_prometheus_reads_the_metrics(page: TestClient):
+    answer = page.get("/metrics")
+    assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+    families = {family.name: family for family in text_string_to_metric_families(answer.text)}
+    leaks = {sample.labels["actuator"]: sample.value for sample in families["sealscope_leak_lpm"].samples}
+    assert leaks[HOSTILE] == pytest.approx(0.00195, rel=0.1)
+    words = {sample.labels["actuator"]: sample.value for sample in families["sealscope_status_word"].samples}
+    assert words == {HOSTILE: 5.0, "a sound one": 0.0}
+    assert families["sealscope_blocks"].type == "counter"
+
+
+def test_the_order_is_error_warning_unseen_then_the_sure_leak():
+    def row(word: int, low: float) -> dict[str, object]:
+        return {"status_word": word, "leak_interval_lpm": [low, 1.0], "leak_lpm": 0.5}
+
+    summaries = {"quiet": row(0, 0.0), "less": row(1, 0.1), "more": row(1, 0.2), "bad": row(2, 0.0), "gone": row(4, 0)}
+    names = [each["name"] for each in ranked(summaries, [])]
+    assert names == ["bad", "more", "less", "gone", "quiet"]
+
+
+def test_a_port_in_use_is_one_line(service: Service):
+    first = PageServer(service.actuators, PageSettings(port=0))
+    with pytest.raises(InputError, match=r"page.port must be free, got .* \(127.0.0.1:\d+\)"):
+        PageServer(service.actuators, PageSettings(port=first.port))
+    first.close()
+    service.actuators.closed = False
+
+
+@pytest.mark.slow
+def test_the_page_in_a_browser(service: Service):
+    """The alarm appears, the hostile name stays text, the alarm is acknowledged by keyboard, at both widths."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    browser_path = shutil.which("chromium")
+    if browser_path is None:
+        pytest.skip("chromium is not installed")
+    server = PageServer(service.actuators, PageSettings(port=0))
+    try:
+        with playwright.sync_playwright() as player:
+            browser = player.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
+            for width in (400, 1300):
+                view = browser.new_page(viewport={"width": width, "height": 900})
+                errors: list[str] = []
+                view.on("pageerror", lambda error, seen=errors: seen.append(str(error)))
+                view.on("console", lambda line, seen=errors: seen.append(line.text) if line.type == "error" else None)
+                view.goto(server.address)
+                view.wait_for_selector("#alarm:not([hidden])")
+                assert view.text_content("#life-title") == HOSTILE
+                assert view.title() == "Sealscope monitor"
+                assert view.locator("img").count() == 0
+                assert view.evaluate("document.documentElement.scrollWidth") <= width
+                assert view.locator("#chart canvas").count() == 1
+                if width == 400:
+                    view.keyboard.press("Tab")
+                    assert view.evaluate("document.activeElement.dataset.name") == HOSTILE
+                    view.locator("#marks button[value=acknowledged]").focus()
+                    view.keyboard.press("Enter")
+                    view.locator("#mark-answer", has_text="acknowledged").wait_for()
+                    view.locator("#alarm-title", has_text="acknowledged").wait_for()
+                assert "acknowledged" in (view.text_content("#alarm-title") or "")
+                assert errors == []
+                view.close()
+            browser.close()
+    finally:
+        server.close()
+        service.actuators.closed = False
+    assert service.store.alarms(actuator=HOSTILE)[0]["state"] == "acknowledged"
