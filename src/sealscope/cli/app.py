@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import campaign, monitoring, prediction, recordings, reproduction, simulation, trend
+from sealscope.cli import campaign, monitoring, prediction, recordings, reproduction, rigs, simulation, trend
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -40,6 +40,7 @@ for command in (
 ):
     app.command()(command)
 app.add_typer(campaign.campaign)
+app.add_typer(rigs.rigs)
 app.add_typer(monitoring.monitor)
 
 

@@ -1,0 +1,71 @@
+"""`sealscope rigs` and `sealscope rigs new`."""
+
+from __future__ import annotations
+
+import pytest
+
+from sealscope.parameters import load_rig, rig_names
+from sealscope.physics.rest import initial_state
+from sealscope.physics.rig import rig_numbers
+from sealscope.physics.solvers.limits import longest_step
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.integrate import LONGEST_STEP, trajectory
+
+SIZES = ("--stroke", "400", "--displacement", "6")
+
+
+def test_the_packaged_rigs_are_listed_with_their_titles(call):
+    done = call("rigs")
+    assert (done.status, done.err) == (0, "")
+    assert [line.split()[0] for line in done.out.splitlines()] == list(rig_names())
+    assert all(load_rig(name).title in done.out for name in rig_names())
+
+
+@pytest.mark.parametrize("areas", [("500", "500"), ("12.5 cm^2", "9.4[cm^2]"), ("700", "900")], ids="{0[0]}".format)
+def test_a_new_rig_loads_rests_and_can_be_resolved(call, tmp_path, areas):
+    path = tmp_path / "press.toml"
+    done = call("rigs", "new", "press", "--area-A", areas[0], "--area-B", areas[1], *SIZES, "-o", path)
+    assert (done.status, done.err) == (0, "")
+    rig = load_rig(path)
+    assert (rig.name, rig.cylinder.L, rig.pump.q_b) == ("press", pytest.approx(0.4), pytest.approx(6e-6))
+    sizes = {"500": (5e-4, 5e-4), "12.5 cm^2": (1.25e-3, 9.4e-4), "700": (7e-4, 9e-4)}[areas[0]]
+    assert pytest.approx(sizes) == (rig.cylinder.A_A, rig.cylinder.A_B)
+    assert rig.makeup.check_valves == ("absent" if sizes[0] == sizes[1] else "pilot-operated")
+    sources = {row.name: row.source for row in rig.table()}
+    assert sources["cylinder.A_A"].startswith("stated when")
+    assert sources["friction.F_v"].startswith("assumed: that of")
+    initial_state(rig, 0.0)
+    assert longest_step(rig_numbers(rig)) > 0.06 * LONGEST_STEP
+    Experiment.of(rig=rig, duration=1.0)
+
+
+@pytest.mark.slow
+def test_a_new_single_rod_runs(call, tmp_path):
+    path = tmp_path / "small.toml"
+    call("rigs", "new", "small", "--area-A", "700", "--area-B", "500", *SIZES, "-o", path)
+    run = trajectory(Experiment.of(rig=path, command="5 sin(2t)", duration=4.0), ())
+    assert run.error < 100.0
+    assert run["x"].max() - run["x"].min() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        (("--area-A", "0", "--area-B", "500"), "area-A must be > 0, got 0"),
+        (("--area-A", "500 kg", "--area-B", "500"), "--area-A must have a unit of area, such as m^2, got kg"),
+        (("--area-A", "500", "--area-B", "500", "-o", "press.txt"), "a rig's file must end in .toml, got press.txt"),
+    ],
+)
+def test_a_wrong_size_is_one_line_and_writes_nothing(call, tmp_path, monkeypatch, words, rule):
+    monkeypatch.chdir(tmp_path)
+    assert call("rigs", "new", "press", *words, *SIZES).refused().startswith(rule)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_exists_is_kept(call, tmp_path):
+    path = tmp_path / "press.toml"
+    path.write_text("mine")
+    words = ("--area-A", "500", "--area-B", "500", *SIZES, "-o", path)
+    assert call("rigs", "new", "press", *words).refused().endswith("which exists")
+    assert path.read_text() == "mine"
+    assert "name of a rig must be of letters" in call("rigs", "new", 'a"b', *words).refused()
