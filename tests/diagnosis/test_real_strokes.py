@@ -10,11 +10,12 @@ import json
 import re
 from collections import Counter
 from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter1d
 
 from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.baseline.operating_point import operating_point
@@ -71,6 +72,16 @@ def test_defective_against_healthy(healthy: list[Recording], defective: list[Rec
         json.dumps(found.as_dict(), allow_nan=False)
 
 
+@pytest.fixture(scope="module")
+def strokes() -> ModuleType:
+    """`benchmarks/strokes.py`, which measures what is tested here."""
+    spec = spec_from_file_location("strokes", Path(__file__).resolve().parents[2] / "benchmarks" / "strokes.py")
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 SESSIONS = ("session_act_1_healthy", "session_act_2_healthy")
 
 
@@ -124,23 +135,16 @@ def test_a_defective_seal_is_not_called_healthy(
 
 
 @pytest.mark.parametrize(("gain", "share"), [(1.0, 0.0), (1.1, 0.9), (1.3, 0.9)])
-def test_a_change_within_a_session_is_found(gain: float, share: float, sessions: dict[str, list[Recording]]) -> None:
+def test_a_change_within_a_session_is_found(
+    gain: float, share: float, sessions: dict[str, list[Recording]], strokes: ModuleType
+) -> None:
     """Pairs in turn as baseline; what is faster than d5 is scaled in the others of the session's second half."""
-    strokes = sessions["session_act_1_healthy"]
-    baseline = [one for k, one in enumerate(strokes) if (k // 2) % 2 == 0]
-    later = [one for k, one in enumerate(strokes) if (k // 2) % 2 and k > len(strokes) // 2]
-    verdicts = Counter(diagnose(scaled(stroke, gain), baseline).verdict for stroke in later)
+    session = sessions["session_act_1_healthy"]
+    baseline = [stroke for k, stroke in enumerate(session) if (k // 2) % 2 == 0]
+    later = [stroke for k, stroke in enumerate(session) if (k // 2) % 2 and k > len(session) // 2]
+    verdicts = Counter(diagnose(strokes.louder(stroke, gain), baseline).verdict for stroke in later)
     assert verdicts["leak"] >= share * len(later)
     assert gain > 1.0 or verdicts["leak"] == 0
-
-
-def scaled(stroke: Recording, gain: float) -> Recording:
-    """Scale the band of d2 to d4 of both pressures, in whole counts."""
-    channels = dict(stroke.channels)
-    for name in ("p_A", "p_B"):
-        band = gaussian_filter1d(stroke[name], 0.6) - gaussian_filter1d(stroke[name], 8.0)
-        channels[name] = np.rint(stroke[name] + (gain - 1.0) * band)
-    return replace(stroke, channels=channels)
 
 
 def test_healthy_against_its_own_other_half(healthy: list[Recording]) -> None:
