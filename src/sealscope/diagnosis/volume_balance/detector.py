@@ -10,13 +10,13 @@ turns the result into L/min, and displacement over area shows whether the assume
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import share_of_each
-from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
+from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, DriftStep
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import (
     BalanceBlocks,
@@ -86,7 +86,7 @@ class VolumeBalance:
         evidence = judge(
             fit,
             probability,
-            dated=lambda own, step: date_step(own, step, recording, self.geometry),
+            samples=_BehindTheFit(self, recording),
             healthy=self.rig.pump.G_healthy or None,
         )
         if baseline:
@@ -130,6 +130,25 @@ class VolumeBalance:
         fit = fit_balance(blocks, metres=recording.units["x"] == "m", geometry=self.geometry)
         problem = trouble(fit) or _unseen(recording, fit)
         return (fit, "") if problem is None else (None, problem)
+
+
+@dataclass(frozen=True)
+class _BehindTheFit:
+    """The recording behind a fit."""
+
+    detector: VolumeBalance
+    recording: Recording
+
+    def dated(self, fit: BalanceFit, step: DriftStep) -> DriftStep:
+        """Return the step with its onset from the samples about it."""
+        return date_step(fit, step, self.recording, self.detector.geometry)
+
+    def levelled(self, zero: float) -> tuple[BalanceFit, _BehindTheFit] | None:
+        """Return the fit of the recording with `zero` [Pa] added to p_A, and that recording."""
+        channels = {**self.recording.channels, "p_A": self.recording["p_A"] + zero}
+        shifted = replace(self.recording, channels=channels)
+        fit, _ = self.detector.fit(shifted)
+        return None if fit is None else (fit, _BehindTheFit(self.detector, shifted))
 
 
 def _unseen(recording: Recording, fit: BalanceFit) -> str | None:

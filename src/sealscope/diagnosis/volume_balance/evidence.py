@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from sealscope.diagnosis.verdict.evidence import (
 from sealscope.diagnosis.volume_balance.blocks import FLOW, Y
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, Law, discriminate, findable, search
 from sealscope.diagnosis.volume_balance.growth import grown
+from sealscope.diagnosis.volume_balance.law import OrificeShare, evened, orifice_share, reach, shape_of, zero_error
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -63,8 +65,9 @@ _WHOLE = 0.6
 _WORTH = 0.02
 #: A drift over this share of the conductance at the start is more than warm oil does within a recording.
 _LARGE_DRIFT = 0.5
-#: Blocks within this time of the rise [s], and twelve at least, show where the oil goes.
-_REACH = 60.0
+#: A leak follows both laws where either takes more than this share of it.
+_SOME = 0.15
+_LAWS: tuple[Law, Law] = ("laminar", "orifice")
 
 
 def trouble(fit: BalanceFit) -> str | None:
@@ -88,32 +91,65 @@ def trouble(fit: BalanceFit) -> str | None:
     return None
 
 
+class Samples(Protocol):
+    """The samples behind a fit, for what its blocks do not show."""
+
+    def dated(self, fit: BalanceFit, step: DriftStep) -> DriftStep:
+        """Return the step with its onset from the samples about it."""
+        ...
+
+    def levelled(self, zero: float) -> tuple[BalanceFit, Samples] | None:
+        """Return the fit, and its samples, with `zero` [Pa] added to p_A - p_B; None where there is none."""
+        ...
+
+
 def judge(
     fit: BalanceFit,
     probability: float,
     *,
     window: bool = False,
-    dated: Callable[[BalanceFit, DriftStep], DriftStep] | None = None,
+    samples: Samples | None = None,
     healthy: float | None = None,
 ) -> Evidence:
     """Return the evidence of a rise of the conductance within a recording.
 
-    `window`: of a stream, where neither a fall is named nor the smallest step that would have shown; `dated`: gives the
-    onset from the samples about the step (`onset`); `healthy`: the most that pump and piston of a healthy machine pass
-    together [m^3/(s Pa)], None where not known.
+    `window`: of a stream, where neither a fall is named nor the smallest step that would have shown; `samples` behind
+    the fit, where they are at hand; `healthy`: the most that pump and piston of a healthy machine pass together
+    [m^3/(s Pa)], None where not known.
     """
-    step, growth = search(fit, probability), grown(fit, probability)
-    if growth is not None and not (step.alarm and step.size > _WHOLE * growth.size):
-        return _measured(replace(describe_leak(fit, growth), passage=passage(fit, None, healthy)), fit)
-    if step.alarm:
-        evidence = describe_leak(fit, step if dated is None else dated(fit, step))
-        return _measured(replace(evidence, passage=passage(fit, None, healthy)), fit)
+    step = search(fit, probability)
+    risen = _risen(fit, step, probability)
+    if risen is not None:
+        if samples is not None:
+            fit, risen, samples = _levelled(fit, risen, samples, probability)
+            risen = samples.dated(fit, risen)
+        return _measured(replace(describe_leak(fit, risen, probability), passage=passage(fit, None, healthy)), fit)
     if window:
         return no_step(fit, step, None, 0.0)
     smallest = findable(fit, probability, step.noise)
     evidence = no_step(fit, step, search(fit, probability, sign=-1), smallest)
     evidence = replace(evidence, passage=passage(fit, smallest, healthy), refuses=_refused(fit))
     return _measured(_from_the_start(evidence, fit, probability), fit)
+
+
+def _risen(fit: BalanceFit, step: DriftStep, probability: float) -> DriftStep | None:
+    """Return the growth of the conductance, else its step, None where neither is an alarm."""
+    growth = grown(fit, probability)
+    if growth is not None and not (step.alarm and step.size > _WHOLE * growth.size):
+        return growth
+    return step if step.alarm else None
+
+
+def _levelled(
+    fit: BalanceFit, risen: DriftStep, samples: Samples, probability: float
+) -> tuple[BalanceFit, DriftStep, Samples]:
+    """Return fit, rise and samples with the zero of p_A - p_B that the leak itself shows, where it still rises then."""
+    zero = zero_error(fit, risen)
+    again = samples.levelled(zero) if zero else None
+    if again is None:
+        return fit, risen, samples
+    rise = _risen(again[0], search(again[0], probability), probability)
+    return (fit, risen, samples) if rise is None else (again[0], rise, again[1])
 
 
 def judge_level(fit: BalanceFit, baseline: Sequence[BalanceFit], within: Evidence, probability: float) -> Evidence:
@@ -394,45 +430,39 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
     )
 
 
-def _shape(fit: BalanceFit, step: DriftStep) -> Array:
-    """Return the share (n,) of the leak that is open in each block."""
-    lead, width = (0.5 * fit.blocks.seconds, fit.blocks.seconds) if step.rise == 0.0 else (0.0, step.rise)
-    return np.clip((fit.blocks.t + lead - step.onset) / width, 0.0, 1.0)
-
-
-def describe_leak(fit: BalanceFit, step: DriftStep) -> Evidence:
+def describe_leak(fit: BalanceFit, step: DriftStep, probability: float) -> Evidence:
     """Return the evidence where the conductance rises: where the oil goes, since when, how much."""
-    shape = _shape(fit, step)
-    near = discriminate(fit, step.onset, step.rise, within=max(_REACH, 12.0 * fit.blocks.seconds))
+    shape = shape_of(fit, step)
+    near = discriminate(fit, step.onset, step.rise, within=reach(fit))
     cause, place = _place(fit, step, shape, near)
     open_ = shape >= 1.0 if step.rise == 0.0 else shape > 0.0
-    size, size_sd = step.size, step.size_sd
-    laws, law_text = _laws(near)
+    law = orifice_share(fit, step)
+    even, unit_flow = evened(fit, law, open_) if open_.any() else (fit, fit.unit_flow("laminar"))
+    again = search(even, probability) if step.rise == 0.0 and open_.any() else step
+    by_law = again if again.alarm and again.rise == step.rise else step
+    size, size_sd = by_law.size, by_law.size_sd
     lpm, interval, course, relative = None, None, None, None
     if open_.any():
-        flows = [float(np.mean((fit.unit_flow(law) * shape)[open_])) / LITRE_PER_MINUTE for law in laws]
-        lift = float(np.mean(np.abs(fit.blocks.lift[open_])))
-        halves = [
-            _t_quantile(step.freedom) * math.hypot(size_sd, _RELATIVE * size, (law == "orifice") * lift * size)
-            for law in laws
-        ]
-        lpm = size * flows[0]
-        interval = (
-            max(0.0, min((size - half) * flow for half, flow in zip(halves, flows, strict=True))),
-            max((size + half) * flow for half, flow in zip(halves, flows, strict=True)),
-        )
+        laminar, orifice = (float(np.mean((fit.unit_flow(name) * shape)[open_])) / LITRE_PER_MINUTE for name in _LAWS)
+        flow = float(np.mean((unit_flow * shape)[open_])) / LITRE_PER_MINUTE
+        more = abs(orifice - laminar) * size
+        lift = law.mean * float(np.mean(np.abs(fit.blocks.lift[open_])))
+        half = _t_quantile(step.freedom) * math.hypot(size_sd, _RELATIVE * size, lift * size) * flow
+        less, most = (law.mean - law.low, law.high - law.mean)[:: 1 if orifice > laminar else -1]
+        lpm = size * flow
+        interval = max(0.0, lpm - half - less * more), lpm + half + most * more
         low, high = (LITRE_PER_MINUTE * limit for limit in interval)
         relative = _relative(fit, LITRE_PER_MINUTE * lpm, (low, high), open_)
     if lpm is not None and interval is not None and states_flow(fit):
-        course = _course(fit, step, shape, laws[0])
+        course = _course(even, by_law, shape, unit_flow)
         by = f" by {lpm:.2g} L/min ({interval[0]:.2g} to {interval[1]:.2g})"
     else:
         by = f" by {_flow_text(size, fit)}; {_no_flow_text(fit, lpm)}"
         lpm, interval = None, None
     grows = f", over {step.rise:.0f} s" if step.rise > 0 else ""
     reason = (
-        f"the leakage conductance rises at {step.onset:.1f} s{grows}{by}; {place}{law_text} ({_figures(step)})"
-        f"{_left_out_text(fit)}"
+        f"the leakage conductance rises at {step.onset:.1f} s{grows}{by}; {place}{_law_text(law, near)} "
+        f"({_figures(step)}){_left_out_text(fit)}"
     )
     evidence = Evidence(
         "leak" if cause in LEAKS else "cannot tell" if cause == "sensor fault" else "no leak",
@@ -455,13 +485,15 @@ def describe_leak(fit: BalanceFit, step: DriftStep) -> Evidence:
     return replace(evidence, leak_lpm=None, leak_interval_lpm=None, course=None, relative=None)
 
 
-def _laws(near: dict[str, float]) -> tuple[tuple[Law, ...], str]:
-    """Return the laws that the leak may follow, the likelier first, and the law in words where the blocks decide."""
-    if near.get("orifice", 0.0) < -_DECISIVE:
-        return ("laminar",), "; it is laminar, as of a worn seal"
-    if near.get("orifice", 0.0) > _DECISIVE:
-        return ("orifice",), "; it goes with the root of the pressure, as of an orifice"
-    return ("laminar", "orifice"), ""
+def _law_text(law: OrificeShare, near: dict[str, float]) -> str:
+    """Return the law of a leak in words where the blocks decide."""
+    if law.low > _SOME and law.high < 1.0 - _SOME:
+        return f"; about {law.mean:.0%} of it goes with the root of the pressure, as of an orifice, the rest is laminar"
+    if near.get("orifice", 0.0) < -_DECISIVE and law.mean < 0.5:
+        return "; it is laminar, as of a worn seal"
+    if near.get("orifice", 0.0) > _DECISIVE and law.mean > 0.5:
+        return "; it goes with the root of the pressure, as of an orifice"
+    return ""
 
 
 def _place(fit: BalanceFit, step: DriftStep, shape: Array, near: dict[str, float]) -> tuple[Cause, str]:
@@ -493,8 +525,7 @@ def _lost(fit: BalanceFit, step: DriftStep, shape: Array) -> float:
 
     0 where it is no more than a bias of the pressures makes of a leak between the sides.
     """
-    reach = max(_REACH, 12.0 * fit.blocks.seconds)
-    close = np.abs(fit.blocks.t - step.onset - 0.5 * step.rise) < reach + 0.5 * step.rise
+    close = np.abs(fit.blocks.t - step.onset - 0.5 * step.rise) < reach(fit) + 0.5 * step.rise
     before, after = fit.slip[close & (shape == 0.0)], fit.slip[close & (shape == 1.0)]
     if min(before.size, after.size) < 3:
         return 0.0
@@ -504,9 +535,9 @@ def _lost(fit: BalanceFit, step: DriftStep, shape: Array) -> float:
     return lost if lost > least else 0.0
 
 
-def _course(fit: BalanceFit, step: DriftStep, shape: Array, law: Law) -> LeakCourse:
-    """Return the leak block by block: the conductance beyond its drift, under each block's own pressure difference."""
-    flow = fit.unit_flow(law) / LITRE_PER_MINUTE
+def _course(fit: BalanceFit, step: DriftStep, shape: Array, unit_flow: Array) -> LeakCourse:
+    """Return the leak block by block: the conductance beyond its drift, by the flow (n,) of a unit of it there."""
+    flow = unit_flow / LITRE_PER_MINUTE
     lpm = (fit.g - step.level) * flow
     noise = fit.sd * max(1.0, step.noise)
     half = _t_quantile(step.freedom) * np.hypot(noise, step.size_sd * shape) * flow

@@ -13,7 +13,7 @@ pump's direction or by the higher pressure. docs/decisions/0023-volume-balance.m
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -354,42 +354,69 @@ def discriminate(fit: BalanceFit, onset: float, rise: float, *, within: float) -
     """Compare the explanations of a rise of the conductance at `onset` [s] over `rise` [s].
 
     Returns twice the log likelihood by which each explains the blocks better than a laminar leak past the piston:
-    `orifice` (past the piston, with the root of the pressure difference), `scale` (no
-    leak: displacement or the reading of an encoder changed by a factor), `pump` (with the pressure difference at the
-    pump's ports, where it is recorded). Near 0: the data do not tell.
+    `orifice` (past the piston, with the root of the pressure difference), `scale` (no leak: displacement or the reading
+    of an encoder changed by a factor), `pump` (with the pressure difference at the pump's ports, where it is recorded).
+    Near 0: the data do not tell.
 
-    In each block within `within` seconds of the rise the other integral is fitted beside that of dp_AB: its coefficient
-    b_k moves by nothing if the leak is laminar and past the piston, and by all of the leak if it is the other. The
-    scatter of b_k, which knows the colour of the noise, judges between the two (Student's likelihoods). The blocks that
-    the rise passes through do not count.
+    The coefficient of the other integral moves by nothing if the leak is laminar and past the piston, and by all of the
+    leak if it is the other (`moved_share`). The scatter of the blocks, which knows the colour of the noise, judges
+    between the two (Student's likelihoods).
+    """
+    evidence = {}
+    for name, column in (("orifice", I_ROOT), ("scale", THETA), ("pump", I_12)):
+        moved = moved_share(fit, column, onset, rise, within=within)
+        if moved is None:
+            continue
+        z = np.array([moved.share, moved.share - 1.0]) / max(moved.deviation, np.finfo(float).tiny)
+        here, there = (moved.freedom + 1) * np.log1p(z**2 / moved.freedom)
+        evidence[name] = float(here - there)
+    return evidence
+
+
+class MovedShare(NamedTuple):
+    """By how much of a leak the coefficient of another column moved.
+
+    `share` of the whole leak and its `deviation` [1] by the scatter of the blocks, with so much `freedom`; `noise`:
+    squares of the noise in the integral of dp_AB over those of the column beyond it.
+    """
+
+    share: float
+    deviation: float
+    freedom: int
+    noise: float
+
+
+def moved_share(fit: BalanceFit, column: int, onset: float, rise: float, *, within: float) -> MovedShare | None:
+    """Return by how much of a rise at `onset` [s] over `rise` [s] the coefficient of a column moved.
+
+    In each block within `within` seconds of the rise the column is fitted beside the integral of dp_AB; blocks that the
+    rise passes through do not count. None where too few are left, or the column is not recorded or shows nothing of its
+    own. A leak past the piston may follow either law: what is taken for the pump's is beyond both of its integrals.
     """
     t, half = fit.blocks.t, 0.5 * fit.blocks.seconds
     near = np.abs(t - onset - 0.5 * rise) < within + 0.5 * rise
     before, after = near & (t + half <= onset), near & (t - half >= onset + rise)
-    if min(before.sum(), after.sum()) < 3:
-        return {}
     gram, shared, beta = fit.blocks.gram, list(fit.columns), fit.beta
+    if min(before.sum(), after.sum()) < 3 or column >= gram.shape[1]:
+        return None
     rest = _beyond(gram, I_AB)
-    evidence = {}
-    for name, column in (("orifice", I_ROOT), ("scale", THETA), ("pump", I_12)):
-        if column >= gram.shape[1]:
-            continue
-        own = np.maximum(rest[:, column, column], np.finfo(float).tiny)
-        if column == I_12 and np.median(own[before | after]) < _APART * _noise_of_integrals(fit.blocks):
-            continue
-        b = -fit.sense * (rest[:, column, Y] - rest[:, column][:, shared] @ beta) / own
-        share = gram[:, column, I_AB] / np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny)
-        whole = float(np.mean(fit.g[after]) - np.mean(fit.g[before])) / float(np.mean(share[after]))
-        moved = float(np.mean(b[after]) - np.mean(b[before]))
-        freedom = int(before.sum() + after.sum()) - 2
-        deviation = np.sqrt(np.var(b[after], ddof=1) / after.sum() + np.var(b[before], ddof=1) / before.sum())
-        if column == THETA:  # where nearly all flow leaks, noise of dp, integrated, is no small part of the motion
-            taken = fit.g**2 * _noise_of_integral(fit.blocks, fit.blocks.noise)
-            deviation = np.hypot(deviation, np.sqrt(np.mean(taken[after]) / np.mean(own[after])))
-        z = np.array([moved, moved - whole]) / max(float(deviation), np.finfo(float).tiny)
-        here, there = (freedom + 1) * np.log1p(z**2 / freedom)
-        evidence[name] = float(here - there)
-    return evidence
+    if column == I_12:
+        rest = _beyond(rest, I_ROOT)
+    own = np.maximum(rest[:, column, column], np.finfo(float).tiny)
+    if column == I_12 and np.median(own[before | after]) < _APART * _noise_of_integrals(fit.blocks):
+        return None
+    b = -fit.sense * (rest[:, column, Y] - rest[:, column][:, shared] @ beta) / own
+    shown = gram[:, column, I_AB] / np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny)
+    whole = float(np.mean(fit.g[after]) - np.mean(fit.g[before])) / float(np.mean(shown[after]))
+    moved = float(np.mean(b[after]) - np.mean(b[before]))
+    deviation = np.sqrt(np.var(b[after], ddof=1) / after.sum() + np.var(b[before], ddof=1) / before.sum())
+    if column == THETA:  # where nearly all flow leaks, noise of dp, integrated, is no small part of the motion
+        taken = fit.g**2 * _noise_of_integral(fit.blocks, fit.blocks.noise)
+        deviation = np.hypot(deviation, np.sqrt(np.mean(taken[after]) / np.mean(own[after])))
+    size = max(abs(whole), np.finfo(float).tiny)
+    freedom = int(before.sum() + after.sum()) - 2
+    noise = _noise_of_integral(fit.blocks, fit.blocks.noise) * shown**2 / own
+    return MovedShare(moved / whole if whole else 0.0, float(deviation) / size, freedom, float(np.mean(noise[after])))
 
 
 def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> DriftStep:
