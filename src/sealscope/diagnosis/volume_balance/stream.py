@@ -105,8 +105,8 @@ class SequentialBalance:
     ...     state = balance.update(recording.between(start, start + 10))
     ...     if state.alarm is not None:
     ...         break
-    >>> round(state.alarm.onset_s), f"{state.alarm.leak_lpm:.4f} L/min"
-    (80, '0.0042 L/min')
+    >>> round(state.alarm.onset_s), f"{state.alarm.leak_lpm:.3f} L/min"
+    (80, '0.004 L/min')
     """
 
     def __init__(
