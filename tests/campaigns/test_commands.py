@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from sealscope import cli
+from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.recordings import write
 from sealscope.simulation.experiment import Experiment
@@ -49,6 +50,23 @@ def test_run_status_and_report(call, tiny, tmp_path):
     assert again[0] == 0
     assert (folder / "report.html").read_text(encoding="utf-8") == page
     assert json.loads((folder / "calibration.json").read_text())["made_from"]["campaign"]["name"] == "tiny"
+
+
+def test_no_more_processes_than_two_a_core(call, tiny, tmp_path, monkeypatch):
+    from sealscope.campaigns.execution import run, workers
+
+    monkeypatch.setattr(workers, "cores", lambda: 2)
+    assert [workers.process_count(asked) for asked in (None, 1, 4, 30)] == [2, 1, 4, 4]
+    started = []
+
+    def rows(task, cases, jobs):
+        started.append(jobs)
+        return (CaseRow.of(case, error="not carried out") for case in cases)
+
+    monkeypatch.setattr(run, "_in_processes", rows)
+    _, _, err = call("campaign", "run", tiny, "-o", tmp_path / "out", "-j", "30")
+    assert started == [4]
+    assert err.startswith("sealscope: --jobs 30: 4 processes are started, two a core\n")
 
 
 def test_in_batches_it_says_so_and_goes_on(call, tiny, tmp_path):

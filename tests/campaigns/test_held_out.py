@@ -248,6 +248,7 @@ def test_without_the_sheet_it_says_what_it_needs(tmp_path, monkeypatch):
         ("ridge = -1.0", "ridge must be >= 0, got -1"),
         ('features = "d3"', "features must be a list of names"),
         ("permutations = -1", "permutations must be"),
+        ("permutations = 1000000000000", "permutations must be at most 100000, got 1000000000000"),
         ("choose = []", "choose must be a list of lists of names"),
         ('choose = ["d3"]', "choose must be a list of lists of names"),
         ('choose = [["d3"]]\nridges = [0.0]', "ridges must be a list of numbers > 0"),

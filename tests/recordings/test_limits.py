@@ -41,6 +41,68 @@ def test_texts_in_place_of_numbers(tmp_path: Path, count: int, kind: str) -> Non
     assert refused(path).startswith("p_A must hold numbers, or at most 4194304 texts of 400 bytes, got ")
 
 
+@pytest.mark.parametrize("own", [False, True])
+def test_many_references_to_one_long_text(own: bool, tmp_path: Path) -> None:
+    """HDF5 holds texts of any length beside the data set, which refers to them: 20 000 times a megabyte in 1.3 MB."""
+    path, count = tmp_path / "log.h5", 20_000
+    with h5py.File(path, "w") as file:
+        if own:  # the mark of files that are read in this process
+            file.attrs["sealscope_format"] = 1
+        data = file.create_dataset("p_A", (count,), h5py.string_dtype())
+        data.attrs["units"] = "Pa"
+        data[0] = "1" * 1_000_000
+        begin = data.id.get_offset()
+    raw = bytearray(path.read_bytes())
+    raw[begin : begin + 16 * count] = bytes(raw[begin : begin + 16]) * count
+    path.write_bytes(raw)
+    tracemalloc.start()
+    try:
+        with pytest.raises(UnreadableFile, match=r"p_A must hold numbers, or at most .* got 20000 of 1000000"):
+            read(path, rate=500)
+        assert tracemalloc.get_traced_memory()[1] < 700e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_lists_in_place_of_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("p_A", (4,), h5py.vlen_dtype(np.float64))
+        data.attrs["units"] = "Pa"
+        data[0] = np.zeros(9)
+    assert refused(path) == "p_A must hold numbers, got lists or references (FILE)"
+
+
+def test_texts_of_any_length_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        file["t"] = [f"2024-05-31T12:00:00.{k:03d}" for k in range(0, 900, 2)]
+        file["p_A"] = np.arange(450.0)
+        file["p_A"].attrs["units"] = "Pa"
+    assert read(path).rate == 500.0
+
+
+def test_a_long_text_that_a_table_repeats(tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    path = tmp_path / "log.parquet"
+    texts = pyarrow.DictionaryArray.from_arrays(pyarrow.array([0] * 100_000), pyarrow.array(["1" * 1_000_000]))
+    parquet.write_table(pyarrow.table({"p_A [Pa]": texts.cast(pyarrow.dictionary(pyarrow.int32(), "string"))}), path)
+    schema = parquet.read_schema(path).remove_metadata()
+    assert path.stat().st_size < 10_000_000
+    assert "dictionary" in str(schema)
+    assert refused(path).startswith("p_A [Pa] must hold numbers, got the type dictionary")
+    plain = pyarrow.schema([("p_A [Pa]", pyarrow.string())])
+    with parquet.ParquetWriter(path, plain, store_schema=False) as writer:
+        for _ in range(4):
+            writer.write_table(pyarrow.table({"p_A [Pa]": ["1" * 1_000_000] * 100}, schema=plain))
+    assert path.stat().st_size < 10_000_000
+    assert refused(path).startswith(
+        "p_A [Pa] must hold numbers, or at most 4194304 texts of 400 bytes, got 400 of 1000000"
+    )
+
+
 def test_a_constant_column_that_compresses_well_is_read(tmp_path: Path) -> None:
     path = tmp_path / "log.h5"
     with h5py.File(path, "w") as file:
@@ -72,6 +134,8 @@ def test_factors_of_a_plan_do_not_multiply_without_end(tmp_path: Path) -> None:
 
 
 def test_steps_and_draws_are_bounded() -> None:
+    with pytest.raises(InputError, match=r"at most 1000000000 steps .* got 2e\+12 \(at least, of 0.001 s\)"):
+        Experiment.of(duration=2e9, rate=0.005, error="20 Pa")
     with pytest.raises(InputError, match=r"at most 1000000000 steps of the solver, got 6e\+12"):
         Experiment.of(duration=6.0, step=1e-12)
     from sealscope.campaigns.prediction.responses import bench_responses

@@ -14,6 +14,7 @@ import typer
 from sealscope.cli.options import (
     AssumeOption,
     FalseAlarmOption,
+    JobsOption,
     MapOption,
     RateOption,
     assumed_rig,
@@ -21,6 +22,7 @@ from sealscope.cli.options import (
     channel_map_of,
     check_folder,
     complain,
+    say_jobs,
 )
 from sealscope.errors import InputError
 
@@ -79,7 +81,7 @@ DataOption = Annotated[
 def run(
     plan: PlanArgument,
     folder: FolderOption = None,
-    jobs: Annotated[int | None, typer.Option("--jobs", "-j", help="Processes; by default one a core.")] = None,
+    jobs: JobsOption = None,
     cluster: Annotated[
         str | None, typer.Option("--cluster", metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786.")
     ] = None,
@@ -106,6 +108,7 @@ def run(
     if (batch or device != "cpu") and not isinstance(loaded, SimulatedPlan):
         raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
     if isinstance(loaded, SimulatedPlan):
+        say_jobs(jobs)
         with progress_bar() as progress:
             state = carry_out(
                 loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, device=device

@@ -112,6 +112,19 @@ CalibrationOption = Annotated[
 SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the instruments' noise.")]
 
 
+JobsOption = Annotated[
+    int | None, typer.Option("--jobs", "-j", help="Processes; by default one a core, two a core at most.")
+]
+
+
+def say_jobs(jobs: int | None) -> None:
+    """Say so on standard error where fewer processes are started than `--jobs` asks for."""
+    from sealscope.campaigns.execution.workers import most_processes
+
+    if jobs is not None and jobs > most_processes():
+        complain(f"--jobs {jobs}: {most_processes()} processes are started, two a core")
+
+
 @contextmanager
 def progress() -> Iterator[Progress]:
     """Return a progress line on standard error, gone when done; silent where nobody looks."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sealscope.cli.options import complain
+from sealscope.cli.options import JobsOption, complain, say_jobs
 
 if TYPE_CHECKING:
     from sealscope.thesis.engine.build import Progress, Reproduction
@@ -46,7 +46,7 @@ def reproduce(
             "./data.",
         ),
     ] = None,
-    jobs: Annotated[int | None, typer.Option("--jobs", "-j", help="Processes; by default one a core.")] = None,
+    jobs: JobsOption = None,
 ) -> None:
     """Make the thesis's tables and figures anew, with a verdict on each claim. Exit status 1 where one failed."""
     if listing:
@@ -61,6 +61,7 @@ def reproduce(
     if not ids:
         raise InputError("an item must be named: an id, chapter-N or all (sealscope reproduce --list)")
     require_drawing()
+    say_jobs(jobs)
     with _progress() as progress:
         reproduction = build(ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish, progress=progress)
     products = ((status, reproduction.products(status)) for status in reproduction.statuses)

@@ -209,6 +209,7 @@ def _signatures(recording: Recording) -> Signatures | None:
 
 
 @checked_call
+@np.errstate(all="ignore")  # what overflows is a finding, not a warning
 def diagnose(
     recording: Recording,
     baseline: Recording | Sequence[Recording] = (),

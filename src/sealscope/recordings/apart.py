@@ -21,6 +21,8 @@ from sealscope.errors import SealscopeError
 T = TypeVar("T")
 #: Time that starting the process may take beside the work [s].
 _START = 30.0
+#: Memory that the process may take [bytes]: the values that a recording may have, a few times over.
+MOST_MEMORY = 12 * 2**30
 
 
 class CrashedApartError(RuntimeError):
@@ -98,8 +100,19 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float) -> T:
     return value  # type: ignore[no-any-return]
 
 
+def _limit_memory() -> None:
+    """Let this process take `MOST_MEMORY` at most, where the system can: a tiny file may ask for any amount."""
+    with suppress(ImportError, AttributeError, OSError, ValueError):
+        import resource
+
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        most = MOST_MEMORY if hard == resource.RLIM_INFINITY else min(MOST_MEMORY, hard)
+        resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
+
+
 def _serve() -> None:
     """Answer requests on standard input until it ends; what libraries print goes nowhere."""
+    _limit_memory()
     answers = os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)

@@ -23,6 +23,8 @@ POINTS, STILL_POINTS = 16_000, 800
 #: samples drawn one by one round the onset, so that the ringing itself can be looked at
 NEAR_SAMPLES = 6_000
 
+#: largest value drawn; least extent of an axis, and over the size of its values: what is less is a constant
+_LARGEST, _LEAST, _LEAST_SHARE = 1e100, 1e-100, 1e-12
 #: unit of pressures -> Pa per unit, unit of their details, Pa per that unit
 PRESSURE_UNITS: dict[str, tuple[float, str, float]] = {
     "bar": (1e5, "kPa", 1e3),
@@ -57,11 +59,20 @@ class Mark:
 
 @dataclass(frozen=True)
 class ChartLine:
-    """One line of a chart: its label, the style's name in the style sheet, and its values in the chart's unit."""
+    """One line of a chart: its label, the style's name in the style sheet, and its values in the chart's unit.
+
+    Values beyond +-1e100 are drawn there, so that no scale overflows.
+    """
 
     label: str
     style: str
     values: Array
+
+    def __post_init__(self) -> None:
+        beyond = np.isfinite(self.values) & (np.abs(self.values) > _LARGEST)
+        if beyond.any():
+            drawn = np.where(beyond, np.copysign(_LARGEST, self.values), self.values)
+            object.__setattr__(self, "values", drawn)
 
 
 @dataclass(frozen=True)
@@ -292,8 +303,10 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
     stacked = np.concatenate(lines)
     finite = stacked[np.isfinite(stacked)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    if high - low <= 0:
-        low, high = low - 0.5, high + 0.5
+    size = max(abs(low), abs(high))
+    if high - low <= max(_LEAST, _LEAST_SHARE * size):
+        pad = max(0.5, 1e-6 * size)
+        low, high = low - pad, high + pad
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
     lines = [np.clip(line, low, high) for line in lines]

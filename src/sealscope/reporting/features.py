@@ -78,16 +78,17 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
     for part in usable:
         try:
             transformed = details(series[part], levels=LEVELS)
-        except InputError as error:
+            product, inside = transformed.product(3, 4), transformed.inside()
+            ends, levels = windowed_rms(transformed, WINDOW, STEP)
+            products = windowed_rms(product[inside], WINDOW, STEP).rms
+        except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
-        product, inside = transformed.product(3, 4), transformed.inside()
         for level, name in enumerate(NAMES[:LEVELS], start=1):
             _place(values[name], transformed[level], transformed.inside(level), part)
         _place(values[PRODUCT], product, transformed.inside(3, 4), part)
-        ends, levels = windowed_rms(transformed, WINDOW, STEP)
         if not ends.size:
             continue
-        lines = [*levels, windowed_rms(product[inside], WINDOW, STEP).rms]
+        lines = [*levels, products]
         centres = t[part.start] + (ends - WINDOW / 2) / recording.rate
         if window_t:  # a point without a value parts two stretches
             window_t.append(centres[:1])

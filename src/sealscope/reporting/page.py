@@ -113,6 +113,7 @@ def _all_marks(marks: Sequence[Mark], truth_onset_s: float | None) -> tuple[Mark
     return (*marks, *known)
 
 
+@np.errstate(all="ignore")  # what overflows is not drawn
 def render_page(
     recording: Recording,
     diagnosis: Diagnosis,

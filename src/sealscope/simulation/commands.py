@@ -157,7 +157,7 @@ class PseudoRandom:
 
     def volts(self, t: Array) -> Array:
         """Return u [V] at times t [s]."""
-        slot = np.maximum(np.floor(t / self.hold), 0.0).astype(np.uint64)
+        slot = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
         start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
         z = start + (slot + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

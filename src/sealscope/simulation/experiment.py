@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 MOST_SAMPLES = 20_000_000
 #: Most steps of the solver that may be asked for: an hour at 3.6 us.
 MOST_STEPS = 1_000_000_000
+#: Longest step [s] that is tried when the step is chosen by error (docs/decisions/0004-solvers.md).
+LONGEST_STEP = 1e-3
 #: Default for the rms error [Pa] that a pressure may have (a transducer's noise is 8600 Pa).
 PRESSURE_TOLERANCE = 100.0
 Method = Literal["auto", "rk4", "imex"]
@@ -113,10 +115,11 @@ class Experiment:
         half = self.rig.cylinder.L / 2
         if not abs(self.x_0) <= half:
             raise InputError(f"x_0 must be within the stroke, -{half:g} m to {half:g} m, got {self.x_0}")
-        if self.step is not None and self.step > 0 and self.duration / self.step > MOST_STEPS:
+        step = LONGEST_STEP if self.step is None else self.step
+        if step > 0 and self.duration / step > MOST_STEPS:
+            what = f"at least, of {step:g} s" if self.step is None else f"step = {step:g} s"
             raise InputError(
-                f"a run must have at most {MOST_STEPS} steps of the solver, got {self.duration / self.step:.4g} "
-                f"(step = {self.step:g} s)"
+                f"a run must have at most {MOST_STEPS} steps of the solver, got {self.duration / step:.4g} ({what})"
             )
         if self.step is not None and self.error is not None:
             raise InputError(

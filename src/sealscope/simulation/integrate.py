@@ -22,7 +22,7 @@ from sealscope.simulation.changes import Effect, Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
 from sealscope.simulation.courses import Force
-from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment, Method, choose_method
+from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, Method, choose_method
 from sealscope.simulation.faults import Leak
 from sealscope.simulation.instruments import FILTER_REACH
 
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 Progress = Callable[[float], None]
 #: Step [s] that suits the thesis's rig: error in p_A under 10 Pa rms (docs/decisions/0004-solvers.md).
 DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
-#: Longest step [s] that is tried when the step is chosen by error (docs/decisions/0004-solvers.md), and how many times
-#: finer it may become.
-LONGEST_STEP = 1e-3
+#: How many times finer than `LONGEST_STEP` a step that is chosen by error may become.
 FINEST = 20
 #: Lowest gauge pressure [Pa] the model is valid for: there is no cavitation in it, and oil holds no tension.
 VACUUM = -101325.0

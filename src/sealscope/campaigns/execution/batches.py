@@ -216,8 +216,8 @@ class StepChooser:
         """
         from sealscope.physics.rig import rig_numbers
         from sealscope.physics.solvers.limits import longest_step
-        from sealscope.simulation.experiment import choose_method
-        from sealscope.simulation.integrate import FINEST, LONGEST_STEP
+        from sealscope.simulation.experiment import LONGEST_STEP, choose_method
+        from sealscope.simulation.integrate import FINEST
 
         method = choose_method(experiment.rig, experiment.method)
         step = self._cell(case.levels).get(method) or chosen_step(experiment)

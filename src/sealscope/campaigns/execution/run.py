@@ -15,7 +15,7 @@ from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
 from sealscope.campaigns.execution.cluster import on_cluster
-from sealscope.campaigns.execution.workers import Workers, cores
+from sealscope.campaigns.execution.workers import Workers, process_count
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
 from sealscope.storage.folders import inner_folder
@@ -39,11 +39,11 @@ def run(
 ) -> store.CampaignProgress:
     """Carry out what is missing of the plan in `folder`, and return how far it is then.
 
-    `jobs`: processes of this machine, one a core by default, 1 for this process alone; `cluster`: address of a Dask
-    scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side by side (`batches`) on the
-    `device`, cpu (with `jobs` threads) or gpu, which implies `batch`. The rows are the same whoever makes them and in
-    whatever order, those of batches in any batch. Raises InputError where the folder holds another campaign, another
-    run is at work in it, or a batch cannot do what the plan asks for.
+    `jobs`: processes of this machine, one a core by default and two a core at most, 1 for this process alone;
+    `cluster`: address of a Dask scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side
+    by side (`batches`) on the `device`, cpu (with `jobs` threads) or gpu, which implies `batch`. The rows are the same
+    whoever makes them and in whatever order, those of batches in any batch. Raises InputError where the folder holds
+    another campaign, another run is at work in it, or a batch cannot do what the plan asks for.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be >= 1, got {jobs}")
@@ -70,7 +70,7 @@ def run(
         keep = None
         if plan.keep_recordings:
             keep = inner_folder(place, RECORDINGS)
-        jobs = jobs or cores()
+        jobs = process_count(jobs)
         if batch:
             new_rows = batches.in_batches(plan, waiting, jobs, device)
         else:

@@ -123,6 +123,16 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
+def most_processes() -> int:
+    """Return how many processes are started at most, whatever is asked for: two a core."""
+    return 2 * cores()
+
+
+def process_count(asked: int | None) -> int:
+    """Return how many processes to start: as many as asked for, at most two a core; by default one a core."""
+    return min(asked or cores(), most_processes())
+
+
 def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | None]]:
     """Yield each item and its result in the order given, as soon as it and all before it are there.
 

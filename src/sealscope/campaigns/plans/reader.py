@@ -43,6 +43,8 @@ MOST_RECORDS = 1_000_000
 _LONGEST_NAME = 80
 #: Most combinations of the factors' levels.
 MOST_CELLS = 100_000
+#: Most swaps of labels by which chance is estimated.
+MOST_PERMUTATIONS = 100_000
 #: Most groups of features to choose from: more have too many unions to try them all.
 MOST_GROUPS = 8
 
@@ -311,7 +313,7 @@ def _held_out(tree: Mapping[str, Any], place: str) -> HeldOutPlan:
         place=place,
         unit="grade" if data == "hydraulic" else "L/min",
         note=head.text("note", ""),
-        permutations=part.whole("permutations", 0),
+        permutations=part.whole("permutations", 0, most=MOST_PERMUTATIONS),
         seed=part.whole("seed", 0),
     )
     head.end()

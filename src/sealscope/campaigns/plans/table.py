@@ -61,11 +61,13 @@ class PlanTable:
             raise self.fail(f"{key} must be {wanted}, got {value!r}")
         return float(value)
 
-    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
-        """Take a whole number of at least `least`."""
+    def whole(self, key: str, default: int | None = None, least: int = 0, most: int = 2**53) -> int:
+        """Take a whole number from `least` to `most`."""
         value = self.take(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise self.fail(f"{key} must be a whole number >= {least}, got {value!r}")
+        if value > most:
+            raise self.fail(f"{key} must be at most {most}, got {value}")
         return value
 
     def flag(self, key: str) -> bool:

@@ -26,6 +26,8 @@ from sealscope.recordings.formats.table import (
 
 #: Most values that stand for a missing sample: the CF conventions know one, a few tools write two.
 _MOST_FILLS = 16
+#: Bytes of texts of any length that are read together at most, and their number.
+_READ_AT_ONCE, _MOST_AT_ONCE = 500_000_000, 4096
 #: Attribute that marks a file of our own.
 OWN = "sealscope_format"
 _ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
@@ -95,8 +97,7 @@ def _label(name: str, data: Any) -> Label:
 def _values(data: Any, name: str, time: bool, place: str) -> NDArray[Any]:
     """Read a data set as doubles (or, for time, stamps), with scale, offset and fill value of the CF conventions."""
     if data.dtype.kind in "OSU":
-        check_texts(data.size, data.dtype.itemsize, name, place)
-        return from_text([_text(cell) or "" for cell in data[...]], time, name, place)
+        return from_text(_texts(data, name, place), time, name, place)
     if data.dtype.kind not in "fiub":
         raise UnreadableFile(f"{name} must hold numbers, got the type {data.dtype} ({place})")
     raw = data[...]
@@ -114,6 +115,27 @@ def _values(data: Any, name: str, time: bool, place: str) -> NDArray[Any]:
         values = values.copy() if values is raw else values
         values[missing] = np.nan
     return values
+
+
+def _texts(data: Any, name: str, place: str) -> list[str]:
+    """Return the cells of a data set of texts; those of any length are read a few at a time, and none may be long.
+
+    Any number of cells may refer to one text, which is at most as long as the file.
+    """
+    import h5py
+
+    check_texts(data.size, data.dtype.itemsize, name, place)
+    if data.dtype.kind == "O" and h5py.check_string_dtype(data.dtype) is None:
+        raise UnreadableFile(f"{name} must hold numbers, got lists or references ({place})")
+    if data.dtype.kind != "O":
+        return [_text(cell) or "" for cell in data[...]]
+    at_once = min(max(_READ_AT_ONCE // Path(place).stat().st_size, 1), _MOST_AT_ONCE)
+    cells: list[str] = []
+    for start in range(0, data.size, at_once):
+        part = data[start : start + at_once]
+        check_texts(data.size, max(len(cell) if isinstance(cell, bytes | str) else 0 for cell in part), name, place)
+        cells += [_text(cell) or "" for cell in part]
+    return cells
 
 
 def _description(file: Any, place: str) -> dict[str, Any] | None:

@@ -32,6 +32,10 @@ def read_parquet(path: Path, choose: Choose) -> RawTable:
         choice = choose([_label(field) for field in schema])
         fields = [schema.field(column) for column, _ in choice.columns]
         check_size(file.metadata.num_rows, len(fields), place)
+        texts = [field.name for field in fields if _is_text(field)]
+        for name in texts:
+            check_texts(file.metadata.num_rows, 1, name, place)
+    with parquet.ParquetFile(path, read_dictionary=texts) as file:  # a text that repeats is held but once
         table = file.read(columns=[field.name for field in fields])
         columns = [
             _values(table.column(field.name), field, time, place)
@@ -47,6 +51,21 @@ def _label(field: Any) -> Label:
     return Label.parse(field.name, unit)
 
 
+def _is_text(field: Any) -> bool:
+    import pyarrow
+
+    return bool(pyarrow.types.is_string(field.type) or pyarrow.types.is_large_string(field.type))
+
+
+def _widest(column: Any) -> int:
+    """Return the length [bytes] of the longest text of a column that is coded by a dictionary or plain."""
+    import pyarrow
+    from pyarrow import compute
+
+    chunks = [chunk.dictionary if isinstance(chunk, pyarrow.DictionaryArray) else chunk for chunk in column.chunks]
+    return max((compute.max(compute.binary_length(chunk)).as_py() or 0 for chunk in chunks), default=0)
+
+
 def _values(column: Any, field: Any, time: bool, place: str) -> NDArray[Any]:
     import pyarrow
 
@@ -55,8 +74,8 @@ def _values(column: Any, field: Any, time: bool, place: str) -> NDArray[Any]:
         return np.asarray(column.cast(pyarrow.timestamp("ns", field.type.tz)).to_numpy().astype("datetime64[ns]"))
     if types.is_integer(field.type) or types.is_floating(field.type) or types.is_decimal(field.type):
         return np.asarray(column.cast(pyarrow.float64(), safe=False).to_numpy(), dtype=np.float64)
-    if types.is_string(field.type) or types.is_large_string(field.type):
-        check_texts(len(column), 1, field.name, place)
+    if _is_text(field):
+        check_texts(len(column), _widest(column), field.name, place)
         return from_text([cell or "" for cell in column.to_pylist()], time, field.name, place)
     raise UnreadableFile(f"{field.name} must hold numbers, got the type {field.type} ({place})")
 

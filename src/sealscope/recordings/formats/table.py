@@ -22,7 +22,7 @@ from sealscope.units import to_si
 MAX_VALUES = 2**28
 #: A table up to this many bytes may be a fill value alone; a larger one at most this many times its file.
 _SMALL, _EXPANSION = 2**26, 4096
-_MOST_TEXTS, _WIDEST_TEXT = 2**22, 400
+_MOST_TEXTS, _WIDEST_TEXT, _MOST_TEXT = 2**22, 400, 2**29
 FORMAT_VERSION = 1
 #: Decides from a table's labels which columns are read.
 Choose = Callable[[Sequence[Label]], ColumnMap]
@@ -107,8 +107,11 @@ def check_size(rows: int, columns: int, place: str) -> None:
 
 
 def check_texts(cells: int, width: int, name: str, place: str) -> None:
-    """Raise UnreadableFile where a column of texts has more than `_MOST_TEXTS` cells, or cells wider than a number."""
-    if cells > _MOST_TEXTS or width > _WIDEST_TEXT:
+    """Raise UnreadableFile where a column of texts has more than `_MOST_TEXTS` cells, or cells wider than a number.
+
+    Or, where both are large, more than half a gigabyte together.
+    """
+    if cells > _MOST_TEXTS or width > _WIDEST_TEXT or cells * width > _MOST_TEXT:
         raise UnreadableFile(
             f"{name} must hold numbers, or at most {_MOST_TEXTS} texts of {_WIDEST_TEXT} bytes, got {cells} of {width} "
             f"({place})"

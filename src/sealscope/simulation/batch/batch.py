@@ -20,8 +20,8 @@ from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.run import LaneSet, SetRun, sets_of, with_sizes
-from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment
-from sealscope.simulation.integrate import FINEST, FIRST_WINDOW, LONGEST_STEP
+from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment
+from sealscope.simulation.integrate import FINEST, FIRST_WINDOW
 from sealscope.simulation.sizing import scaled_size
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 

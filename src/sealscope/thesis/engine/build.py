@@ -14,7 +14,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, Literal
 
-from sealscope.campaigns.execution.workers import Workers
+from sealscope.campaigns.execution.workers import Workers, process_count
 from sealscope.errors import InputError, SealscopeError
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.folder import ResultsFolder
@@ -93,7 +93,7 @@ def reproduce(
 ) -> Reproduction:
     """Make the chosen items (see `items.select_items`) and what they need, and draw them with `publish`.
 
-    `jobs` processes (default: one a core; 1: in this process); `sheet`: folder of the data sheet (see
+    `jobs` processes (default: one a core, at most two; 1: in this process); `sheet`: folder of the data sheet (see
     `sheet.find_sheet`). What was made by an earlier call from the same sources stays. A failed item does not stop the
     others. KeyboardInterrupt leaves all finished items valid.
 
@@ -119,7 +119,7 @@ def reproduce(
             if progress is not None:
                 progress(ended, len(stale), in_work)
 
-        count = min(jobs or os.cpu_count() or 1, len(stale))
+        count = min(process_count(jobs), len(stale))
         built = _in_turn(builder, stale, report) if count <= 1 else _side_by_side(job, stale, count, report)
         with closing(built):
             for status in built:
