@@ -41,6 +41,8 @@ LOST = 0.05
 #: Both means step by at least this, over that mean difference, where the charge pressure is another one: a leak of 0.5
 #: L/min on the thesis's rig steps them by 0.02.
 CHARGED = 0.1
+#: A rise of the conductance of up to so many times what a fall of the pressure difference at the same flow makes of it.
+SAME_FLOW = 1.5
 #: Log power of the noise from which a baseline was made with other noise than the recording.
 NOISY = 0.2
 #: One chamber's mean moves alone where the other moves by less than this share of it, both move alike above that one.
@@ -61,6 +63,12 @@ FILTERED, HUMS = 0.5, 1.2
 #: A sure step anywhere in the recording; blocks of one duty correlate by more than the one, of another phase by less
 #: than the other.
 SURE_ANYWHERE, SAME_PHASE, OTHER_PHASE = 6.0, 0.7, 0.35
+#: Where the chambers ring [Hz]; longest delay of one channel that is looked for [s], the least that matters, and how
+#: sure it must be.
+RINGING, LAGS, LEAST_LAG, LAGGED = (20.0, 150.0), 8e-3, 1e-3, 0.5
+#: Variance of the phase between the chambers that any machine has [rad^2], the most with which a frequency counts, and
+#: fewest frequencies.
+OWN_VARIANCE, MOST_VARIANCE, FEWEST_LINES = 0.01, 0.25, 5
 #: Fewest samples of a block.
 _SHORTEST = 64
 
@@ -79,6 +87,18 @@ class OtherCause:
 
 
 @dataclass(frozen=True, eq=False)
+class Together:
+    """Spectra of p_A and p_B in n blocks at the frequencies `f` (k,) [Hz] of the ringing.
+
+    `cross` (n, k) of p_A and p_B, `own` (2, n, k) of each.
+    """
+
+    f: Array
+    cross: NDArray[np.complex128]
+    own: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Signatures:
     """A recording over n blocks of whole cycles.
 
@@ -88,7 +108,8 @@ class Signatures:
     power of its noise in one line of the spectrum, `lines` (b,) of each band; `motion`: where the strokes changed;
     `tilt` (n, 2) log power of the noise of p_A and p_B near half the rate over that at two thirds of it; `hum` (n, 2,
     h) log power in lines of mains frequencies over what lies beside them, `mains` (h,) [Hz]; `alike` (n - 1, 2)
-    correlation of p_A - p_B in each block with that one and two blocks before, None where the duty does not repeat.
+    correlation of p_A - p_B in each block with that one and two blocks before, None where the duty does not repeat;
+    `together`: how p_A and p_B ring together.
     """
 
     t: Array
@@ -105,6 +126,7 @@ class Signatures:
     hum: Array
     mains: Array
     alike: Array | None
+    together: Together
 
 
 def signatures(recording: Recording) -> Signatures | None:
@@ -139,7 +161,9 @@ def signatures(recording: Recording) -> Signatures | None:
         return None
     t, mean, swing, power, noise = (values[whole] for values in (t, mean, swing, power, noise))
     duty = None if duty is None else duty[whole]
-    tilt, hum, mains = _sensors((p_A, p_B), rate)
+    f: Array = np.fft.rfftfreq(length, 1.0 / rate).astype(np.float64)
+    spectra = [np.fft.rfft((own - own.mean(axis=1, keepdims=True)) * np.hanning(length), axis=1) for own in (p_A, p_B)]
+    tilt, hum, mains = _sensors(spectra, f, rate)
     return Signatures(
         t,
         0.5 * length / rate,
@@ -155,6 +179,7 @@ def signatures(recording: Recording) -> Signatures | None:
         hum[whole],
         mains,
         None if find_cycle(recording) is None else _alike(_smooth(dp, rate)[whole]),
+        _together([own[whole] for own in spectra], f, rate),
     )
 
 
@@ -182,17 +207,23 @@ def _bands(dp: Array, rate: float) -> tuple[Array, Array, Array, Array]:
     return power, edges[:-1] * 2.0**0.25, noise, lines
 
 
-def _sensors(chambers: tuple[Array, Array], rate: float) -> tuple[Array, Array, Array]:
-    """Return what shows a change of a sensor's filter or of its wiring: tilt, hum and mains of `Signatures`."""
-    length = chambers[0].shape[1]
-    f = np.fft.rfftfreq(length, 1.0 / rate)
+def _together(spectra: Sequence[NDArray[np.complex128]], f: Array, rate: float) -> Together:
+    here = (f >= RINGING[0]) & (f <= min(RINGING[1], HIGHEST * rate))
+    a, b = (own[:, here] for own in spectra)
+    return Together(f[here], a * np.conj(b), np.stack([np.abs(a) ** 2, np.abs(b) ** 2]))
+
+
+def _sensors(spectra: Sequence[NDArray[np.complex128]], f: Array, rate: float) -> tuple[Array, Array, Array]:
+    """Return what shows a change of a sensor's filter or of its wiring: tilt, hum and mains of `Signatures`.
+
+    `spectra` of p_A and p_B (n, f.size) at the frequencies `f` [Hz].
+    """
     mains = np.array([hertz for hertz in MAINS if hertz + HUM_BESIDE[1] < 0.5 * rate])
-    own = np.searchsorted(f, mains) if HUM_BESIDE[0] * length > 2.0 * rate else np.empty(0, dtype=np.intp)
+    own = np.searchsorted(f, mains) if HUM_BESIDE[0] > 2.0 * f[1] else np.empty(0, dtype=np.intp)
     mains = mains[: own.size]
     tilts, hums = [], []
-    for values in chambers:
-        rest = values - values.mean(axis=1, keepdims=True)
-        spectrum = np.abs(np.fft.rfft(rest * np.hanning(length), axis=1)) ** 2
+    for values in spectra:
+        spectrum = np.abs(values) ** 2
         low, high = ((f > share * rate) & (f <= (share + TILT_WIDTH) * rate) for share in TILT)
         with np.errstate(divide="ignore", invalid="ignore"):
             tilts.append(np.log(np.median(spectrum[:, high], axis=1) / np.median(spectrum[:, low], axis=1)))
@@ -203,6 +234,34 @@ def _sensors(chambers: tuple[Array, Array], rate: float) -> tuple[Array, Array, 
                 lines.append(np.log(spectrum[:, line - 1 : line + 2].max(axis=1) / beside.mean(axis=1)))
         hums.append(np.reshape(lines, (len(lines), len(values))).T)
     return np.stack(tilts, axis=1), np.stack(hums, axis=1), mains
+
+
+def lag_step(seen: Signatures, onset: float) -> tuple[float, float]:
+    """Return by how much later p_A is read, beside p_B, after an instant than before [s], and how sure that is.
+
+    The chambers ring against each other, leaking or not, so the phase of their cross spectrum stays; a delay tau of one
+    turns it by 2 pi f tau. tau is that of the largest mean of cos(phase - 2 pi f tau), each frequency weighted by what
+    its coherence tells of its phase; what it gains over tau = 0, of 2 at most, is how sure it is.
+    """
+    f, none = seen.together.f, (0.0, 0.0)
+    sides = [seen.t <= onset - NEAR, seen.t >= onset + NEAR]
+    if min(map(np.count_nonzero, sides)) < 2 * FEWEST or not f.size:
+        return none
+    crosses, variance = [], np.full(f.size, OWN_VARIANCE)
+    for side in sides:
+        cross = seen.together.cross[side].sum(axis=0)
+        own = np.prod(seen.together.own[:, side].sum(axis=1), axis=0)
+        coherence = np.clip(np.abs(cross) ** 2 / np.maximum(own, np.finfo(float).tiny), 1e-6, 1.0)
+        variance = variance + (1.0 - coherence) / (2.0 * np.count_nonzero(side) * coherence)
+        crosses.append(cross)
+    phase = np.angle(crosses[1] * np.conj(crosses[0]))
+    weight = np.where(variance < MOST_VARIANCE, 1.0 / variance, 0.0)
+    if np.count_nonzero(weight) < FEWEST_LINES:
+        return none
+    delays = LAGS * np.linspace(-1.0, 1.0, 161)
+    fit = np.cos(phase + 2.0 * math.pi * np.outer(delays, f)) @ weight / weight.sum()
+    best = int(np.argmax(fit))
+    return float(delays[best]), float(fit[best] - fit[delays.size // 2])
 
 
 def _alike(rows: Array) -> Array:
@@ -260,11 +319,12 @@ def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] =
     if evidence.onset_s is None:
         other = unlike(seen, known) if evidence.cause is None else None
     else:
-        other = elsewhere(seen) or _charge(seen, evidence.onset_s)
+        other = elsewhere(seen)
         if other is None and evidence.detector != BALANCED:
             other = other_cause(seen, evidence.onset_s) or _readings(
                 seen, evidence.onset_s if evidence.cause is not None else None
             )
+        other = other or _scale(seen, evidence) or _charge(seen, evidence.onset_s)
     if other is None:
         return evidence
     return replace(
@@ -376,6 +436,9 @@ def _readings(seen: Signatures, onset: float | None) -> OtherCause | None:
             if abs(size) > HUMS and abs(surely) > sure:
                 verb = "began" if size > 0 else "ended"
                 return OtherCause("sensor fault", f"hum of {hertz:g} Hz {verb} in {name}")
+    lag, surely = lag_step(seen, onset) if onset is not None else (0.0, 0.0)
+    if abs(lag) >= LEAST_LAG and surely > LAGGED:
+        return OtherCause("sensor fault", f"p_A is read {abs(lag) * 1e3:.1f} ms {'later' if lag > 0 else 'earlier'}")
     return None
 
 
@@ -391,6 +454,24 @@ def _sensor(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
         "sensor fault",
         f"the mean of {CHAMBERS[largest]} alone steps by {size[largest]:+.1%} of the strokes' pressure difference, "
         "which a piston that floats between both chambers does not allow",
+    )
+
+
+def _scale(seen: Signatures, evidence: Evidence) -> OtherCause | None:
+    """Return whether a conductance rose because the pressure difference fell while the flow Q stayed, G = Q/|dp|.
+
+    With the pressure difference times s, a conductance of the same flow rises by what passes (1 - s) of Q. A leak
+    lowers the pressure difference only where it is many times what pump and piston passed before.
+    """
+    if evidence.onset_s is None or evidence.leak_lpm is None or evidence.passage is None:
+        return None
+    size, surely = _step(seen, seen.swing, evidence.onset_s)
+    if size > -FRICTION or surely > -SURE or evidence.leak_lpm > SAME_FLOW * evidence.passage.lpm * -math.expm1(size):
+        return None
+    return OtherCause(
+        None,
+        f"the strokes' pressure difference falls by {-math.expm1(size):.0%} while what passes the pump and the piston "
+        "stays: another scale of the pressures, or another friction",
     )
 
 
