@@ -463,10 +463,11 @@ def _scale(seen: Signatures, evidence: Evidence) -> OtherCause | None:
     With the pressure difference times s, a conductance of the same flow rises by what passes (1 - s) of Q. A leak
     lowers the pressure difference only where it is many times what pump and piston passed before.
     """
-    if evidence.onset_s is None or evidence.leak_lpm is None or evidence.passage is None:
+    passed = None if evidence.passage is None else evidence.passage.lpm
+    if evidence.onset_s is None or evidence.leak_lpm is None or passed is None:
         return None
     size, surely = _step(seen, seen.swing, evidence.onset_s)
-    if size > -FRICTION or surely > -SURE or evidence.leak_lpm > SAME_FLOW * evidence.passage.lpm * -math.expm1(size):
+    if size > -FRICTION or surely > -SURE or evidence.leak_lpm > SAME_FLOW * passed * -math.expm1(size):
         return None
     return OtherCause(
         None,
