@@ -90,7 +90,7 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
             break
         if word == "--baseline":
             group = []
-            while index < len(arguments) and not arguments[index].startswith("-"):
+            while index < len(arguments) and (arguments[index] == "-" or not arguments[index].startswith("-")):
                 group.append(arguments[index])
                 index += 1
             groups.append(group)
@@ -99,7 +99,7 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
             if word in takes_value and index < len(arguments):
                 plain.append(arguments[index])
                 index += 1
-            elif not word.startswith("-"):
+            elif word == "-" or not word.startswith("-"):
                 files += 1
     if not all(groups):
         raise InputError("--baseline must be followed by one file or more, got none")

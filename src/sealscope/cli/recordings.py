@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import redirect_stderr
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -40,6 +44,8 @@ if TYPE_CHECKING:
     from sealscope.recordings.formats.columns import ChannelMap
 
 
+#: Stands for standard input.
+STANDARD_INPUT = Path("-")
 #: Fewer files are diagnosed one after the other: processes take a second or two to start.
 _FEWEST_SIDE_BY_SIDE = 4
 
@@ -63,28 +69,74 @@ class TextFormat(StrEnum):
     jsonl = "jsonl"
 
 
-def _read_all(
-    files: Sequence[Path], channel_map: ChannelMap, rate: float | None
-) -> Iterator[tuple[Path, Recording | None]]:
+@dataclass(frozen=True)
+class _Reading:
+    """How files are read: channel -> column of the call, rate, and the map beside the machine's rig."""
+
+    channel_map: ChannelMap
+    rate: float | None
+    beside_rig: ChannelMap = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, maps: Sequence[str] | None, rate: float | None, rig: Rig | None) -> _Reading:
+        """Return what the options state; a `--map` stands in place of the rig's own map."""
+        from sealscope.recordings.formats.columns import check_call
+
+        own = channel_map_of(maps)
+        beside = {} if rig is None or own else rig.channel_map
+        check_call(own, rate)
+        check_call(beside, rate)
+        return cls(own, rate, beside)
+
+    def read(self, file: Path) -> Recording:
+        """Read a file, standard input for `-`; the rig's map is for files that have its columns."""
+        if file != STANDARD_INPUT:
+            return self._read(file)
+        with TemporaryDirectory() as folder:
+            kept = Path(folder) / "standard input"
+            with kept.open("wb") as copy:
+                shutil.copyfileobj(sys.stdin.buffer, copy)
+            try:
+                return self._read(kept)
+            except UnreadableFile as error:
+                raise UnreadableFile(str(error).replace(str(kept), kept.name)) from error
+
+    def _read(self, file: Path) -> Recording:
+        from sealscope.recordings import read
+
+        if not self.beside_rig:
+            return read(file, channel_map=self.channel_map or None, rate=self.rate)
+        try:
+            return read(file, channel_map=self.beside_rig, rate=self.rate)
+        except UnreadableFile as unmapped:
+            try:
+                return read(file, rate=self.rate)
+            except UnreadableFile:
+                raise unmapped from None
+
+
+def _check_standard_input(files: Iterable[Path]) -> bool:
+    """Return whether standard input is among the files; raise InputError where it is so more than once."""
+    count = sum(file == STANDARD_INPUT for file in files)
+    if count > 1:
+        raise InputError(f"standard input (-) must be given once, got it {count} times")
+    return count == 1
+
+
+def _read_all(files: Sequence[Path], reading: _Reading) -> Iterator[tuple[Path, Recording | None]]:
     """Yield each file and its recording; None, with one line on standard error, where it cannot be read."""
-    from sealscope.recordings import read
-    from sealscope.recordings.formats.columns import check_call
-
-    check_call(channel_map, rate)
     for file in files:
-        yield file, attempt(file, partial(read, file, channel_map=channel_map or None, rate=rate))
+        yield file, attempt(file, partial(reading.read, file))
 
 
-def _read_parts(
-    files: Sequence[Path], channel_map: ChannelMap, rate: float | None, join_them: bool
-) -> Iterator[tuple[Path, Recording | None]]:
+def _read_parts(files: Sequence[Path], reading: _Reading, join_them: bool) -> Iterator[tuple[Path, Recording | None]]:
     """Yield what `_read_all` does; or the first file and the recording of all files joined, None where one is bad."""
     if not join_them:
-        yield from _read_all(files, channel_map, rate)
+        yield from _read_all(files, reading)
         return
     from sealscope.recordings import join
 
-    parts = [recording for _, recording in _read_all(files, channel_map, rate)]
+    parts = [recording for _, recording in _read_all(files, reading)]
     whole = [part for part in parts if part is not None]
     yield files[0], join(whole, names=[file.name for file in files]) if len(whole) == len(files) else None
 
@@ -106,19 +158,19 @@ def _diagnoses(
 
     check_probability(false_alarm)
     RepairLimit.of(limit)
-    channel_map = channel_map_of(maps)
+    reading = _Reading.of(maps, rate, rig)
     if calibration is not None:
-        yield from _calibrated(files, join_them, baseline, channel_map, rate, calibration, rig, limit)
+        yield from _calibrated(files, join_them, baseline, reading, calibration, rig, limit)
         return
     for file in files if baseline else ():
         if all(path.resolve() == file.resolve() for path in baseline):
             raise InputError(f"a baseline must be another recording than the file itself, got {file}")
-    known = [(file, recording) for file, recording in _read_all(baseline, channel_map, rate) if recording is not None]
+    known = [(file, recording) for file, recording in _read_all(baseline, reading) if recording is not None]
     if len(known) < len(baseline):
         yield None
         if not known:
             raise UnreadableFile("no baseline could be read, so nothing is diagnosed")
-    for file, recording in _read_parts(files, channel_map, rate, join_them):
+    for file, recording in _read_parts(files, reading, join_them):
         if recording is None:
             yield None
             continue
@@ -138,8 +190,7 @@ def _calibrated(
     files: Sequence[Path],
     join_them: bool,
     baseline: Sequence[Path],
-    channel_map: ChannelMap,
-    rate: float | None,
+    reading: _Reading,
     calibration: Path,
     rig: Rig | None,
     limit: str | None,
@@ -151,7 +202,7 @@ def _calibrated(
     if baseline:
         raise InputError("--calibration must stand without --baseline: its leak-free recordings are in it")
     known = load(calibration)
-    for file, recording in _read_parts(files, channel_map, rate, join_them):
+    for file, recording in _read_parts(files, reading, join_them):
         diagnosis = None
         if recording is not None:
             work = partial(diagnose_calibrated, recording, known, file=str(file), rig=rig, limit=limit)
@@ -162,7 +213,8 @@ def _calibrated(
 def diagnose(
     context: typer.Context,
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Recordings: CSV or text, NetCDF, HDF5, Parquet.")
+        list[Path],
+        typer.Argument(metavar="FILE...", help="Recordings, of any format; `-` is standard input."),
     ],
     baseline: BaselineOption = None,
     output: Annotated[TextFormat, typer.Option("--format", help="Text, or one JSON object a line.")] = TextFormat.text,
@@ -203,7 +255,9 @@ def diagnose(
         limit=limit,
     )
     jobs = min(cores(), len(files))
-    if join or baseline or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:  # what a baseline costs is spent once
+    piped = _check_standard_input([*files, *(baseline or ())])
+    # what a baseline costs is spent once, and standard input is this process's
+    if join or piped or baseline or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:
         said: Iterator[tuple[str, Sequence[tuple[str, str] | None]]] = (("", [verdict]) for verdict in task(files))
     else:
         said = (
@@ -317,19 +371,33 @@ def inspect(
     maps: MapOption = None,
     rate: RateOption = None,
     join: JoinOption = False,
+    rig: AssumeOption = None,
+    save_map: Annotated[
+        bool, typer.Option("--save-map", help="Keep the map in the file of --rig, for later calls with that rig.")
+    ] = False,
 ) -> None:
     """Show what a file holds and what is wrong with it; columns without a map are taken by their names."""
+    from sealscope.parameters.load import save_channel_map
     from sealscope.recordings import inspect as inspected
     from sealscope.reporting import overview_text
 
     complete = True
-    for file, recording in _read_parts(files, channel_map_of(maps) or "auto", rate, join):
+    _check_standard_input(files)
+    reading = _Reading.of(maps, rate, assumed_rig(rig))
+    if save_map and (rig is None or not reading.channel_map or reading.channel_map == "auto"):
+        raise InputError("--save-map must stand with --rig and its file, and with the --map options to be kept")
+    if not (reading.channel_map or reading.beside_rig):
+        reading = replace(reading, channel_map="auto")
+    for file, recording in _read_parts(files, reading, join):
         if recording is None:
             complete = False
         else:
             say(overview_text(str(file), recording, inspected(recording)))
     if not complete:
         raise typer.Exit(1)
+    if save_map and rig is not None and not isinstance(reading.channel_map, str):
+        save_channel_map(rig, reading.channel_map)
+        say(f"map kept in {rig}: later calls with --rig {rig} find it")
 
 
 def convert(
@@ -339,12 +407,12 @@ def convert(
     rate: RateOption = None,
 ) -> None:
     """Rewrite a recording in another format, with Sealscope's channel names and units."""
-    from sealscope.recordings import inspect, read, write
+    from sealscope.recordings import inspect, write
     from sealscope.recordings.files import check_target
 
     check_target(target)
     check_folder(target)
-    recording = read(source, channel_map=channel_map_of(maps) or None, rate=rate)
+    recording = _Reading.of(maps, rate, None).read(source)
     write(recording, target)
     say(f"{target}: {len(recording)} samples at {recording.rate:g} Hz, channels {', '.join(recording.channels)}")
     for finding in inspect(recording):

@@ -5,9 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from shutil import get_terminal_size
+from textwrap import wrap
+from typing import Annotated, Any
 
 import typer
 
@@ -19,8 +22,11 @@ from sealscope.cli.options import (
     complete_rigs,
     progress,
     rig_with,
+    say,
 )
 from sealscope.errors import InputError
+
+_INDENTED: Mapping[str, Any] = {"initial_indent": "    ", "subsequent_indent": "    "}
 
 
 class TableFormat(StrEnum):
@@ -148,17 +154,20 @@ def parameters(
         writer.writeheader()
         writer.writerows(rows)
     else:
-        from rich.console import Console
-        from rich.table import Table
+        say(_listing(f"{loaded.name}: {loaded.title}", rows, min(get_terminal_size((80, 24)).columns, 120)))
 
-        console = Console(width=None if sys.stdout.isatty() else 240)
-        table = Table(*columns, title=f"{loaded.name}: {loaded.title}", row_styles=("", "dim"))
-        for row in rows:
-            value = row["value"]
-            table.add_row(
-                *(f"{row[c]:.6g}" if c == "value" and isinstance(value, float) else str(row[c]) for c in columns)
-            )
-        console.print(table)
+
+def _listing(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> str:
+    """Return parameters as lines of at most `width` columns: name, value, unit and meaning, then the source."""
+    wide = max(len(row["name"]) for row in rows) + 2
+    lines = [*wrap(title, width), ""]
+    for row in rows:
+        value = f"{row['value']:.6g}" if isinstance(row["value"], float) else str(row["value"])
+        line = f"{row['name']:<{wide}}{value} {row['unit'] if row['unit'] != '1' else ''}".rstrip()
+        whole = f"{line}  {row['meaning']}"
+        lines += [whole] if len(whole) <= width else [line, *wrap(row["meaning"], width, **_INDENTED)]
+        lines += wrap(row["source"], width, **_INDENTED)
+    return "\n".join(lines)
 
 
 def demo(

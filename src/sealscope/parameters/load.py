@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
 from sealscope.calls import checked_call, closest
 from sealscope.errors import InputError
 from sealscope.parameters.rig import ParameterEntry, Rig, flatten
+from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import names_a_file
 from sealscope.storage.toml_file import read_toml
 
 _PACKAGED = Path(__file__).parent / "rigs"
 _DEEPEST = 8
+_MAP = "[map]"
 
 
 def rig_names() -> tuple[str, ...]:
@@ -30,7 +34,8 @@ def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
     rig : Rig, str or path-like, optional
         Name of a packaged rig (`sealscope parameters` lists one), or path of a TOML file with value, unit and source
         for each parameter; a Rig is returned as it is. A file may say ``[rig] extends = "thesis"`` (or the path of
-        another file) and then states only the values that differ.
+        another file) and then states only the values that differ; a table ``[map]`` names the columns of the machine's
+        logs (``p_A = "PG_1[psi]"``).
 
     Returns
     -------
@@ -75,12 +80,37 @@ def _is_path(text: str) -> bool:
 
 
 def _build(path: Path, place: str) -> Rig:
-    head, entries = _collect(path, place, ())
-    return Rig.from_entries(entries, name=head.get("name", path.stem), title=head.get("title", ""), place=place)
+    head, entries, columns = _collect(path, place, ())
+    rig = Rig.from_entries(entries, name=head.get("name", path.stem), title=head.get("title", ""), place=place)
+    return rig.with_channel_map(columns) if columns else rig
 
 
-def _collect(path: Path, place: str, seen: tuple[Path, ...]) -> tuple[dict[str, str], dict[str, ParameterEntry]]:
-    """Head and entries of a file, on top of those of the rig it extends."""
+def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -> None:
+    """Write channel -> column into the table `[map]` of a rig's file, in place of the one that is there.
+
+    Raises InputError where the file is no rig's, or cannot be written; then it stays as it was.
+    """
+    if os.fspath(path) in rig_names():
+        raise InputError(f"a map is saved beside a rig of your own, a .toml file, got the packaged rig {path}")
+    file = Path(path)
+    load_rig(file)
+    lines = file.read_text(encoding="utf-8-sig").splitlines()
+    starts = [number for number, line in enumerate(lines) if line.strip() == _MAP]
+    if starts:
+        end = next((k for k in range(starts[0] + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))
+        lines[starts[0] : end] = []
+    while lines and not lines[-1].strip():
+        lines.pop()
+    table = [f"{json.dumps(channel)} = {json.dumps(column)}" for channel, column in columns.items()]
+    with atomic_write(file) as temporary:
+        temporary.write_text("\n".join([*lines, "", _MAP, *table]) + "\n", encoding="utf-8")
+        _collect(temporary, os.fspath(path), ())
+
+
+def _collect(
+    path: Path, place: str, seen: tuple[Path, ...]
+) -> tuple[dict[str, str], dict[str, ParameterEntry], dict[str, str]]:
+    """Head, entries and map of columns of a file, on top of those of the rig it extends."""
     here = path.resolve()
     if here in seen or len(seen) >= _DEEPEST:
         raise InputError(f"extends must end at a rig of its own, got a circle or more than {_DEEPEST} files ({place})")
@@ -93,14 +123,18 @@ def _collect(path: Path, place: str, seen: tuple[Path, ...]) -> tuple[dict[str, 
             raise InputError(f"rig.{key} is not known; [rig] has name, title and extends ({place})")
         if not isinstance(value, str) or not value.strip():
             raise InputError(f"rig.{key} must be a text, got {value!r} ({place})")
+    own = tree.pop("map", {})
+    if not isinstance(own, dict) or not all(isinstance(column, str) and column.strip() for column in own.values()):
+        raise InputError(f"map must be a table of channels and the names of their columns, got {own!r:.80} ({place})")
     entries: dict[str, ParameterEntry] = {}
+    columns: dict[str, str] = {}
     base = head.get("extends")
     if base in rig_names():
-        entries = _collect(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*seen, here))[1]
+        _, entries, columns = _collect(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*seen, here))
     elif base is not None and "\0" not in base and _is_path(base):
-        entries = _collect(path.parent / base, os.fspath(Path(place).parent / base), (*seen, here))[1]
+        _, entries, columns = _collect(path.parent / base, os.fspath(Path(place).parent / base), (*seen, here))
     elif base is not None:
         raise InputError(
             f"extends must be a packaged rig ({', '.join(rig_names())}) or a .toml file, got {base!r} ({place})"
         )
-    return head, entries | flatten(tree.items(), place)
+    return head, entries | flatten(tree.items(), place), own or columns

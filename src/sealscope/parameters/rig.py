@@ -69,6 +69,7 @@ class Rig(Part):
     _name: str = PrivateAttr(default="")
     _title: str = PrivateAttr(default="")
     _entries: tuple[tuple[str, ParameterEntry], ...] = PrivateAttr(default=())
+    _channel_map: tuple[tuple[str, str], ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
@@ -126,6 +127,17 @@ class Rig(Part):
         """What the rig is, in words."""
         return self._title
 
+    @property
+    def channel_map(self) -> dict[str, str]:
+        """Channel -> column of this machine's logs, from the table `[map]` of its file."""
+        return dict(self._channel_map)
+
+    def with_channel_map(self, columns: Mapping[str, str]) -> Rig:
+        """Return the same rig with another map of columns."""
+        rig = self.model_copy()
+        rig._channel_map = tuple(columns.items())
+        return rig
+
     def __getitem__(self, name: str) -> Value:
         """Return the SI value of a parameter by its bare or dotted name."""
         value: Any = self
@@ -144,7 +156,8 @@ class Rig(Part):
     def as_assumed(self, reason: str) -> Rig:
         """Return the same rig with each value an assumption, for this reason."""
         entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._given().items()}
-        return Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
+        rig = Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
+        return rig.with_channel_map(self.channel_map)
 
     def _given(self) -> dict[str, ParameterEntry]:
         if not self._entries:
@@ -168,7 +181,8 @@ class Rig(Part):
                 raise InputError(f"{full} must be set once, got {replaced[full]} and {name}")
             replaced[full] = name
             entries[full] = ParameterEntry(*_as_given(full, value, source), source, source)
-        return Rig.from_entries(entries, name=self._name, title=self._title, place=source)
+        rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
+        return rig.with_channel_map(self.channel_map)
 
     def table(self) -> list[ParameterRow]:
         """Every parameter in the order of declaration."""
