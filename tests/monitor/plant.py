@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import create_engine, inspect, text
 
+from sealscope.monitor.memory.tables import metadata
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, read_settings
 from sealscope.recordings import write
@@ -121,4 +122,9 @@ def kill_often(settings: MonitorSettings, lines: Path, kills: int, seed: int) ->
         if killed >= kills:
             return killed
         # it ended before the instant: a fresh start, or there is nothing left to disturb
-        Path(settings.database).unlink()
+        if "://" in settings.database:
+            engine = create_engine(settings.database)
+            metadata.drop_all(engine)
+            engine.dispose()
+        else:
+            Path(settings.database).unlink()

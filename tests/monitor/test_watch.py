@@ -11,7 +11,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
+from sealscope.diagnosis.changepoint.smooth_drift import find_step
 from sealscope.errors import InputError
+from sealscope.monitor.stream.decisions import worth_a_search
 from sealscope.monitor.stream.watch import BlockEstimate, Watch
 from sealscope.recordings.recording import Recording
 
@@ -208,3 +210,18 @@ def test_wrong_settings_are_refused():
         ss.watch("thesis", false_alarms_per_1000_h=1e-6)
     with pytest.raises(InputError, match="learn_hours must be"):
         ss.watch("thesis", learn_hours=0.0)
+
+
+def test_no_alarm_is_lost_by_searching_only_where_it_is_worth_it():
+    """Steps in noise and random walks: whatever the search would raise passes the cheap contrasts before it."""
+    random, alarms = np.random.default_rng(0), 0
+    for k in range(70):
+        walk, n = (0.0, 1e-2, 0.1, 1.0, 4.0)[k % 5], (20, 40, 50, 60)[k % 4]
+        g = random.standard_normal(n) + np.sqrt(walk) * np.cumsum(random.standard_normal(n))
+        g[random.integers(3, n - 2) :] += random.uniform(3.0, 14.0) * (1.0 + np.sqrt(walk))
+        if find_step(np.arange(n, dtype=float), g, np.ones(n), 1e-6).alarm:
+            alarms += 1
+            assert worth_a_search(g)
+    assert alarms > 30
+    quiet = [worth_a_search(random.standard_normal(60)) for _ in range(200)]
+    assert np.mean(quiet) < 0.05

@@ -39,8 +39,13 @@ WINDOW = 60
 _SHARES = {"step": 0.45, "rise": 0.45, "level": 0.1}
 #: Probabilities of a look for which a threshold is tabled.
 _PROBABILITIES = (1e-7, 0.05)
-#: A search is worth its time where the contrast of a step is this many deviations; every alarm has more.
-_WORTH_A_SEARCH = 3.5
+#: A search is worth its time where the contrast of a step is this many deviations. An alarm has more: a score over 26,
+#: the least threshold, is a contrast of 5.8, of which the deviation's own error takes a fifth.
+_WORTH_A_SEARCH = 4.5
+#: Fewer values than this do not show how far they wander.
+_FEW = 40
+#: ... and so many beside the means of so many values before it, where the conductance wanders.
+_BESIDE_NEIGHBOURS, _NEIGHBOURS, _LAG = 3.5, (1, 2, 4, 8, 16, 24), 8
 #: Logarithm by which the duty changes where a rise of the conductance is not compared across it.
 _OTHER_DUTY = 0.15
 #: A rise that comes from these is an alarm, whichever of them it is.
@@ -91,12 +96,27 @@ def _contrasts(n: int) -> Array:
 
 
 def worth_a_search(g: Array) -> bool:
-    """Return whether any step in a series (n,) beyond a straight line is so large that a search could raise an alarm.
+    """Return whether any step in a series (n,) is so large that a search for a rise could end in an alarm.
 
-    The scale of the noise is that of the second differences, by their median, which a step does not move.
+    It must stand out from a straight line and noise, and beside its neighbours from noise and a random walk. The scale
+    of the noise is that of the second differences, that of the walk of differences over `_LAG` blocks, by their
+    medians, which one step does not move. Means of m values on either side differ by 2 s^2/m + 2 q m/3 (variance).
     """
     noise = float(np.median(np.abs(np.diff(g, 2)))) / (0.6745 * np.sqrt(6.0))
-    return bool(np.max(_contrasts(g.size) @ g) > _WORTH_A_SEARCH * noise)
+    if not np.max(_contrasts(g.size) @ g) > _WORTH_A_SEARCH * noise:
+        return False
+    if g.size < _FEW:
+        return True
+    moved = float(np.median(np.abs(g[_LAG:] - g[:-_LAG]))) / 0.6745
+    walk = max(0.0, moved**2 - 2.0 * noise**2) / _LAG
+    sums = np.concatenate([[0.0], np.cumsum(g)])
+    for m in _NEIGHBOURS:
+        if 2 * m > g.size:
+            break
+        rise = float(np.max(sums[2 * m :] - 2.0 * sums[m:-m] + sums[: -2 * m])) / m
+        if rise > _BESIDE_NEIGHBOURS * np.sqrt(2.0 * noise**2 / m + 2.0 * walk * m / 3.0):
+            return True
+    return False
 
 
 def step_of(

@@ -196,7 +196,8 @@ class Watch:
                 continue
             length = round(self._seconds * self._samples.rate)
             while len(self._samples) >= length:
-                estimate = self._take(self._samples.taken(length))
+                with np.errstate(all="ignore"):  # a block whose sums overflow is passed over
+                    estimate = self._take(self._samples.taken(length))
                 yield estimate, self.leak
 
     def continue_from(self, before: Watch) -> None:
@@ -229,9 +230,13 @@ class Watch:
         return False
 
     def _take(self, block: Recording) -> BlockEstimate:
+        samples = {name: block[name] for name in self._used}
+        cut = cut_blocks(block.t, samples, len(block), block.rate, self._geometry)
+        return self.judged(cut, float(block.t[-1]) + 1.0 / block.rate)
+
+    def judged(self, cut: BalanceBlocks, end: float) -> BlockEstimate:
+        """Return the estimate of a block that is cut already, none or one, which ends at the clock `end` [s]."""
         self.blocks += 1
-        end = float(block.t[-1]) + 1.0 / block.rate
-        cut = cut_blocks(block.t, {name: block[name] for name in self._used}, len(block), block.rate, self._geometry)
         if len(cut) == 0 or not np.all(np.isfinite(cut.gram)):
             return self._passed_over(end, "missing values")
         if not in_motion(cut).all():

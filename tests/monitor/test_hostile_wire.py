@@ -1,0 +1,122 @@
+"""Messages and samples from a hostile wire: an error of one line or a block, never anything else."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+import warnings
+
+import cbor2
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.errors import InputError
+from sealscope.monitor.sources.source_block import SourceBlock, decoded
+from sealscope.recordings.recording import Recording
+
+from ..diagnosis.balance_machine import machine
+from .plant import message
+
+GOOD = message("press 1", machine(1, duration=0.4, rate=50.0))
+TEXTS = (json.dumps(GOOD).encode(), cbor2.dumps(GOOD))
+ODD = (
+    b"{" * 100_000,
+    b"[" * 100_000,
+    b'{"t": 1e999, "rate": 50, "x": [1]}',
+    b'{"t": 1, "rate": 1e308, "x": [1], "actuator": "a"}',
+    b'{"t": 9007199254740993, "rate": 50, "x": [1]}',
+    b'{"t": 0, "rate": 50, "x": [1, [2]], "actuator": "a"}',
+    b'{"t": 0, "rate": 50, "x": [], "actuator": "a"}',
+    b'{"t": 0, "rate": 50, "x": {"0": 1}, "actuator": "a"}',
+    b'{"t": 0, "rate": 50, "x": ["1e5"], "actuator": ["a"]}',
+    b'{"t": true, "rate": 50, "x": [1], "actuator": "a"}',
+    b"\x9b\xff\xff\xff\xff\xff\xff\xff\xff",  # CBOR: an array of 2^64 - 1
+    b"\x5b\x7f\xff\xff\xff\xff\xff\xff\xff",  # CBOR: 2^63 - 1 bytes
+    b"\xd8\x1c\x81\xd8\x1d\x00",  # CBOR: a list that holds itself
+    b"\xc2" + b"\x59\x27\x10" + b"\xff" * 10_000,  # CBOR: a number of 10 000 bytes
+    b"\x81" * 50_000,
+    b"",
+    b"\x00",
+)
+
+
+def taken(payload: bytes) -> str:
+    """What a message is, in a word."""
+    try:
+        block = decoded(payload, None)
+    except InputError as error:
+        assert "\n" not in str(error) and len(str(error)) < 400
+        return "refused"
+    assert isinstance(block, SourceBlock)
+    return "block"
+
+
+@pytest.mark.parametrize("payload", ODD, ids=range(len(ODD)))
+def test_an_odd_message_is_refused_in_one_line(payload: bytes):
+    # samples at 1e308 Hz are a block, which the stream counts and drops
+    assert taken(payload) == ("block" if b"1e308" in payload else "refused")
+
+
+def mutated(random: np.random.Generator) -> bytes:
+    data = bytearray(TEXTS[random.integers(2)])
+    for _ in range(random.integers(1, 6)):
+        at = int(random.integers(len(data)))
+        kind = random.integers(4)
+        if kind == 0:
+            data[at] = int(random.integers(256))
+        elif kind == 1:
+            del data[at : at + int(random.integers(1, 40))]
+        elif kind == 2:
+            data[at:at] = bytes(random.integers(0, 256, int(random.integers(1, 20)), dtype=np.uint8))
+        else:
+            data[at:at] = data[at : at + int(random.integers(1, 60))]
+    return bytes(data)
+
+
+@pytest.mark.parametrize("count", [1500, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_mutated_messages_are_blocks_or_refused(count: int):
+    random = np.random.default_rng(count)
+    outcomes = {"block": 0, "refused": 0}
+    tracemalloc.start()
+    for number in range(count):
+        if number == count // 10:
+            tracemalloc.reset_peak()
+            before = tracemalloc.get_traced_memory()[0]
+        outcomes[taken(mutated(random))] += 1
+    after = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert min(outcomes.values()) > count // 100
+    assert after - before < 2_000_000
+
+
+def test_no_samples_raise_or_warn():
+    """Infinite, huge and missing values, times out of order, rates of any size, between sound samples."""
+    random, sound = np.random.default_rng(5), machine(1, duration=120.0, rate=50.0)
+    watch = ss.watch("thesis", learn_hours=0.02)
+    watch.update(sound)
+    blocks = watch.blocks
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for number in range(150):
+            part = sound.samples(slice(0, 400))
+            channels = {name: values.copy() for name, values in part.channels.items()}
+            t, rate = part.t + 120.0 + 8.0 * number, 50.0
+            name = list(channels)[random.integers(len(channels))]
+            odd = (np.nan, np.inf, -np.inf, 1e308, -1e200, 1e-308, 0.0)[random.integers(7)]
+            kind = random.integers(6)
+            if kind == 0:
+                channels[name][random.integers(0, 400, 5)] = odd
+            elif kind == 1:
+                channels[name][:] = odd
+            elif kind == 2:
+                t = random.permutation(t)
+            elif kind == 3:
+                t = t + random.choice([1e300, -1e300, np.nan, np.inf, 1e9, -1e9])
+            elif kind == 4:
+                rate = float(random.choice([1e-300, 9.0, 50.2, 500.0, 1e300]))
+            watch.update(Recording(t, channels, part.units, rate))
+    assert watch.blocks > blocks
+    assert all(number > 0 for number in watch.counters.values())
+    assert len(json.dumps(watch.state(), allow_nan=False)) < 300_000
+    assert len(watch.counters) < 40
