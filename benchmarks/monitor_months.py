@@ -15,8 +15,8 @@ Ornstein-Uhlenbeck process of 3 % and 40 min, friction (dp) another of 10 % and 
 L/min of cold oil. The baseline is learned over the first 8 h. Nobody says when a leak begins; an alarm is false where
 none is there, and is dismissed as a person would.
 
-With `--leaks` each actuator gets one leak after two days: steps of 0.002, 0.0042, 0.015 L/min, and a growth from 0 to
-0.005 L/min in a week.
+With `--leaks` each actuator gets one leak after ten operating hours: steps of 0.002, 0.0042, 0.015 L/min, and a growth
+from 0 to 0.005 L/min in a week.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from sealscope.units import LITRE_PER_MINUTE
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0
 STEPS = (0.002, 0.0042, 0.015)
 WEEK_LPM = 0.005
+ONSET_S = 10 * 3600.0
 
 
 def library(seed: int) -> tuple[ss.Recording, list[BalanceBlocks]]:
@@ -86,7 +87,7 @@ def main() -> None:
     parser.add_argument("--actuators", type=int, default=4)
     parser.add_argument("--rate", type=float, default=20.0, help="stated false alarms per 1000 h")
     parser.add_argument("--minutes", type=float, default=8.0, help="no further actuator is begun after so long")
-    parser.add_argument("--leaks", action="store_true", help="each actuator gets a leak after two days")
+    parser.add_argument("--leaks", action="store_true", help="each actuator gets a leak after ten hours")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     recording, blocks = library(chosen.seed)
@@ -105,7 +106,7 @@ def main() -> None:
         watch.dismiss()
         seconds = blocks[0].seconds
         day_s = warm = ran = 0.0
-        day = 0
+        day, opened = 0, 0.0
         kind = number % (len(STEPS) + 1)
         while ran < chosen.hours * 3600.0:
             day_s += seconds
@@ -117,7 +118,9 @@ def main() -> None:
             warm += (1.0 - warm) * (1.0 - math.exp(-seconds / tau))
             g = cold * WARMEST**warm * (1.0 + slow.after(seconds))
             lpm = 0.0
-            if chosen.leaks and (since := clock - 1000.0 - 2 * DAY_S) > 0.0:
+            if chosen.leaks and ran > ONSET_S:
+                opened = opened or clock
+                since = clock - opened
                 lpm = STEPS[kind] if kind < len(STEPS) else min(1.0, since / (7 * DAY_S)) * WEEK_LPM
             block = changed(
                 blocks[random.integers(len(blocks))], clock, g + lpm / flow, math.exp(friction.after(seconds))
@@ -129,7 +132,7 @@ def main() -> None:
             if lpm > 0.0:
                 size = "no L/min" if leak.leak_lpm is None else f"{estimate.leak_lpm:.4f} L/min"
                 low, high = estimate.leak_interval_lpm or (math.nan, math.nan)
-                after = (clock - 1000.0 - 2 * DAY_S) / 3600.0
+                after = (clock - opened) / 3600.0
                 print(
                     f"actuator {number}: true {lpm:.4f} L/min, alarm ({leak.test}) {after:.3f} h"
                     f" after the onset, states {size} ({low:.4f} to {high:.4f})"

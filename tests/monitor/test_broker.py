@@ -42,22 +42,43 @@ topic = "plant/press 2"
 """
 
 
+class Broker:
+    """A broker whose sessions survive its restart."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = int(free.getsockname()[1])
+        self._config = folder / "mosquitto.conf"
+        self._config.write_text(
+            f"listener {self.port} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 0\n"
+            f"persistence true\npersistence_location {folder}/\nuser root\n"
+        )
+        self.start()
+
+    def start(self) -> None:
+        self._process = subprocess.Popen([str(MOSQUITTO), "-c", str(self._config)], stderr=subprocess.DEVNULL)
+        for _ in range(100):
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return
+            time.sleep(0.05)
+
+    def stop(self) -> None:
+        self._process.terminate()
+        self._process.wait()
+
+
 @pytest.fixture
-def port(tmp_path: Path) -> Iterator[int]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        number = int(free.getsockname()[1])
-    config = tmp_path / "mosquitto.conf"
-    config.write_text(f"listener {number} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 0\n")
-    broker = subprocess.Popen([str(MOSQUITTO), "-c", str(config)], stderr=subprocess.DEVNULL)
-    for _ in range(100):
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", number)) == 0:
-                break
-        time.sleep(0.05)
-    yield number
-    broker.terminate()
-    broker.wait()
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = Broker(tmp_path)
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def port(broker: Broker) -> int:
+    return broker.port
 
 
 class Running:
@@ -110,3 +131,23 @@ def test_what_comes_while_the_monitor_is_away_is_stored_once(port: int, tmp_path
     retained = subscribe.simple("sealscope/press 1/alarm", hostname="127.0.0.1", port=port)
     alarm = json.loads(retained.payload)
     assert (alarm["id"], alarm["state"]) == ("press 1-1", "unacknowledged")
+
+
+def test_a_broker_that_restarts_loses_nothing(broker: Broker, tmp_path: Path):
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    served(settings_in(plain), LINES)
+    file = tmp_path / "monitor.toml"
+    file.write_text(SETTINGS.format(port=broker.port))
+    lines = LINES.splitlines()
+    running = Running(read_settings(file))
+    time.sleep(0.5)
+    for start in range(0, len(lines), 30):
+        send(broker.port, lines[start : start + 30])
+        broker.stop()
+        time.sleep(0.2)
+        broker.start()
+    running.until(len(lines))
+    running.end()
+    assert rows_of(running.service.settings.database) == rows_of(str(plain / "monitor.db"))
+    assert running.service.actuators.counters.get("messages that hold no block") is None

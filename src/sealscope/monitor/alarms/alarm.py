@@ -77,6 +77,11 @@ class Alarm:
         return self.state in ("unacknowledged", "acknowledged")
 
     @property
+    def shelved(self) -> bool:
+        """Whether it is not to be announced, as of its last change."""
+        return self.shelved_until_s > self.updated_s
+
+    @property
     def diagnostic_number(self) -> int:
         """Number of the message, by level."""
         return DIAGNOSTIC_NUMBERS[self.level]
@@ -86,15 +91,15 @@ class Alarm:
         values = asdict(self)
         for name in ("onset_interval_s", "leak_interval_lpm"):
             values[name] = None if values[name] is None else list(values[name])
-        return {**values, "diagnostic_number": self.diagnostic_number}
+        return {**values, "diagnostic_number": self.diagnostic_number, "shelved": self.shelved}
 
 
 def status_word(alarms: Iterable[Alarm]) -> int:
-    """Return the status bits of an actuator: 1 a warning lasts, 2 an error lasts, 4 one is not acknowledged."""
+    """Return the status bits of an actuator: 1 a warning lasts, 2 an error lasts, 4 one is to be acknowledged."""
     word = 0
     for alarm in alarms:
         if alarm.active:
             word |= ERROR_BIT if alarm.level == "error" else WARNING_BIT
-        if alarm.state in ("unacknowledged", "returned"):
+        if alarm.state in ("unacknowledged", "returned") and not alarm.shelved:
             word |= UNSEEN_BIT
     return word

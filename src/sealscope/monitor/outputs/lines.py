@@ -8,13 +8,15 @@ from typing import TextIO
 from sealscope.monitor.memory.store import MonitorStore
 
 _NAME = "lines"
+#: Events that a shelved alarm keeps to itself.
+_BY_ITSELF = ("raised", "error", "warning", "returned")
 
 
 class EventLines:
     """Writes the events of a store, in their order, to a stream of text.
 
     How far it is stands in the store, so that a restart goes on there; an event whose line was written just before a
-    crash is written again, with the same number.
+    crash is written again, with the same number. What happens to a shelved alarm is left out.
     """
 
     def __init__(self, store: MonitorStore, stream: TextIO) -> None:
@@ -27,7 +29,9 @@ class EventLines:
         if not events:
             return
         for number, event in events:
-            self._stream.write(json.dumps(event) + "\n")
+            # what a person does is said all the same
+            if event["event"] not in _BY_ITSELF or not event["alarm"]["shelved"]:
+                self._stream.write(json.dumps(event) + "\n")
             self._position = number
         self._stream.flush()
         self._store.keep_position(_NAME, self._position)

@@ -48,6 +48,7 @@ class _Connection:
             self._client.username_pw_set(settings.user, password)
         if settings.tls:
             self._client.tls_set(ca_certs=None if settings.ca_file is None else str(settings.ca_file))
+        self._connection = 0
         self._client.on_connect = self._connected
         self._client.on_message = self._message
         self._client.on_disconnect = self._lost
@@ -74,6 +75,7 @@ class _Connection:
             self._client.loop_stop()
 
     def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+        self._connection += 1
         if reason.is_failure:
             _log.error("the broker %s refuses the connection: %s", self._settings.host, reason)
             return
@@ -85,10 +87,12 @@ class _Connection:
             _log.warning("the connection to the broker %s is lost: %s", self._settings.host, reason)
 
     def _message(self, client: Any, userdata: Any, message: Any) -> None:
-        number, qos = message.mid, message.qos
+        number, qos, connection = message.mid, message.qos, self._connection
 
         def done() -> None:
-            client.ack(number, qos)
+            # after a lost connection the number may be another message's, and the broker sends this one again
+            if connection == self._connection:
+                client.ack(number, qos)
 
         try:
             self._service.hand(decoded(message.payload, self._names.get(message.topic), done))

@@ -1,0 +1,110 @@
+"""An alarm's life: thresholds, debounce and hysteresis, and the states of ISA-18.2."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sealscope.monitor.alarms.alarm import status_word
+from sealscope.monitor.alarms.judging import AlarmJudge, Thresholds
+from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.outputs.lines import EventLines
+from sealscope.monitor.stream.watch import BlockEstimate, WatchedLeak
+
+THRESHOLDS = Thresholds(warning_lpm=0.002, error_lpm=0.01, debounce=2, return_share=0.5)
+LEAK = WatchedLeak(
+    10.0, 9.0, (8.0, 10.0), 0.003, (0.002, 0.004), 1e-13, 1e-15, "step", "pump leak", "it rises", 50.0, 28.0
+)
+
+
+def through(judge: AlarmJudge, flows: list[float | None], leak: WatchedLeak | None = LEAK) -> list[str]:
+    """What happens as blocks of these flows follow each other."""
+    happened = []
+    for number, lpm in enumerate(flows):
+        interval = None if lpm is None else (lpm, lpm)
+        change = judge.take(
+            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, THRESHOLDS
+        )
+        if change is not None and change[1]:
+            happened.append(change[1])
+    return happened
+
+
+def test_one_block_is_no_alarm_two_are():
+    judge = AlarmJudge("a")
+    assert through(judge, [0.003, 0.001, 0.003, 0.001]) == []
+    assert through(judge, [0.003, 0.003]) == ["raised"]
+    assert judge.alarm is not None
+    assert (judge.alarm.level, judge.alarm.diagnostic_number) == ("warning", 4101)
+    assert "case drain" in judge.alarm.next_check
+
+
+def test_it_returns_well_below_its_threshold():
+    judge = AlarmJudge("a")
+    assert through(judge, [0.003] * 3 + [0.0015] * 20) == ["raised"]
+    assert through(judge, [0.0009, 0.0011, 0.0009]) == []
+    assert through(judge, [0.0009]) == ["returned"]
+    assert judge.alarm is not None and judge.alarm.state == "returned"
+    assert judge.marked("acknowledged", 100.0).state == "normal"
+    assert judge.alarm is None
+
+
+def test_an_error_must_be_seen_again_and_becomes_a_warning_below():
+    judge = AlarmJudge("a")
+    through(judge, [0.003] * 2)
+    assert judge.marked("acknowledged", 5.0).state == "acknowledged"
+    assert through(judge, [0.02] * 2) == ["error"]
+    assert judge.alarm is not None
+    assert (judge.alarm.state, status_word([judge.alarm])) == ("unacknowledged", 6)
+    assert through(judge, [0.004] * 2) == ["warning"]
+    judge.marked("acknowledged", 50.0)
+    assert through(judge, [0.0] * 2, None) == ["returned"]
+    assert judge.alarm is None
+
+
+def test_without_litres_a_leak_is_a_warning():
+    judge = AlarmJudge("a")
+    assert through(judge, [None, None]) == ["raised"]
+    assert judge.alarm is not None and judge.alarm.leak_lpm is None
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from([0.0, 0.001, 0.003, 0.02]), st.sampled_from(["", "acknowledged", "false"]))))
+def test_its_state_is_plain_and_a_life_ends_in_normal(steps: list[tuple[float, str]]):
+    judge, lived = AlarmJudge("a"), []
+    for lpm, mark in steps:
+        again = AlarmJudge.from_state(json.loads(json.dumps(judge.state())))
+        assert again == judge
+        through(judge, [lpm])
+        if judge.alarm is not None and mark and not (mark == "acknowledged" and judge.alarm.state == "acknowledged"):
+            lived.append(judge.marked(mark, 1.0).state)
+    assert judge.raised >= lived.count("normal")
+    assert judge.alarm is None or judge.alarm.state != "normal"
+
+
+def test_a_shelved_alarm_keeps_its_changes_to_itself(tmp_path: Path):
+    store, judge, out = MonitorStore(str(tmp_path / "a.db")), AlarmJudge("a"), io.StringIO()
+    lines = EventLines(store, out)
+
+    def kept(kind: str) -> None:
+        assert judge.alarm is not None
+        with store.writing() as connection:
+            store.keep_event(connection, judge.alarm, kind, judge.alarm.updated_s)
+        lines.pass_on()
+
+    through(judge, [0.003] * 2)
+    kept("raised")
+    judge.marked("shelved", 3.0, 100.0)
+    kept("shelved")
+    assert judge.alarm is not None and status_word([judge.alarm]) == 1
+    assert through(judge, [0.02] * 2) == ["error"]
+    kept("error")
+    assert [json.loads(line)["event"] for line in out.getvalue().splitlines()] == ["raised", "shelved"]
+    assert through(judge, [0.02] * 40) == []
+    assert judge.alarm.updated_s == pytest.approx(117.0)
+    assert status_word([judge.alarm]) == 6
