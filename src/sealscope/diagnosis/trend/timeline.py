@@ -132,9 +132,9 @@ def _clock(ordered: Sequence[LeakReading]) -> list[Finding]:
                 "machines",
             )
         ]
-    shapes = {tuple("#" if part[0] == 0 else part[2] for part in natural(reading.file)) for reading in ordered}
-    if len(shapes) != 1:
-        return []
+    kinds = sorted({_kind(reading.file) for reading in ordered})
+    if len(kinds) != 1:
+        return _names_of_kinds(ordered, kinds)
     by_number = sorted(ordered, key=lambda reading: natural(reading.file))
     back = [(early, late) for early, late in pairwise(by_number) if (late.start or 0.0) < (early.start or 0.0)]
     if not back or 2 * len(back) >= len(ordered):  # numbers that say nothing of the order
@@ -144,16 +144,34 @@ def _clock(ordered: Sequence[LeakReading]) -> list[Finding]:
     return [_finding("clock", "warning", len(back), text)]
 
 
+def _kind(name: str) -> str:
+    """Return the first word of a file's name, without numbers."""
+    return re.split(r"[\d\W_]", name, maxsplit=1)[0].lower()
+
+
+def _names_of_kinds(ordered: Sequence[LeakReading], kinds: Sequence[str]) -> list[Finding]:
+    """Return that the names begin with few words, each with several recordings, as those of several machines do."""
+    counts = {kind: sum(_kind(reading.file) == kind for reading in ordered) for kind in kinds}
+    if len(kinds) > 3 or min(counts.values()) < 3 or "" in counts:
+        return []
+    listed = ", ".join(f"{count} as {kind!r}" for kind, count in counts.items())
+    text = f"the names begin with {len(kinds)} words ({listed}): a trend is that of a single machine"
+    return [_finding("names", "note", len(ordered), text)]
+
+
 def _named(
     left_out: Sequence[tuple[LeakReading, str]], kept: Sequence[LeakReading], group: IntArray, groups: Sequence[str]
 ) -> list[Finding]:
     reasons: dict[str, list[str]] = {}
+    texts: dict[str, str] = {}
     for reading, reason in left_out:
-        reasons.setdefault(reason, []).append(reading.file)
+        alike = re.sub(r"\d[\d.]*", "#", reason)  # but for its numbers
+        texts.setdefault(alike, reason)
+        reasons.setdefault(alike, []).append(reading.file)
     total = len(left_out) + len(kept)
     findings = [
-        _finding("left_out", "warning", len(files), f"{len(files)} of {total} left out: {reason} ({_names(files)})")
-        for reason, files in reasons.items()
+        _finding("left_out", "warning", len(files), f"{len(files)} of {total} left out: {texts[own]} ({_names(files)})")
+        for own, files in reasons.items()
     ]
     for number in range(1, len(groups)):
         files = [reading.file for reading, own in zip(kept, group, strict=True) if own == number]

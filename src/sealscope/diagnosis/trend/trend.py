@@ -32,8 +32,6 @@ _YEARS = (0.1, 1000.0)
 #: A laminar leak goes with 1/viscosity: ISO VG 46 of viscosity index 100 has 117 mm^2/s at 20 deg C and 30 at 50
 #: (ISO 3448), 4.5 % a kelvin; what the oil's sensor sees is not what the gap does. Mean and deviation [1/K].
 _PER_KELVIN, _PER_KELVIN_SD = 0.04, 0.015
-#: What lasts of the changes from day to day does so for a week, within a session for an hour [days].
-_WEEK, _HOUR, _SESSION = 7.0, 1.0 / 24.0, 1.0
 #: A step of so many deviations from day to day is surely found at the second recording after it.
 _FOUND = 5.0
 #: Fewest comparable recordings that show that nothing grows.
@@ -374,8 +372,7 @@ def _series(line: Timeline, first: float, healthy: int, repair: RepairLimit) -> 
     elif repair.kind == "creep" and readings[0].area is not None:
         allowed = repair.value * readings[0].area / pressure * unit
     levels = Levels(t, value * unit, error * unit, line.group, covariate, slope_sd * unit)
-    lasting = _WEEK if t.size and float(np.ptp(t)) > _SESSION else _HOUR
-    prior = WearPrior(replace(scatter, scale=scatter.scale * unit), lasting)
+    prior = WearPrior(replace(scatter, scale=scatter.scale * unit))
     return _Series(levels, prior, flows, pressure, allowed)
 
 

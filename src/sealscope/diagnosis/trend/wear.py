@@ -6,11 +6,11 @@ The level that recording i states at the time t_i is
 
 mu of the group l that the recording belongs to (duty, sensors), a covariate c with a normal prior on beta, what changes
 from day to day d, the recording's own error e_i of stated deviation s_i, and the change g: a step, ``g = [t >= t_j]``,
-or a growth, ``g = max(t - t_(j-1), 0)``. d is normal with variance tau^2, of which a share r lasts: its covariance is
-``tau^2 ((1 - r) [i = k] + r exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`DayToDay`), r is
-uniform on a few values, and both are summed on a grid. mu has a flat prior, and delta a half-normal one of some scales
-in units of tau. So every marginal likelihood has a closed form. With L L' = cov(y), the rows of L^-1 y up to n are
-those of the first n recordings alone, and one factorisation serves all n.
+or a growth, ``g = max(t - t_(j-1), 0)``. d is normal with variance tau^2, of which a share r lasts, half of it for an
+hour and half for a week: its covariance is ``tau^2 ((1 - r) [i = k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a
+scaled inverse chi-square prior (`DayToDay`), r is uniform on a few values, and both are summed on a grid. mu has a flat
+prior, and delta a half-normal one of some scales in units of tau. So every marginal likelihood has a closed form. With
+L L' = cov(y), the rows of L^-1 y up to n are those of the first n recordings alone, and one factorisation serves all n.
 
 The test is Shiryaev's and Roberts's: with the likelihood ratio LR_j(n) of a change after recording j - 1 against none,
 
@@ -48,6 +48,10 @@ MONTH = 365.25 / 12.0
 #: Grid of tau, from a share of the prior's scale to so many times the larger of scale and scatter seen, and of r.
 _LEAST, _MOST, _NODES = 0.1, 10.0, 14
 _LASTING = (0.0, 0.5, 0.9)
+#: How long what lasts does [days]: for an hour within a session (a machine warms up), for a week (weather, load).
+_TIMES = (1.0 / 24.0, 7.0)
+#: Recordings of a shorter time [days] state no growth by a month.
+_LEAST_SPAN = 1.0
 #: Scales of a step's prior in tau, and of a growth's: tau in so many typical intervals between recordings.
 _STEPS, _INTERVALS = (2.0, 8.0, 40.0, 200.0), (0.05, 0.5, 4.0, 12.0, 48.0)
 #: A single recording counts no further than so many deviations from those before it, until the next agrees ...
@@ -67,10 +71,9 @@ _TINY = 1e-10
 
 @dataclass(frozen=True)
 class WearPrior:
-    """What is assumed of a machine: its scatter from day to day, and how long the part of it that lasts does [days]."""
+    """What is assumed of a machine: its scatter from day to day."""
 
     scatter: DayToDay
-    lasting: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +279,8 @@ class _Model:
         from scipy.linalg import solve_triangular
 
         own = self.levels
-        lasting = np.exp(-np.abs(own.t[:, None] - own.t) / self.prior.lasting)
+        waits = np.abs(own.t[:, None] - own.t)
+        lasting = np.mean([np.exp(-waits / time) for time in _TIMES], axis=0)
         right = np.column_stack([self.columns, own.value - self.origin, self.changes])
         q = self.columns.shape[1]
         result = []
@@ -396,7 +400,8 @@ def describe(levels: Levels, prior: WearPrior, allowed: float | None, alarmed: i
     nodes = _Model(levels, prior, changes.shape).nodes()
     a, b = (np.stack([getattr(node, name)[-1][changes.column] for node in nodes]) for name in ("a", "b"))
     k = changes.scale * np.array([[node.tau] for node in nodes])
-    if told := bool(alarmed is not None or (a > 0.0).all()):
+    told = float(levels.t[-1] - levels.t[0]) >= _LEAST_SPAN and bool(alarmed is not None or (a > 0.0).all())
+    if alarmed is not None or (a > 0.0).all():
         v = 1.0 / (a + k**-2)
         ratio = -0.5 * np.log(a) + 0.5 * b * b * v if alarmed is None else _log_ratio(a, b, k, 1)
     else:  # all recordings at one time, or each in a group of its own

@@ -127,7 +127,7 @@ def growth(trend: Trend) -> str | None:
     if wear.step is not None:
         return f"a step of {figure(wear.step, trend.unit)}"
     if not math.isfinite(wear.growth.value):
-        return "not known from so few recordings"
+        return "not stated: the recordings are too few, or span less than a day"
     return f"{figure(wear.growth, trend.unit)} a month"
 
 
@@ -145,6 +145,8 @@ def reach(trend: Trend) -> str | None:
         return None
     limit = f"{number(trend.limit, 2)} {trend.unit}"
     own = wear.reach
+    if math.isnan(own.value):
+        return None
     if own.value == 0.0:
         text = f"{limit} is reached"
     elif not math.isfinite(own.value) or own.value / MONTH > _FURTHEST:
