@@ -79,3 +79,13 @@ def test_files_without_a_time_ask_for_every(call, days: Path, tmp_path: Path) ->
 )
 def test_wrong_options_are_refused_in_a_line(call, days: Path, words: tuple[str, ...], complaint: str) -> None:
     assert complaint in call("trend", days / "day_1.nc", *words).refused()
+
+
+def test_diagnose_offers_the_trend_of_days_and_of_nothing_else(call, days: Path) -> None:
+    files = [days / f"day_{k}.nc" for k in (1, 2, 3)]
+    assert call("diagnose", *files).err == (
+        "sealscope: these 3 files follow one another in time: `sealscope trend` shows how the leakage went\n"
+    )
+    assert call("diagnose", *files[:2]).err == ""
+    assert call("diagnose", *files, "--format", "jsonl").err == ""
+    assert call("diagnose", *files, "--quiet").err == ""

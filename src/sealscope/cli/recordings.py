@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,9 +12,10 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -258,29 +260,55 @@ def diagnose(
     piped = _check_standard_input([*files, *(baseline or ())])
     # what a baseline costs is spent once, and standard input is this process's
     if join or piped or baseline or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:
-        said: Iterator[tuple[str, Sequence[tuple[str, str] | None]]] = (("", [verdict]) for verdict in task(files))
+        said: Iterator[tuple[str, Sequence[SaidOfFile | None]]] = (("", [verdict]) for verdict in task(files))
     else:
         said = (
             result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
             for part, result in in_order(jobs, partial(_aside, task), [[file] for file in files])
         )
+    starts: list[float | None] = []
     for complaints, verdicts in said:
         typer.echo(complaints, err=True, nl=False)
         for verdict in verdicts:
             if verdict is None:
                 complete = False
             else:
-                failed |= verdict[0] in (fail_on or ())
-                say(verdict[1])
+                failed |= verdict.verdict in (fail_on or ())
+                starts.append(verdict.start)
+                say(verdict.text)
+    if form in ("short", "whole") and _in_time(files, starts):
+        complain(f"these {len(files)} files follow one another in time: `sealscope trend` shows how the leakage went")
     if not complete or failed:
         raise typer.Exit(_FAILED_ON if failed else 1)
 
 
-def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[tuple[str, str] | None]:
+#: Fewest files, and time between two of them [s], from which on they may be a machine's over time.
+_FEWEST_IN_TIME, _APART_IN_TIME = 3, 3600.0
+
+
+def _in_time(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
+    """Return whether files with names of one kind were recorded one after another, an hour apart or more."""
+    known = sorted(start for start in starts if start is not None)
+    if len(known) < max(_FEWEST_IN_TIME, len(files)):
+        return False
+    kinds = {re.sub(r"\d+", "#", file.name) for file in files}
+    return len(kinds) == 1 and all(late - early >= _APART_IN_TIME for early, late in pairwise(known))
+
+
+class SaidOfFile(NamedTuple):
+    """Verdict on a file, what is printed of it, and when it was recorded [s since 1970], None where not known."""
+
+    verdict: str
+    text: str
+    start: float | None
+
+
+def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[SaidOfFile | None]:
     """Yield each file's verdict and what is printed of it in a `form`: jsonl, whole, short or line.
 
     None for a file that cannot be read; `options` of `_diagnoses`.
     """
+    from sealscope.diagnosis.baseline.sessions import start_seconds
     from sealscope.reporting import diagnosis_text, short_text
 
     for result in _diagnoses(files, **options):
@@ -292,12 +320,13 @@ def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[tupl
             text = json.dumps(diagnosis.as_dict(), allow_nan=False)
         else:
             text = diagnosis_text(diagnosis) if form == "whole" else short_text(diagnosis)
-        yield diagnosis.verdict, text.partition("\n")[0] if form == "line" else text
+        text = text.partition("\n")[0] if form == "line" else text
+        yield SaidOfFile(diagnosis.verdict, text, start_seconds(result[0]))
 
 
 def _aside(
-    task: Callable[[Sequence[Path]], Iterator[tuple[str, str] | None]], files: Sequence[Path]
-) -> tuple[str, list[tuple[str, str] | None]]:
+    task: Callable[[Sequence[Path]], Iterator[SaidOfFile | None]], files: Sequence[Path]
+) -> tuple[str, list[SaidOfFile | None]]:
     """Return what a task says on standard error, and what it yields."""
     with redirect_stderr(StringIO()) as complaints:
         verdicts = list(task(files))
