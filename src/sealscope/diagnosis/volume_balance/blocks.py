@@ -200,6 +200,8 @@ class Geometry:
         Whether the areas of the two sides differ.
     area_stated, displacement_stated : bool
         Whether they are this machine's, or were merely assumed.
+    asymmetry : float
+        (A_A - A_B)/(A_A + A_B) of the assumed machine.
     """
 
     area: float
@@ -207,6 +209,7 @@ class Geometry:
     unequal: bool = False
     area_stated: bool = True
     displacement_stated: bool = True
+    asymmetry: float = 0.0
 
 
 def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple[Array, Array, Array]:

@@ -62,6 +62,7 @@ class VolumeBalance:
             areas[0] != areas[1],
             rig.states("cylinder.A_A", "cylinder.A_B"),
             rig.states("pump.q_b"),
+            (areas[0] - areas[1]) / sum(areas),
         )
 
     def usable(self, recording: Recording) -> str | None:

@@ -213,7 +213,7 @@ def _geometry_agrees(fit: BalanceFit) -> bool:
     """Return whether displacement over area is near the assumed one, whichever way the encoders count."""
     known = fit.geometry
     far = GEOMETRY if known.area_stated or known.displacement_stated else UNSTATED_GEOMETRY + 2.0 * fit.scale_sd
-    return abs(abs(fit.scale) - 1.0) <= far
+    return abs(fit.misfit - 1.0) <= far
 
 
 def _geometry_fits(fit: BalanceFit) -> bool:
@@ -239,7 +239,7 @@ def _no_flow_text(fit: BalanceFit, lpm: float | None = None) -> str:
     """Return why L/min is not stated; `lpm`: what it would be for a machine of the assumed size."""
     if not fit.metres:
         return "L/min is not stated: the position is in counts"
-    ratio = f"displacement over area is {abs(fit.scale):.3g} times"
+    ratio = f"displacement over area is {fit.misfit:.3g} times"
     if fit.geometry.area_stated or fit.geometry.displacement_stated:
         return f"L/min is not stated: {ratio} the assumed one, so the geometry is another"
     ask = "state --rig, --area or --displacement"
@@ -256,8 +256,8 @@ def _refused(fit: BalanceFit) -> frozenset[Figure]:
 
 def _measured(evidence: Evidence, fit: BalanceFit) -> Evidence:
     """Return the evidence with displacement over area as measured, over the assumed one."""
-    half = 1.96 * math.hypot(fit.scale_sd, _RELATIVE * fit.scale)
-    ratio = abs(fit.scale)
+    half = 1.96 * fit.carrying * math.hypot(fit.scale_sd, _RELATIVE * fit.scale)
+    ratio = fit.misfit
     return replace(evidence, ratio=ratio, ratio_interval=(ratio - half, ratio + half)) if fit.metres else evidence
 
 

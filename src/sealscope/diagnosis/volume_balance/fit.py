@@ -80,7 +80,8 @@ class BalanceFit:
     piston, or of both together [m^3/(s Pa)], positive where oil leaks; `sd` (n,): its deviation, from the residual and
     the noise of dp; `shared` (n, m): deviations common to the blocks, from the shared coefficients; `residual` [m^3]:
     rms; `signal` [m^3]: rms of the volume delivered; `slip` (n,): flow that nothing explains [m^3/s]; `metres`: the
-    position has a unit; `unequal`: the sides' areas differ; `scale_sd`: deviation of `scale`; `geometry`: as assumed.
+    position has a unit; `unequal`: the sides' areas differ; `scale_sd`: deviation of `scale`; `geometry`: as assumed;
+    `side`: 1 where p_A is the higher one along most of the way, -1 where p_B is.
     """
 
     blocks: BalanceBlocks
@@ -100,11 +101,25 @@ class BalanceFit:
     unequal: bool
     scale_sd: float
     geometry: Geometry
+    side: int
 
     @property
     def scale(self) -> float:
         """Displacement over area, over the assumed one, s; negative where an encoder counts the other way."""
         return float(self.beta[0])
+
+    @property
+    def carrying(self) -> float:
+        """Area of the side that carries the load most of the way, over the mean of both, of the assumed machine.
+
+        1 where the sides are counted by the pump's direction: then `scale` is by the mean.
+        """
+        return 1.0 if Y_PUMP in self.columns else 1.0 + self.side * self.sense * self.geometry.asymmetry
+
+    @property
+    def misfit(self) -> float:
+        """Displacement over area, over that of the assumed machine: 1 where it is this one."""
+        return abs(self.scale) * self.carrying
 
     @property
     def lag(self) -> float:
@@ -266,13 +281,14 @@ def _filling(blocks: BalanceBlocks) -> NDArray[np.bool_]:
     return np.asarray(filling & (np.mean(filling) <= _SELDOM))
 
 
-def _by_lesser_side(blocks: BalanceBlocks) -> BalanceBlocks:
+def _by_lesser_side(blocks: BalanceBlocks, side: int) -> BalanceBlocks:
     """Return the blocks with the volume displaced under pressure from the side that has it less, in place of `Y_SIDE`.
 
-    It is nothing where one side carries the load throughout; twice it and the volume displaced differ by a sign only.
+    `side`: 1 where that is B, -1 where it is A. It is nothing where one side carries the load throughout; twice it and
+    the volume displaced differ by a sign only.
     """
     turn = np.eye(blocks.gram.shape[1])
-    turn[Y_SIDE, Y_SIDE] = -0.5 if float(np.sum(blocks.gram[:, Y, Y_SIDE])) >= 0 else 0.5
+    turn[Y_SIDE, Y_SIDE] = -0.5 * side
     turn[Y_SIDE, Y] = 0.5
     return replace(blocks, gram=turn @ blocks.gram @ turn.T, slope=blocks.slope @ turn.T, stored=blocks.stored @ turn.T)
 
@@ -283,7 +299,8 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
     `geometry`: what made volumes of the samples. Needs one block or more; `residual` and `signal` show a fit that means
     nothing (no motion, encoders that do not belong together).
     """
-    blocks = _by_lesser_side(blocks)
+    side = 1 if float(np.sum(blocks.gram[:, Y, Y_SIDE])) >= 0 else -1
+    blocks = _by_lesser_side(blocks, side)
     keep = _moving(blocks) & ~_filling(blocks)
     if not keep.any():
         keep = np.ones(len(blocks), dtype=bool)
@@ -333,6 +350,7 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
         unequal=geometry.unequal or bool({Y_PUMP, Y_SIDE} & set(shared)),
         scale_sd=float(np.sqrt(max(inverse[0, 0], 0.0) * usual)),
         geometry=geometry,
+        side=side,
     )
 
 
