@@ -16,11 +16,14 @@ from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.judging.judge import calibration_of, judge
 from sealscope.campaigns.plans.model import RecordGroup, SimulatedPlan
 from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, ChangeDetector
+from sealscope.campaigns.prediction.judges import judge_predictions
 from sealscope.campaigns.prediction.predict import DetectionTarget, closing_text, experiment_for, predict, with_closing
 from sealscope.campaigns.prediction.report import PredictionReport
 from sealscope.campaigns.prediction.responses import instrument_noise, noise_responses
 from sealscope.cli import prediction
 from sealscope.diagnosis.calibration.scorers import Look
+from sealscope.diagnosis.pressure_model.detector import PressureModel
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.faults import From, Leak
@@ -113,7 +116,7 @@ def made(rig: Rig) -> PredictionReport:
         closings=(None,),
         progress=lambda words, share: told.append((words, share)),
     )
-    assert {words for words, _ in told} == {"this command", "commands compared"}
+    assert {words for words, _ in told} == {"this command", "judging detectors", "commands compared"}
     assert all(0.0 <= share <= 1.0 for _, share in told)
     return found
 
@@ -127,6 +130,39 @@ def test_plan_names_every_detector_and_keeps_the_bound_below_them(made: Predicti
     assert bound.known_lpm < bound.unknown_lpm
     assert bound.change_known_lpm == pytest.approx(math.sqrt(2.0) * bound.known_lpm)
     assert bound.half_s == 10.0
+
+
+def test_the_judging_detectors_say_what_they_would_find(made: PredictionReport, rig: Rig) -> None:
+    """Half as large again is found, and a third is not, in records made afresh; onset and size are the detector's."""
+    balance, model = made.judges
+    assert balance.smallest is not None
+    assert balance.smallest < min(one.smallest for one in made.detectors if one.smallest is not None)
+    assert model.smallest is None and "needs 40 s or more" in model.reason
+    experiment = experiment_for(rig, "7 sin(4t)", 20.0)
+    for size, verdict in ((1.5, "leak"), (1 / 3, "no leak")):
+        leak = Leak("laminar", coefficient=size * balance.smallest * LITRE_PER_MINUTE / made.pressure_difference,
+                    opening=From(10.0))  # fmt: skip
+        for seed in (70, 71, 72):
+            recording = simulate_with_truth(replace(experiment, leaks=(leak,), seed=seed)).recording
+            assert VolumeBalance(rig).examine(recording, [], 0.01).verdict == verdict
+    assert "volume balance" in made.text() and "onset not given, rig given" in made.text()
+    tree = made.as_dict()["judges"][0]
+    assert tree["given"]["onset"] is False and tree["smallest_leak_lpm"] == balance.smallest
+
+
+@pytest.mark.slow
+def test_the_pressure_model_finds_what_is_predicted() -> None:
+    thesis = load_rig("thesis")
+    experiment = experiment_for(thesis, "3 sin(4t)", 80.0)
+    _, model = judge_predictions(experiment, 0.01, 0.9, 0)
+    assert model.smallest is not None
+    dp = float(np.mean(np.abs(np.diff(simulate_with_truth(experiment).recording.to_pandas()[["p_A", "p_B"]], axis=1))))
+    found = []
+    for seed in range(70, 76):
+        leak = Leak("laminar", coefficient=1.3 * model.smallest * LITRE_PER_MINUTE / dp, opening=From(40.0))
+        recording = simulate_with_truth(replace(experiment, leaks=(leak,), seed=seed)).recording
+        found.append(PressureModel(thesis).examine(recording, [], 0.01).verdict == "leak")
+    assert sum(found) >= 5
 
 
 def test_a_command_that_cannot_be_run_is_told_in_its_row(made: PredictionReport) -> None:

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import bz2
-import datetime as dt
 import gzip
 import lzma
-import warnings
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,215 +14,29 @@ import pytest
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import Recording, read
 
+from .dialects import (
+    DIALECTS,
+    FILES,
+    P_A,
+    P_B,
+    RATE,
+    N,
+    T,
+    X,
+    deviations,
+    lvm,
+    matlab,
+    tdms_other_groups,
+    timeseries,
+    vectors,
+    xlsx,
+)
+
 pytest.importorskip("nptdms")
 pytest.importorskip("matio")
 pytest.importorskip("asammdf")
 pytest.importorskip("python_calamine")
 
-RATE = 500.0
-N = 200
-T = np.arange(N) / RATE
-P_A = 20.0 + np.sin(7.0 * T)  # bar
-P_B = 18.0 - np.sin(7.0 * T)
-X = 12.5 * np.sin(3.0 * T)  # mm
-START = dt.datetime(2024, 5, 31, 12, 0, 0, 250000, tzinfo=dt.UTC)
-Writer = Callable[[Path], Path]
-
-
-def tdms(folder: Path, groups: dict[str, dict[str, Any]], **properties: Any) -> Path:
-    from nptdms import ChannelObject, TdmsWriter
-
-    with TdmsWriter(folder / "log.tdms") as writer:
-        writer.write_segment(
-            [
-                ChannelObject(group, name, data, {**properties, "unit_string": unit})
-                for group, channels in groups.items()
-                for name, (data, unit) in channels.items()
-            ]
-        )
-    return folder / "log.tdms"
-
-
-def tdms_waveform(folder: Path) -> Path:
-    channels = {"p_A": (P_A, "bar"), "p_B": (P_B, "bar"), "x": (X, "mm")}
-    start = np.datetime64("2024-05-31T12:00:00.250000", "us")
-    return tdms(folder, {"Measured": channels}, wf_increment=1 / RATE, wf_start_offset=0.0, wf_start_time=start)
-
-
-def tdms_time_column(folder: Path) -> Path:
-    return tdms(folder, {"Log": {"Time": (T, "s"), "p_A": (P_A, "bar"), "p_B": (P_B, "bar"), "x": (X, "mm")}})
-
-
-def tdms_other_groups(folder: Path) -> Path:
-    fast = {"p_A": (P_A, "bar"), "p_B": (P_B, "bar"), "x": (X, "mm")}
-    other = {"p_A": (np.zeros(4), "bar"), "oil": (np.full(4, 40.0), "degC")}
-    return tdms(folder, {"Statistics": other, "Fast": fast}, wf_increment=1 / RATE)
-
-
-def matlab(folder: Path, held: dict[str, Any], version: str) -> Path:
-    path = folder / "log.mat"
-    if version in ("4", "5"):
-        from scipy.io import savemat
-
-        savemat(path, held, format=version, oned_as="row")
-    else:
-        from matio import save_to_mat
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # on the resolution of time deltas
-            save_to_mat(path, held, version=version)
-    return path
-
-
-def vectors(folder: Path, version: str) -> Path:
-    return matlab(folder, {"t": T[None, :], "p_A": P_A[:, None] * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3}, version)
-
-
-def struct(folder: Path, version: str) -> Path:
-    fields = {"t": T, "p_A": P_A * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3, "remark": "rig 3"}
-    return matlab(folder, {"log": fields, "operator": "N. N."}, version)
-
-
-def table(folder: Path, version: str) -> Path:
-    import pandas as pd
-
-    return matlab(folder, {"T": pd.DataFrame({"t": T, "p_A": P_A * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3})}, version)
-
-
-def timetable(folder: Path, version: str) -> Path:
-    import pandas as pd
-
-    times = pd.TimedeltaIndex((T * 1e9).round().astype("timedelta64[ns]").astype("timedelta64[ms]"), name="Time")
-    frame = pd.DataFrame({"p_A": P_A * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3}, index=times)
-    return matlab(folder, {"TT": frame}, version)
-
-
-def structure_with_time(folder: Path, version: str) -> Path:
-    signals = np.zeros(3, dtype=[("values", object), ("dimensions", object), ("label", object)])
-    for place, (name, values) in enumerate({"p_A": P_A * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3}.items()):
-        signals[place] = (values[:, None], 1.0, name)
-    return matlab(folder, {"ScopeData": {"time": T[:, None], "signals": signals, "blockName": "rig/Scope"}}, version)
-
-
-def timeseries(name: str, values: Any, uniform: bool) -> Any:
-    """Return an object with the properties that MATLAB's timeseries stores."""
-    from matio.utils.matclass import MatlabOpaque
-
-    info = {"Units": "seconds", "Start": 0.0, "Increment": 1 / RATE, "Length": float(N)}
-    properties = {"Name": name, "Data_": values[:, None], "TimeInfo": info, "DataInfo": {"Units": "bar"}}
-    properties["Time_"] = np.empty((0, 0)) if uniform else T[:, None]
-    return MatlabOpaque(properties, "timeseries")
-
-
-def mdf(folder: Path, version: str, name: str) -> Path:
-    from asammdf import MDF, Signal
-
-    with MDF(version=version) as file:
-        file.header.start_time = START
-        file.append([Signal(P_A, T, unit="bar", name="p_A"), Signal(P_B, T, unit="bar", name="p_B")], comment="fast")
-        file.append([Signal(X, T, unit="mm", name="x")], comment="position")
-        file.save(folder / name, overwrite=True)
-    return folder / name
-
-
-def xlsx(folder: Path) -> Path:
-    openpyxl = pytest.importorskip("openpyxl")
-    book = openpyxl.Workbook()
-    book.active.title = "Info"
-    book.active.append(["Operator", "N. N."])
-    sheet = book.create_sheet("Data")
-    sheet.append(["exported by a logger"])
-    sheet.append(["Time", "p_A", "p_B", "x"])
-    sheet.append(["s", "bar", "bar", "mm"])
-    for row in zip(T, P_A, P_B, X, strict=True):
-        sheet.append([float(value) for value in row])
-    book.save(folder / "log.xlsx")
-    return folder / "log.xlsx"
-
-
-def ods(folder: Path) -> Path:
-    """Write OpenDocument's content.xml by hand, from the published format."""
-    rows = "".join(
-        "<table:table-row>"
-        + "".join(
-            f'<table:table-cell office:value-type="float" office:value="{float(value)!r}"><text:p/></table:table-cell>'
-            for value in row
-        )
-        + "</table:table-row>"
-        for row in zip(T, P_A, P_B, X, strict=True)
-    )
-    names = "".join(
-        f'<table:table-cell office:value-type="string"><text:p>{name}</text:p></table:table-cell>'
-        for name in ("t [s]", "p_A [bar]", "p_B [bar]", "x [mm]")
-    )
-    space = "urn:oasis:names:tc:opendocument:xmlns"
-    content = (
-        f'<?xml version="1.0"?><office:document-content xmlns:office="{space}:office:1.0" '
-        f'xmlns:table="{space}:table:1.0" xmlns:text="{space}:text:1.0" office:version="1.2"><office:body>'
-        f'<office:spreadsheet><table:table table:name="Log"><table:table-row>{names}</table:table-row>{rows}'
-        "</table:table></office:spreadsheet></office:body></office:document-content>"
-    )
-    kind = "application/vnd.oasis.opendocument.spreadsheet"
-    manifest = (
-        f'<?xml version="1.0"?><manifest:manifest xmlns:manifest="{space}:manifest:1.0">'
-        f'<manifest:file-entry manifest:full-path="/" manifest:media-type="{kind}"/></manifest:manifest>'
-    )
-    with zipfile.ZipFile(folder / "log.ods", "w") as archive:
-        archive.writestr("mimetype", kind)
-        archive.writestr("content.xml", content)
-        archive.writestr("META-INF/manifest.xml", manifest)
-    return folder / "log.ods"
-
-
-def lvm(folder: Path, columns: str = "One", comma: bool = False, packets: int = 1, name: str = "log.lvm") -> Path:
-    """Write a LabVIEW measurement file from the format's published description."""
-    separator = ","
-    lines = ["LabVIEW Measurement", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab"]
-    lines += [f"Decimal_Separator\t{separator if comma else '.'}", f"X_Columns\t{columns}", "Time_Pref\tRelative"]
-    lines += ["Operator\tN. N.", "Date\t2024/05/31", "Time\t12:00:00.25", "***End_of_Header***\t", "\t"]
-    for part in np.array_split(np.arange(N), packets):
-        moment = f"12:00:{0.25 + T[part[0]]:010.7f}"
-        lines += ["Channels\t3\t\t", f"Samples\t{len(part)}\t{len(part)}\t{len(part)}"]
-        lines += ["Date\t2024/05/31\t2024/05/31\t2024/05/31", f"Time\t{moment}\t{moment}\t{moment}"]
-        lines += ["Y_Unit_Label\tbar\tbar\tmm", "X_Dimension\tTime\tTime\tTime", "X0\t0.0\t0.0\t0.0"]
-        lines += [f"Delta_X\t{1 / RATE}\t{1 / RATE}\t{1 / RATE}", "***End_of_Header***\t\t\t"]
-        heads = ["X_Value", "p_A", "X_Value", "p_B", "X_Value", "x"] if columns == "Multi" else ["X_Value", "p_A"]
-        heads += [] if columns == "Multi" else ["p_B", "x"]
-        lines.append("\t".join([*heads, "Comment"]))
-        for i in part:
-            time = repr(float(T[i] - T[part[0]])) if columns != "No" else ""
-            cells = [repr(float(values[i])) for values in (P_A, P_B, X)]
-            row = [cell for value in cells for cell in (time, value)] if columns == "Multi" else [time, *cells]
-            lines.append("\t".join(row).replace(".", "," if comma else "."))
-    text = "\r\n".join(lines) + "\r\n"
-    if comma:
-        text = text.replace(f"Delta_X\t{1 / RATE}", f"Delta_X\t{1 / RATE}".replace(".", ","))
-    (folder / name).write_text(text, newline="")
-    return folder / name
-
-
-FILES: dict[str, Writer] = {
-    "TDMS, waveform": tdms_waveform,
-    "TDMS, time column": tdms_time_column,
-    "TDMS, two groups": tdms_other_groups,
-    "MATLAB 4": lambda folder: vectors(folder, "4"),
-    **{
-        f"MATLAB {version}, {form.__name__}": lambda folder, form=form, version=version: form(folder, version)
-        for version in ("v7", "v7.3")
-        for form in (vectors, struct, table, timetable, structure_with_time)
-    },
-    "MATLAB 5, struct": lambda folder: struct(folder, "5"),
-    "MDF 3.30": lambda folder: mdf(folder, "3.30", "log.mdf"),
-    "MDF 4.10": lambda folder: mdf(folder, "4.10", "log.mf4"),
-    "Excel": xlsx,
-    "OpenDocument": ods,
-    "LabVIEW, time column": lvm,
-    "LabVIEW, decimal comma": lambda folder: lvm(folder, comma=True),
-    "LabVIEW, no time": lambda folder: lvm(folder, "No"),
-    "LabVIEW, a time each": lambda folder: lvm(folder, "Multi"),
-    "LabVIEW, packets": lambda folder: lvm(folder, packets=4),
-    "LabVIEW, packets without time": lambda folder: lvm(folder, "No", packets=4),
-}
 #: Files that know the moment of their first sample.
 STAMPED = ("TDMS, waveform", "MDF", "LabVIEW")
 
@@ -247,6 +57,23 @@ def test_files(kind: str, tmp_path: Path) -> None:
     agrees(recording)
     if kind.startswith(STAMPED):
         assert recording.provenance["start"].startswith("2024-05-31T12:00:00.25")
+
+
+@pytest.mark.parametrize("name", [name for name in DIALECTS if name not in FILES])
+def test_dialects_are_read_to_their_last_digit(name: str, tmp_path: Path) -> None:
+    dialect = DIALECTS[name]
+    recording = read(dialect.write(tmp_path), **dialect.options)
+    assert recording.rate == pytest.approx(RATE, rel=1e-6)
+    assert len(recording) == N
+    missing = sum(int(np.isnan(recording[channel]).sum()) for channel in ("p_A", "p_B", "x"))
+    assert missing == ("in a cell" in name or "empty cell" in name)
+    assert recording.t - recording.t[0] == pytest.approx(T, abs=1e-6)
+    for channel, off in deviations(recording).items():
+        assert off <= 0.5 * dialect.digit + 1e-11, channel
+
+
+def test_there_are_forty_dialects() -> None:
+    assert len(DIALECTS) >= 40
 
 
 def test_the_group_that_holds_most_channels_is_read(tmp_path: Path) -> None:

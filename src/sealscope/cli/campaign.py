@@ -284,7 +284,11 @@ def calibrate(
     rate: RateOption = None,
     rig: AssumeOption = None,
 ) -> None:
-    """Set thresholds from leak-free recordings of your own machine, for `diagnose --calibration`."""
+    """Set thresholds from leak-free recordings of your own machine, for `diagnose --calibration`.
+
+    It takes 5 recordings or more of an operating point. By default rms change judges, with details of the pressures
+    beside it; a detector that judges by default is calibrated by name, --detector 'volume balance, calibrated'.
+    """
     from hashlib import sha256
 
     from sealscope import __version__

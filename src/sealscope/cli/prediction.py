@@ -34,7 +34,7 @@ def predict(
     overrides: SetOption = None,
     detectors: Annotated[
         list[str] | None,
-        typer.Option("--detector", help="Detector, e.g. 'd3 of p_A fell', 'd2 of p_B changed'; repeat. The thesis's."),
+        typer.Option("--detector", help="A detail's change, 'd3 of p_A fell'; repeat. [default: the thesis's]"),
     ] = None,
     bench: Annotated[
         str,
@@ -57,7 +57,11 @@ def predict(
         PredictionFormat, typer.Option("--format", help="Text, or one JSON object.")
     ] = PredictionFormat.text,
 ) -> None:
-    """Predict the smallest leak that each detector finds, with the Cramer-Rao bound beside it."""
+    """Predict the smallest leak that each detector finds, with the Cramer-Rao bound beside it.
+
+    The thesis's detectors, or those of --detector, are given the onset; volume balance and pressure model, which make
+    the verdict of diagnose, look for it.
+    """
     from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, change_detector
     from sealscope.campaigns.prediction.predict import (
         STANDARD_COMMANDS,

@@ -2,7 +2,8 @@
 
 A record of T seconds has the leak from its middle on. The rig is simulated with leaks of rising size; the instruments'
 own noise is laid over it many times; the scorers judge the records as a campaign's would. With a bench, every record
-is a machine of its own that drifts as the bench says, and the scatter holds both.
+is a machine of its own that drifts as the bench says, and the scatter holds both. The detectors that make the verdict
+of `diagnose` are asked what they would find (`judges`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from sealscope.campaigns.cases.bound import (
     smallest_found,
 )
 from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, ChangeDetector, Responses, smallest_leaks
+from sealscope.campaigns.prediction.judges import judge_predictions
 from sealscope.campaigns.prediction.report import BoundFigures, CommandRow, PredictionReport
 from sealscope.campaigns.prediction.responses import (
     ProgressCallback,
@@ -177,6 +179,8 @@ def predict(
     responses = elsewhere or alone
     bound = leak_bound(_half_of(experiment), unknown=UNKNOWN, progress=lambda share: report(0.5 + 0.5 * share))
     report(1.0)
+    judging = partial(progress, "judging detectors")
+    judges = judge_predictions(experiment, target.false_alarm, target.detection, target.seed, judging)
     duties = [(command, with_closing(rig, closing)) for command in commands for closing in closings]
     jobs = [
         partial(_command_row, throttled, command, experiment.duration, noise[:TABLE_NOISES], target)
@@ -202,6 +206,7 @@ def predict(
         bound=bound_figures(bound, dp, target),
         commands=tuple(rows),
         largest_compared=TABLE_SIZES[-1],
+        judges=judges,
     )
 
 

@@ -8,9 +8,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from sealscope.campaigns.prediction.detection import CONFIDENCE, DetectorPrediction
+from sealscope.campaigns.prediction.judges import RECORDS, JudgePrediction
 
 #: Size [L/min] whose probability of detection the text shows: the thesis's smallest leak; one of `CURVE_SIZES`.
 SHOWN = 0.0042
+#: Longest line of text [1].
+_WIDEST = 160
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,9 @@ class PredictionReport:
 
     `pressure_difference` [Pa]: mean |p_A - p_B| that drives a leak; `noise`: channel -> standard deviation of a sample
     [Pa]; `origin`: where the scatter comes from, as text; `records`: leak-free records behind it; `largest` [L/min]:
-    the largest leak tried, `largest_compared` [L/min] that of the comparison. The detectors compare the two halves of
-    a record, so they are given the onset: the leak opens in its middle.
+    the largest leak tried, `largest_compared` [L/min] that of the comparison. The `detectors` compare the two halves
+    of a record, so they are given the onset: the leak opens in its middle. The `judges` make the verdict of `diagnose`;
+    they look for the onset and are given the rig.
     """
 
     rig: str
@@ -93,6 +97,7 @@ class PredictionReport:
     bound: BoundFigures
     commands: tuple[CommandRow, ...]
     largest_compared: float
+    judges: tuple[JudgePrediction, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON values; sizes in L/min, None where no leak up to the largest is found."""
@@ -115,6 +120,16 @@ class PredictionReport:
             "interval_confidence": CONFIDENCE,
             "given_to_detectors": {"onset": True, "channels": list(self.noise), "rig": False},
             "detectors": [_detector(detector) for detector in self.detectors],
+            "judges": [
+                {
+                    "name": judge.detector,
+                    "smallest_leak_lpm": judge.smallest,
+                    "reason": judge.reason,
+                    "given": {"onset": False, "channels": list(judge.channels), "rig": True},
+                    "records": RECORDS,
+                }
+                for judge in self.judges
+            ],
             "bound": {**asdict(self.bound), "unknown_parameters": list(self.bound.unknown_parameters)},
             "largest_leak_compared_lpm": self.largest_compared,
             "commands": [row.as_dict() for row in self.commands],
@@ -137,6 +152,7 @@ class PredictionReport:
             *(self._line(detector) for detector in self.detectors),
             f"(true onset given: every detector compares the {self.duration_s / 2:g} s before the leak with those "
             f"after; given {', '.join(self.noise)} and no rig)",
+            *self._judges(),
             "",
             f"Cramer-Rao bound [L/min], halves of {bound.half_s:g} s  {'all known':>12}{'unknown':>12}",
             f"  standard deviation, one half{bound.known_lpm:>20.2g}{bound.unknown_lpm:>12.2g}",
@@ -150,6 +166,20 @@ class PredictionReport:
             lines += _comparison(self.commands)
             lines += ["", self.advice()]
         return "\n".join(lines)
+
+    def _judges(self) -> list[str]:
+        if not self.judges:
+            return []
+        lines = ["", f"{'judging detector':<20}{'smallest leak [L/min]':>22}  sees"]
+        for judge in self.judges:
+            size = "cannot tell" if judge.smallest is None else f"{judge.smallest:.2g}"
+            sees = f"{', '.join(judge.channels)}{': ' if judge.reason else ''}{judge.reason}"
+            lines.append(f"{judge.detector:<20}{size:>22}  {sees}"[:_WIDEST])
+        return [
+            *lines,
+            f"(these make the verdict of diagnose; onset not given, rig given; found in all of {RECORDS} records, "
+            "instrument noise alone)",
+        ]
 
     def _line(self, detector: DetectorPrediction) -> str:
         if detector.smallest is None:

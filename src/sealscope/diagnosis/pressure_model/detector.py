@@ -109,6 +109,26 @@ class PressureModel:
             level = without_flow(level, NO_RIG)
         return replace(level, share=followed.share)
 
+    def findable(self, recording: Recording, false_alarm_probability: float, detection: float) -> float | str:
+        """Return the step of a leak in the middle of a leak-free record that would be found [L/min], or why none is.
+
+        With the deviation s of a step there, in the record's own scatter, it is ``(threshold + z_detection) s``.
+        """
+        from scipy.special import ndtri
+
+        followed = self.follow(recording)
+        if isinstance(followed, str):
+            return followed
+        if followed.excess > UNRULY:
+            return f"the model does not follow this record: its parameters wander {followed.excess:.2f} times"
+        steps, inner = followed.steps, slice(LEAST - 1, followed.blocks - LEAST)
+        z = steps.z[inner]
+        correlation = steps.correlation[inner, inner]
+        threshold, _ = largest_normal(correlation, false_alarm_probability, seed_of(z), float(np.max(z)))
+        middle = slice(followed.blocks // 3, max(followed.blocks // 3 + 1, 2 * followed.blocks // 3))
+        deviation = float(np.max(steps.deviation[middle])) * float(np.sqrt(max(1.0, followed.excess)))
+        return (threshold + float(ndtri(detection))) * deviation * _mean_drop(recording) / LITRE_PER_MINUTE
+
     def follow(self, recording: Recording) -> Followed | str:
         """Return the record as the model follows it, or the reason why it does not."""
         from sealscope.diagnosis.pressure_model.follow import follow

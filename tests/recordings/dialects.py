@@ -1,0 +1,384 @@
+"""Logs in the dialects of test benches: written by the libraries of the formats, or by hand from their descriptions.
+
+``python tests/recordings/dialects.py`` writes each, reads it, and prints how far each channel is from what was written.
+"""
+
+from __future__ import annotations
+
+import bz2
+import datetime as dt
+import gzip
+import lzma
+import tempfile
+import warnings
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from sealscope.recordings import Recording, read
+
+RATE = 500.0
+N = 200
+T = np.arange(N) / RATE
+P_A = 20.0 + np.sin(7.0 * T)  # bar
+P_B = 18.0 - np.sin(7.0 * T)
+X = 12.5 * np.sin(3.0 * T)  # mm
+START = dt.datetime(2024, 5, 31, 12, 0, 0, 250000, tzinfo=dt.UTC)
+Writer = Callable[[Path], Path]
+
+
+def tdms(folder: Path, groups: dict[str, dict[str, Any]], **properties: Any) -> Path:
+    from nptdms import ChannelObject, TdmsWriter
+
+    with TdmsWriter(folder / "log.tdms") as writer:
+        writer.write_segment(
+            [
+                ChannelObject(group, name, data, {**properties, "unit_string": unit})
+                for group, channels in groups.items()
+                for name, (data, unit) in channels.items()
+            ]
+        )
+    return folder / "log.tdms"
+
+
+def tdms_waveform(folder: Path) -> Path:
+    channels = {"p_A": (P_A, "bar"), "p_B": (P_B, "bar"), "x": (X, "mm")}
+    start = np.datetime64("2024-05-31T12:00:00.250000", "us")
+    return tdms(folder, {"Measured": channels}, wf_increment=1 / RATE, wf_start_offset=0.0, wf_start_time=start)
+
+
+def tdms_time_column(folder: Path) -> Path:
+    return tdms(folder, {"Log": {"Time": (T, "s"), "p_A": (P_A, "bar"), "p_B": (P_B, "bar"), "x": (X, "mm")}})
+
+
+def tdms_other_groups(folder: Path) -> Path:
+    fast = {"p_A": (P_A, "bar"), "p_B": (P_B, "bar"), "x": (X, "mm")}
+    other = {"p_A": (np.zeros(4), "bar"), "oil": (np.full(4, 40.0), "degC")}
+    return tdms(folder, {"Statistics": other, "Fast": fast}, wf_increment=1 / RATE)
+
+
+def matlab(folder: Path, held: dict[str, Any], version: str) -> Path:
+    path = folder / "log.mat"
+    if version in ("4", "5"):
+        from scipy.io import savemat
+
+        savemat(path, held, format=version, oned_as="row")
+    else:
+        from matio import save_to_mat
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on the resolution of time deltas
+            save_to_mat(path, held, version=version)
+    return path
+
+
+def vectors(folder: Path, version: str) -> Path:
+    return matlab(folder, {"t": T[None, :], "p_A": P_A[:, None] * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3}, version)
+
+
+def struct(folder: Path, version: str) -> Path:
+    fields = {"t": T, "p_A": P_A * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3, "remark": "rig 3"}
+    return matlab(folder, {"log": fields, "operator": "N. N."}, version)
+
+
+def table(folder: Path, version: str) -> Path:
+    import pandas as pd
+
+    return matlab(folder, {"T": pd.DataFrame({"t": T, "p_A": P_A * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3})}, version)
+
+
+def timetable(folder: Path, version: str) -> Path:
+    import pandas as pd
+
+    times = pd.TimedeltaIndex((T * 1e9).round().astype("timedelta64[ns]").astype("timedelta64[ms]"), name="Time")
+    frame = pd.DataFrame({"p_A": P_A * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3}, index=times)
+    return matlab(folder, {"TT": frame}, version)
+
+
+def structure_with_time(folder: Path, version: str) -> Path:
+    signals = np.zeros(3, dtype=[("values", object), ("dimensions", object), ("label", object)])
+    for place, (name, values) in enumerate({"p_A": P_A * 1e5, "p_B": P_B * 1e5, "x": X * 1e-3}.items()):
+        signals[place] = (values[:, None], 1.0, name)
+    return matlab(folder, {"ScopeData": {"time": T[:, None], "signals": signals, "blockName": "rig/Scope"}}, version)
+
+
+def timeseries(name: str, values: Any, uniform: bool) -> Any:
+    """Return an object with the properties that MATLAB's timeseries stores."""
+    from matio.utils.matclass import MatlabOpaque
+
+    info = {"Units": "seconds", "Start": 0.0, "Increment": 1 / RATE, "Length": float(N)}
+    properties = {"Name": name, "Data_": values[:, None], "TimeInfo": info, "DataInfo": {"Units": "bar"}}
+    properties["Time_"] = np.empty((0, 0)) if uniform else T[:, None]
+    return MatlabOpaque(properties, "timeseries")
+
+
+def mdf(folder: Path, version: str, name: str) -> Path:
+    from asammdf import MDF, Signal
+
+    with MDF(version=version) as file:
+        file.header.start_time = START
+        file.append([Signal(P_A, T, unit="bar", name="p_A"), Signal(P_B, T, unit="bar", name="p_B")], comment="fast")
+        file.append([Signal(X, T, unit="mm", name="x")], comment="position")
+        file.save(folder / name, overwrite=True)
+    return folder / name
+
+
+def xlsx(folder: Path) -> Path:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.title = "Info"
+    book.active.append(["Operator", "N. N."])
+    sheet = book.create_sheet("Data")
+    sheet.append(["exported by a logger"])
+    sheet.append(["Time", "p_A", "p_B", "x"])
+    sheet.append(["s", "bar", "bar", "mm"])
+    for row in zip(T, P_A, P_B, X, strict=True):
+        sheet.append([float(value) for value in row])
+    book.save(folder / "log.xlsx")
+    return folder / "log.xlsx"
+
+
+def ods(folder: Path) -> Path:
+    """Write OpenDocument's content.xml by hand, from the published format."""
+    rows = "".join(
+        "<table:table-row>"
+        + "".join(
+            f'<table:table-cell office:value-type="float" office:value="{float(value)!r}"><text:p/></table:table-cell>'
+            for value in row
+        )
+        + "</table:table-row>"
+        for row in zip(T, P_A, P_B, X, strict=True)
+    )
+    names = "".join(
+        f'<table:table-cell office:value-type="string"><text:p>{name}</text:p></table:table-cell>'
+        for name in ("t [s]", "p_A [bar]", "p_B [bar]", "x [mm]")
+    )
+    space = "urn:oasis:names:tc:opendocument:xmlns"
+    content = (
+        f'<?xml version="1.0"?><office:document-content xmlns:office="{space}:office:1.0" '
+        f'xmlns:table="{space}:table:1.0" xmlns:text="{space}:text:1.0" office:version="1.2"><office:body>'
+        f'<office:spreadsheet><table:table table:name="Log"><table:table-row>{names}</table:table-row>{rows}'
+        "</table:table></office:spreadsheet></office:body></office:document-content>"
+    )
+    kind = "application/vnd.oasis.opendocument.spreadsheet"
+    manifest = (
+        f'<?xml version="1.0"?><manifest:manifest xmlns:manifest="{space}:manifest:1.0">'
+        f'<manifest:file-entry manifest:full-path="/" manifest:media-type="{kind}"/></manifest:manifest>'
+    )
+    with zipfile.ZipFile(folder / "log.ods", "w") as archive:
+        archive.writestr("mimetype", kind)
+        archive.writestr("content.xml", content)
+        archive.writestr("META-INF/manifest.xml", manifest)
+    return folder / "log.ods"
+
+
+def lvm(folder: Path, columns: str = "One", comma: bool = False, packets: int = 1, name: str = "log.lvm") -> Path:
+    """Write a LabVIEW measurement file from the format's published description."""
+    separator = ","
+    lines = ["LabVIEW Measurement", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab"]
+    lines += [f"Decimal_Separator\t{separator if comma else '.'}", f"X_Columns\t{columns}", "Time_Pref\tRelative"]
+    lines += ["Operator\tN. N.", "Date\t2024/05/31", "Time\t12:00:00.25", "***End_of_Header***\t", "\t"]
+    for part in np.array_split(np.arange(N), packets):
+        moment = f"12:00:{0.25 + T[part[0]]:010.7f}"
+        lines += ["Channels\t3\t\t", f"Samples\t{len(part)}\t{len(part)}\t{len(part)}"]
+        lines += ["Date\t2024/05/31\t2024/05/31\t2024/05/31", f"Time\t{moment}\t{moment}\t{moment}"]
+        lines += ["Y_Unit_Label\tbar\tbar\tmm", "X_Dimension\tTime\tTime\tTime", "X0\t0.0\t0.0\t0.0"]
+        lines += [f"Delta_X\t{1 / RATE}\t{1 / RATE}\t{1 / RATE}", "***End_of_Header***\t\t\t"]
+        heads = ["X_Value", "p_A", "X_Value", "p_B", "X_Value", "x"] if columns == "Multi" else ["X_Value", "p_A"]
+        heads += [] if columns == "Multi" else ["p_B", "x"]
+        lines.append("\t".join([*heads, "Comment"]))
+        for i in part:
+            time = repr(float(T[i] - T[part[0]])) if columns != "No" else ""
+            cells = [repr(float(values[i])) for values in (P_A, P_B, X)]
+            row = [cell for value in cells for cell in (time, value)] if columns == "Multi" else [time, *cells]
+            lines.append("\t".join(row).replace(".", "," if comma else "."))
+    text = "\r\n".join(lines) + "\r\n"
+    if comma:
+        text = text.replace(f"Delta_X\t{1 / RATE}", f"Delta_X\t{1 / RATE}".replace(".", ","))
+    (folder / name).write_text(text, newline="")
+    return folder / name
+
+
+FILES: dict[str, Writer] = {
+    "TDMS, waveform": tdms_waveform,
+    "TDMS, time column": tdms_time_column,
+    "TDMS, two groups": tdms_other_groups,
+    "MATLAB 4": lambda folder: vectors(folder, "4"),
+    **{
+        f"MATLAB {version}, {form.__name__}": lambda folder, form=form, version=version: form(folder, version)
+        for version in ("v7", "v7.3")
+        for form in (vectors, struct, table, timetable, structure_with_time)
+    },
+    "MATLAB 5, struct": lambda folder: struct(folder, "5"),
+    "MDF 3.30": lambda folder: mdf(folder, "3.30", "log.mdf"),
+    "MDF 4.10": lambda folder: mdf(folder, "4.10", "log.mf4"),
+    "Excel": xlsx,
+    "OpenDocument": ods,
+    "LabVIEW, time column": lvm,
+    "LabVIEW, decimal comma": lambda folder: lvm(folder, comma=True),
+    "LabVIEW, no time": lambda folder: lvm(folder, "No"),
+    "LabVIEW, a time each": lambda folder: lvm(folder, "Multi"),
+    "LabVIEW, packets": lambda folder: lvm(folder, packets=4),
+    "LabVIEW, packets without time": lambda folder: lvm(folder, "No", packets=4),
+}
+
+
+class Dialect(NamedTuple):
+    """How a log is written, what is said of it when it is read, and the last digit of its samples [bar, bar, mm]."""
+
+    write: Writer
+    options: Mapping[str, Any] = {}
+    digit: float = 0.0
+
+
+def rows(times: list[str], join: str = ",", comma: bool = False) -> str:
+    """Return the samples as lines of text, six digits behind the point."""
+    lines = [
+        join.join([time, *(f"{value:.6f}" for value in values)])
+        for time, *values in zip(times, P_A, P_B, X, strict=True)
+    ]
+    return "\n".join(lines).replace(".", "," if comma else ".") + "\n"
+
+
+def log(head: str, times: list[str] | None = None, *, encoding: str = "utf-8", **form: Any) -> Writer:
+    """Return what writes a text with this head above the samples."""
+    body = rows([f"{t:.3f}" for t in T] if times is None else times, **form)
+
+    def write(folder: Path) -> Path:
+        (folder / "log.csv").write_bytes((head + body).encode(encoding))
+        return folder / "log.csv"
+
+    return write
+
+
+def spoilt(word: str) -> Writer:
+    """Return what writes a log in which one sample is a word."""
+
+    def write(folder: Path) -> Path:
+        path = log("t [s],p_A [bar],p_B [bar],x [mm]\n")(folder)
+        lines = path.read_text().splitlines()
+        lines[100] = lines[100].rpartition(",")[0] + f",{word}"
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+    return write
+
+
+def packed(ending: str) -> Writer:
+    """Return what writes a log inside an archive."""
+
+    def write(folder: Path) -> Path:
+        content = log("t [s],p_A [bar],p_B [bar],x [mm]\n")(folder).read_bytes()
+        path = folder / f"log.csv.{ending}"
+        if ending == "zip":
+            with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr("folder/log.csv", content)
+        elif ending == "zst":
+            import pyarrow
+
+            with pyarrow.CompressedOutputStream(str(path), "zstd") as file:
+                file.write(content)
+        else:
+            path.write_bytes({"gz": gzip, "bz2": bz2, "xz": lzma}[ending].compress(content))
+        return path
+
+    return write
+
+
+def parquet(folder: Path) -> Path:
+    import pandas as pd
+
+    frame = pd.DataFrame({"t [s]": T, "p_A [bar]": P_A, "p_B [bar]": P_B, "x [mm]": X})
+    frame.to_parquet(folder / "log.parquet")
+    return folder / "log.parquet"
+
+
+def hdf5(folder: Path) -> Path:
+    import h5py
+
+    with h5py.File(folder / "log.h5", "w") as file:
+        for name, values, unit in (("t", T, "s"), ("p_A", P_A, "bar"), ("p_B", P_B, "bar"), ("x", X, "mm")):
+            file.create_dataset(name, data=values).attrs["units"] = unit
+    return folder / "log.h5"
+
+
+MOMENTS = [dt.datetime(2024, 5, 31, 23, 59, 59, 900000) + dt.timedelta(seconds=float(t)) for t in T]
+HEADS = "p_A [bar],p_B [bar],x [mm]\n"
+TEXTS: dict[str, Dialect] = {
+    "text, comma": Dialect(log("t [s]," + HEADS)),
+    "text, semicolon and decimal comma": Dialect(log("t [s];p_A [bar];p_B [bar];x [mm]\n", join=";", comma=True)),
+    "text, tab": Dialect(log("t [s]\tp_A [bar]\tp_B [bar]\tx [mm]\n", join="\t")),
+    "text, blanks": Dialect(log("t [s]   p_A [bar]   p_B [bar]   x [mm]\n", join="   ")),
+    "text, units in a row of their own": Dialect(log("Time,p_A,p_B,x\ns,bar,bar,mm\n")),
+    "text, preamble": Dialect(log("Operator: N. N.\nOil: 41 degC\n\nt [s]," + HEADS)),
+    "text, commented head": Dialect(log("# t [s],p_A [bar],p_B [bar],x [mm]\n")),
+    "text, ms": Dialect(log("t [ms]," + HEADS, [f"{1e3 * t:.0f}" for t in T])),
+    "text, UTF-16": Dialect(log("t [s]," + HEADS, encoding="utf-16")),
+    "text, byte order mark": Dialect(log("t [s]," + HEADS, encoding="utf-8-sig")),
+    "text, Latin-1": Dialect(log("Prüfstand: 3 µ\n\nt [s]," + HEADS, encoding="latin-1")),
+    "text, date and time over midnight": Dialect(
+        log("Datum,Zeit," + HEADS, [f"{m:%d.%m.%Y},{m:%H:%M:%S.%f}" for m in MOMENTS])
+    ),
+    "text, American date": Dialect(
+        log("Time," + HEADS, [f"{m:%m/%d/%Y %I:%M:%S}.{m.microsecond // 1000:03d} {m:%p}" for m in MOMENTS])
+    ),
+    "text, ISO 8601": Dialect(log("Time," + HEADS, [f"{m:%Y-%m-%dT%H:%M:%S.%f}Z" for m in MOMENTS])),
+    "text, seconds since 1970": Dialect(log("t [s]," + HEADS, [f"{1717199999.9 + t:.3f}" for t in T])),
+    "text, OVERLOAD in a cell": Dialect(spoilt("OVERLOAD")),
+    "text, #N/A in a cell": Dialect(spoilt("#N/A")),
+    "text, an empty cell": Dialect(spoilt("")),
+    "text, German names": Dialect(log("Zeit [s],Druck A [bar],Druck B [bar],Weg [mm]\n"), {"channel_map": "auto"}),
+    "text, units as suffixes": Dialect(log("time_s,PA_bar,PB_bar,Weg_mm\n"), {"channel_map": "auto"}),
+    "text, English names": Dialect(
+        log("Time (s),Cyl_P_Cap (bar),Cyl_P_Rod (bar),Position (mm)\n"), {"channel_map": "auto"}
+    ),
+    "text, mapped names": Dialect(
+        log("Zeit,Druck1,Druck2,Weg1\n"),
+        {"channel_map": {"t": "Zeit[s]", "p_A": "Druck1[bar]", "p_B": "Druck2[bar]", "x": "Weg1[mm]"}},
+    ),
+    "text, names twice": Dialect(
+        log("t [s],P,P,s\n"), {"channel_map": {"p_A": "#2[bar]", "p_B": "#3[bar]", "x": "#4[mm]"}}
+    ),
+    "text, no head": Dialect(
+        log(""), {"channel_map": {"t": "#1[s]", "p_A": "#2[bar]", "p_B": "#3[bar]", "x": "#4[mm]"}}
+    ),
+    "text, a rate and no time": Dialect(
+        log("no," + HEADS, [str(k) for k in range(N)]),
+        {"channel_map": {"p_A": "p_A", "p_B": "p_B", "x": "x"}, "rate": RATE},
+    ),
+    **{f"archive, {ending}": Dialect(packed(ending)) for ending in ("gz", "bz2", "xz", "zst", "zip")},
+}
+DIALECTS: dict[str, Dialect] = {
+    **{name: Dialect(write) for name, write in FILES.items()},
+    "Parquet": Dialect(parquet),
+    "HDF5": Dialect(hdf5),
+    **{name: own._replace(digit=1e-6) for name, own in TEXTS.items()},
+}
+
+
+def deviations(recording: Recording) -> dict[str, float]:
+    """Return the largest deviation of each channel from what was written [bar, bar, mm], but missing samples."""
+    sources = {"p_A": (P_A, 1e5), "p_B": (P_B, 1e5), "x": (X, 1e-3)}
+    return {name: float(np.nanmax(np.abs(recording[name] / unit - values))) for name, (values, unit) in sources.items()}
+
+
+def main() -> None:
+    """Print the table."""
+    print(
+        f"{'dialect':<40}{'samples':>8}{'missing':>8}{'rate [Hz]':>10}{'p_A [bar]':>11}{'p_B [bar]':>11}{'x [mm]':>11}"
+    )
+    for name, dialect in DIALECTS.items():
+        with tempfile.TemporaryDirectory() as folder:
+            recording = read(dialect.write(Path(folder)), **dialect.options)
+        missing = sum(int(np.isnan(recording[channel]).sum()) for channel in ("p_A", "p_B", "x"))
+        figures = "".join(f"{value:>11.1e}" for value in deviations(recording).values())
+        print(f"{name:<40}{len(recording):>8}{missing:>8}{recording.rate:>11g}{figures}")
+    print(f"{len(DIALECTS)} dialects")
+
+
+if __name__ == "__main__":
+    main()
