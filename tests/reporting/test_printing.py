@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import pytest
 
 from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError, MissingExtra
-from sealscope.reporting import printing, write_page
+from sealscope.reporting import printing, render_page, write_page
 from sealscope.reporting.card import render_card
 
 PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
@@ -65,8 +67,34 @@ def test_a_card_says_what_a_reader_must_know(recording, make_diagnosis) -> None:
     assert "d3 fell in both chambers" in unsure and 'class="still"' not in unsure
 
 
+def test_weasyprint_gets_drawings_with_styles_of_their_own(recording, make_diagnosis) -> None:
+    """It applies no sheet of the page within a drawing, and knows no variables there: all would be black."""
+    page = printing._styles_in_place(render_page(recording, make_diagnosis()))
+    drawings = re.findall(r"<svg\b.*?</svg>", page, re.DOTALL)
+    assert drawings
+    for drawing in drawings:
+        (sheet,) = re.findall(r"<style>(.*?)</style>", drawing, re.DOTALL)
+        assert ".chamber-a{fill:#dbe8f4}" in sheet and ".line.a{stroke:#0d4f8b}" in sheet
+    assert "body{margin:0;background:#fff;" in page  # the printed value comes before the light one
+
+
+@pytest.mark.slow
+def test_weasyprint_prints_a_page_in_colour(tmp_path: Path, monkeypatch, recording, make_diagnosis) -> None:
+    pytest.importorskip("weasyprint", reason="the extra `pdf` is not installed")
+    monkeypatch.setattr(printing, "_browser", lambda: None)
+    streams: list[bytes] = []
+    for rig in (None, "thesis"):
+        page = write_page(tmp_path / "page.pdf", recording, make_diagnosis(), rig=rig)
+        assert page.read_bytes().startswith(b"%PDF-")
+        for stream in re.findall(rb"stream\r?\n(.*?)\r?\nendstream", page.read_bytes(), re.DOTALL):
+            with contextlib.suppress(zlib.error):
+                streams.append(zlib.decompress(stream))
+    blue = b"0.05098 0.309804 0.545098"  # #0d4f8b, the pen of the curves
+    assert any(blue in stream for stream in streams)
+
+
 def test_without_a_browser_no_card_is_drawn(tmp_path: Path, monkeypatch, recording, make_diagnosis) -> None:
-    monkeypatch.setattr(printing, "BROWSERS", ())
+    monkeypatch.setattr(printing, "_browser", lambda: None)
     with pytest.raises(MissingExtra, match=r"^a picture needs Chromium, got none: install it, or write \.html .*\.png"):
         write_page(tmp_path / "card.png", recording, make_diagnosis())
     assert list(tmp_path.iterdir()) == []
@@ -85,7 +113,7 @@ def test_a_picture_of_another_size_is_refused(tmp_path: Path, monkeypatch: pytes
 
 
 def test_without_a_printer_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(printing, "BROWSERS", ())
+    monkeypatch.setattr(printing, "_browser", lambda: None)
     monkeypatch.setitem(__import__("sys").modules, "weasyprint", None)
     with pytest.raises(MissingExtra, match=r"a PDF needs Chromium or WeasyPrint, got neither.*page\.pdf"):
         printing.print_page(PAGE, tmp_path / "page.pdf")

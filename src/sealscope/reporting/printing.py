@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -13,6 +14,14 @@ from sealscope.storage.atomic import atomic_write
 
 #: Browsers that print without a window, the first that is there prints.
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+#: Where such browsers stand on machines that have them and do not name them in the path: macOS, Windows.
+_PLACES = (
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    "/Applications/Microsoft Edge.app/Contents/MacOS/Microsoft Edge",
+    r"C:\Program Files (x86)\Microsoft\Edge\Application\msedge.exe",
+    r"C:\Program Files\Microsoft\Edge\Application\msedge.exe",
+    r"C:\Program Files\Google\Chrome\Application\chrome.exe",
+)
 _OPTIONS = (
     "--headless",
     "--disable-gpu",
@@ -39,9 +48,10 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
             from weasyprint import HTML
         except (ImportError, OSError) as error:  # OSError: its C libraries are not there
             raise MissingExtra(
-                f"a PDF needs Chromium or WeasyPrint, got neither: install one of them, or write .html ({path})"
+                "a PDF needs Chromium or WeasyPrint, got neither: install one of them (pip install weasyprint), or "
+                f"write .html ({path})"
             ) from error
-        HTML(string=page).write_pdf(temporary)  # without scripts: charts stand as on paper
+        HTML(string=_styles_in_place(page)).write_pdf(temporary)  # without scripts: charts stand as on paper
         return "WeasyPrint"
 
 
@@ -66,8 +76,24 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
         return Path(browser).name
 
 
+def _styles_in_place(page: str) -> str:
+    """Return a page for WeasyPrint, which styles no drawing by the page's sheet and knows no variables in one.
+
+    Variables become their printed values, and each drawing gets the sheet.
+    """
+    sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
+    if sheet is None:
+        return page
+    values: dict[str, str] = {}
+    for block in re.findall(r"(?:^|@media print\{)\s*:root\{([^}]*)\}", sheet[1], re.MULTILINE):
+        values |= dict(re.findall(r"(--[\w-]+):([^;]+)", block))
+    plain = re.sub(r"var\((--[\w-]+)\)", lambda match: values.get(match[1], match[0]), sheet[1])
+    page = page.replace(sheet[1], plain, 1)
+    return re.sub(r"<svg\b[^>]*>", lambda match: f"{match[0]}<style>{plain}</style>", page)
+
+
 def _browser() -> str | None:
-    return next(filter(None, map(shutil.which, BROWSERS)), None)
+    return next(filter(None, map(shutil.which, (*BROWSERS, *_PLACES))), None)
 
 
 def _by_browser(browser: str, page: str, target: Path, options: list[str], begins: bytes) -> None:
