@@ -185,6 +185,19 @@ def test_other_settings_begin_a_new_baseline(tmp_path):
     assert (state["watch"]["baseline_version"], state["watch"]["blocks"]) == (2, 41)
 
 
+def test_old_estimates_and_identities_are_forgotten(tmp_path, monkeypatch):
+    monkeypatch.setattr("sealscope.monitor.actuators.KEPT_IDENTITIES", 20)
+    settings = settings_in(tmp_path).model_copy(update={"keep_days": 60.0 / 86_400.0})
+    served(settings, LINES)
+    rows = rows_of(settings.database)
+    for name in ("press 1", "press 2"):
+        numbers = [row[1] for row in rows["estimates"] if row[0] == name]
+        assert numbers == list(range(min(numbers), 42))
+        assert 19 <= len(numbers) <= 19 + 16 + 1
+        assert 20 <= sum(row[0] == name for row in rows["blocks"]) < 20 + 16
+    assert len(rows["alarms"]) == 1
+
+
 def test_one_monitor_at_a_time(tmp_path):
     settings = settings_in(tmp_path)
     first = Service(settings, once=True)

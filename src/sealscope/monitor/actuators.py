@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 from sealscope.errors import InputError
 from sealscope.monitor.alarms.alarm import Alarm, status_word
 from sealscope.monitor.alarms.judging import AlarmJudge
-from sealscope.monitor.memory.store import PENDING_BLOCKS, PENDING_BYTES, MonitorStore
+from sealscope.monitor.memory.store import KEPT_IDENTITIES, PENDING_BLOCKS, PENDING_BYTES, MonitorStore
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock
 from sealscope.monitor.stream.baseline import plain_dataclass
@@ -32,17 +33,19 @@ class _Actuator:
     judge: AlarmJudge
     pending: int = 0
     bytes: int = 0
+    taken: int = 0
     last: BlockEstimate | None = None
 
 
 class WatchedActuators:
-    """The actuators of a monitor, restored from its database.
+    """The actuators of a monitor, restored from its database, which keeps estimates of `keep_days` of operation.
 
     `counters`: blocks that were dropped since the start, by reason.
     """
 
-    def __init__(self, settings: list[ActuatorSettings], store: MonitorStore) -> None:
+    def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
         self.store = store
+        self._keep_s = keep_days * 86_400.0
         self.counters: dict[str, int] = {}
         self.changes = threading.Condition()
         self.changed = 0
@@ -67,6 +70,7 @@ class WatchedActuators:
         learned_with, state, pending = saved
         judge = AlarmJudge.from_state(state["judge"])
         actuator = _Actuator(settings, Watch.from_state(state["watch"]), judge)
+        actuator.taken = self.store.blocks_kept(settings.name)
         if state["last"] is not None:
             actuator.last = plain_dataclass(BlockEstimate, state["last"], "last")
         for samples, follows in pending:
@@ -100,7 +104,8 @@ class WatchedActuators:
                     if self.store.knows(connection, block.actuator, block.identity):
                         self.count("blocks stored already")
                         return []
-                    self.store.keep_block(connection, block.actuator, block.identity)
+                    actuator.taken += 1
+                    self.store.keep_block(connection, block.actuator, block.identity, actuator.taken)
                     estimates = [] if block.samples is None else self._taken(connection, actuator, block, block.samples)
             except BaseException:
                 # what the detector took is not stored: the next block begins at the last transaction
@@ -155,6 +160,10 @@ class WatchedActuators:
         state = {"watch": actuator.watch.state(), "judge": actuator.judge.state(), "last": last}
         settings = actuator.settings
         self.store.keep_checkpoint(connection, settings.name, settings.learned_with, state, self._summary(actuator))
+        kept = self._keep_s / actuator.watch.block_seconds
+        self.store.forget(
+            connection, settings.name, actuator.taken - KEPT_IDENTITIES, math.floor(actuator.watch.blocks - kept)
+        )
         actuator.pending = actuator.bytes = 0
 
     @staticmethod

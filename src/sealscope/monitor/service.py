@@ -72,7 +72,7 @@ class Service:
             self._hold.enter_context(locked(Path(settings.database + ".lock"), busy))
         try:
             self.store = MonitorStore(settings.database)
-            self.actuators = WatchedActuators(settings.actuator, self.store)
+            self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days)
         except BaseException:
             self._hold.close()
             raise

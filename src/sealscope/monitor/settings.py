@@ -78,7 +78,7 @@ class MonitorSettings(_Part):
     database: str = "monitor.db"
     lines: bool = False
     settle_s: float = Field(default=5.0, ge=0, le=3600)
-    keep_days: float = Field(default=400.0, gt=0)
+    keep_days: float = Field(default=90.0, gt=0)
     defaults: WatchSettings = Field(default_factory=WatchSettings)
     page: PageSettings | None = None
     mqtt: BrokerSettings | None = None
@@ -155,6 +155,7 @@ TEMPLATE = """\
 
 database = "monitor.db"          # a file of SQLite, or a URL such as postgresql+psycopg://user@host/name
 lines = false                    # take JSON lines from standard input
+keep_days = 90.0                 # estimates of so many days of operation are kept; alarms and marks stay
 settle_s = 5.0                   # a file is read when it has not changed for so long [s]
 
 [defaults]                       # of every actuator

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 #: Blocks of samples between two checkpoints, and their bytes.
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
-#: Identities of blocks that are kept for each actuator.
+#: Identities of blocks that are kept for each actuator: more than a day of messages of 1 s.
+KEPT_IDENTITIES = 100_000
 _ESTIMATES = (
     "total_lpm",
     "total_low_lpm",
@@ -80,9 +81,27 @@ class MonitorStore:
         with self.engine.connect() as connection:
             return self.knows(connection, actuator, identity)
 
-    def keep_block(self, connection: Connection, actuator: str, identity: str) -> None:
-        """Store the identity of a block."""
-        connection.execute(self.tables.blocks.insert().values(actuator=actuator, identity=identity))
+    def keep_block(self, connection: Connection, actuator: str, identity: str, number: int) -> None:
+        """Store the identity of a block and its number among those of its actuator."""
+        connection.execute(self.tables.blocks.insert().values(actuator=actuator, identity=identity, number=number))
+
+    def blocks_kept(self, actuator: str) -> int:
+        """Return the number of the last block of an actuator."""
+        from sqlalchemy import func, select
+
+        blocks = self.tables.blocks
+        with self.engine.connect() as connection:
+            query = select(func.max(blocks.c.number)).where(blocks.c.actuator == actuator)
+            return int(connection.execute(query).scalar() or 0)
+
+    def forget(self, connection: Connection, actuator: str, block: int, estimate: int) -> None:
+        """Delete the identities up to the number `block`, and the estimates up to the number `estimate`."""
+        blocks, estimates = self.tables.blocks, self.tables.estimates
+        if block > 0:
+            connection.execute(blocks.delete().where(blocks.c.actuator == actuator, blocks.c.number <= block))
+        if estimate > 0:
+            old = (estimates.c.actuator == actuator) & (estimates.c.number <= estimate)
+            connection.execute(estimates.delete().where(old))
 
     def keep_estimates(self, connection: Connection, actuator: str, estimates: list[BlockEstimate]) -> None:
         """Store the estimates of blocks."""

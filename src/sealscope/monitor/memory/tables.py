@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Column, Float, Integer, LargeBinary, MetaData, String, Table, Text
+from sqlalchemy import Column, Float, Index, Integer, LargeBinary, MetaData, String, Table, Text
 
 metadata = MetaData()
 #: Version of the tables, kept in `facts`.
@@ -15,6 +15,8 @@ blocks = Table(
     metadata,
     Column("actuator", String(120), primary_key=True),
     Column("identity", String(120), primary_key=True),
+    Column("number", Integer, nullable=False),
+    Index("blocks_in_order", "actuator", "number"),
 )
 #: Samples since the checkpoint, which a restart goes through once more.
 pending = Table(

@@ -169,6 +169,11 @@ class Watch:
         """What was dropped, passed over or interrupted, by reason, in samples, blocks or events."""
         return dict(self._samples.counters)
 
+    @property
+    def block_seconds(self) -> float:
+        """About how long a block is [s]."""
+        return self._seconds or BLOCK_SECONDS
+
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
         """Take the next samples; results do not depend on how they are cut.
 
