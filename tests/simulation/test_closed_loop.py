@@ -138,6 +138,15 @@ def test_a_load_that_is_there_from_the_start_is_carried_from_the_start(check_rig
     assert np.abs(run["x"]).max() < 1e-12
 
 
+def test_faults_and_leaks_meet_a_closed_loop():
+    """A changed duty changes the target, a leak is sized under the controller."""
+    words = {"rig": "thesis-closed-loop", "command": "position 20 mm sin(2t)", "duration": 4.0}
+    run = simulate_with_truth(Experiment.of(**words, fault="duty amplitude x1.5 from 2 s", leak="0.05 L/min from 1 s"))
+    assert run.truth.mean_leak_lpm == pytest.approx(0.05, rel=2e-3)
+    assert run.truth.outputs["x"][run.truth.t < 2.0].max() == pytest.approx(0.02, rel=0.02)
+    assert run.truth.outputs["x"].max() == pytest.approx(0.03, rel=0.02)
+
+
 def test_words_of_targets_and_loads():
     t = np.array([0.0, 0.5, 2.0])
     np.testing.assert_allclose(parse_position("position 50 mm sin(2t) + 1 cm").at(t), 0.05 * np.sin(2 * t) + 0.01)
