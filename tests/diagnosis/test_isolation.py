@@ -85,6 +85,19 @@ def test_each_step_has_its_cause(changed: dict[str, float], cause: str | None) -
         assert cause_of(made(seed, **changed)) == cause
 
 
+def test_what_steps_plainly_anywhere_is_the_cause_of_a_change_of_the_spectrum() -> None:
+    """The RMS of the details depends on all of it; a model of the machine follows friction and leaves offsets out."""
+    seen, steady = signatures(made(mean_A=2e4, duration=240.0)), signatures(made(duration=240.0))
+    assert seen is not None and steady is not None
+    late = replace(FOUND, onset_s=ONSET + 100.0, onset_interval_s=(ONSET + 97.0, ONSET + 103.0))
+    assert isolated(late, seen) is late
+    unnamed = replace(late, cause=None)
+    other = isolated(unnamed, seen)
+    assert (other.verdict, other.cause) == ("cannot tell", "sensor fault")
+    assert "near 6" in other.reason or "near 5" in other.reason
+    assert isolated(unnamed, steady) is unnamed
+
+
 def test_a_step_elsewhere_is_not_the_cause() -> None:
     """Beyond its reach the step takes no part; within it, the onset may be off by some seconds."""
     recording = made(mean_A=8e3, duration=240.0)

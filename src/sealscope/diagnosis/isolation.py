@@ -309,10 +309,11 @@ def elsewhere(seen: Signatures) -> OtherCause | None:
 def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] = ()) -> Evidence:
     """Return the evidence of a leak as `cannot tell` with another cause where one stepped at its onset.
 
-    A sensor's filter that changed counts wherever it happened: both sides of any onset are not read alike. So does hum
-    for evidence that names no cause, which comes from the spectrum alone; a model of the machine leaves it out but at
-    the onset. A duty that goes on in another phase or sense counts against all. Evidence without an onset comes from
-    the comparison with a baseline, of the signatures `known`: there counts what differs from all of it.
+    A sensor's filter that changed counts wherever it happened: both sides of any onset are not read alike. For evidence
+    that names no cause, which comes from the spectrum alone, so does hum, and whatever else stepped plainly
+    (`unasked`); a model of the machine leaves that out but at the onset. A duty that goes on in another phase or sense
+    counts against all. Evidence without an onset comes from the comparison with a baseline, of the signatures `known`:
+    there counts what differs from all of it.
     """
     if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS):
         return evidence
@@ -324,6 +325,8 @@ def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] =
             other = other_cause(seen, evidence.onset_s) or _readings(
                 seen, evidence.onset_s if evidence.cause is not None else None
             )
+        if other is None and evidence.cause is None:
+            other = _anywhere(seen)
         other = other or _scale(seen, evidence) or _charge(seen, evidence.onset_s)
     if other is None:
         return evidence
@@ -337,6 +340,13 @@ def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] =
         course=None,
         relative=None,
     )
+
+
+def _anywhere(seen: Signatures) -> OtherCause | None:
+    stepped = unasked(seen)
+    if stepped is None:
+        return None
+    return OtherCause(stepped[1].cause, f"near {stepped[0]:.0f} s {stepped[1].description}")
 
 
 def unlike(seen: Signatures, known: Sequence[Signatures]) -> OtherCause | None:
