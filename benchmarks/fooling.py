@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -408,26 +409,27 @@ def judge(file: Path, machines_of: dict[bool, list[Machine]], first: int, keys: 
 
 
 def write_table(file: Path, lines: Iterable[dict[str, object]]) -> None:
-    """Write how often each row was called what, through each set of channels, as CSV."""
-    counts: dict[tuple[str, str, bool], Counter[str]] = {}
+    """Write how often each row was called what, through each set of channels, as CSV: judging machines, then others."""
+    counts: dict[tuple[str, str, str, bool], Counter[str]] = {}
     for line in lines:
-        name, view, leaking, _ = key_of(line)
-        counts.setdefault((name, view, leaking), Counter())[str(line["verdict"])] += 1
-        counts[name, view, leaking][f"cause: {line['cause']}"] += 1
+        name, view, leaking, number = key_of(line)
+        own = counts.setdefault(
+            (name, view, "developed on" if number in DEVELOPMENT else "judged on", leaking), Counter()
+        )
+        own[str(line["verdict"])] += 1
+        own[f"cause: {line['cause']}"] += 1
     verdicts = ("leak", "no leak", "cannot tell")
     with file.open("w", encoding="utf-8", newline="") as out:
         writer = csv.writer(out, lineterminator="\n")
         sides = [f"{side}: {verdict}" for side in ("healthy", "leaking") for verdict in verdicts]
-        writer.writerow(["group", "row", "channels", *sides, "causes named, healthy"])
-        for name, own in ROWS.items():
-            for view in VIEWS:
-                sound, worn = (counts.get((name, view, leaking), Counter[str]()) for leaking in (False, True))
-                if not sound and not worn:
-                    continue
+        writer.writerow(["machines", "group", "row", "channels", *sides, "causes named, healthy"])
+        for part, (name, row_), view in product(("judged on", "developed on"), ROWS.items(), VIEWS):
+            sound, worn = (counts.get((name, view, part, leaking), Counter[str]()) for leaking in (False, True))
+            if sound or worn:
                 named = [(key.removeprefix("cause: "), count) for key, count in sorted(sound.items())]
                 causes = [f"{cause} {count}" for cause, count in named if cause not in (*verdicts, "None")]
                 cells = [side[verdict] for side in (sound, worn) for verdict in verdicts]
-                writer.writerow([own.group, name, view, *cells, "; ".join(causes)])
+                writer.writerow([part, row_.group, name, view, *cells, "; ".join(causes)])
 
 
 def main() -> None:

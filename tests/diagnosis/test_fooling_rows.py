@@ -104,7 +104,7 @@ def test_verdicts_are_kept_and_an_interrupted_run_goes_on(
     assert sorted(map(fooling.key_of, fooling.known_verdicts(file))) == sorted(keys)
     fooling.write_table(tmp_path / "table.csv", fooling.known_verdicts(file))
     rows = (tmp_path / "table.csv").read_text(encoding="utf-8").splitlines()
-    assert rows[1].startswith("gap,nothing,pressures,0,1,0,0,0,0")
+    assert rows[1].startswith("developed on,gap,nothing,pressures,0,1,0,0,0,0")
     assert len(rows) == 3
 
 
