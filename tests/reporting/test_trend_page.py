@@ -78,6 +78,8 @@ def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
     assert "<day>" not in page and "&lt;day&gt; 5.csv" in page
     for words in ("press 4", "the level fell", "another command", "needs theta", "The leakage does not grow", "95 %"):
         assert words in page, words
+    key = page[page.index('class="key"') : page.index('class="card"')]
+    assert "alarm" in key and "fell back" in key and "not before" in page  # nothing grows since the repair
     wide = page[page.index('class="trend wide"') : page.index('class="trend narrow"')]
     assert wide.count('class="point other"') == 3 and wide.count('class="absent"') == 1
     assert wide.count("<circle") == 39 and wide.count('class="course"') == len(trend.episodes) == 2
@@ -107,3 +109,10 @@ def test_another_kind_of_file_is_refused(trend: Trend, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"\.html, \.htm, \.pdf, got .*page\.png"):
         write_trend_page(tmp_path / "page.png", trend)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_has_ticks_of_minutes(trend: Trend) -> None:
+    points = tuple(replace(own, day=own.day / 1440.0) for own in trend.points)
+    chart = chart_of(replace(trend, points=points), "wide")
+    assert chart is not None and len(chart["x_ticks"]) >= 3
+    assert all(":" in label for _, label in chart["x_ticks"])

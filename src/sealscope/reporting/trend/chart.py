@@ -16,7 +16,8 @@ SIZES = {"wide": (900.0, 320.0), "narrow": (420.0, 300.0)}
 #: The limit is drawn where it is below so many times the highest level; else it is named only.
 _NEAR = 2.5
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58.0, 12.0, 14.0, 26.0
-_STEPS = (1 / 24, 1 / 8, 1 / 4, 1.0, 2.0, 7.0, 14.0, 30.0, 61.0, 91.0, 182.0, 365.0, 730.0, 1826.0)
+#: Distances between two ticks: minutes, hours, days; in days.
+_STEPS = (*(m / 1440 for m in (1, 5, 15, 60, 180, 360)), 1, 2, 7, 14, 30, 61, 91, 182, 365, 730, 1826)
 
 
 @dataclass(frozen=True)

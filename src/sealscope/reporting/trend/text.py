@@ -71,6 +71,12 @@ def sentence(trend: Trend) -> str:
     return "Cannot tell"
 
 
+def title_of_levels(trend: Trend) -> str:
+    """Return what the levels are, with their unit."""
+    what = "Damping of the pressures' ringing" if trend.basis == "ringing" else "The leakage over time"
+    return f"{what} [{trend.unit}]"
+
+
 def level_now(trend: Trend) -> str | None:
     """Return the present level, None where there is none."""
     wear = trend.wear
@@ -107,7 +113,7 @@ def assumed(trend: Trend) -> str:
     temperature = any(point.temperature is not None for point in trend.points)
     oil = "The oil's temperature is taken out. " if temperature else "The oil's temperature is not known. "
     machine = ""
-    if trend.machine is not None and trend.basis is not None:
+    if trend.machine is not None and trend.basis not in (None, "ringing"):
         machine = f"L/min rest on {machine_text(trend.machine)}. "
         if trend.unit != "L/min":
             machine = "No L/min: area and displacement of this machine are not stated (--rig, --area, --displacement). "
@@ -149,7 +155,7 @@ def reach(trend: Trend) -> str | None:
         return None
     if own.value == 0.0:
         text = f"{limit} is reached"
-    elif not math.isfinite(own.value) or own.value / MONTH > _FURTHEST:
+    elif trend.alarm is None or not math.isfinite(own.value) or own.value / MONTH > _FURTHEST:
         text = f"{limit} not before {_wait(own.low)}" if own.low / MONTH <= _FURTHEST else f"{limit} not in sight"
     else:
         text = f"{limit} in {_wait(own.value)} ({_wait(own.low)} to {_wait(own.high)}) if it goes on so"
