@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -144,9 +144,6 @@ def predictive_threshold(
     with the stated `confidence`. Scores under 0 are taken as they are (`power` 1). Raises InputError for too few scores
     and for scores that do not scatter. Source: Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sec. 3.2.
     """
-    from scipy.optimize import brentq
-    from scipy.special import ndtr, ndtri
-
     values = numbers(scores, "leak-free scores")
     share(false_alarm, "the false-alarm probability")
     share(confidence, "confidence")
@@ -159,6 +156,19 @@ def predictive_threshold(
     m, s = float(y.mean()), float(y.std(ddof=1))
     if not s > 1e-12 * abs(m):
         raise InputError(f"leak-free scores must scatter, got {n} equal to {values[0]:.4g}")
+    at, expected, low, high = _standardised(n, false_alarm, confidence, promise, wander)
+    value = max(m + s * at, 0.0) ** (1.0 / power) if power != 1.0 else m + s * at
+    return Threshold(value, false_alarm, promise, 0, n, expected, low, high, confidence)
+
+
+@lru_cache(maxsize=1024)
+def _standardised(
+    n: int, false_alarm: float, confidence: float, promise: Promise, wander: LevelWander | None
+) -> tuple[float, float, float, float]:
+    """Return (threshold - m)/s, which no score changes, with the mean and the interval of the true probability."""
+    from scipy.optimize import brentq
+    from scipy.special import ndtr, ndtri
+
     shift, sigma = _posterior(n, wander)
     if promise == "bound":
         at = float(np.quantile(shift - sigma * ndtri(false_alarm), confidence))
@@ -167,8 +177,7 @@ def predictive_threshold(
         at = float(brentq(lambda t: float(np.mean(ndtr((shift - t) / sigma))) - false_alarm, -span, span, rtol=1e-10))
     true = ndtr((shift - at) / sigma)
     low, high = np.quantile(true, [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0])
-    value = max(m + s * at, 0.0) ** (1.0 / power) if power != 1.0 else m + s * at
-    return Threshold(value, false_alarm, promise, 0, n, float(np.mean(true)), float(low), float(high), confidence)
+    return at, float(np.mean(true)), float(low), float(high)
 
 
 @cache
