@@ -94,10 +94,10 @@ def test_a_campaign_over_recordings_goes_on(batch, call, monkeypatch, tmp_path):
 ODD = os.fsdecode(b"odd\xff\x1b[31m.nc")
 
 
-def test_odd_names_of_files(batch, shell):
+def test_odd_names_of_files(batch, shell, call):
     """Bytes that are no UTF-8, and a terminal's escape."""
     shutil.copy(batch / "good.nc", batch / ODD)
-    done = shell("sealscope", "report", "-o", batch / "page.html", batch / ODD)
+    done = call("report", "-o", batch / "page.html", batch / ODD)
     assert (done.status, done.err) == (0, "")
     assert "\x1b" not in done.out
     assert "odd" in (batch / "page.html").read_text(encoding="utf-8")

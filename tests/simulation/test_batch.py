@@ -41,8 +41,15 @@ def rms_of(recording, bounds):
     return found
 
 
-@pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
-@pytest.mark.parametrize("volumes", ["fixed", "position"])
+@pytest.mark.parametrize(
+    ("volumes", "throttled"),
+    [  # each pair is compiled of its own, a law in each of them is in one of the first two
+        pytest.param("fixed", False, id="fixed-free"),
+        pytest.param("position", True, id="position-throttled"),
+        pytest.param("position", False, id="position-free", marks=pytest.mark.slow),
+        pytest.param("fixed", True, id="fixed-throttled", marks=pytest.mark.slow),
+    ],
+)
 def test_each_run_is_what_it_is_by_itself(check_rig, throttled, volumes):
     leaks = [None, "G = 6e-13 from 4 s", "C = 2e-10 from 3 s", "G = 1e-12 growing from 2 s to 9 s", "G = 6e-13"]
     bounds = [0.0, 2.5, 4.0, 10.0]
