@@ -71,6 +71,7 @@ def test_only_leaks_that_the_bound_allows_count_against_it():
     found = findings()
     assert (found[ALL, 0.004, "orifice"].allowed.count, found[ALL, 0.004, "orifice"].allowed.n) == (0, 1)
     assert (found[ALL, 0.004, ANY_LAW].allowed.count, found[ALL, 0.004, ANY_LAW].allowed.n) == (1, 2)
+    assert (found[ALL, 0.004, ANY_LAW].reachable.count, found[ALL, 0.004, ANY_LAW].reachable.n) == (2, 3)
 
 
 def test_the_table_says_which_half_it_is():
@@ -79,6 +80,7 @@ def test_the_table_says_which_half_it_is():
     assert {line[0] for line in families.rows} == {"held back"}
     assert {line[1] for line in families.rows} == {ALL, "hoses", "mass"}
     assert all(len(line) == len(families.columns) for line in families.rows)
+    assert "bound allows 90% detection: count" in families.columns
 
 
 def test_the_page_shows_each_family():
@@ -86,7 +88,8 @@ def test_the_page_shows_each_family():
     assert lines[0][:3] == (NAME, ALL, "no leak")
     both = next(line for line in lines if line[1:3] == ("hoses", "0.004 any"))
     assert both[3].startswith("50 %")
-    assert both[6].startswith("100 %")
+    assert both[6] == "1 of 2"
+    assert both[7].startswith("1 of 1, 100 %")
 
 
 def test_rows_survive_being_stored():

@@ -23,8 +23,9 @@ class FamilyFinding:
     """One detector on one family of machines at one size (0: no leak) and law of the leak.
 
     `alarms`, `cannot_tell` over all records; `coverage`: how often a stated interval holds the flow that there was;
-    `allowed`: alarms over the records whose leak the Cramer-Rao bound of their machine allows to find, None where no
-    bound was asked for; `failed`: records without a result, among those that cannot be told.
+    `reachable`: records whose leak the Cramer-Rao bound of their machine allows to find, over those that have a bound,
+    and `allowed`: alarms over these, both None where no bound was asked for; `failed`: records without a result, among
+    those that cannot be told.
     """
 
     family: str
@@ -34,6 +35,7 @@ class FamilyFinding:
     alarms: Proportion
     cannot_tell: Proportion
     coverage: Proportion
+    reachable: Proportion | None
     allowed: Proportion | None
     failed: int
 
@@ -96,10 +98,12 @@ def _finding(
         if stated is not None and row.error is None and stated.leak_interval_lpm is not None:
             low, high = stated.leak_interval_lpm
             intervals.append(low <= (row.leak_lpm if row.flow_lpm is None else row.flow_lpm) <= high)
-    within = None
-    if size and any(row.bound_lpm is not None for row in rows):
-        reachable = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if allowed(row, false_alarm)]
-        within = proportion(sum(reachable), len(reachable), confidence)
+    reachable, within = None, None
+    bounded = sum(row.bound_lpm is not None for row in rows)
+    if size and bounded:
+        found = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if allowed(row, false_alarm)]
+        reachable = proportion(len(found), bounded, confidence)
+        within = proportion(sum(found), len(found), confidence)
     return FamilyFinding(
         family=family,
         detector=detector,
@@ -108,6 +112,7 @@ def _finding(
         alarms=proportion(given.count("leak"), len(rows), confidence),
         cannot_tell=proportion(given.count(CANNOT_TELL), len(rows), confidence),
         coverage=proportion(sum(intervals), len(intervals), confidence),
+        reachable=reachable,
         allowed=within,
         failed=sum(row.error is not None for row in rows),
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.judging.families import ALLOWED_DETECTION
 from sealscope.campaigns.judging.judge import Judgement
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.evaluation.binomial import Proportion
@@ -99,14 +100,16 @@ def _families(judgement: Judgement, unit: str, known: Mapping[str, PriorKnowledg
     """Return what each detector finds in each family of machines, beside what the Cramer-Rao bound allows to find."""
     columns = (
         "part", "family", "detector", "channels given", "rig assumed", f"leak [{unit}]", "law", *_columns("alarms"),
-        *_columns("cannot tell"), *_columns("interval holds the flow"), *_columns("alarms where the bound allows"),
+        *_columns("cannot tell"), *_columns("interval holds the flow"),
+        *_columns(f"bound allows {ALLOWED_DETECTION:.0%} detection"), *_columns("alarms where the bound allows"),
         "failed",
     )  # fmt: skip
     rows: list[tuple[Value, ...]] = []
     for row in judgement.families:
         given = known.get(row.detector)
         prior = (None, None) if given is None else (" ".join(given.channels), given.rig)
-        shares = (*_of(row.alarms), *_of(row.cannot_tell), *_stated_coverage(row.coverage), *_of(row.allowed))
+        stated = *_of(row.alarms), *_of(row.cannot_tell), *_stated_coverage(row.coverage)
+        shares = (*stated, *_of(row.reachable), *_of(row.allowed))
         rows.append((part, row.family, row.detector, *prior, row.leak_lpm, row.law, *shares, row.failed))
     return ResultTable("families", columns, tuple(rows))
 

@@ -65,6 +65,8 @@ _WHOLE = 0.6
 _WORTH = 0.02
 #: A drift over this share of the conductance at the start is more than warm oil does within a recording.
 _LARGE_DRIFT = 0.5
+#: A share through an orifice from which a leak shows unevenly.
+_UNEVEN = 0.02
 #: A leak follows both laws where either takes more than this share of it.
 _SOME = 0.15
 _LAWS: tuple[Law, Law] = ("laminar", "orifice")
@@ -438,7 +440,7 @@ def describe_leak(fit: BalanceFit, step: DriftStep, probability: float) -> Evide
     open_ = shape >= 1.0 if step.rise == 0.0 else shape > 0.0
     law = orifice_share(fit, step)
     even, unit_flow = evened(fit, law, open_) if open_.any() else (fit, fit.unit_flow("laminar"))
-    again = search(even, probability) if step.rise == 0.0 and open_.any() else step
+    again = search(even, probability) if step.rise == 0.0 and open_.any() and law.mean > _UNEVEN else step
     by_law = again if again.alarm and again.rise == step.rise else step
     size, size_sd = by_law.size, by_law.size_sd
     lpm, interval, course, relative = None, None, None, None

@@ -16,6 +16,14 @@ def percent(proportion: Proportion | None) -> str:
     return f"{_p(proportion.value)} % ({_p(proportion.low)}–{_p(proportion.high)})"
 
 
+def _of(proportion: Proportion | None) -> str:
+    return "–" if proportion is None else f"{proportion.count} of {proportion.n}"
+
+
+def _counted(proportion: Proportion | None) -> str:
+    return _of(proportion) if proportion is None or not proportion.n else f"{_of(proportion)}, {percent(proportion)}"
+
+
 def _p(share: float) -> str:
     value = 100.0 * share
     return (
@@ -59,8 +67,8 @@ def onset_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str]]:
     ]
 
 
-def family_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str, str, str]]:
-    """Return detector, family, leak, alarms, cannot tell, coverage of the flow, alarms where the bound allows."""
+def family_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str, str, str, str]]:
+    """Return detector, family, leak, alarms, cannot tell, coverage of the flow, what the bound allows, alarms there."""
     return [
         (
             row.detector,
@@ -69,7 +77,8 @@ def family_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str, st
             percent(row.alarms),
             percent(row.cannot_tell),
             percent(row.coverage),
-            percent(row.allowed),
+            _of(row.reachable),
+            _counted(row.allowed),
         )
         for row in judgement.families
     ]
