@@ -43,10 +43,11 @@ def grown(fit: BalanceFit, probability: float) -> DriftStep | None:
         return None
     t = fit.blocks.t
     instants = np.linspace(t[0], t[-1], _INSTANTS)
-    pairs = [
-        (begin, stop) for begin in instants[:-2] for stop in instants[2:] if stop - begin > 2.0 * fit.blocks.seconds
-    ]
-    shapes = np.stack([rises(t, np.array([begin]), stop - begin)[0] for begin, stop in pairs])
+    spacing = float(instants[1] - instants[0])
+    # all begins of one duration at once
+    apart = [steps for steps in range(1, _INSTANTS) if steps * spacing > 2.0 * fit.blocks.seconds]
+    pairs = [(begin, begin + steps * spacing) for steps in apart for begin in instants[:-steps]]
+    shapes = np.concatenate([rises(t, instants[:-steps], steps * spacing) for steps in apart])
     weight = 1.0 / fit.sd**2
     centred = shapes - (shapes @ weight / weight.sum())[:, None]
     g = fit.g - float(fit.g @ weight / weight.sum())
@@ -56,7 +57,6 @@ def grown(fit: BalanceFit, probability: float) -> DriftStep | None:
     variance = float(squares[best]) / (n - 4)
     begins = np.array([pairs[k][0] for k in np.flatnonzero(squares - squares[best] <= _SPAN * variance)])
     begin, stop = pairs[best]
-    spacing = float(instants[1] - instants[0])
     return DriftStep(
         score=score,
         threshold=threshold,
