@@ -156,7 +156,8 @@ def test_the_pressure_model_finds_what_is_predicted() -> None:
     experiment = experiment_for(thesis, "3 sin(4t)", 80.0)
     _, model = judge_predictions(experiment, 0.01, 0.9, 0)
     assert model.smallest is not None
-    dp = float(np.mean(np.abs(np.diff(simulate_with_truth(experiment).recording.to_pandas()[["p_A", "p_B"]], axis=1))))
+    healthy = simulate_with_truth(experiment).recording
+    dp = float(np.mean(np.abs(healthy["p_A"] - healthy["p_B"])))
     found = []
     for seed in range(70, 76):
         leak = Leak("laminar", coefficient=1.3 * model.smallest * LITRE_PER_MINUTE / dp, opening=From(40.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -15,6 +16,7 @@ from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.diagnosis.verdict.severity import Severity
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 
@@ -174,3 +176,16 @@ def test_any_recording_gets_a_verdict(data: st.DataObject) -> None:
         return Recording(np.arange(n) / rate, {name: channel(n) for name in names}, dict.fromkeys(names, "count"), rate)
 
     check(diagnose(one(), [one() for _ in range(data.draw(st.integers(0, 4)))], false_alarm_probability=0.05))
+
+
+def test_every_field_is_documented(sound: Recording) -> None:
+    """Each key, and each key within it, stands in docs/verdict.md."""
+    page = (Path(__file__).parents[2] / "docs" / "verdict.md").read_text(encoding="utf-8")
+    told = diagnose(sound).as_dict()
+    for key, value in told.items():
+        assert f"`{key}`" in page, key
+        inner = value[0] if isinstance(value, list) and value and isinstance(value[0], dict) else value
+        for name in inner if isinstance(inner, dict) and key != "about" else ():
+            assert f"`{name}`" in page, (key, name)
+    for name in Severity((1.0, 0.0, 2.0), None, None, None).as_dict():
+        assert f"`{name.removesuffix('_interval')}`" in page, name
