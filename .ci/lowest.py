@@ -6,5 +6,6 @@ from pathlib import Path
 
 project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 extras = project["optional-dependencies"]
-for requirement in dict.fromkeys(project["dependencies"] + extras["io"] + extras["report"] + extras["cluster"]):
+installed = ("io", "report", "pdf", "cluster", "serve", "mqtt", "postgres")
+for requirement in dict.fromkeys(project["dependencies"] + [line for extra in installed for line in extras[extra]]):
     print(re.sub(r"\[.*?\]", "", requirement).replace(">=", "=="))
