@@ -60,8 +60,6 @@ MAINS, HUM_BESIDE = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0), (1.5, 6.0)
 TILT, TILT_WIDTH = (0.30, 0.42), 0.07
 #: Steps that matter, as logarithms: of that ratio, of a hum line over what lies beside it; no leak moves either so far.
 FILTERED, HUMS = 0.5, 1.2
-#: ... of a hum line's median over one recording against that over another.
-HUMS_BETWEEN = 0.75
 #: A sure step anywhere in the recording; blocks of one duty correlate by more than the one, of another phase by less
 #: than the other.
 SURE_ANYWHERE, SAME_PHASE, OTHER_PHASE = 6.0, 0.7, 0.35
@@ -377,7 +375,7 @@ def unlike(seen: Signatures, known: Sequence[Signatures]) -> OtherCause | None:
                 "sensor fault", f"the noise of {name} is {what} than in the baseline, as by another filter"
             )
         for hertz, change in zip(seen.mains, hum[chamber], strict=True):
-            if abs(change) > HUMS_BETWEEN:
+            if abs(change) > HUMS:
                 which = "more" if change > 0 else "less"
                 return OtherCause(
                     "sensor fault", f"there is {which} hum of {hertz:g} Hz in {name} than in the baseline"
