@@ -122,9 +122,8 @@ def main() -> None:
                 opened = opened or clock
                 since = clock - opened
                 lpm = STEPS[kind] if kind < len(STEPS) else min(1.0, since / (7 * DAY_S)) * WEEK_LPM
-            block = changed(
-                blocks[random.integers(len(blocks))], clock, g + lpm / flow, math.exp(friction.after(seconds))
-            )
+            scaled = math.exp(friction.after(seconds))
+            block = changed(blocks[random.integers(len(blocks))], clock, g + lpm / flow, scaled)
             estimate = watch.judged(block, clock + 0.5 * seconds)
             if watch.leak is None:
                 continue
@@ -134,7 +133,7 @@ def main() -> None:
                 low, high = estimate.leak_interval_lpm or (math.nan, math.nan)
                 after = (clock - opened) / 3600.0
                 print(
-                    f"actuator {number}: true {lpm:.4f} L/min, alarm ({leak.test}) {after:.3f} h"
+                    f"actuator {number}: true {lpm * scaled:.4f} L/min, alarm ({leak.test}) {after:.3f} h"
                     f" after the onset, states {size} ({low:.4f} to {high:.4f})"
                 )
                 break

@@ -149,12 +149,17 @@ def _rise(evidence: Evidence, blocks: BalanceBlocks, g: Array) -> ConductanceRis
     if min(before.size, after.size) == 0:
         before, after = g[:1], g[-1:]
     scatter = float(np.median(np.abs(np.diff(g)))) / (0.6745 * np.sqrt(2.0))
+    size = float(after.mean() - before.mean())
+    deviation = scatter * math.sqrt(1.0 / before.size + 1.0 / after.size)
+    if evidence.leak_lpm and evidence.leak_interval_lpm is not None:  # which knows how the conductance drifts
+        low, high = evidence.leak_interval_lpm
+        deviation = max(deviation, abs(size) * (high - low) / (2.0 * 1.96 * evidence.leak_lpm))
     return ConductanceRise(
         "step",
         onset,
         evidence.onset_interval_s or (onset, onset),
-        float(after.mean() - before.mean()),
-        scatter * math.sqrt(1.0 / before.size + 1.0 / after.size),
+        size,
+        deviation,
         evidence.cause or "",
         evidence.reason,
         float(evidence.score or 0.0),
