@@ -34,6 +34,9 @@ _SAME_RATE = 0.01
 
 
 def _frozen(values: Any) -> Array:
+    """Return values as doubles that cannot be written: a copy, but of an array that is such doubles and no view."""
+    if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
+        return values
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array

@@ -69,6 +69,8 @@ class RawTable:
         for name, (column, unit) in choice.channels.items():
             units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
             channels[name] = to_si(values[column], unit, units[name], name=name)
+            if channels[name] is not values[column]:
+                channels[name].setflags(write=False)  # made here: a recording takes it as it is
         notes = (*self.notes, *choice.notes)
         start: dict[str, Any] = {}
         if choice.time_label is None:

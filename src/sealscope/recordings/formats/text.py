@@ -169,7 +169,10 @@ def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> t
                     for row, cell in zip(rows, cells, strict=True)
                 ]
             part.append(_dates(cells, numbers, column, layout, place))
-    joined = [np.concatenate(part) if part else np.empty(0) for part in parts]
+    joined: list[NDArray[Any]] = []
+    for part in parts:  # each column's blocks are let go before the next is joined
+        joined.append(np.concatenate(part) if part else np.empty(0))
+        part.clear()
     notes = [note for odd in words for note in odd.notes(total)]
     if dated and choice.date is not None:
         before, after = layout.labels[choice.date], layout.labels[columns[-1][0]]
