@@ -121,3 +121,12 @@ def test_parameters_fit_80_columns(call, monkeypatch):
     assert max(map(len, lines)) <= 80
     assert "motor.R_c                  0.73 ohm  winding resistance" in lines
     assert "    Table 4.1; Table 2.1 (winding resistance at ambient)" in lines
+
+
+def test_a_log_whose_pressures_bear_other_names_says_which_map_would_read_them(call, tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("t [s],u [V],Druck A [bar],Druck B [bar]\n" + "".join(f"{t:.3f},1,20,18\n" for t in T[:400]))
+    (line,) = call("diagnose", log, "--format", "jsonl").objects
+    assert "--map 'p_A=Druck A [bar]' --map 'p_B=Druck B [bar]'" in line["reason"]
+    (line,) = call("diagnose", log, "--map", "auto", "--format", "jsonl").objects
+    assert "--map" not in line["reason"]

@@ -41,3 +41,6 @@ LONG_NAMES: Mapping[str, str] = MappingProxyType(
 )
 #: Unit of a mapped channel that came without one: raw counts of a converter.
 COUNTS = "count"
+
+#: Beginning of the line of a history that names the columns of a file that are no channels.
+UNUSED = "columns not used"

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.channels import Array
+from sealscope.recordings.channels import UNUSED, Array
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Recording
 
@@ -136,3 +136,14 @@ def _time(recording: Recording) -> str | None:
     if _correlation(turned, omega, 1) < _BELONGS or 1.0 / _MISFIT <= factor <= _MISFIT:
         return None
     return f"the speed is {factor:.3g} times that at which the angle turns: is the unit of the time right?"
+
+
+def lack_of_chambers(recording: Recording) -> str | None:
+    """Return that a recording has no chamber pressure, and which columns of its file were not used; None where it has.
+
+    What the names of those columns tell stands in the same line, as the `--map` that would read them.
+    """
+    if chambers_of(recording):
+        return None
+    unused = [line for line in recording.history if line.startswith(UNUSED)]
+    return "; ".join(["needs the pressure of a chamber (p_A or p_B)", *unused])

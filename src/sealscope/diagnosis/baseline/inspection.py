@@ -18,7 +18,7 @@ from sealscope.diagnosis.baseline.operating_point import OperatingPoint, differe
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.gaps import MOST_BRIDGED, bridge
-from sealscope.recordings.hydraulics import no_machine
+from sealscope.recordings.hydraulics import lack_of_chambers, no_machine
 from sealscope.recordings.motion import does_not_move, runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
 from sealscope.recordings.recording import Recording, remembered
@@ -49,8 +49,8 @@ class Inspection:
     @property
     def defect(self) -> str | None:
         """Why the recording can neither be calibrated with nor stand for a leak-free machine; None where it can."""
-        if not chambers_of(self.part):
-            return "needs the pressure of a chamber (p_A or p_B)"
+        if lack := lack_of_chambers(self.part):
+            return lack
         if len(self.part) < SHORTEST:
             return f"needs {SHORTEST} samples or more without a gap, got {len(self.part)}"
         return self.distrust

@@ -36,6 +36,7 @@ from sealscope.diagnosis.rms_change.by_recordings import (
 from sealscope.diagnosis.rms_change.drift import drift_beyond_noise, drift_of
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.hydraulics import lack_of_chambers
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import shortest
@@ -60,12 +61,11 @@ class RmsChange:
 
     def usable(self, recording: Recording) -> str | None:
         """Return None when the recording has a chamber pressure that moves, else the reason why not."""
-        chambers = chambers_of(recording)
-        if not chambers:
-            return "needs the pressure of a chamber (p_A or p_B)"
+        if lack := lack_of_chambers(recording):
+            return lack
         if len(recording) < shortest():
             return f"needs {shortest()} samples or more without a gap, got {len(recording)}"
-        for chamber in chambers:
+        for chamber in chambers_of(recording):
             if constant(recording[chamber]):
                 return f"{chamber} is constant"
         return None

@@ -9,7 +9,7 @@ from typing import Literal
 
 from sealscope.calls import nearest
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
 from sealscope.recordings.formats.headings.labels import Label, square_brackets
 from sealscope.recordings.formats.headings.proposal import map_options, proposed_map
 from sealscope.units import same_dimension, to_si
@@ -218,7 +218,9 @@ def choose_columns(labels: Sequence[Label], channel_map: ChannelMap, rate: float
         time = time_label = None
     ignored = [label.whole for i, label in enumerate(labels) if i not in used and i != date and label.whole]
     if ignored:
-        notes.append(f"columns not used: {listed(ignored, 40)}")
+        guesses = {name: column for name, column in proposed_map(labels).items() if name not in {*channels, "t"}}
+        hint = f"; --map auto would also read {map_options(guesses)}" if guesses else ""
+        notes.append(f"{UNUSED}: {listed(ignored, 40)}{hint}")
     order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel][0])}
     names = {channel: labels[column].whole for channel, (column, _) in order.items() if labels[column].name != channel}
     return ColumnMap(time, time_label, order, tuple(notes), None if time is None else date, names)
