@@ -74,13 +74,18 @@ def test_every_state_on_the_way_is_the_same() -> None:
 
 
 def test_the_last_window_is_judged_as_a_recording_would_be() -> None:
-    """Same blocks, same statistic: only the probability is another, and the samples date the onset of a recording."""
+    """Same blocks, same statistic: only the probability is another.
+
+    A recording's samples date the onset, and its pressures' zero error is taken out, which a stream's interval holds.
+    """
     rate = 0.01 / (3.14 / 3600.0)
     final = stream(WORN, [len(WORN)], window=100, alarms_per_hour=rate)[-1]
     detector = VolumeBalance(RIG)
     batch = detector.examine(WORN, [], 0.01)
-    assert final.evidence.score == pytest.approx(batch.score, rel=1e-9)
-    assert final.evidence.leak_lpm == pytest.approx(batch.leak_lpm, rel=1e-9)
+    assert final.evidence.score == pytest.approx(batch.score, rel=5e-3)
+    low, high = final.evidence.leak_interval_lpm
+    assert low < batch.leak_lpm < high
+    assert final.evidence.leak_lpm == pytest.approx(batch.leak_lpm, rel=0.02)
     # a recording is dated by the samples about the onset, a stream by its blocks of 3.14 s and with their interval
     assert batch.onset_s == pytest.approx(80.0, abs=0.05)
     low, high = final.evidence.onset_interval_s
