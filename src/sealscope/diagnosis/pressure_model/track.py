@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.pressure_model.chain import Chain
 from sealscope.diagnosis.pressure_model.fit import steps_of
 from sealscope.diagnosis.pressure_model.model import (
     BIAS,
@@ -127,23 +128,6 @@ def _anchor(theta: Array, units: Array) -> Array:
     return weight
 
 
-def precision(N: Array, walk: Array, anchor: Array) -> Array:
-    """Return Lambda (b p, b p) of all blocks' parameters; `walk` (b - 1, p) from each block to the next."""
-    blocks, p, _ = N.shape
-    matrix = np.zeros((blocks, p, blocks, p))
-    for b in range(blocks):
-        matrix[b, :, b] += N[b] + 1e-10 * np.diag(np.diagonal(N[b]))
-        if b:
-            steps = np.diag(1.0 / walk[b - 1] ** 2)
-            matrix[b, :, b] += steps
-            matrix[b - 1, :, b - 1] += steps
-            matrix[b - 1, :, b] -= steps
-            matrix[b, :, b - 1] -= steps
-    for k in np.flatnonzero(anchor > 0):
-        matrix[:, k, :, k] += anchor[k] / blocks**2
-    return matrix.reshape(blocks * p, blocks * p)
-
-
 def right_sides(r: Array, anchor: Array, centre: Array) -> Array:
     """Return the right sides (b, p) of the blocks with the first fit's weight `anchor` (p,) on `centre` (p,)."""
     return r + anchor * centre / len(r)
@@ -241,14 +225,13 @@ def track(
             misfit,
             strain(path, allowed),
         )
-        matrix, right = precision(followed.N, allowed, anchor), right_sides(followed.r, anchor, centre).reshape(-1)
-        if rise is not None:
-            matrix, right = _with_rise(matrix, right, followed.rises[rise[0]], rise[1] + 1)
-        solved = np.linalg.solve(matrix, right)
-        fresh = np.column_stack(
-            [_held(solved[: blocks * SIZE].reshape(blocks, SIZE)[:, :SOUND] * h[:SOUND], theta), path[:, SOUND:]]
-        )
-        further = (max(0.0, solved[-1]) if rise is not None else 0.0) - size
+        chain, right = Chain(followed.N, allowed, anchor), right_sides(followed.r, anchor, centre).reshape(-1, 1)
+        if rise is None:
+            solved, fitted = chain.solve(right), 0.0
+        else:
+            solved, fitted = _with_rise(chain, right, followed.rises[rise[0]], rise[1] + 1)
+        fresh = np.column_stack([_held(solved.reshape(blocks, SIZE)[:, :SOUND] * h[:SOUND], theta), path[:, SOUND:]])
+        further = max(0.0, fitted) - size
         tries = path + _SHARES[:, None, None] * (fresh - path)
         sizes = size + _SHARES * further
         runs = model.run(tries + sizes[:, None, None] * risen, segment, np.tile(start, (_SHARES.size, 1)))
@@ -277,13 +260,15 @@ def track(
 _WANDERING = np.delete(np.arange(SIZE + 1), ORIFICE)
 
 
-def _with_rise(matrix: Array, right: Array, rise: Rise, first: int) -> tuple[Array, Array]:
-    """Return the normal equations with a rise in all blocks from the `first` on as the last unknown."""
+def _with_rise(chain: Chain, right: Array, rise: Rise, first: int) -> tuple[Array, float]:
+    """Return the solution with a rise in all blocks from the `first` on as one more unknown, and that rise."""
     cross = rise.cross.copy()
     cross[:first] = 0.0
     border = cross.reshape(-1)
+    without, shared = chain.solve(np.hstack([right, border[:, None]])).T
     own, side = float(rise.own[first:].sum()), float(rise.right[first:].sum())
-    return np.block([[matrix, border[:, None]], [border[None, :], np.array([[own]])]]), np.append(right, side)
+    size = (side - border @ without) / (own - border @ shared)
+    return without - size * shared, float(size)
 
 
 def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Array, Array, Array]:
@@ -373,19 +358,18 @@ def steps_in(
     """
     anchor, centre = np.split(followed.anchor, 2)
     walk = np.tile(wander(theta, followed.units, followed.seconds, speed), (len(followed.N) - 1, 1))
-    right = right_sides(followed.r, anchor, centre).reshape(-1)
+    right = right_sides(followed.r, anchor, centre).reshape(-1, 1)
     blocks = len(followed.N)
-    best: tuple[float, float, Array, float] | None = None
+    best: tuple[float, float, Chain, float] | None = None
     for scale in scales:
-        L = np.asarray(np.linalg.cholesky(precision(followed.N, scale * walk, anchor)), dtype=np.float64)
-        half = np.linalg.solve(L, right)
-        fit = float(half @ half)
-        likelihood = fit - 2.0 * np.sum(np.log(np.diagonal(L)))
+        chain = Chain(followed.N, scale * walk, anchor)
+        fit = float(np.vdot(right, chain.solve(right)))
+        likelihood = fit - chain.log_determinant()
         likelihood -= 2.0 * np.sum(np.log(scale * walk))
         if best is None or likelihood > best[0] + 2.0:
-            best = (float(likelihood), scale, L, fit)
+            best = (float(likelihood), scale, chain, fit)
     assert best is not None
-    _, scale, L, fit = best
+    _, scale, chain, fit = best
     free, ranks = float(np.sum(anchor * centre**2)), 0
     for N, r in zip(followed.N, followed.r, strict=True):
         solution, _, rank, _ = np.linalg.lstsq(N, r, rcond=1e-12)
@@ -398,13 +382,13 @@ def steps_in(
     inner = later_blocks.reshape(blocks * SIZE, blocks - 1)
     level_rows = np.zeros((blocks * SIZE, blocks))
     level_rows[np.arange(blocks) * SIZE + G, np.arange(blocks)] = 1.0
-    solved = np.linalg.solve(L, np.column_stack([inner, right, level_rows]))
-    steps, half, levels = solved[:, : blocks - 1], solved[:, blocks - 1], solved[:, blocks:]
+    solved = chain.solve(np.hstack([inner, right, level_rows]))
+    steps, middle, levels = solved[:, : blocks - 1], solved[:, blocks - 1], solved[:, blocks:]
     later = np.cumsum(rise.own[::-1])[::-1]
     at = np.arange(1, blocks)
-    information = later[np.maximum(at[:, None], at[None, :])] - steps.T @ steps
+    information = later[np.maximum(at[:, None], at[None, :])] - inner.T @ steps
     right_sum = np.cumsum(rise.right[::-1])[::-1][1:]
-    score = right_sum - steps.T @ half
+    score = right_sum - inner.T @ middle
     own = np.sqrt(np.diagonal(information))
     unit = followed.units[G]
     return ConductanceSteps(
@@ -412,8 +396,8 @@ def steps_in(
         rise.unit / own,
         score / own,
         information / np.outer(own, own),
-        levels.T @ half * unit,
-        np.sqrt(np.sum(levels**2, axis=0)) * unit,
+        middle.reshape(blocks, SIZE)[:, G] * unit,
+        np.sqrt(levels[np.arange(blocks) * SIZE + G, np.arange(blocks)]) * unit,
         scale,
         (free - fit, float(ranks - SIZE + np.count_nonzero(anchor))),
     )
