@@ -25,7 +25,15 @@ from sealscope.diagnosis.verdict.evidence import (
 from sealscope.diagnosis.volume_balance.blocks import FLOW, Y
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, Law, discriminate, findable, search
 from sealscope.diagnosis.volume_balance.growth import grown
-from sealscope.diagnosis.volume_balance.law import OrificeShare, evened, orifice_share, reach, shape_of, zero_error
+from sealscope.diagnosis.volume_balance.law import (
+    OrificeShare,
+    evened,
+    one_sided_share,
+    orifice_share,
+    reach,
+    shape_of,
+    zero_error,
+)
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -505,6 +513,10 @@ def _law_text(law: OrificeShare, near: dict[str, float]) -> str:
 def _place(fit: BalanceFit, step: DriftStep, shape: Array, near: dict[str, float]) -> tuple[Cause, str]:
     """Return where the oil goes, as a cause and in words."""
     lost = _lost(fit, step, shape)
+    steady = one_sided_share(fit, step) if lost > 0.0 else None
+    if steady is not None and abs(steady[0] - 0.5) < 0.5 + 2.0 * steady[1]:
+        cause, place = _between(near)
+        return cause, f"{place}; under a load that never reverses, a leak to the outside would look alike"
     if lost > 0.0:
         return "external leak", (
             f"from then on the sides lose oil unevenly, {lost / LITRE_PER_MINUTE:.2g} L/min whichever way the pressure "
@@ -514,6 +526,11 @@ def _place(fit: BalanceFit, step: DriftStep, shape: Array, near: dict[str, float
         return "sensor fault", (
             "it is no leak but a change of the scale of position, angle or displacement: an encoder slips"
         )
+    return _between(near)
+
+
+def _between(near: dict[str, float]) -> tuple[Cause, str]:
+    """Return whether oil that stays inside passes the piston or the pump, as a cause and in words."""
     if "pump" not in near:
         return "piston or pump leak", "pump and piston cannot be told apart without the pressures at the pump's ports"
     if near["pump"] > _DECISIVE:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import DriftStep
-from sealscope.diagnosis.volume_balance.blocks import I_ROOT
+from sealscope.diagnosis.volume_balance.blocks import I_AB, I_ROOT
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, moved_share
 from sealscope.recordings.recording import Array
 
@@ -26,6 +26,8 @@ from sealscope.recordings.recording import Array
 _REACH = 60.0
 #: Usual error of the zero of p_A - p_B, and the largest, as shares of its usual size: beyond, oil leaves for good.
 _ZERO, _LARGEST_ZERO = 0.3, 0.5
+#: Least mean of the pressure difference, over its usual size, where it never reverses; error of the zero there [Pa].
+_ONE_SIDED, _SENSOR_ZERO = 0.75, 3.5e4
 #: Deviation of the share from what the balance does not model (own bench, development families of `strangers`).
 _MISSED = 0.03
 #: Share of the squares of the integrated noise that passes for a root, and the relative error of that.
@@ -91,20 +93,45 @@ def zero_error(fit: BalanceFit, step: DriftStep) -> float:
     towards 0 by its own error against the usual zero error. 0 where the sides' areas differ, and where it would be so
     large that it is no zero error but oil that leaves for good.
     """
+    seen = None if fit.unequal else _apparent_zero(fit, step)
+    if seen is None:
+        return 0.0
+    zero, error = seen
+    usual = _ZERO * float(fit.blocks.abs_dp.mean())
+    zero *= usual**2 / (usual**2 + error**2)
+    return zero if abs(zero) < _LARGEST_ZERO / _ZERO * usual else 0.0
+
+
+def _apparent_zero(fit: BalanceFit, step: DriftStep) -> tuple[float, float] | None:
+    """Return the zero [Pa] that the flow which nothing explains shows, and its error; None where none can be seen."""
     shape = shape_of(fit, step)
     near = np.abs(fit.blocks.t - step.onset - 0.5 * step.rise) < reach(fit) + 0.5 * step.rise
     opening = shape[near] - shape[near].mean()
     spread = float(opening @ opening)
-    if fit.unequal or near.sum() < 6 or spread == 0.0:
-        return 0.0
+    if near.sum() < 6 or spread == 0.0:
+        return None
     slip = fit.slip[near] - fit.slip[near].mean()
     rise, flow = float(opening @ fit.g[near]) / spread, float(opening @ slip) / spread
     if rise <= 0.0:
-        return 0.0
+        return None
     scatter = float(np.sum((slip - flow * opening) ** 2)) / (near.sum() - 2)
-    error, usual = math.sqrt(scatter / spread) / rise, _ZERO * float(fit.blocks.abs_dp.mean())
-    zero = -fit.sense * flow / rise * usual**2 / (usual**2 + error**2)
-    return zero if abs(zero) < _LARGEST_ZERO / _ZERO * usual else 0.0
+    return -fit.sense * flow / rise, math.sqrt(scatter / spread) / rise
+
+
+def one_sided_share(fit: BalanceFit, step: DriftStep) -> tuple[float, float] | None:
+    """Return the share of a leak that goes with the root, and its error, where the pressure difference never reverses.
+
+    About a mean dp the root is ``sqrt(dp)/2 + delta/(2 sqrt(dp))``: half of an orifice's flow is steady, and no
+    conductance explains it. With that flow over the conductance's own, ``rho = f/(g dp)``, the share is
+    ``2 rho/(1 + rho)``. None where the difference reverses: there the steady halves cancel.
+    """
+    level, usual = float(fit.blocks.slope[:, I_AB].mean()), float(fit.blocks.abs_dp.mean())
+    seen = _apparent_zero(fit, step)
+    if seen is None or abs(level) < _ONE_SIDED * usual:
+        return None
+    zero, error = seen
+    rho = min(max(zero / level, -0.5), 2.0)
+    return 2.0 * rho / (1.0 + rho), 2.0 * math.hypot(error, _SENSOR_ZERO) / abs(level) / (1.0 + rho) ** 2
 
 
 def orifice_share(fit: BalanceFit, step: DriftStep) -> OrificeShare:
@@ -117,12 +144,17 @@ def orifice_share(fit: BalanceFit, step: DriftStep) -> OrificeShare:
     that ``moved = w + (1 - w) N/4`` (errors in variables: Fuller, Measurement Error Models, 1987, ch. 1).
     """
     moved = moved_share(fit, I_ROOT, step.onset, step.rise, within=reach(fit))
+    steady = one_sided_share(fit, step)
     if moved is None:
-        return OrificeShare(0.5, 0.0, 1.0)
+        return OrificeShare(0.5, 0.0, 1.0) if steady is None else OrificeShare.seen(*steady)
     bent = _BENDS * abs(zero_error(fit, step)) / float(fit.blocks.abs_dp.mean())
     blurred = min(_BLUR * moved.noise, 0.9)
     deviation = math.hypot(moved.deviation, bent, _BLUR_ERROR * blurred, _MISSED) / (1.0 - blurred)
-    return OrificeShare.seen((moved.share - blurred) / (1.0 - blurred), deviation)
+    share = (moved.share - blurred) / (1.0 - blurred)
+    if steady is not None:
+        weight = deviation**2 / (deviation**2 + steady[1] ** 2)
+        share, deviation = share + weight * (steady[0] - share), deviation * math.sqrt(1.0 - weight)
+    return OrificeShare.seen(share, deviation)
 
 
 def evened(fit: BalanceFit, law: OrificeShare, open_: NDArray[np.bool_]) -> tuple[BalanceFit, Array]:
