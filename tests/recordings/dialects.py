@@ -268,23 +268,28 @@ def spoilt(word: str) -> Writer:
     return write
 
 
+def pack(content: bytes, folder: Path, ending: str) -> Path:
+    """Write a log's bytes inside an archive and return its path."""
+    path = folder / f"log.csv.{ending}"
+    if ending == "zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("folder/log.csv", content)
+    elif ending == "zst":
+        import pyarrow
+
+        with pyarrow.CompressedOutputStream(str(path), "zstd") as file:
+            file.write(content)
+    else:
+        path.write_bytes({"gz": gzip, "bz2": bz2, "xz": lzma}[ending].compress(content))
+    return path
+
+
 def packed(ending: str) -> Writer:
     """Return what writes a log inside an archive."""
 
     def write(folder: Path) -> Path:
         content = log("t [s],p_A [bar],p_B [bar],x [mm]\n")(folder).read_bytes()
-        path = folder / f"log.csv.{ending}"
-        if ending == "zip":
-            with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-                archive.writestr("folder/log.csv", content)
-        elif ending == "zst":
-            import pyarrow
-
-            with pyarrow.CompressedOutputStream(str(path), "zstd") as file:
-                file.write(content)
-        else:
-            path.write_bytes({"gz": gzip, "bz2": bz2, "xz": lzma}[ending].compress(content))
-        return path
+        return pack(content, folder, ending)
 
     return write
 

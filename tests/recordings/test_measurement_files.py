@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import bz2
 import gzip
-import lzma
 import zipfile
 from pathlib import Path
 
@@ -26,6 +24,7 @@ from .dialects import (
     deviations,
     lvm,
     matlab,
+    pack,
     tdms_other_groups,
     timeseries,
     vectors,
@@ -115,17 +114,7 @@ def test_rates_are_brought_to_that_of_the_pressures(tmp_path: Path) -> None:
 def test_archives(ending: str, tmp_path: Path) -> None:
     rows = "".join(f"{t},{a!r},{b!r},{x!r}\n" for t, a, b, x in zip(T, P_A.tolist(), P_B.tolist(), X, strict=True))
     text = ("t [s],p_A [bar],p_B [bar],x [mm]\n" + rows.replace("np.float64(", "").replace(")", "")).encode()
-    path = tmp_path / f"log.csv.{ending}"
-    if ending == "zip":
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("folder/log.csv", text)
-    elif ending == "zst":
-        import pyarrow
-
-        with pyarrow.CompressedOutputStream(str(path), "zstd") as file:
-            file.write(text)
-    else:
-        path.write_bytes({"gz": gzip, "bz2": bz2, "xz": lzma}[ending].compress(text))
+    path = pack(text, tmp_path, ending)
     recording = read(path)
     agrees(recording)
     assert recording.provenance["file"] == path.name

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
+#: Exit status where a verdict is one of those that `--fail-on` names.
+FAILED_ON = 3
 _log = logging.getLogger(__name__)
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from sealscope.cli.options import (
+    FAILED_ON,
     AreaOption,
     AssumeOption,
     BaselineOption,
@@ -50,10 +51,6 @@ if TYPE_CHECKING:
 STANDARD_INPUT = Path("-")
 #: Fewer files are diagnosed one after the other: processes take a second or two to start.
 _FEWEST_SIDE_BY_SIDE = 4
-
-
-#: Exit status where a verdict is one of `--fail-on`.
-_FAILED_ON = 3
 
 
 class Verdict(StrEnum):
@@ -279,7 +276,7 @@ def diagnose(
     if form in ("short", "whole") and _in_time(files, starts):
         complain(f"these {len(files)} files follow one another in time: `sealscope trend` shows how the leakage went")
     if not complete or failed:
-        raise typer.Exit(_FAILED_ON if failed else 1)
+        raise typer.Exit(FAILED_ON if failed else 1)
 
 
 #: Fewest files, and time between two of them [s], from which on they may be a machine's over time.

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sealscope.cli.options import (
+    FAILED_ON,
     AreaOption,
     AssumeOption,
     DisplacementOption,
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.trend.reading import LeakReading
     from sealscope.parameters import Rig
     from sealscope.recordings.formats.columns import ChannelMap
-
-#: Exit status where a leak was seen and `--fail-on leak` asks for it.
-_FAILED_ON = 3
 
 
 class TrendFormat(StrEnum):
@@ -148,7 +146,7 @@ def trend(
             write_trend_page(output, result, title=files[0].resolve().name if files[0].is_dir() else "")
     failed = result.verdict in (fail_on or ())
     if failed or len(readings) < len(read):
-        raise typer.Exit(_FAILED_ON if failed else 1)
+        raise typer.Exit(FAILED_ON if failed else 1)
 
 
 def _check_output(output: Path, files: Sequence[Path]) -> None:

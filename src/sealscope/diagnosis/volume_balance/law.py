@@ -26,7 +26,8 @@ from sealscope.recordings.recording import Array
 _REACH = 60.0
 #: Usual error of the zero of p_A - p_B, and the largest, as shares of its usual size: beyond, oil leaves for good.
 _ZERO, _LARGEST_ZERO = 0.3, 0.5
-#: Least mean of the pressure difference, over its usual size, where it never reverses; error of the zero there [Pa].
+#: Least mean of the pressure difference, over its usual size, where it never reverses (0.89 and 1 on the rig
+#: `single-rod-eha`, about 0 on the bench); zero error of a transducer that is reckoned with there, 5 psi [Pa].
 _ONE_SIDED, _SENSOR_ZERO = 0.75, 3.5e4
 #: Deviation of the share from what the balance does not model (own bench, development families of `strangers`).
 _MISSED = 0.03
