@@ -29,25 +29,44 @@ def holding_current(dp: float, q_b: float, C_m: float) -> float:
     return pump_torque(dp, q_b) / C_m
 
 
-def rest_pressures(rig: Rig, force: float) -> tuple[float, float]:
+@kernel
+def holding_integral(i: float, R_c: float, K_i: float) -> float:
+    """Speed controller's integral [rad] that gives the winding its current i [A] at rest: R_c i/K_i, eq. (4.3)."""
+    return R_c * i / K_i if K_i > 0.0 else 0.0
+
+
+@kernel
+def pressures_at_rest(
+    force: float, A_A: float, A_B: float, V_A: float, V_B: float, p_charge: float, made_up: bool
+) -> tuple[float, float]:
     """Return p_A, p_B [Pa] that carry `force` [N] against +x at rest: p_A A_A - p_B A_B = force.
 
     With a make-up the lower of both is at the accumulator's charge pressure. Without one the circuit holds as much oil
-    as at the charge pressure throughout: the mean of both, weighted by the volumes, stays.
+    as at the charge pressure throughout: the mean of both, weighted by the volumes V_A, V_B of the sides [m^3], stays.
+    """
+    if made_up:
+        p_B = max((p_charge * A_A - force) / A_B, p_charge)
+        p_A = max((p_charge * A_B + force) / A_A, p_charge)
+        return p_A, p_B
+    lack = force - p_charge * (A_A - A_B)  # of force, at the charge pressure
+    moved = lack / (A_A / V_A + A_B / V_B)
+    return p_charge + moved / V_A, p_charge - moved / V_B
+
+
+def side_volumes(rig: Rig) -> tuple[float, float]:
+    """Oil volumes [m^3] of both sides at mid-stroke: chamber, hose, and the line where there is one."""
+    c, line = rig.cylinder, rig.line
+    V_1, V_2 = (line.V_1, line.V_2) if line.orifices == "present" else (0.0, 0.0)
+    return c.V + c.V_hose_A + V_1, c.V - c.V_rod + c.V_hose_B + V_2
+
+
+def rest_pressures(rig: Rig, force: float) -> tuple[float, float]:
+    """Return p_A, p_B [Pa] that carry `force` [N] against +x at rest (`pressures_at_rest`).
 
     Raises InputError where one of them is below vacuum.
     """
-    c, charge = rig.cylinder, rig.fluid.p_charge
-    if rig.makeup.check_valves != "absent":
-        p_B = max((charge * c.A_A - force) / c.A_B, charge)
-        p_A = max((charge * c.A_B + force) / c.A_A, charge)
-        return p_A, p_B
-    lack = force - charge * (c.A_A - c.A_B)  # of force, at the charge pressure
-    V_A, V_B = c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
-    if rig.line.orifices == "present":
-        V_A, V_B = V_A + rig.line.V_1, V_B + rig.line.V_2
-    moved = lack / (c.A_A / V_A + c.A_B / V_B)
-    p_A, p_B = charge + moved / V_A, charge - moved / V_B
+    c, made_up = rig.cylinder, rig.makeup.check_valves != "absent"
+    p_A, p_B = pressures_at_rest(force, c.A_A, c.A_B, *side_volumes(rig), rig.fluid.p_charge, made_up)
     if min(p_A, p_B) < -P_ATM:
         raise InputError(
             f"a load of {force:.4g} N must be carried at rest by pressures above vacuum, got p_A = {p_A:.4g} Pa and "
@@ -78,6 +97,5 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
             f"the drive must hold the load of {force:.4g} N at rest, which takes {abs(y[CURRENT]):.4g} A, got at most "
             f"{most:.4g} A (motor.i_max, motor.V_max); take a smaller load or pump"
         )
-    if m.K_i > 0:
-        y[INTEGRAL] = m.R_c * y[CURRENT] / m.K_i
+    y[INTEGRAL] = holding_integral(y[CURRENT], m.R_c, m.K_i)
     return y

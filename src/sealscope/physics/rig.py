@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.compiled import contracted
+from sealscope.compiled import contracted, kernel
 from sealscope.parameters import Rig
 from sealscope.parameters.fields import leaves, unit_of
 from sealscope.physics.cylinder import (
@@ -133,22 +133,31 @@ else:  # numba takes a named tuple apart; its fields are those of the models
     RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
 
 
-def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
+@kernel
+def coefficients_of_throttles(
+    C_d: float, d_line: float, closed_A: float, closed_B: float, rho: float, exponent: float, literal: bool
+) -> tuple[float, float, float, float]:
     """Return the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
-    "Closed" is a share of the area (eq. 4.8) or of the diameter (the text). Metering "meter-out": free flow towards the
-    cylinder and throttled return on both sides (the text and Appendix A); "literal": as eqs. (4.9)-(4.12) are printed,
-    side B the other way round.
+    "Closed" is a share of the area (`exponent` 1, eq. 4.8) or of the diameter (2, the text). Metering "meter-out": free
+    flow towards the cylinder and throttled return on both sides (the text and Appendix A); `literal`: as eqs.
+    (4.9)-(4.12) are printed, side B the other way round.
     """
-    line = rig.line
-    area = math.pi / 4.0 * line.d_line**2  # eq. (4.7)
-    exponent = 2.0 if line.closed_means == "diameter" else 1.0
-    free = orifice_coefficient(line.C_d, area, rig.fluid.rho)
-    throttled_A = free * (1.0 - line.closed_A) ** exponent  # eq. (4.8)
-    throttled_B = free * (1.0 - line.closed_B) ** exponent
-    if line.metering == "literal":
+    free = orifice_coefficient(C_d, math.pi / 4.0 * d_line**2, rho)  # eq. (4.7)
+    throttled_A = free * (1.0 - closed_A) ** exponent  # eq. (4.8)
+    throttled_B = free * (1.0 - closed_B) ** exponent
+    if literal:
         return free, throttled_A, throttled_B, free
     return free, throttled_A, free, throttled_B
+
+
+def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
+    """Return the coefficients of the rig's throttles (`coefficients_of_throttles`)."""
+    line = rig.line
+    exponent, literal = 2.0 if line.closed_means == "diameter" else 1.0, line.metering == "literal"
+    return coefficients_of_throttles(  # type: ignore[no-any-return]
+        line.C_d, line.d_line, line.closed_A, line.closed_B, rig.fluid.rho, exponent, literal
+    )
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
