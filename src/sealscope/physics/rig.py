@@ -74,7 +74,7 @@ _NOT_TAKEN = {
     *("cylinder.V_hose_A", "cylinder.V_hose_B", "cylinder.V_rod"),
 }
 #: Dotted name of each parameter that the laws take, by its symbol, as the models declare them.
-_PARAMETERS = {
+PARAMETERS = {
     name.rpartition(".")[2]: name
     for name, field in leaves(Rig)
     if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN
@@ -87,9 +87,15 @@ _CHOICES = {
     "coulomb_of_difference": ("friction.coulomb_pressure", "difference"),
     "literal_bracket": ("friction.bracket", "literal"),
 }
-#: The numbers of `RigNumbers`: parameters, coefficients of throttle A (from the pump to the cylinder, back) and B, and
-#: the volumes of both sides at mid-stroke.
-NUMBERS = (*_PARAMETERS, "c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B")
+#: Numbers that follow from parameters: coefficients of throttle A (from the pump to the cylinder, back) and B, and the
+#: volumes of both sides at mid-stroke; and the parameters they follow from (`derived_numbers`).
+DERIVED = ("c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B")
+DERIVED_FROM = (
+    *("line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "fluid.rho"),
+    *("cylinder.V", "cylinder.V_rod", "cylinder.V_hose_A", "cylinder.V_hose_B"),
+)
+#: The numbers of `RigNumbers`.
+NUMBERS = (*PARAMETERS, *DERIVED)
 #: Laws that most rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out. Air
 #: in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has bristles, that differs
 #: between the directions; check valves with pilots, relief valves, an accumulator that exchanges little heat; a damper,
@@ -151,12 +157,37 @@ def coefficients_of_throttles(
     return free, throttled_A, free, throttled_B
 
 
+@kernel
+def derived_numbers(
+    C_d: float,
+    d_line: float,
+    closed_A: float,
+    closed_B: float,
+    rho: float,
+    V: float,
+    V_rod: float,
+    V_hose_A: float,
+    V_hose_B: float,
+    exponent: float,
+    literal: bool,
+) -> tuple[float, float, float, float, float, float]:
+    """Return the numbers of `DERIVED` from the parameters of `DERIVED_FROM`; `exponent`, `literal`: see above."""
+    c_A_in, c_A_out, c_B_in, c_B_out = coefficients_of_throttles(
+        C_d, d_line, closed_A, closed_B, rho, exponent, literal
+    )
+    return c_A_in, c_A_out, c_B_in, c_B_out, V + V_hose_A, V - V_rod + V_hose_B
+
+
+def throttle_readings(rig: Rig) -> tuple[float, bool]:
+    """Return how the throttles of a rig are read: `exponent` and `literal` of `coefficients_of_throttles`."""
+    return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
+
+
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
     """Return the coefficients of the rig's throttles (`coefficients_of_throttles`)."""
     line = rig.line
-    exponent, literal = 2.0 if line.closed_means == "diameter" else 1.0, line.metering == "literal"
     return coefficients_of_throttles(  # type: ignore[no-any-return]
-        line.C_d, line.d_line, line.closed_A, line.closed_B, rig.fluid.rho, exponent, literal
+        line.C_d, line.d_line, line.closed_A, line.closed_B, rig.fluid.rho, *throttle_readings(rig)
     )
 
 
@@ -178,10 +209,8 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "pushed": False,
     }
     return RigNumbers(
-        *(attrgetter(name)(rig) for name in _PARAMETERS.values()),
-        *throttle_coefficients(rig),
-        rig.cylinder.V + rig.cylinder.V_hose_A,
-        rig.cylinder.V - rig.cylinder.V_rod + rig.cylinder.V_hose_B,
+        *(attrgetter(name)(rig) for name in PARAMETERS.values()),
+        *derived_numbers(*(attrgetter(name)(rig) for name in DERIVED_FROM), *throttle_readings(rig)),
         **choices,
         **{name: (True,) if there else () for name, there in laws.items()},
     )
