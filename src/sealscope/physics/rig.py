@@ -210,7 +210,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
     }
     return RigNumbers(
         *(attrgetter(name)(rig) for name in PARAMETERS.values()),
-        *derived_numbers(*(attrgetter(name)(rig) for name in DERIVED_FROM), *throttle_readings(rig)),
+        *derived_numbers(*(attrgetter(name)(rig) for name in DERIVED_FROM), *throttle_readings(rig)),  # type: ignore[call-arg]
         **choices,
         **{name: (True,) if there else () for name, there in laws.items()},
     )
