@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.trend.trend import Trend, trend
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.diagnosis.volume_balance.stream import SequentialBalance
+    from sealscope.fmu.build import write_fmu
     from sealscope.monitor.stream.watch import Watch, watch
     from sealscope.parameters import Rig, load_rig
     from sealscope.recordings import Recording, inspect, read, write
@@ -48,6 +49,7 @@ _HOMES = {
     "trend": "diagnosis.trend.trend",
     "watch": "monitor.stream.watch",
     "write": "recordings",
+    "write_fmu": "fmu.build",
     "write_page": "reporting",
 }
 
@@ -74,6 +76,7 @@ __all__ = [
     "trend",
     "watch",
     "write",
+    "write_fmu",
     "write_page",
 ]
 

@@ -15,6 +15,7 @@ import hashlib
 import logging
 import os
 import platform
+import re
 import shutil
 import stat
 import sys
@@ -173,3 +174,22 @@ def contracted(function: _F) -> _F:
     the lane.
     """
     return numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "arcp"}, forceinline=True)(function)  # type: ignore[no-any-return]
+
+
+def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]:
+    """Return a function's LLVM code, free of Python, and its symbol there.
+
+    `arguments`: "double*", "double" or "int64" each. The function returns an integer, takes pointers and numbers, and
+    allocates nothing; what C calls is ``int symbol(int64_t *result, void **unused, arguments...)``.
+    """
+    kinds = {"double*": numba.types.CPointer(numba.float64), "double": numba.float64, "int64": numba.int64}
+    signature = numba.int64(*(kinds[argument] for argument in arguments))
+    dispatcher = numba.njit(signature, nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(
+        function
+    )
+    (compiled,) = dispatcher.overloads.values()
+    text = compiled.library.get_llvm_str()
+    # numba's counting of references comes with every module; nothing calls it here, and it is for one processor only
+    text = re.sub(r"^define linkonce_odr void @NRT_decref\(.*?^}\n", "", text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^declare .* @(NRT_MemInfo_call_dtor|llvm\.x86\.[\w.]+)\(.*\n", "", text, flags=re.MULTILINE)
+    return text, compiled.fndesc.llvm_func_name

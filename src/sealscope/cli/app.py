@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import campaign, monitoring, prediction, recordings, reproduction, rigs, simulation, trend
+from sealscope.cli import campaign, fmu, monitoring, prediction, recordings, reproduction, rigs, simulation, trend
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -36,6 +36,7 @@ for command in (
     recordings.inspect,
     recordings.convert,
     reproduction.reproduce,
+    fmu.fmu,
     campaign.calibrate,
 ):
     app.command()(command)

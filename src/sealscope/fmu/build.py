@@ -1,0 +1,265 @@
+"""Build a unit: machine code of the laws, a thin layer in C around it, a description, one archive."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+from sealscope.calls import checked_call
+from sealscope.errors import InputError
+from sealscope.fmu.description import description_2, description_3
+from sealscope.fmu.machine import FAILURES, Choice, code, object_code
+from sealscope.fmu.variables import (
+    INPUT_BASE,
+    INPUTS,
+    RESULT_BASE,
+    RESULTS,
+    START_POSITION,
+    STEP,
+    VALUE_BASE,
+    VALUES,
+    Variable,
+    variables,
+)
+from sealscope.parameters import Rig, load_rig
+from sealscope.physics.state import STATES
+from sealscope.storage.atomic import atomic_write
+
+Version = Literal[2, 3]
+#: rms error [Pa] of a pressure by which a unit's step is chosen, and the commands under which.
+ERROR = 1.0
+COMMANDS = ("3 sin(4t)", "5 sin(2t)")
+_SOURCES = ("unit.c", "unit.h")
+_COMPILE_TIMEOUT = 300.0
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A system that a unit runs on: LLVM's and the compiler's names of it, its folders in the archive, its suffix."""
+
+    triple: str
+    target: str
+    folders: Mapping[int, str]
+    suffix: str
+
+
+PLATFORMS: Mapping[str, Platform] = MappingProxyType(
+    {
+        "linux": Platform(
+            "x86_64-unknown-linux-gnu", "x86_64-linux-gnu.2.17", {2: "linux64", 3: "x86_64-linux"}, ".so"
+        ),
+        "windows": Platform("x86_64-pc-windows-gnu", "x86_64-windows-gnu", {2: "win64", 3: "x86_64-windows"}, ".dll"),
+        "macos": Platform(
+            "x86_64-apple-macosx11.0", "x86_64-macos.11.0", {2: "darwin64", 3: "x86_64-darwin"}, ".dylib"
+        ),
+        "macos-arm": Platform("arm64-apple-macosx11.0", "aarch64-macos.11.0", {3: "aarch64-darwin"}, ".dylib"),
+        "linux-arm": Platform("aarch64-unknown-linux-gnu", "aarch64-linux-gnu.2.17", {3: "aarch64-linux"}, ".so"),
+    }
+)
+
+
+def this_platform() -> str:
+    """Return the name in `PLATFORMS` of the system that runs.
+
+    Raises InputError on another one.
+    """
+    import platform
+
+    arm = platform.machine().lower() in ("arm64", "aarch64")
+    name = {"linux": "linux", "win32": "windows", "darwin": "macos"}.get(sys.platform, sys.platform)
+    name += "-arm" if arm else ""
+    if name not in PLATFORMS:
+        raise InputError(f"platform must be one of {', '.join(PLATFORMS)}, got {name}; name it")
+    return name
+
+
+def compiler() -> tuple[list[str], bool]:
+    """Return the call of a C compiler, and whether it compiles for other systems, too: zig's, else the system's.
+
+    Raises InputError where there is none.
+    """
+    from importlib.util import find_spec
+
+    if find_spec("ziglang") is not None:
+        return [sys.executable, "-m", "ziglang", "cc"], True
+    for name in ("cc", "gcc", "clang"):
+        if path := shutil.which(name):
+            return [path], False
+    raise InputError("an FMU needs a C compiler, and there is none here; pip install 'sealscope[fmu]' brings it")
+
+
+def identifier_of(path: Path) -> str:
+    """Return the file's name as an identifier of C."""
+    name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
+    return name if re.match(r"[A-Za-z_]", name) else f"_{name}"
+
+
+def chosen_step(rig: Rig, error: float) -> tuple[float, float]:
+    """Return a step [s] of the solver by which pressures are off by `error` [Pa rms] at most, and the error it has.
+
+    As a run of some seconds under each of `COMMANDS` chooses it, at the piston's mid-stroke.
+    """
+    from sealscope.simulation.experiment import Experiment
+    from sealscope.simulation.integrate import trajectory
+
+    runs = [trajectory(Experiment.of(rig=rig, command=command, duration=4.0, error=error), ()) for command in COMMANDS]
+    return min(run.step for run in runs), max(run.error for run in runs)
+
+
+def configuration(rig: Rig, token: str, step: float, present: Sequence[bool]) -> str:
+    """Return the header of a unit: its sizes, its token and the values it starts with."""
+    from operator import attrgetter
+
+    sizes = {"STATES": len(STATES), "VALUES": len(VALUES), "INPUTS": len(INPUTS), "RESULTS": len(RESULTS)}
+    bases = {"INPUT_BASE": INPUT_BASE, "VALUE_BASE": VALUE_BASE, "RESULT_BASE": RESULT_BASE}
+    lines = [f"#define N_{name} {size}" for name, size in sizes.items()]
+    lines += [f"#define {name} {base}" for name, base in bases.items()]
+    lines += [f"#define START_POSITION {START_POSITION}", f"#define STEP {STEP}"]
+    lines += [f'#define TOKEN "{token}"', f"#define START_STEP {step!r}"]
+    lines += ["#define VALUES_AT_START {" + ", ".join(repr(float(attrgetter(name)(rig))) for name in VALUES) + "}"]
+    lines += ["#define VALUES_PRESENT {" + ", ".join("1" if there else "0" for there in present) + "}"]
+    lines += ["#define FAILURES {" + ", ".join(f'"{words}"' for words in FAILURES.values()) + "}"]
+    return "\n".join(lines) + "\n"
+
+
+def library(folder: Path, modules: Mapping[str, str], name: str, version: Version, identifier: str) -> bytes:
+    """Return the shared library of a unit for the platform `name`, from the sources in `folder`.
+
+    Raises InputError where the compiler refuses.
+    """
+    platform, (call, crosses) = PLATFORMS[name], compiler()
+    objects = []
+    for function, module in modules.items():
+        path = folder / f"{function}-{name}.o"
+        path.write_bytes(object_code(module, platform.triple))
+        objects.append(str(path))
+    output = folder / f"{identifier}-{name}{platform.suffix}"
+    target = ["-target", platform.target] if crosses else []
+    sources = [str(folder / "unit.c"), str(folder / f"fmi{version}.c")]
+    flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}"]
+    command = [*call, *target, *flags, "-o", str(output), *sources, *objects, "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
+    if done.returncode:
+        raise InputError(f"the C compiler ({' '.join(call)}) could not build the unit for {name}: {done.stderr[-500:]}")
+    return output.read_bytes()
+
+
+@checked_call
+def write_fmu(
+    path: str | os.PathLike[str],
+    *,
+    rig: Rig | str | os.PathLike[str] = "thesis",
+    fmi: Version = 2,
+    platforms: Sequence[str] | None = None,
+    error: float = ERROR,
+    step: float | None = None,
+) -> tuple[Variable, ...]:
+    """Write a rig as a functional mock-up unit for co-simulation.
+
+    Its code is that of the laws which `simulate` runs, compiled; there is no Python in it. Inputs are the command, a
+    leak, leakage outwards and a load; every parameter that the rig's laws take can be tuned; outputs are the states,
+    the flows and the powers.
+
+    Parameters
+    ----------
+    path : str or path-like
+        File to write (.fmu).
+    rig : Rig, str or path-like, optional
+        A rig, the name of a packaged one, or the path of a TOML file.
+    fmi : {2, 3}, optional
+        Version of the Functional Mock-up Interface.
+    platforms : sequence of str, optional
+        Systems that it shall run on: "linux", "windows", "macos", and for FMI 3 also "macos-arm" and "linux-arm"; by
+        default the one that runs. Others need the compiler that ``pip install 'sealscope[fmu]'`` brings.
+    error : float, optional
+        rms error [Pa] that a pressure may have, by which the longest step of the unit's solver is chosen.
+    step : float, optional
+        That step [s], instead of one chosen by `error`.
+
+    Returns
+    -------
+    tuple of Variable
+        What the unit lists: name, unit, causality, value at the start.
+
+    Raises
+    ------
+    InputError
+        An argument breaks a rule, or there is no compiler.
+
+    Examples
+    --------
+    >>> import sealscope as ss, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     variables = ss.write_fmu(f"{folder}/eha.fmu", step=5e-4)
+    >>> [variable.name for variable in variables if variable.causality == "input"]
+    ['u', 'G', 'C', 'F', 'G_ext_A', 'G_ext_B']
+    """
+    path = Path(path)
+    if path.suffix != ".fmu":
+        raise InputError(f"a unit's file must end in .fmu, got {path}")
+    if fmi not in (2, 3):
+        raise InputError(f"fmi must be 2 or 3, got {fmi!r}")
+    wanted = tuple(dict.fromkeys(platforms or (this_platform(),)))
+    for name in wanted:
+        if name not in PLATFORMS or fmi not in PLATFORMS[name].folders:
+            known = ", ".join(key for key, platform in PLATFORMS.items() if fmi in platform.folders)
+            raise InputError(f"a platform of FMI {fmi} must be one of {known}, got {name!r}")
+        if name != this_platform() and not compiler()[1]:
+            raise InputError(f"a unit for {name} needs a compiler for it: pip install 'sealscope[fmu]'")
+    machine = load_rig(rig)
+    if step is None:
+        step, reached = chosen_step(machine, error)
+        accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {reached:.2g} Pa rms"
+    elif step > 0:
+        accuracy = f"steps of at most {step:.3g} s"
+    else:
+        raise InputError(f"step must be > 0 s, got {step}")
+    listed = tuple(variables(machine, step))
+    words = f"{machine.title}; {accuracy}"
+    modules, identifier = code(Choice.of(machine)), identifier_of(path)
+    token = hashlib.sha256("".join([words, str(listed), *modules.values()]).encode()).hexdigest()[:32]
+    references = {variable.reference for variable in listed}
+    present = [VALUE_BASE + k in references for k in range(len(VALUES))]
+    describe = description_2 if fmi == 2 else description_3
+    with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
+        place = Path(folder)
+        sources = _sources(place, modules, configuration(machine, token, step, present), fmi)
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("modelDescription.xml", describe(identifier, token, words, listed))
+            for name in wanted:
+                target = f"binaries/{PLATFORMS[name].folders[fmi]}/{identifier}{PLATFORMS[name].suffix}"
+                archive.writestr(target, library(place, modules, name, fmi, identifier))
+            for source in sources:
+                archive.write(source, f"sources/{source.relative_to(place).as_posix()}")
+    return listed
+
+
+def _sources(place: Path, modules: Mapping[str, str], header: str, version: Version) -> list[Path]:
+    """Write the sources of a unit below `place`, and return their paths."""
+    layer = files("sealscope.fmu") / "c"
+    written = {name: (layer / name).read_text("utf-8") for name in (*_SOURCES, f"fmi{version}.c")}
+    for entry in (layer / "headers").iterdir():
+        if entry.name.startswith(f"fmi{version}"):
+            written[f"headers/{entry.name}"] = entry.read_text("utf-8")
+    written["config.h"] = header
+    written |= {f"{function}.ll": module for function, module in modules.items()}
+    written["README.txt"] = (
+        "The machine's laws are LLVM code (.ll), the interface around them is C11. To build the library for another\n"
+        "system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so *.c *.ll -lm\n"
+    )
+    (place / "headers").mkdir()
+    for name, text in written.items():
+        (place / name).write_text(text, encoding="utf-8")
+    return [place / name for name in written]

@@ -1,0 +1,211 @@
+"""The code of a unit: the laws that `simulate` runs, compiled for a rig's choice of them, as functions that C can call.
+
+Pointers of all functions: `values` in the order of `variables.VALUES`, `inputs` of `variables.INPUTS`, the state `y` of
+`physics.state.STATES`, `results` of `variables.RESULTS`. What they return: 0, or one of `FAILURES`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import llvmlite.binding as llvm
+from numba import carray
+from numba.cpython.unsafe.tuple import tuple_setitem
+from numba.np.unsafe.ndarray import to_fixed_tuple
+
+from sealscope.compiled import law, plain_code
+from sealscope.fmu.variables import INPUTS, RESULTS, VALUES
+from sealscope.parameters import Rig
+from sealscope.physics.fluid import P_ATM
+from sealscope.physics.rest import carried_at_rest, holding_current, holding_integral, pressures_at_rest
+from sealscope.physics.rig import (
+    CHOICES,
+    DERIVED_FROM,
+    NUMBERS,
+    PARAMETERS,
+    RigNumbers,
+    derived_numbers,
+    observe,
+    rig_numbers,
+    throttle_readings,
+)
+from sealscope.physics.solvers.imex import IMEX_NODES, imex_step
+from sealscope.physics.solvers.rk4 import RK4_NODES, rk4_step
+from sealscope.physics.state import (
+    CURRENT,
+    INTEGRAL,
+    OUTPUTS,
+    P_1,
+    P_2,
+    P_A,
+    P_B,
+    POSITION,
+    STATES,
+    VELOCITY,
+    state_of,
+)
+from sealscope.simulation.experiment import choose_method
+
+#: What a function of a unit returns where it fails.
+FAILURES = MappingProxyType(
+    {
+        1: "the state is not finite: take a smaller step, or smaller gains",
+        2: "a pressure is below vacuum, where the model does not hold",
+        3: "the drive cannot hold the load at rest",
+    }
+)
+_SIZES = {"values": len(VALUES), "inputs": len(INPUTS), "y": len(STATES), "results": len(RESULTS)}
+_N_VALUES, _N_INPUTS, _N_STATES, _N_RESULTS = _SIZES.values()
+_N_PARAMETERS, _N_OUTPUTS = len(PARAMETERS), len(OUTPUTS)
+_FROM = tuple(VALUES.index(name) for name in DERIVED_FROM)
+_OUTWARD_A, _OUTWARD_B = VALUES.index("cylinder.G_ext_A"), VALUES.index("cylinder.G_ext_B")
+_U, _G, _C, _F, _MORE_A, _MORE_B = range(len(INPUTS))
+_VOLTAGE, _Q_1 = OUTPUTS.index("V"), OUTPUTS.index("Q_1")
+#: The arguments of each function of a unit, as C passes them.
+ARGUMENTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "start": ("double*", "double*", "double", "double*"),
+        "advance": ("double*", "double*", "double*", "double*", "double", "int64"),
+        "report": ("double*", "double*", "double*", "double*"),
+    }
+)
+
+
+@law
+def _along(a: float, b: float, t: float, h: float) -> tuple[float, float, float]:
+    """Return a + b t at the nodes of an explicit step of h [s]."""
+    n = RK4_NODES
+    return a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
+
+
+@law
+def _along_implicit(a: float, b: float, t: float, h: float) -> tuple[float, float, float, float, float, float]:
+    """Return a + b t at the nodes of an implicit-explicit step of h [s]."""
+    n = IMEX_NODES
+    first = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
+    return first[0], first[1], first[2], a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
+
+
+class Choice(NamedTuple):
+    """The laws and readings by which a rig's code differs from that of others; numbers stay variables of the unit."""
+
+    laws: tuple[bool | tuple[bool, ...], ...]
+    exponent: float
+    literal: bool
+    implicit: bool
+    euler: bool
+
+    @classmethod
+    def of(cls, rig: Rig) -> Choice:
+        """Return a rig's choice, with the laws of a load and of leakage outwards, which are inputs of every unit."""
+        laws = tuple(rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,)))[len(NUMBERS) :]
+        return cls(laws, *throttle_readings(rig), choose_method(rig, "auto") == "imex", rig.motor.integrator == "euler")
+
+
+def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
+    """Return the functions of a unit, to be compiled.
+
+    ``start(values, inputs, x_0, y)`` puts the state at rest under the load of the inputs; ``advance(values, inputs,
+    slopes, y, span, steps)`` moves it over `span` [s], while the inputs move along their slopes; ``report(values,
+    inputs, y, results)`` writes the outputs.
+    """
+    choices, exponent, literal, implicit, euler = choice
+    throttled, made_up = bool(choices[CHOICES.index("throttled")]), bool(choices[CHOICES.index("made_up")])
+
+    @law
+    def numbers(v: Any, inputs: Any) -> Any:
+        V, V_rod, V_hose_A, V_hose_B = v[_FROM[5]], v[_FROM[6]], v[_FROM[7]], v[_FROM[8]]
+        C_d, d_line, closed_A, closed_B, rho = v[_FROM[0]], v[_FROM[1]], v[_FROM[2]], v[_FROM[3]], v[_FROM[4]]
+        derived = derived_numbers(C_d, d_line, closed_A, closed_B, rho, V, V_rod, V_hose_A, V_hose_B, exponent, literal)
+        taken = to_fixed_tuple(v, _N_PARAMETERS)
+        taken = tuple_setitem(taken, _OUTWARD_A, taken[_OUTWARD_A] + inputs[_MORE_A])
+        taken = tuple_setitem(taken, _OUTWARD_B, taken[_OUTWARD_B] + inputs[_MORE_B])
+        return RigNumbers(*(taken + derived + choices))
+
+    def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
+        v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
+        p = numbers(v, given)
+        force = carried_at_rest(x_0, p.F_l, p.k_load, p.L, p.k_stop, p.d_stop) + given[_F]
+        V_A, V_B = (p.V_A + p.V_1, p.V_B + p.V_2) if throttled else (p.V_A, p.V_B)
+        p_A, p_B = pressures_at_rest(force, p.A_A, p.A_B, V_A, V_B, p.p_charge, made_up)
+        state[:] = 0.0
+        state[POSITION] = x_0
+        state[P_A] = state[P_1] = p_A
+        state[P_B] = state[P_2] = p_B
+        state[CURRENT] = holding_current(p_A - p_B, p.q_b, p.C_m)
+        state[INTEGRAL] = holding_integral(state[CURRENT], p.R_c, p.K_i)
+        if not min(p_A, p_B) >= -P_ATM:
+            return 2
+        held = abs(state[CURRENT]) <= p.i_max and p.R_c * abs(state[CURRENT]) <= p.V_max
+        return 0 if held else 3
+
+    def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
+        v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
+        out = carray(results, _N_RESULTS)
+        p, z = numbers(v, given), state_of(state)
+        observe(z, given[_U], given[_G], given[_C], p, out)
+        out[_N_OUTPUTS] = out[_VOLTAGE] * z[CURRENT]
+        out[_N_OUTPUTS + 1] = out[_Q_1] * ((z[P_1] - z[P_2]) if throttled else (z[P_A] - z[P_B]))
+        out[_N_OUTPUTS + 2] = (z[P_A] * p.A_A - z[P_B] * p.A_B) * z[VELOCITY]
+        return 0
+
+    if implicit:
+
+        @law
+        def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
+            u, G = _along_implicit(a[_U], b[_U], t, h), _along_implicit(a[_G], b[_G], t, h)
+            C, F = _along_implicit(a[_C], b[_C], t, h), _along_implicit(a[_F], b[_F], t, h)
+            return imex_step(z, h, u, G, C, F, p)
+
+    else:
+
+        @law
+        def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
+            u, G = _along(a[_U], b[_U], t, h), _along(a[_G], b[_G], t, h)
+            C, F = _along(a[_C], b[_C], t, h), _along(a[_F], b[_F], t, h)
+            return rk4_step(z, h, u, G, C, F, p, euler)
+
+    def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
+        v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
+        a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)
+        p, z, h = numbers(v, a), state_of(state), span / steps
+        for k in range(steps):
+            z = step(z, h, k * h, a, b, p)
+        total = 0.0
+        for m in range(_N_STATES):
+            state[m] = z[m]
+            total += 0.0 * z[m]  # NaN from any value that is not finite
+        if total != 0.0:
+            return 1
+        return 2 if min(z[P_A], z[P_B], z[P_1], z[P_2]) < -P_ATM else 0
+
+    return {"start": start, "advance": advance, "report": report}
+
+
+@lru_cache(maxsize=8)
+def code(choice: Choice) -> Mapping[str, str]:
+    """Return the LLVM code of each function of a unit, by its name, with the symbol ``sealscope_NAME``."""
+    modules = {}
+    for name, function in functions(choice).items():
+        text, symbol = plain_code(function, *ARGUMENTS[name])
+        modules[name] = re.sub(r'"?' + re.escape(symbol) + r'"?(?=\()', f"sealscope_{name}", text)
+    return MappingProxyType(modules)
+
+
+def object_code(module: str, triple: str | None = None) -> bytes:
+    """Return the machine code of LLVM code for a target ("x86_64-pc-windows-gnu"); None: this machine's system.
+
+    For any processor of the target's family, with the addresses of a shared library.
+    """
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    target = llvm.Target.from_triple(triple or llvm.get_process_triple())
+    machine = target.create_target_machine(opt=3, reloc="pic", codemodel="default")
+    parsed = llvm.parse_assembly(module)
+    parsed.triple, parsed.data_layout = machine.triple, str(machine.target_data)
+    parsed.verify()
+    return bytes(machine.emit_object(parsed))

@@ -1,0 +1,79 @@
+"""What a unit's description says: variables, units, what is refused."""
+
+from __future__ import annotations
+
+import sys
+from xml.etree import ElementTree
+
+import pytest
+
+from sealscope.errors import InputError
+from sealscope.fmu import build
+from sealscope.fmu.description import base_units, description_2, description_3
+from sealscope.fmu.variables import VALUE_BASE, VALUES, variables
+from sealscope.parameters import load_rig
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        ("Pa", {"kg": "1", "m": "-1", "s": "-2"}),
+        ("m^3/(s Pa)", {"m": "4", "s": "1", "kg": "-1"}),
+        ("m^3/(s Pa^0.5)", None),  # half powers have no form in FMI
+        ("L/min", {"m": "3", "s": "-1", "factor": repr(1e-3 / 60.0)}),
+        ("rad/s", {"rad": "1", "s": "-1"}),
+    ],
+)
+def test_units_are_written_as_powers_of_base_units(unit, expected):
+    assert base_units(unit) == expected
+
+
+@pytest.mark.parametrize("name", ["thesis", "single-rod-eha"])
+def test_every_parameter_that_a_law_takes_is_tunable_unless_it_is_absent(name):
+    rig = load_rig(name)
+    listed = {v.name: v for v in variables(rig, 1e-3)}
+    for symbol, value in zip(VALUES, range(len(VALUES)), strict=True):
+        if symbol in listed:
+            assert listed[symbol].reference == VALUE_BASE + value
+            assert listed[symbol].start == rig[symbol]
+            assert listed[symbol].unit
+    assert {"pump.q_b", "cylinder.A_A", "friction.F_v", "line.C_d", "fluid.rho"} <= set(listed)
+    assert ("makeup.G_relief" in listed) == (rig["makeup.G_relief"] > 0)  # a law that the rig does without
+
+
+@pytest.mark.parametrize("describe", [description_2, description_3])
+def test_references_and_names_are_unique_and_outputs_are_listed(describe):
+    listed = tuple(variables(load_rig("thesis"), 1e-3))
+    root = ElementTree.fromstring(describe("eha", "token", "words", listed))
+    tag = {description_2: "ScalarVariable", description_3: "Float64"}[describe]
+    held = list(root.iter(tag))
+    assert len({v.get("name") for v in held}) == len(held)
+    assert len({v.get("valueReference") for v in held}) == len(held)
+    outputs = [v.name for v in listed if v.causality == "output"]
+    assert len(list(root.iter("InitialUnknown")) or list(root.find("ModelStructure/InitialUnknowns"))) == len(outputs)
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"path": "eha.zip"}, "a unit's file must end in .fmu, got eha.zip"),
+        ({"fmi": 1}, "fmi must be 2 or 3, got 1"),
+        ({"platforms": ["amiga"]}, "a platform of FMI 2 must be one of linux, windows, macos, got 'amiga'"),
+        ({"platforms": ["macos-arm"]}, "a platform of FMI 2 must be one of linux, windows, macos, got 'macos-arm'"),
+        ({"step": 0.0}, "step must be > 0 s, got 0.0"),
+    ],
+)
+def test_wrong_options_are_one_line_and_write_nothing(tmp_path, monkeypatch, options, rule):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(build, "compiler", lambda: ([sys.executable], True))
+    with pytest.raises(InputError) as caught:
+        build.write_fmu(**{"path": "eha.fmu"} | options)
+    assert str(caught.value) == rule
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_compiler_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(build.shutil, "which", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"there is none here; pip install 'sealscope\[fmu\]' brings it"):
+        build.compiler()
