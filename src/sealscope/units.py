@@ -71,6 +71,9 @@ _ATOMS: dict[str, Unit] = {
     "psi": _unit(_PSI, kg=1, m=-1, s=-2),
     "psia": _unit(_PSI, offset=-101325 / _PSI, kg=1, m=-1, s=-2),
     "bara": _unit(10**5, offset="-1.01325", kg=1, m=-1, s=-2),
+    "kgf": _unit("9.80665", kg=1, m=1, s=-2),
+    "in": _unit("0.0254", m=1),
+    "mil": _unit("0.0000254", m=1),
     "lpm": _unit("1/60000", m=3, s=-1),
     "min": _unit(60, s=1),
     "h": _unit(3600, s=1),
@@ -86,23 +89,31 @@ _ATOMS: dict[str, Unit] = {
 _SPELLINGS = {
     spelling: name
     for name, spellings in {
-        "psi": "PSI Psi psig PSIG psi(g)",
-        "psia": "PSIA psi(a)",
-        "bar": "BAR Bar barg bar(g)",
-        "bara": "bar(a)",
+        "psi": "PSI Psi",
+        "bar": "BAR Bar",
         "Pa": "pa PA",
-        "rpm": "RPM Rpm U/min r/min",
+        "kPa": "kpa Kpa KPA KPa",
+        "MPa": "mpa Mpa MPA",
+        "mbar": "MBAR Mbar",
+        "kgf": "kp",
+        "kgf/cm^2": "kg/cm2 kg/cm^2 kg/cm\u00b2",
+        "lbf/in^2": "lb/in2 lb/in^2 lb/in\u00b2 lbs/in2",
+        "rpm": "RPM Rpm U/min r/min Upm UPM upm tr/min giri/min r.p.m.",
         "lpm": "LPM",
         "V": "Volt volt Volts volts",
-        "s": "sec Sec second seconds",
-        "ms": "msec",
+        "s": "sec Sec second seconds Seconds sek Sek Sekunden secondes secondi segundos",
+        "ms": "msec Millisekunden",
+        "mm": "MM millimetre millimeter Millimeter millimeters",
+        "cm": "CM Zentimeter",
+        "in": 'inch inches Inch Inches IN Zoll in. " \u2033',
+        "mil": "mils thou",
         "min": "minute minutes",
         "h": "hr hour hours",
         "count": "counts Count Counts cts",
         "ohm": "Ohm",
-        "rev": "revolution revs",
-        "rad": "radian",
-        "deg": "degree degrees °",
+        "rev": "revolution revs revolutions turn turns Umdr Umdr. Umdrehungen tr tours giri",
+        "rad": "radian radians",
+        "deg": "degree degrees Degree Degrees DEG Deg deg. Grad \u00b0",
         "degC": "°C C",
         "degF": "°F",
         "m": "metre meter",
@@ -117,7 +128,17 @@ _SPELLINGS = {
 } | {"": "1"}
 _SIGNS = str.maketrans(
     dict.fromkeys("\u00b7\u22c5\u00d7*", " ")
-    | {"\u00b2": "^2", "\u00b3": "^3", "\u00b5": "u", "\u03bc": "u", "\u03a9": "ohm", "\u2126": "ohm", "\u2212": "-"}
+    | {
+        "\u00b2": "^2",
+        "\u00b3": "^3",
+        "\u207b": "^-",
+        "\u00b9": "1",
+        "\u00b5": "u",
+        "\u03bc": "u",
+        "\u03a9": "ohm",
+        "\u2126": "ohm",
+        "\u2212": "-",
+    }
 )
 _KINDS = {
     "Pa": "pressure", "m": "length", "m^2": "area", "m^3": "volume", "m^3/s": "volume flow", "rad/s": "angular speed",
@@ -132,6 +153,11 @@ _NUMBER = re.compile(
     r"\s*(?P<number>[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:inf|nan)\b)(?P<rest>.*)",
     re.DOTALL | re.IGNORECASE,
 )
+#: How instruments mark a pressure as absolute or as gauge: `bar abs`, `MPa(g)`, `bar\u00fc`.
+_MARKED = re.compile(
+    r"(?P<unit>.{1,40}?)[\s_]*\(?(?:(?P<absolute>a|A|abs\.?|absolute?)|g|G|gauge|gage|rel\.?|relative?|\u00fc|\u00dc)\)?"
+)
+_STANDARD_ATMOSPHERE = 101325
 _LONGEST_TEXT = 200
 #: A unit's factor is a double: its fraction has at most so many bits, and pi at most this power.
 _MOST_BITS, _MOST_PI = 900, 100
@@ -230,6 +256,20 @@ class _Parser:
         raise InputError(f"got {self.text[:60]}, which is no product of units")
 
 
+def _marked_pressure(text: str) -> Unit | None:
+    """Return the unit of a pressure marked as absolute, which has an offset, or as gauge; None for any other text."""
+    marked = _MARKED.fullmatch(text)
+    if marked is None:
+        return None
+    try:
+        unit = parse_unit(marked["unit"])
+    except InputError:
+        return None
+    if unit.powers != _ATOMS["Pa"].powers or unit.offset:
+        return None
+    return unit._replace(offset=-_STANDARD_ATMOSPHERE / unit.factor) if marked["absolute"] else unit
+
+
 @lru_cache(maxsize=1024)
 def parse_unit(text: str) -> Unit:
     """Return the unit that `text` names; raises InputError where it is not one."""
@@ -239,6 +279,9 @@ def parse_unit(text: str) -> Unit:
         return _ATOMS[text]
     if len(text) > _LONGEST_TEXT:
         raise InputError(f"got {text[:60]}..., which is no product of units")
+    pressure = _marked_pressure(text)
+    if pressure is not None:
+        return pressure
     plain = re.sub(r"(?<=[A-Za-z])-(?=[A-Za-z])", " ", text.replace("**", "^").translate(_SIGNS))
     return _Parser(plain).product()
 

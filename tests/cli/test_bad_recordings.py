@@ -31,7 +31,7 @@ def make(kind: str, path: Path) -> None:
         "header only": HEAD,
         "one column": "p_A [Pa]\n1\n2\n3\n",
         "text in numbers": HEAD + re.sub(r"(0\.1\d\d),", r"\1,high ", rows(t, p_A, p_B)),
-        "reversed time": HEAD + rows(t[::-1], p_A, p_B),
+        "standing time": HEAD + rows(0.0 * t, p_A, p_B),
         "wrong unit": HEAD.replace("p_B [Pa]", "p_B [mm]") + rows(t, p_A, p_B),
         "unknown unit": HEAD.replace("p_B [Pa]", "p_B [wibble]") + rows(t, p_A, p_B),
     }
@@ -51,7 +51,7 @@ UNREADABLE = {
     "header only": "a recording must have samples, got no row of numbers after t [s], p_A [Pa], p_B [Pa]",
     "one column": "a recording must have a time column such as t [s] or be given a rate",
     "text in numbers": "a sample must be a number, got 'high ",
-    "reversed time": "time must increase between some samples",
+    "standing time": "time must increase between some samples",
     "wrong unit": "p_B must have a unit of pressure, such as Pa, got mm",
     "unknown unit": "p_B must have a unit of pressure, such as Pa, got wibble",
     "2 GB of nothing": "a recording must be text, NetCDF, HDF5 or Parquet, got other binary data",

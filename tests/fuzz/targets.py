@@ -116,7 +116,7 @@ def _fault(text: str) -> None:
 def _columns(text: str) -> None:
     channel, column = split_map_option(text)
     check_call({channel: column}, None)
-    choose_columns(LABELS, {channel: column}, 500.0, "FILE")
+    choose_columns(LABELS, channel_map={channel: column}, rate=500.0, place="FILE")
 
 
 def _experiment(key: str, text: str) -> None:

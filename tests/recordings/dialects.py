@@ -244,12 +244,19 @@ def rows(times: list[str], join: str = ",", comma: bool = False) -> str:
     return "\n".join(lines).replace(".", "," if comma else ".") + "\n"
 
 
-def log(head: str, times: list[str] | None = None, *, encoding: str = "utf-8", **form: Any) -> Writer:
-    """Return what writes a text with this head above the samples."""
+def log(
+    head: str,
+    times: list[str] | None = None,
+    *,
+    encoding: str = "utf-8",
+    change: Callable[[str], str] = str,
+    **form: Any,
+) -> Writer:
+    """Return what writes a text with this head above the samples; `change`: what is done to the whole text."""
     body = rows([f"{t:.3f}" for t in T] if times is None else times, **form)
 
     def write(folder: Path) -> Path:
-        (folder / "log.csv").write_bytes((head + body).encode(encoding))
+        (folder / "log.csv").write_bytes(change(head + body).encode(encoding))
         return folder / "log.csv"
 
     return write
@@ -311,7 +318,57 @@ def hdf5(folder: Path) -> Path:
     return folder / "log.h5"
 
 
-MOMENTS = [dt.datetime(2024, 5, 31, 23, 59, 59, 900000) + dt.timedelta(seconds=float(t)) for t in T]
+def with_lines(*more: str, at: int = N // 2) -> Callable[[str], str]:
+    """Return what puts lines among the samples."""
+    return lambda text: "\n".join([*(lines := text.splitlines())[:at], *more, *lines[at:]]) + "\n"
+
+
+def quoted(text: str) -> str:
+    """Return a text with quotation marks around every cell, and decimal commas in them."""
+    return "\n".join(",".join(f'"{cell.replace(".", ",")}"' for cell in line.split(",")) for line in text.splitlines())
+
+
+def thousands(sign: str, decimal: str, join: str) -> Writer:
+    """Return what writes pressures in Pa with a sign between their thousands."""
+    signs = str.maketrans({",": sign, ".": decimal})
+
+    def write(folder: Path) -> Path:
+        columns = (T, P_A * 1e5, P_B * 1e5, X)
+        lines = [join.join(f"{value:,.6f}".translate(signs) for value in row) for row in zip(*columns, strict=True)]
+        (folder / "log.csv").write_text(join.join(("t [s]", "p_A [Pa]", "p_B [Pa]", "x [mm]\n")) + "\n".join(lines))
+        return folder / "log.csv"
+
+    return write
+
+
+def in_unit(pressure: str, factor: float, length: str, metre: float, offset: float = 0.0) -> Writer:
+    """Return what writes samples in other units; `factor`, `metre`: what they are in Pa and m."""
+    columns = zip(T, (P_A * 1e5 + offset) / factor, (P_B * 1e5 + offset) / factor, X * 1e-3 / metre, strict=True)
+    text = f"t [s],p_A [{pressure}],p_B [{pressure}],x [{length}]\n"
+    text += "\n".join(",".join(f"{value:.12g}" for value in row) for row in columns)
+
+    def write(folder: Path) -> Path:
+        (folder / "log.csv").write_text(text.replace('["]', '[""]') if '"' in length else text)
+        return folder / "log.csv"
+
+    return write
+
+
+def moments(*start: int, fall: float = 0.0) -> list[dt.datetime]:
+    """Return the local time of each sample; from the next full hour on the clocks are put back by `fall` [h]."""
+    begin = dt.datetime(*start)
+    hour = begin.replace(minute=0, second=0, microsecond=0) + dt.timedelta(hours=1)
+    times = [begin + dt.timedelta(seconds=float(t)) for t in T]
+    return [time - dt.timedelta(hours=fall) * (time >= hour) for time in times]
+
+
+def no_time(text: str) -> str:
+    """Return a text of samples without its first column; the lines above them stay."""
+    return "\n".join(line.split(",", 1)[-1] if line.count(",") == 3 else line for line in text.splitlines())
+
+
+MOMENTS = moments(2024, 5, 31, 23, 59, 59, 900000)
+MILLI = [(m, m.microsecond // 1000) for m in MOMENTS]
 HEADS = "p_A [bar],p_B [bar],x [mm]\n"
 TEXTS: dict[str, Dialect] = {
     "text, comma": Dialect(log("t [s]," + HEADS)),
@@ -355,6 +412,95 @@ TEXTS: dict[str, Dialect] = {
         log("no," + HEADS, [str(k) for k in range(N)]),
         {"channel_map": {"p_A": "p_A", "p_B": "p_B", "x": "x"}, "rate": RATE},
     ),
+    "text, quoted decimal commas": Dialect(log("t [s],p_A [bar],p_B [bar],x [mm]\n", change=quoted)),
+    "text, thousands with points": Dialect(thousands(".", ",", ";")),
+    "text, thousands with commas": Dialect(thousands(",", ".", ";")),
+    "text, thousands with narrow blanks": Dialect(thousands("\u202f", ",", "\t")),
+    "text, thousands with strokes": Dialect(thousands("'", ".", ";")),
+    "text, heading repeated": Dialect(
+        log("Time,p_A,p_B,x\ns,bar,bar,mm\n", change=with_lines("Time,p_A,p_B,x", "s,bar,bar,mm"))
+    ),
+    "text, marks among the samples": Dialect(log("t [s]," + HEADS, change=with_lines("EVENT,valve opened", "# pause"))),
+    "text, a summary at the end": Dialect(log("t [s]," + HEADS, change=with_lines("Min,1,2,3", "", "End", at=N + 1))),
+    "text, a row of types": Dialect(log("Time,p_A,p_B,x\ns,bar,bar,mm\nREAL,REAL,REAL,REAL\n")),
+    "text, units above names": Dialect(log("s,bar,bar,mm\nt,p_A,p_B,x\n")),
+    "text, groups above names": Dialect(
+        log(",Pressure,,Position\nTime,A,B,Cyl\ns,bar,bar,mm\n"), {"channel_map": "auto"}
+    ),
+    "text, rows that say what they hold": Dialect(
+        log(
+            '"Model","DL"\n"TraceName","p_A","p_B","x"\n"VUnit","bar","bar","mm"\n"SampleRate",500,500,500\n\n',
+            [""] * N,
+        )
+    ),
+    "text, index and columns of pandas": Dialect(log("signal,p_A,p_B,x\nunit,bar,bar,mm\nt [s],,,\n")),
+    "text, quoted units": Dialect(log("Zeit\tp_A\tp_B\tx\n's'\t'bar'\t'bar'\t'mm'\n", join="\t", comma=True)),
+    "text, unit behind a stroke": Dialect(log("Time,p_A/bar,p_B/bar,x/mm\n")),
+    "text, ruled table": Dialect(log("t [s] | p_A [bar] | p_B [bar] | x [mm]\n---|---|---|---\n", join=" | ")),
+    "text, last sample first": Dialect(
+        log("t [s]," + HEADS, change=lambda text: "\n".join([(lines := text.splitlines())[0], *lines[:0:-1]]))
+    ),
+    "text, rate above": Dialect(log("Sample rate: 500 Hz\n\nt," + HEADS, change=no_time)),
+    "text, interval above": Dialect(log("Abtastintervall [ms]: 2\n\nt," + HEADS, change=no_time)),
+    "text, shared stamps and a rate above": Dialect(
+        log("Sampling frequency,500\nTime," + HEADS, ["31.05.2024 12:00"] * N)
+    ),
+    "text, UTF-16 without a mark": Dialect(log("t [s]," + HEADS, encoding="utf-16-le")),
+    "text, old Mac": Dialect(log("t [s]," + HEADS, change=lambda text: text.replace("\n", "\r"))),
+    "text, absolute pressures": Dialect(in_unit("bar abs", 1e5, "cm", 1e-2, 101325.0)),
+    "text, MPa(a) and inches": Dialect(in_unit("MPa(a)", 1e6, "inch", 0.0254, 101325.0)),
+    "text, gauge pressures in capitals": Dialect(in_unit("KPA", 1e3, "MM", 1e-3)),
+    "text, kp and mil": Dialect(in_unit("kp/cm2", 98066.5, "mil", 2.54e-5)),
+    "text, barü and Zoll": Dialect(in_unit("barü", 1e5, "Zoll", 0.0254)),
+    "text, psig": Dialect(in_unit("psi gauge", 6894.757293168361, "in", 0.0254)),
+    "text, clock over midnight": Dialect(log("Time," + HEADS, [f"{m:%H:%M:%S}.{ms:03d}" for m, ms in MILLI])),
+    "text, four colons": Dialect(log("Uhrzeit," + HEADS, [f"{m:%H:%M:%S}:{ms:03d}" for m, ms in MILLI])),
+    "text, minutes and seconds": Dialect(log("Time," + HEADS, [f"{m:%M:%S}.{ms:03d}" for m, ms in MILLI])),
+    "text, clock with a comma": Dialect(
+        log("Zeit;p_A [bar];p_B [bar];x [mm]\n", [f"{m:%H:%M:%S},{ms:03d}" for m, ms in MILLI], join=";", comma=True)
+    ),
+    "text, year of two digits": Dialect(
+        log("Datum,Uhrzeit," + HEADS, [f"{m:%d.%m.%y,%H:%M:%S}.{ms:03d}" for m, ms in MILLI])
+    ),
+    "text, American year of two digits": Dialect(
+        log("Time," + HEADS, [f"{m:%m/%d/%y %I:%M:%S}.{ms:03d} {m:%p}" for m, ms in MILLI])
+    ),
+    "text, named month": Dialect(log("Zeitstempel," + HEADS, [f"{m:%d-%b-%Y %H:%M:%S}.{ms:03d}" for m, ms in MILLI])),
+    "text, basic ISO 8601": Dialect(log("Time," + HEADS, [f"{m:%Y%m%dT%H%M%S}.{ms:03d}" for m, ms in MILLI])),
+    "text, Chinese date": Dialect(
+        log("时间," + HEADS, [f"{m:%Y}年{m:%m}月{m:%d}日 {m:%H:%M:%S}.{ms:03d}" for m, ms in MILLI])
+    ),
+    "text, clocks put back": Dialect(
+        log("Time," + HEADS, [f"{m:%Y-%m-%d %H:%M:%S.%f}" for m in moments(2024, 10, 27, 2, 59, 59, 800000, fall=1.0)])
+    ),
+    "text, clocks put forward": Dialect(
+        log("Time," + HEADS, [f"{m:%Y-%m-%d %H:%M:%S.%f}" for m in moments(2024, 3, 31, 1, 59, 59, 800000, fall=-1.0)])
+    ),
+    "text, days since 1899": Dialect(log("Date/Time," + HEADS, [repr(45443.99 + t / 86400) for t in T.tolist()])),
+    "text, GB 18030": Dialect(
+        log("时间(s),无杆腔压力(bar),有杆腔压力(bar),位移（mm）\n", encoding="gb18030"),
+        {"channel_map": "auto"},
+    ),
+    "text, Shift JIS": Dialect(
+        log("時間[s],ヘッド側圧力[bar],ロッド側圧力[bar],変位[mm]\n", encoding="shift_jis"),
+        {"channel_map": "auto"},
+    ),
+    **{
+        f"text, {language}": Dialect(log(head + "\n"), {"channel_map": "auto"})
+        for language, head in {
+            "French": "Temps écoulé (s),Pression côté fond (bar),Pression côté tige (bar),Course (mm)",
+            "Italian": "Tempo [s],Pressione lato fondello [bar],Pressione lato stelo [bar],Corsa [mm]",
+            "Spanish": "Tiempo (s),Presión émbolo (bar),Presión vástago (bar),Carrera (mm)",
+            "Portuguese": "Tempo (s),Pressão A (bar),Pressão B (bar),Posição (mm)",
+            "Dutch": "Tijd (s),Druk A (bar),Druk B (bar),Positie (mm)",
+            "Polish": "Czas [s],Ciśnienie A [bar],Ciśnienie B [bar],Położenie [mm]",
+            "German compounds": "Messzeit in s,Zylinderdruck_A in bar,Zylinderdruck_B in bar,Zylinderweg in mm",
+            "cap and head": "Time (s),Cap Pressure (bar),Head Pressure (bar),Stroke (mm)",
+            "head and rod": "Time (s),Head End Pressure (bar),Rod End Pressure (bar),Stroke (mm)",
+            "extend and retract": "Time (s),Extend Pressure (bar),Retract Pressure (bar),LVDT (mm)",
+            "ports": "Time (s),Port A Pressure (bar),Port B Pressure (bar),Displacement (mm)",
+        }.items()
+    },
     **{f"archive, {ending}": Dialect(packed(ending)) for ending in ("gz", "bz2", "xz", "zst", "zip")},
 }
 DIALECTS: dict[str, Dialect] = {

@@ -64,7 +64,7 @@ def refused(path: Path, **options: object) -> str:
             "channel p_A must be one column, got columns 2 and 3: map its number, #2 (FILE)",
         ),
         ("t [s],p_A [Pa]\n0,1\n", "time must increase between some samples (FILE)"),
-        ("t [s],p_A [Pa]\n3,1\n2,1\n1,1\n", "time must increase between some samples (FILE)"),
+        ("t [s],p_A [Pa]\n3,1\n3,1\n3,1\n", "time must increase between some samples (FILE)"),
         ("Date,p_A [Pa]\n5/31/24,1\n6/1/24,2\n",
          "a recording must have a time column such as t [s] or be given a rate, got columns Date, p_A [Pa] (FILE)"),
         ("Timestamp,p_A [Pa]\n2024-05-31T10:00:00,1\nyesterday,2\n2024-05-31T10:00:02,3\n",

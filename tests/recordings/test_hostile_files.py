@@ -163,7 +163,7 @@ def test_no_text_takes_long(tmp_path: Path, name: str) -> None:
         ("p (port A)", "p", None),
         ("p ()", "p", None),
         ("p (a (b) (c))", "p (a (b) (c))", None),
-        ("p/bar", "p/bar", None),
+        ("p/bar", "p", "bar"),
         ("[s]", "", "s"),
     ],
 )

@@ -13,12 +13,30 @@ from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
 from sealscope.units import to_si
 
-_CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d{1,9})?)?"
+_CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
 _STAMP = re.compile(
-    rf"(?:(?P<date>\d{{4}}[-/]\d{{2}}[-/]\d{{2}})|(?P<day>\d{{1,2}})\.(?P<month>\d{{1,2}})\.(?P<year>\d{{4}})"
-    rf"|(?P<first>\d{{1,2}})/(?P<second>\d{{1,2}})/(?P<year_last>\d{{4}}))?"
-    rf"(?:(?:^|[T\s_])\s*(?P<clock>{_CLOCK})\s?(?P<half>[AaPp][Mm])?)?\s*(?P<zone>Z|UTC|[+-]\d{{2}}:?\d{{2}})?"
+    r"(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2})|(?P<basic>(?:19|20)\d{6})(?=[T\s]|\Z)"
+    r"|(?P<year_cjk>\d{4})年(?P<month_cjk>\d{1,2})月(?P<day_cjk>\d{1,2})日"
+    r"|(?P<day>\d{1,2})\.(?P<month>\d{1,2})\.(?P<year>\d{4}|\d{2})"
+    r"|(?P<day_named>\d{1,2})[-. /]{1,2}(?P<name>[^\W\d_]{3,9})[-. /]{1,2}(?P<year_named>\d{4}|\d{2})"
+    r"|(?P<name_first>[^\W\d_]{3,9})[. ]{1,2}(?P<day_after>\d{1,2}),? (?P<year_after>\d{4})"
+    r"|(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year_last>\d{4}|\d{2}))?,?"
+    rf"(?:(?:^|[T\s_]|(?<=日))(?:\s*-)?\s*(?P<clock>{_CLOCK})\s?(?P<half>[AaPp]\.?[Mm]\.?)?)?\s*"
+    r"(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2})?"
 )
+#: Groups of which a stamp has at least one.
+_TELLING = ("date", "basic", "year_cjk", "year", "name", "name_first", "first", "clock")
+#: Beginnings of the months' names in English, German, French, Italian and Spanish.
+_MONTHS = {
+    beginning: month
+    for month, beginnings in enumerate(
+        (
+            "jan ene gen", "feb fév fev", "mar mär mrz", "apr avr abr", "may mai mag", "jun juin giu", "jul juil lug",
+            "aug aoû aou ago", "sep set", "oct okt ott", "nov", "dec déc dez dic",
+        ), start=1
+    )
+    for beginning in beginnings.split()
+}  # fmt: skip
 _LONGEST_STAMP = 64
 _SINCE = re.compile(r"(?P<unit>[a-z]{1,20})\s{1,9}since\s{1,9}(?P<start>.{1,64})", re.IGNORECASE)
 _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
@@ -26,6 +44,16 @@ _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", 
 _EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
 #: Fewer samples do not tell how many share a stamp.
 _FEWEST_SHARED = 20
+#: The date of a time of the day alone.
+_NO_DATE = "1970-01-01"
+#: A step of one hour to so many usual intervals, between midnight and four, is a change of daylight saving time.
+_HOUR, _DAY, _NEAR, _LATEST_CHANGE = 3600.0, 86400.0, 3.0, 4
+#: Days since 1899-12-30 from 1982 to 2078, and the largest intervals [day] that are none of seconds.
+_EXCEL = (30_000, 65_000)
+_LARGEST_STEP, _LARGEST_STEP_OF_DAYS = 2e-6, 1.2e-5
+_OFFSET_OF_DATENUM = 693_960
+#: Seconds since 1904 begin here, in 2008: those since 1970 would be in 2074.
+_SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 _EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
 
 
@@ -41,7 +69,17 @@ class TimeBase(NamedTuple):
 def _parsed_stamp(text: str) -> re.Match[str] | None:
     text = text.strip()
     match = _STAMP.fullmatch(text) if len(text) <= _LONGEST_STAMP else None
-    return match if match and (match["date"] or match["year"] or match["first"] or match["clock"]) else None
+    if match is None or not any(match[group] for group in _TELLING):
+        return None
+    if match["clock"] and ":" not in match["clock"] and not match["basic"]:
+        return None  # six digits are a clock behind a date of eight alone
+    name = match["name"] or match["name_first"]
+    return None if name and _month(name) is None else match
+
+
+def _month(name: str) -> int | None:
+    name = name.casefold()
+    return _MONTHS.get(name[:4], _MONTHS.get(name[:3]))
 
 
 def is_stamp(text: str) -> bool:
@@ -64,7 +102,7 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
                 raise ValueError(index)
             plain.append("NaT")
             continue
-        hour, colon, rest = (match["clock"] or "00:00").replace(",", ".").partition(":")
+        hour, colon, rest = _clock(match["clock"] or "00:00").partition(":")
         if match["half"]:  # 12 AM is midnight, 12 PM is noon
             hour = str(int(hour) % 12 + (12 if match["half"].lower() == "pm" else 0)) if 1 <= int(hour) <= 12 else "99"
         plain.append(f"{_date_of(match, day_first)}T{hour:0>2}{colon}{rest}")
@@ -88,14 +126,33 @@ def seconds_of(stamp: str) -> float | None:
     return None if np.isnat(moment) else float(moment.astype(np.int64)) / 1e3
 
 
+def _clock(text: str) -> str:
+    """Return a time of the day as `hour:minute:second.fraction`; `59:59.9` has no hour, `12:00:00:250` four parts."""
+    text = text.replace(",", ".")
+    if ":" not in text:
+        return f"{text[:2]}:{text[2:4]}:{text[4:]}"
+    if text.count(":") == 3:
+        return ".".join(text.rsplit(":", 1))
+    return f"00:{text:0>2}" if text.count(":") == 1 and "." in text else text
+
+
 def _date_of(match: re.Match[str], day_first: bool) -> str:
     """Return the date of a stamp as ISO writes it; 1970-01-01 for the time of a day alone."""
     if match["first"]:
-        month, day = (match["second"], match["first"]) if day_first else (match["first"], match["second"])
-        return f"{match['year_last']}-{month:0>2}-{day:0>2}"
-    if match["year"]:
-        return f"{match['year']}-{match['month']:0>2}-{match['day']:0>2}"
-    return (match["date"] or "1970-01-01").replace("/", "-")
+        first, second = match["first"], match["second"]
+        day_first = day_first or match["stroke"] == "-"
+        year, month, day = match["year_last"], second if day_first else first, first if day_first else second
+    elif match["basic"]:
+        year, month, day = match["basic"][:4], match["basic"][4:6], match["basic"][6:]
+    elif name := match["name"] or match["name_first"]:
+        year, month = match["year_named"] or match["year_after"], str(_month(name))
+        day = match["day_named"] or match["day_after"]
+    elif match["year"] or match["year_cjk"]:
+        year, month = match["year"] or match["year_cjk"], match["month"] or match["month_cjk"]
+        day = match["day"] or match["day_cjk"]
+    else:
+        year, month, day = re.split("[-/.]", match["date"] or _NO_DATE)
+    return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}"
 
 
 def nominal_rate(t: Array) -> float:
@@ -125,7 +182,12 @@ def nominal_rate(t: Array) -> float:
     return rate
 
 
-def _from_stamps(values: NDArray[np.datetime64]) -> tuple[Array, dict[str, Any]]:
+def falling(times: NDArray[Any]) -> bool:
+    """Return whether every time (n,) is before the one above it, as in logs that begin with the last sample."""
+    return len(times) > 1 and bool(np.all(times[1:] < times[:-1]))
+
+
+def _from_stamps(values: NDArray[np.datetime64], name: str) -> tuple[Array, dict[str, Any], list[str]]:
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
     if not known.any():
@@ -133,7 +195,34 @@ def _from_stamps(values: NDArray[np.datetime64]) -> tuple[Array, dict[str, Any]]
     start = nanoseconds[known][0]
     t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
     t[~known] = np.nan
-    return t, {"start": str(start)}
+    undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
+    notes = []
+    for step, what in ((-_DAY, "day"), (-_HOUR, "hour")) if undated else ():
+        if (wrapped := _unwrapped(t, step)) is not None:
+            t = wrapped
+            notes.append(f"column {name} has no date: begins again with the next {what}")
+    hour = int((nanoseconds[known] - nanoseconds[known].astype("datetime64[D]")).min() / np.timedelta64(1, "h"))
+    if not undated and hour < _LATEST_CHANGE:
+        for step in (-_HOUR, _HOUR):
+            if (wrapped := _unwrapped(t, step)) is not None:
+                t = wrapped
+                notes.append(f"column {name} steps by an hour: taken for daylight saving time, the hour left out")
+    return t, {} if undated else {"start": str(start)}, notes
+
+
+def _unwrapped(t: Array, step: float) -> Array | None:
+    """Return times (n,) without a single jump by `step` [s], to a few usual intervals; None where there is no such."""
+    steps = np.diff(t)
+    forward = steps[np.isfinite(steps) & (steps > 0)]
+    if not forward.size:
+        return None
+    usual = float(np.median(forward))
+    jumps = np.flatnonzero(np.abs(steps - step - usual) <= _NEAR * usual)
+    if len(jumps) != 1 or usual * _NEAR >= 0.1 * abs(step):
+        return None
+    result = t.copy()
+    result[jumps[0] + 1 :] -= step
+    return result
 
 
 def _from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, dict[str, Any], list[str]]:
@@ -154,6 +243,11 @@ def _from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, di
         return seconds, {"start": str(begin)}, []
     if unit is None:
         size = abs(first)
+        if (days := _days_since(finite)) is not None:
+            origin, what = days
+            seconds = (values - first) * _DAY
+            begin = {} if origin is None else {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
+            return seconds, begin, [f"column {name} read as {what}"]
         if np.all(np.diff(finite) == 1) and finite.size == values.size and size < _EARLIEST_EPOCH:
             raise InputError(
                 f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
@@ -163,6 +257,9 @@ def _from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, di
             if size >= least:
                 seconds = to_si(values - first, epoch_unit, "s")
                 epoch = to_si(first, epoch_unit, "s")
+                if _SINCE_1904 <= epoch < _SINCE_1904 + 1e9:
+                    epoch -= _FROM_1904_TO_1970
+                    return seconds, {"start_epoch_s": epoch}, [f"column {name} read as {epoch_unit} since 1904"]
                 return seconds, {"start_epoch_s": epoch}, [f"column {name} read as {epoch_unit} since 1970"]
         return values, {}, [f"column {name} has no unit: taken as s"]
     seconds = to_si(values, unit, "s", name="time")
@@ -172,18 +269,41 @@ def _from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, di
     return seconds, {}, []
 
 
-def time_base(values: NDArray[Any], unit: str | None, name: str) -> TimeBase:
+def _days_since(values: Array) -> tuple[np.datetime64 | None, str] | None:
+    """Return the moment and the words for numbers that are days, as spreadsheets and MATLAB count; None for seconds.
+
+    They are days where as seconds they would be sampled faster than any logger of hydraulics does.
+    """
+    steps = np.diff(values)
+    steps = steps[steps > 0]
+    if not steps.size:
+        return None
+    step, first = float(np.median(steps)), float(values[0])
+    if step <= _LARGEST_STEP_OF_DAYS:
+        if _EXCEL[0] <= first <= _EXCEL[1]:
+            return np.datetime64("1899-12-30", "us"), "days since 1899-12-30, as spreadsheets count"
+        if _EXCEL[0] <= first - _OFFSET_OF_DATENUM <= _EXCEL[1]:
+            return np.datetime64("1899-12-30", "us") - np.timedelta64(_OFFSET_OF_DATENUM, "D"), "days, as MATLAB counts"
+    if step <= _LARGEST_STEP and values.min() >= 0.0 and values.max() <= 1.0:
+        return None, "a share of the day"
+    return None
+
+
+def time_base(values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None) -> TimeBase:
     """Convert a time column's `values` (n,), numbers in `unit` or datetime64, to seconds and a rate.
 
     Stamps and epoch times are based at their first sample, whose moment is kept in `start`; other times are left where
-    they are. Raises InputError.
+    they are. The `stated_rate` of a file [Hz] places samples that share their stamps. Raises InputError.
     """
     notes: list[str] = []
     if values.dtype.kind == "M":
-        t, start = _from_stamps(values)
+        t, start, notes = _from_stamps(values, name)
     else:
         t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name)
     with np.errstate(invalid="ignore", over="ignore"):  # infinite times are findings, not warnings
+        if stated_rate is not None and t.size > 1 and 2 * np.count_nonzero(np.diff(t)) < t.size - 1:
+            notes.append(f"column {name}: samples share their stamps, taken at {stated_rate:g} Hz, as the file says")
+            return TimeBase(t[0] + np.arange(t.size) / stated_rate, stated_rate, start, tuple(notes))
         resolved = _finer(t)
         if resolved is not None:
             resolution, t = resolved

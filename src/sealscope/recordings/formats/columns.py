@@ -11,7 +11,7 @@ from sealscope.calls import nearest
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
 from sealscope.recordings.formats.headings.labels import Label, square_brackets
-from sealscope.recordings.formats.headings.proposal import map_options, proposed_map
+from sealscope.recordings.formats.headings.proposal import TURNS, is_time, map_options, proposed_map, unit_of_time
 from sealscope.units import same_dimension, to_si
 
 #: Names of a time column, most telling first, and the unit that the name itself tells.
@@ -50,7 +50,8 @@ class ColumnMap:
     """What to load of a table: the number of the time column and its label, name -> (column, unit) of each channel.
 
     `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day;
-    `names`: channel -> label of its column, where the file calls it otherwise.
+    `names`: channel -> label of its column, where the file calls it otherwise; `rate`: of the samples [Hz], as the
+    caller or the file says, or None.
     """
 
     time: int | None
@@ -59,6 +60,7 @@ class ColumnMap:
     notes: tuple[str, ...] = ()
     date: int | None = None
     names: Mapping[str, str] = field(default_factory=dict)
+    rate: float | None = None
 
     @property
     def columns(self) -> list[tuple[int, bool]]:
@@ -150,6 +152,8 @@ def _checked_unit(channel: str, unit: str | None, what: str, place: str) -> tupl
         return COUNTS, f"{what} has no unit: taken as raw counts"
     if same_dimension(unit, COUNTS):
         return COUNTS, None
+    if channel == "omega" and unit in TURNS:
+        return "rpm", None
     to_si(0.0, unit, CHANNEL_UNITS[channel], name=channel, place=place)
     return unit, None
 
@@ -163,13 +167,22 @@ def _find_time(labels: Sequence[Label], place: str) -> int | None:
         if matches:
             with_unit = [i for i in matches if labels[i].unit is not None]
             return (with_unit or matches)[0]
-    return None
+    named = [i for i, label in enumerate(labels) if is_time(label) and label.name.casefold() not in _DATE_NAMES]
+    return next((i for i in named if labels[i].unit is not None), named[0] if named else None)
 
 
-def choose_columns(labels: Sequence[Label], channel_map: ChannelMap, rate: float | None, place: str) -> ColumnMap:
+def choose_columns(
+    labels: Sequence[Label],
+    stated_rate: float | None = None,
+    *,
+    channel_map: ChannelMap,
+    rate: float | None,
+    place: str,
+) -> ColumnMap:
     """Decide which columns are read, and as what.
 
-    A map `auto` is what `proposed_map` makes of the labels. A mapped channel comes before a column that bears the
+    Without a time column the samples have the `rate` given, else the `stated_rate` of the file itself [Hz]. A map
+    `auto` is what `proposed_map` makes of the labels. A mapped channel comes before a column that bears the
     channel's own name. Raises UnreadableFile where a mapped column is missing, where no column is a channel, and where
     there is neither time nor rate; InputError for a unit of another dimension.
     """
@@ -198,7 +211,8 @@ def choose_columns(labels: Sequence[Label], channel_map: ChannelMap, rate: float
         time = _find_time(labels, place)
         if time is not None:
             label = labels[time]
-            time_label = Label(label.whole, label.name, label.unit or _TIME_NAMES.get(label.name.casefold()))
+            unit = label.unit or _TIME_NAMES.get(label.name.casefold()) or unit_of_time(label)
+            time_label = Label(label.whole, label.name, unit)
     have = listed(label.whole for label in labels)
     if not channels:
         guess = map_options(proposed_map(labels))
@@ -207,9 +221,11 @@ def choose_columns(labels: Sequence[Label], channel_map: ChannelMap, rate: float
             f"got columns {have} ({place})" + (f"; --map auto would read {guess}" if guess else "")
         )
     if rate is None and time is None:
-        raise UnreadableFile(
-            f"a recording must have a time column such as t [s] or be given a rate, got columns {have} ({place})"
-        )
+        if stated_rate is None:
+            raise UnreadableFile(
+                f"a recording must have a time column such as t [s] or be given a rate, got columns {have} ({place})"
+            )
+        notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
     used = {column for column, _ in channels.values()} | {time}
     dates = [i for i, label in enumerate(labels) if label.name.casefold() in _DATE_NAMES and i not in used]
     date = dates[0] if dates and time is not None else None
@@ -223,4 +239,5 @@ def choose_columns(labels: Sequence[Label], channel_map: ChannelMap, rate: float
         notes.append(f"{UNUSED}: {listed(ignored, 40)}{hint}")
     order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel][0])}
     names = {channel: labels[column].whole for channel, (column, _) in order.items() if labels[column].name != channel}
-    return ColumnMap(time, time_label, order, tuple(notes), None if time is None else date, names)
+    own_rate = stated_rate if rate is None else rate
+    return ColumnMap(time, time_label, order, tuple(notes), None if time is None else date, names, own_rate)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
 from sealscope.recordings.formats.columns import ColumnMap
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.timebase import stamps, time_base
+from sealscope.recordings.timebase import falling, stamps, time_base
 from sealscope.units import to_si
 
 #: Most values that one file may hold in the columns used: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
@@ -24,8 +23,8 @@ MAX_VALUES = 2**28
 _SMALL, _EXPANSION = 2**26, 4096
 _MOST_TEXTS, _WIDEST_TEXT, _MOST_TEXT = 2**22, 400, 2**29
 FORMAT_VERSION = 1
-#: Decides from a table's labels which columns are read.
-Choose = Callable[[Sequence[Label]], ColumnMap]
+#: Decides from a table's labels, and the rate that the file states where it does, which columns are read.
+Choose = Callable[..., ColumnMap]
 
 
 class RecordingFields(NamedTuple):
@@ -64,23 +63,28 @@ class RawTable:
         count = len(self.columns[0])
         if count == 0:
             raise InputError("a recording must have samples, got a header and no rows")
-        values = {column: cells for (column, time), cells in zip(choice.columns, self.columns, strict=True) if not time}
+        notes = (*self.notes, *choice.notes)
+        read = self.columns
+        if choice.time_label is not None and own is None and falling(read[-1]):
+            read = [cells[::-1] for cells in read]
+            notes += ("rows begin with the last sample: taken in the order of time",)
+        values = {column: cells for (column, time), cells in zip(choice.columns, read, strict=True) if not time}
         channels, units = {}, {}
         for name, (column, unit) in choice.channels.items():
             units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
             channels[name] = to_si(values[column], unit, units[name], name=name)
             if channels[name] is not values[column]:
                 channels[name].setflags(write=False)  # made here: a recording takes it as it is
-        notes = (*self.notes, *choice.notes)
         start: dict[str, Any] = {}
         if choice.time_label is None:
+            rate = choice.rate if rate is None else rate
             assert rate is not None
             t = np.arange(count) / rate
         elif own is not None and not infer_rate:
             t, rate = self.columns[-1], own["rate"]
         else:
             label = choice.time_label
-            t, rate, start, more = time_base(self.columns[-1], label.unit, label.whole)
+            t, rate, start, more = time_base(read[-1], label.unit, label.whole, choice.rate)
             notes += more
         if own is not None:
             return RecordingFields(t, channels, units, rate, own["provenance"], (*own["history"], *notes))

@@ -6,7 +6,7 @@ import csv
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,9 +23,11 @@ from sealscope.recordings.formats.text_layout import (
     OWN_MARK,
     SNIFF,
     Layout,
+    blank_cells,
     encoding_of,
     is_number,
     layout_of,
+    ungrouped,
 )
 from sealscope.recordings.timebase import is_stamp, stamps
 
@@ -34,6 +36,10 @@ _LONGEST_OWN_LINE = 64 * 1024 * 1024
 _ROWS_WRITTEN_AT_ONCE = 8192
 #: Share of a column's cells that may hold a word, as loggers write where the input overflows.
 _MOST_WORDS = 0.01
+#: Most lines of text among the samples, however few these are: marks of events, a summary at the end.
+_MOST_REMARKS = 8
+_STAMP_RULE = "time must be a stamp such as 2024-05-31T12:00:00.002"
+_LONGEST_REMARK = 400
 _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 
 
@@ -50,7 +56,7 @@ def read_text(path: Path, choose: Choose) -> RawTable:
         if head.startswith(OWN_MARK.encode()):
             head += _own_line(file, head)
         layout = layout_of(head, encoding, len(file.read(1)) == 0, place)
-        choice = choose(layout.labels)
+        choice = choose(layout.labels, layout.rate)
         file.seek(0)
         columns, notes = _columns(file, layout, choice, place)
     description = None if layout.own is None else parse_description(layout.own, place)
@@ -108,7 +114,7 @@ def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, li
 def _rows(lines: list[str], numbers: Sequence[int], layout: Layout, cut: bool, place: str) -> list[list[str]]:
     """Split lines into cells; a quotation mark must be closed on its line, but on one that was `cut` short."""
     if layout.delimiter == " ":
-        return [line.split() for line in lines]
+        return [blank_cells(line) for line in lines]
     if not any('"' in line for line in lines):
         return [line.split(layout.delimiter) for line in lines]
     reader = csv.reader([*lines, ""], delimiter=layout.delimiter, skipinitialspace=True)
@@ -134,12 +140,18 @@ def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> t
     stamped: bool | None = None
     least = max(column for column, _ in columns) + 1
     usual = 0
+    repeated = 0
+    remarks = _Words("")
     for number, lines, cut in _blocks(file, layout.encoding, place):
         skip = max(0, layout.first_row + 1 - number)
         blank = " " if layout.delimiter == "\t" else None  # tabs alone are a row of missing samples
         kept = [
             i for i in range(skip, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
         ]
+        if layout.above:
+            count = len(kept)
+            kept = [i for i in kept if lines[i].strip() not in layout.above]
+            repeated += count - len(kept)
         if not kept:
             continue
         numbers = [number + i for i in kept]
@@ -149,6 +161,9 @@ def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> t
             # a last line without an end was not written whole: half a number and what follows it are missing
             rows[-1] = [*rows[-1][:-1], *[""] * (least - len(rows[-1]) + 1)]
         usual = len(rows[-1])
+        rows, numbers = _without_remarks(rows, numbers, least, layout, place, remarks)
+        if not rows:
+            continue
         _check_widths(rows, numbers, least, layout, place)
         total += len(rows)
         check_size(total, len(columns), place)
@@ -168,16 +183,40 @@ def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> t
                     f"{row[choice.date].strip()} {cell.strip()}" if cell.strip() else ""
                     for row, cell in zip(rows, cells, strict=True)
                 ]
-            part.append(_dates(cells, numbers, column, layout, place))
+            part.append(_dates(cells, numbers, column, layout, place, odd))
+    no_time = words[-1].at if choice.time is not None else []
     joined: list[NDArray[Any]] = []
     for part in parts:  # each column's blocks are let go before the next is joined
         joined.append(np.concatenate(part) if part else np.empty(0))
         part.clear()
+        if no_time:  # the rows of a summary, where a word stands in place of the time
+            joined[-1] = np.delete(joined[-1], no_time)
     notes = [note for odd in words for note in odd.notes(total)]
+    notes += remarks.notes(total)
+    if repeated:
+        notes.append(f"{counted(repeated, 'line')} of the heading repeated among the samples left out")
     if dated and choice.date is not None:
         before, after = layout.labels[choice.date], layout.labels[columns[-1][0]]
         notes.append(f"date and time joined from columns {before.whole} and {after.whole}")
     return joined, notes
+
+
+def _without_remarks(
+    rows: list[list[str]], numbers: Sequence[int], least: int, layout: Layout, place: str, remarks: _Words
+) -> tuple[list[list[str]], Sequence[int]]:
+    """Return rows and their numbers without the short ones that hold no number, which are counted in `remarks`."""
+    if min(map(len, rows)) >= least:
+        return rows, numbers
+    kept = [
+        i
+        for i, row in enumerate(rows)
+        if len(row) >= least
+        or sum(map(len, row)) > _LONGEST_REMARK
+        or any(is_number(cell, layout.decimal) or is_stamp(cell) for cell in row)
+    ]
+    for i in sorted(set(range(len(rows))) - set(kept)):
+        remarks.add(f"{layout.delimiter.join(rows[i])}", f"(line {numbers[i]}, {place})")
+    return [rows[i] for i in kept], [numbers[i] for i in kept]
 
 
 def _check_widths(rows: list[list[str]], numbers: Sequence[int], least: int, layout: Layout, place: str) -> None:
@@ -195,32 +234,64 @@ def _place_of(index: int, numbers: Sequence[int], column: int, layout: Layout, p
     return f"(line {numbers[index]}, column {layout.labels[column].whole}, {place})"
 
 
-def _dates(cells: list[str], numbers: Sequence[int], column: int, layout: Layout, place: str) -> NDArray[np.datetime64]:
+def _dates(
+    cells: list[str], numbers: Sequence[int], column: int, layout: Layout, place: str, words: _Words
+) -> NDArray[np.datetime64]:
+    texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
     try:
-        return stamps(["" if cell.strip().lower() in MISSING else cell for cell in cells])
+        return words.passed(stamps(texts))
+    except ValueError:
+        for index, text in enumerate(texts):
+            if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text):
+                words.rule = _STAMP_RULE
+                words.add(text.strip(), _place_of(index, numbers, column, layout, place), index)
+                texts[index] = ""
+    try:
+        return words.passed(stamps(texts))
     except ValueError as error:
         bad = int(error.args[0])
         where = _place_of(bad, numbers, column, layout, place)
-        raise UnreadableFile(
-            f"time must be a stamp such as 2024-05-31T12:00:00.002, got {cells[bad]!r} {where}"
-        ) from None
+        raise UnreadableFile(f"{_STAMP_RULE}, got {cells[bad]!r} {where}") from None
 
 
 @dataclass
 class _Words:
-    """Cells of a column that hold a word in place of a number (`OVERLOAD`): how many, the first and its place."""
+    """Cells of a column that hold a word in place of a number (`OVERLOAD`), or lines of words where `name` is empty.
+
+    `rule`: what they break; `count`, `first`, `where`: how many, the first and its place; `at`: their rows; `rows`:
+    those read so far.
+    """
 
     name: str
+    rule: str = "a sample must be a number"
     count: int = 0
     first: str = ""
     where: str = ""
+    at: list[int] = field(default_factory=list)
+    rows: int = 0
+
+    def add(self, text: str, where: str, index: int = 0) -> None:
+        """Count a word, at `index` after the rows read so far."""
+        if not self.count:
+            self.first, self.where = text[:40], where
+        self.count += 1
+        self.at.append(self.rows + index)
+
+    def passed(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values of a block, whose rows are read now."""
+        self.rows += len(values)
+        return values
 
     def notes(self, rows: int) -> list[str]:
         """Return a line for the history; raise UnreadableFile where they are more than a few among `rows`."""
-        if self.count > _MOST_WORDS * rows:
-            raise UnreadableFile(f"a sample must be a number, got {self.first!r} {self.where}")
+        if self.count > max(_MOST_WORDS * rows, 0 if self.name else _MOST_REMARKS):
+            raise UnreadableFile(f"{self.rule}, got {self.first!r} {self.where}")
         if not self.count:
             return []
+        if not self.name:
+            return [
+                f"{counted(self.count, 'line')} of text among the samples left out, first {self.first!r} {self.where}"
+            ]
         cells = counted(self.count, "cell")
         return [f"column {self.name}: {cells} without a number read as missing, first {self.first!r} {self.where}"]
 
@@ -231,28 +302,27 @@ def _numbers(cells: list[str], numbers: Sequence[int], column: int, layout: Layo
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if comma else cells
     plain = not any("_" in text for text in texts)  # Python takes 1_000 for a number
     try:
-        values = np.fromiter(map(float if plain else _number, texts), np.float64, len(texts))
+        if not plain:
+            raise ValueError
+        values = np.fromiter(map(float, texts), np.float64, len(texts))
     except ValueError:
-        values = np.fromiter(map(_number, texts), np.float64, len(texts))
+        values = np.fromiter((_number(cell, layout.decimal) for cell in cells), np.float64, len(cells))
     for index in np.flatnonzero(~np.isfinite(values)).tolist():
         shown = cells[index].strip()
         if shown.lower() not in MISSING:
             where = _place_of(index, numbers, column, layout, place)
             if is_number(shown, layout.decimal):
                 raise UnreadableFile(f"a sample must be a finite number, got {shown[:40]!r} {where}")
-            if not words.count:
-                words.first, words.where = shown[:40], where
-            words.count += 1
-    return values
+            words.add(shown, where, index)
+    return words.passed(values)
 
 
-def _number(text: str) -> float:
-    text = text.strip()
-    try:
-        return float(text) if "_" not in text else np.nan
-    except ValueError:
-        # a Fortran exponent, 1.5D+03
-        return float(text.lower().replace("d", "e")) if is_number(text, ".") else np.nan
+def _number(cell: str, decimal: str) -> float:
+    text = ungrouped(cell.strip().replace("\u2212", "-"), decimal)
+    if not is_number(text, decimal):
+        return np.nan
+    # a Fortran exponent, 1.5D+03
+    return float(text.replace(",", ".").lower().replace("d", "e"))
 
 
 def write_text(

@@ -9,9 +9,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import of_lines
+from sealscope.recordings.formats.headings.preamble import of_lines, stated_rate
+from sealscope.recordings.formats.headings.proposal import knows, measures
 from sealscope.recordings.timebase import is_stamp
 from sealscope.units import parse_unit
 
@@ -28,14 +30,37 @@ _NUMBER = {
     ".": re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
     ",": re.compile(r"[+-]?(?:\d+(?:,\d+)?|,\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
 }
-_LOOKS = (("\t", "."), ("\t", ","), (";", "."), (";", ","), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
+#: Numbers with a sign between their thousands, the same all through.
+_GROUPED = {
+    ".": re.compile(r"[+-]?[1-9]\d{0,2}(?P<sign>[,'\u2019 \u00a0\u202f])\d{3}(?:(?P=sign)\d{3})*(?:\.\d*)?"),
+    ",": re.compile(r"[+-]?[1-9]\d{0,2}(?P<sign>[.'\u2019 \u00a0\u202f])\d{3}(?:(?P=sign)\d{3})*(?:,\d*)?"),
+}
+_LOOKS = (
+    ("\t", "."), ("\t", ","), (";", "."), (";", ","), (",", "."), ("|", "."), ("|", ","), (",", ","), (" ", "."),
+    (" ", ","),
+)  # fmt: skip
+#: First cells of the rows of a heading that say what the others of the row are.
+_NAME_KEYS = frozenset({
+    "name", "names", "channel", "channels", "channel name", "channel names", "trace name", "tracename", "signal",
+    "signals", "signal name", "kanal", "kanalname", "kanalbezeichnung", "messstelle", "bezeichnung", "voie", "canal",
+    "canale",
+})  # fmt: skip
+_UNIT_KEYS = frozenset({
+    "unit", "units", "einheit", "einheiten", "vunit", "unité", "unités", "unidad", "unità", "单位", "単位",
+})  # fmt: skip
+_RULER = re.compile(r"[-=_:+]{1,80}")
+#: Most lines above the samples that are looked at for names and units.
+_DEEPEST_HEADING = 12
 _SPACED_LABEL = re.compile(r"\S+(?:\s{0,20}(?:\[[^\]]{0,40}\]|\([^)]{0,40}\)))?")
 _NAMES = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " ": "blank"}
 
 
 @dataclass(frozen=True)
 class Layout:
-    """`delimiter`: a blank is any white space; `first_row`: index of the first data line; `own`: our JSON line."""
+    """`delimiter`: a blank is any white space; `first_row`: index of the first data line; `own`: our JSON line.
+
+    `above`: the lines above the first row, which some loggers repeat further down; `rate`: what they say of it [Hz].
+    """
 
     encoding: str
     delimiter: str
@@ -45,6 +70,8 @@ class Layout:
     own: str | None = None
     notes: tuple[str, ...] = ()
     about: Mapping[str, str] = field(default_factory=dict)
+    above: frozenset[str] = frozenset()
+    rate: float | None = None
 
     @property
     def kind(self) -> str:
@@ -62,20 +89,33 @@ def encoding_of(head: bytes) -> str | None:
     ):
         if head.startswith(mark):
             return name
-    if b"\0" in head:
-        return None
+    if b"\0" in head:  # UTF-16 without a mark has a zero beside every Latin sign
+        zeros = [head[begin::2].count(0) / max(len(head) // 2, 1) for begin in (0, 1)]
+        names = [name for name, share in zip(("utf-16-be", "utf-16-le"), zeros, strict=True) if share > 0.8]
+        return names[0] if len(names) == 1 else None
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
     except UnicodeDecodeError:
+        for name in ("gb18030", "shift_jis"):
+            try:
+                if knows(codecs.getincrementaldecoder(name)().decode(head)):
+                    return name
+            except UnicodeDecodeError:
+                continue
         control = sum(byte < 9 or 13 < byte < 32 for byte in head)
         return "cp1252" if control <= len(head) // 100 else None
     return "utf-8"
 
 
+def blank_cells(line: str) -> list[str]:
+    """Split one line at its blanks and tabs, and not at the narrow blanks that stand between thousands."""
+    return line.split() if line.isascii() else re.findall(r"[^ \t\v\f]+", line)
+
+
 def cells_of(line: str, delimiter: str) -> list[str]:
     """Split one line into cells, without the quotation marks around a cell."""
     if delimiter == " ":
-        return line.split()
+        return blank_cells(line)
     if '"' in line:
         import csv
 
@@ -86,7 +126,16 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 def is_number(cell: str, decimal: str) -> bool:
     """Return whether the cell is a number with this decimal sign."""
     cell = cell.strip()
-    return len(cell) <= _LONGEST_NUMBER and _NUMBER[decimal].fullmatch(cell) is not None
+    return (
+        len(cell) <= _LONGEST_NUMBER
+        and (_NUMBER[decimal].fullmatch(cell) or _GROUPED[decimal].fullmatch(cell)) is not None
+    )
+
+
+def ungrouped(cell: str, decimal: str) -> str:
+    """Return a number's text without the signs between its thousands; any other text as it is."""
+    match = _GROUPED[decimal].fullmatch(cell)
+    return cell if match is None else cell.replace(match["sign"], "")
 
 
 def _is_value(cell: str, decimal: str) -> bool:
@@ -103,7 +152,7 @@ def _width(row: Sequence[str]) -> int:
 
 def _look(body: Sequence[str]) -> tuple[str, str, int]:
     """Return (delimiter, decimal sign, cells a row) with which most cells of the body are values."""
-    best: tuple[tuple[float, int], tuple[str, str, int]] | None = None
+    best: tuple[tuple[float, float, bool, int], tuple[str, str, int]] | None = None
     for delimiter, decimal in _LOOKS:
         rows = [cells_of(line, delimiter) for line in body]
         values = [sum(_is_value(cell, decimal) for cell in row) for row in rows]
@@ -118,14 +167,18 @@ def _look(body: Sequence[str]) -> tuple[str, str, int]:
             continue
         present = sum(cell.strip().lower() not in MISSING for row, _ in valued for cell in row)
         share = sum(many for row, many in valued if len(row) == width) / present
-        if share > 0 and (best is None or (share, width) > best[0]):
-            best = (share, width), (delimiter, decimal, width)
+        grouped = sum(_GROUPED[decimal].fullmatch(cell.strip()) is not None for row, _ in valued for cell in row)
+        rank = share, -grouped / present, delimiter != " ", width  # thousands where nothing plainer fits
+        if share > 0 and (best is None or rank > best[0]):
+            best = rank, (delimiter, decimal, width)
     return best[1] if best else (",", ".", 1)
 
 
-def _header_labels(line: str, delimiter: str) -> list[str]:
+def _header_labels(line: str, delimiter: str, width: int = 0) -> list[str]:
     if delimiter == " ":
-        return _SPACED_LABEL.findall(line)
+        labels = _SPACED_LABEL.findall(line)
+        apart = re.split(r"\s{2,}|\t", line.strip())  # names with a blank, in columns that two part
+        return apart if len(labels) != width == len(apart) else labels
     return [cell.strip() for cell in cells_of(line, delimiter)]
 
 
@@ -134,7 +187,7 @@ def _unit_cells(cells: Sequence[str]) -> list[str | None] | None:
     units: list[str | None] = []
     known = present = 0
     for cell in cells:
-        text = cell.strip().strip("[]()").strip()
+        text = cell.strip().strip("[]()<>'").strip()
         if not text or text == "-":
             units.append(None)
             continue
@@ -152,14 +205,12 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
     """Return (labels, number of rows they take) from the lines above the first data row."""
 
     def names(index: int, commented: bool = False) -> list[str] | None:
-        if index < 0:
-            return None
         line = lines[index].strip()
         if line.startswith(COMMENTS):
             if not commented:
                 return None
             line = line.lstrip('#%/!" ').rstrip('"')
-        cells = _header_labels(line if commented else lines[index].strip("\r\n "), delimiter)
+        cells = _header_labels(line if commented else lines[index].strip("\r\n "), delimiter, width)
         if cells and not cells[-1]:
             cells = cells[: max(_width(cells), min(width, len(cells)))]
         enough = abs(len(cells) - width) <= 1 or (len(cells) >= width > 1)
@@ -168,16 +219,71 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
     above = [i for i in range(first - 1, -1, -1) if lines[i].strip()]
     if not above:
         return [], 0
-    row = names(above[0])
-    if row is not None:
-        over = names(above[1]) if len(above) > 1 else None
-        units = _unit_cells(row) if over is not None else None
-        if over is not None and units is not None:
-            units += [None] * (len(over) - len(units))
-            return [Label.parse(name, unit) for name, unit in zip(over, units, strict=False)], 2
-        return [Label.parse(name) for name in row], 1
+    rows: list[list[str]] = []
+    for index in above[:_DEEPEST_HEADING]:
+        row = names(index)
+        if row is None:
+            break
+        rows.append(row)
+    if rows:
+        return _keyed(rows) or _stacked(rows)
     commented = names(above[0], commented=True) if not lines[above[0]].startswith(OWN_MARK) else None
     return ([Label.parse(name) for name in commented], 1) if commented else ([], 0)
+
+
+def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
+    """Return (labels, rows taken) of a heading whose rows say what they hold: `Name`, `Unit`; None for any other.
+
+    `rows`: the lowest first.
+    """
+    keys = [row[0].strip().rstrip(":").casefold() for row in rows]
+    at = next((i for i, key in enumerate(keys) if key in _NAME_KEYS and _width(rows[i]) > 1), None)
+    unit = next((i for i, key in enumerate(keys) if key in _UNIT_KEYS), None)
+    if at is None or unit is None:
+        return None
+    texts = list(rows[at])
+    units = _unit_cells(rows[unit][1:]) or []
+    if _width(rows[0]) == 1:  # a name of the first column alone
+        texts[0] = rows[0][0]
+    labels = [Label.parse(texts[0])]
+    units += [None] * (len(texts) - 1 - len(units))
+    labels += [Label.parse(name, given) for name, given in zip(texts[1:], units, strict=False)]
+    return labels, max(at, unit) + 1
+
+
+def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
+    """Return (labels, rows taken) of a heading of names, with units below or above them, and groups over them.
+
+    Rows that say the same of every column (`REAL`, a ruler) are passed over. `rows`: the lowest first.
+    """
+    skipped = 0
+    while skipped + 1 < len(rows) and _tells_nothing(rows[skipped]):
+        skipped += 1
+    row, *over = rows[skipped:]
+    texts, taken = list(row), skipped + 1
+    units = _unit_cells(row) if over else None
+    if units is not None:
+        texts, over, taken = list(over[0]), over[1:], taken + 1
+    elif over and (units := _unit_cells(over[0])) is not None and None not in units and len(units) == len(row) > 1:
+        over, taken = over[1:], taken + 1
+    else:
+        units = []
+    known = {name.casefold() for name in CHANNEL_UNITS}
+    if over and not any(Label.parse(text).name.casefold() in known for text in texts) and any(map(measures, over[0])):
+        group, joined = "", []
+        for text, cell in zip(texts, [*over[0], *[""] * len(texts)], strict=False):
+            group = cell.strip() or group
+            joined.append(f"{group} {text}".strip())
+        texts, taken = joined, taken + 1
+    units += [None] * (len(texts) - len(units))
+    return [Label.parse(name, unit) for name, unit in zip(texts, units, strict=False)], taken
+
+
+def _tells_nothing(row: Sequence[str]) -> bool:
+    cells = [cell.strip() for cell in row if cell.strip()]
+    return all(_RULER.fullmatch(cell) for cell in cells) or (
+        len(set(cells)) == 1 < len(cells) and _unit_cells(cells) is None
+    )
 
 
 def _own_layout(lines: Sequence[str], encoding: str) -> Layout | None:
@@ -213,6 +319,7 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         for i in range(width)
         if 2 * sum(_is_value(r[i], decimal) for r in rows) > sum(r[i].strip().lower() not in MISSING for r in rows)
     ]
+    worded = any(not _is_value(row[0], decimal) and row[0].strip().lower() not in MISSING for row in rows)
     first = len(lines)
     for index, line in enumerate(lines):
         if not line.strip() or line.lstrip().startswith(COMMENTS):
@@ -220,12 +327,15 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         cells = cells_of(line, delimiter)
         if len(cells) < min(width, (numeric or [0])[-1] + 1):
             continue
+        if not worded and not (_is_value(cells[0], decimal) or cells[0].strip().lower() in MISSING):
+            continue  # a row that says what it holds, such as `SampleRate,500,500`
         good = [i for i in numeric if i < len(cells) and _is_value(cells[i], decimal)]
         empty = [i for i in numeric if i < len(cells) and cells[i].strip().lower() in MISSING]
         if good and 2 * (len(good) + len(empty)) > len(numeric):
             first = index
             break
     if first == len(lines):
+        _refuse_markup(content[0], place)
         names = _header_labels(content[0], delimiter if width > 1 else _likely(content[0]))
         raise UnreadableFile(
             f"a recording must have samples, got no row of numbers after {', '.join(names)[:80]} ({place})"
@@ -242,7 +352,16 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
     unused = len(plain) - len(of_lines(plain, delimiter))
     if unused > 0:
         notes.append(f"{counted(unused, 'line')} before the header not used")
-    return Layout(encoding, delimiter, decimal, tuple(labels), first, None, tuple(notes), about)
+    lines_above = frozenset(line.strip() for line in above)
+    rate = stated_rate(of_lines(above, delimiter))
+    return Layout(encoding, delimiter, decimal, tuple(labels), first, None, tuple(notes), about, lines_above, rate)
+
+
+def _refuse_markup(line: str, place: str) -> None:
+    """Raise UnreadableFile for texts that are no tables."""
+    kind = {"{": "JSON", "[": "JSON", "<": "XML or HTML"}.get(line.lstrip()[:1])
+    if kind is not None:
+        raise UnreadableFile(f"a recording must be a table, got {kind}: export it as CSV ({place})")
 
 
 def _likely(line: str) -> str:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from sealscope.errors import InputError
-from sealscope.units import parse_unit
+from sealscope.recordings.channels import CHANNEL_UNITS
+from sealscope.units import parse_unit, same_dimension
+
+#: Brackets as they are typed between Chinese or Japanese signs.
+_WIDE = str.maketrans("\uff08\uff09\uff3b\uff3d\u3010\u3011", "()[][]")
+#: `Druck in bar`, `p_A/bar`, `p_A, bar`: what stands behind is a unit where a channel may have it.
+_BEHIND = re.compile(r"(?P<name>.{1,80}?)(?:\s+in\s+|\s*/|\s*,\s+)(?P<unit>\S{1,20})")
 
 
 @dataclass(frozen=True)
@@ -18,12 +25,15 @@ class Label:
 
     @classmethod
     def parse(cls, text: str, unit: str | None = None) -> Label:
-        """Parse `p_A [psi]`, `p_A (psi)` or `p_A / psi`; a unit given elsewhere (a row or an attribute) is `unit`."""
-        whole = text.strip()
+        """Parse `p_A [psi]`, `p_A (psi)`, `p_A / psi` or `p_A in psi`; a unit given elsewhere (a row) is `unit`."""
+        whole = text.strip().translate(_WIDE)
         name, bracketed = square_brackets(whole)
         if bracketed is not None:
             return cls(whole, name, bracketed if unit is None else unit)
         name, remark = _round_brackets_or_stroke(whole)
+        behind = _BEHIND.fullmatch(whole) if unit is None and remark is None else None
+        if behind and any(same_dimension(behind["unit"], known) for known in (*CHANNEL_UNITS.values(), "s")):
+            return cls(whole, behind["name"].rstrip(), behind["unit"])
         return cls(whole, name, _unit_or_none(remark) if unit is None else unit)
 
 

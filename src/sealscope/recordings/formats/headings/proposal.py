@@ -18,27 +18,46 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-#: What a column may measure -> words of its name: English, German, French, Spanish, Italian, Chinese.
+#: What a column may measure -> words of its name: English, German, French, Spanish, Italian, Portuguese, Dutch, Polish,
+#: Chinese and Japanese.
 _WORDS: Mapping[str, frozenset[str]] = {
     "pressure": _words(
-        "p pr pres press pressure druck kammerdruck zylinderdruck pression presion pressione pg pt 压力 压强"
+        "p pr pres press pressure druck kammerdruck zylinderdruck pression presion pressione pressao druk cisnienie "
+        "pg pt 压力 压强 圧力"
     ),
     "position": _words(
         "x pos position weg hub stroke displ displacement travel kolbenweg kolbenposition lvdt deplacement course "
-        "posicion carrera posizione corsa 位移 行程 位置"
+        "posicion carrera posizione corsa posicao curso positie slag polozenie skok 位移 行程 位置 変位 ストローク"
     ),
     "command": _words(
         "u cmd command soll sollwert setpoint ref reference demand spannung voltage stellgroesse ansteuerung consigne "
-        "tension comando mando tensione 指令 电压"
+        "tension comando mando tensione 指令 电压 電圧"
     ),
-    "speed": _words("omega n speed rpm drehzahl motordrehzahl vitesse velocidad velocita giri 转速"),
-    "angle": _words("theta phi angle winkel motorwinkel encoder drehwinkel angulo angolo 角度 转角"),
-    "leak": _words("leak leakage leck leckage leckstrom fuite fuga trafilamento 泄漏"),
-    "time": _words("t time zeit temps tiempo tempo 时间"),
+    "speed": _words(
+        "omega n speed rpm drehzahl motordrehzahl vitesse velocidad velocidade velocita giri toerental 转速 回転数"
+    ),
+    "angle": _words("theta phi angle winkel motorwinkel encoder drehwinkel angulo angolo hoek kat 角度 转角"),
+    "leak": _words("leak leakage leck leckage leckstrom fuite fuga trafilamento 泄漏 漏れ"),
+    "time": _words(
+        "t time timestamp datetime zeit messzeit uhrzeit zeitstempel temps horodatage heure tiempo hora tempo ora "
+        "tijd tijdstip czas 时间 时刻 時間 時刻"
+    ),
 }
-_A = _words("a cap bore blind piston kolben kolbenseite kolbenseitig bodenseite boden fond fondo 无杆腔")
-_B = _words("b rod ring annulus annular stange stangenseite stangenseitig ringseite tige vastago stelo 有杆腔")
-_PUMP = _words("pump pumpe port pompe bomba pompa 泵")
+#: Last words of German compounds (Zylinderweg, Messzeit), where a whole word is not known.
+_ENDINGS = ("druck", "weg", "hub", "position", "winkel", "drehzahl", "zeit", "druk")
+_A = _words(
+    "a cap bore blind extend extension piston kolben kolbenseite kolbenseitig kolbenraum kolbenkammer bodenseite boden "
+    "bodem fond fondo fondello embolo zuiger tlok 无杆腔 ヘッド側 ボトム側 キャップ側"
+)
+_B = _words(
+    "b rod ring annulus annular retract retraction stange stangenseite stangenseitig stangenraum ringseite ringraum "
+    "kolbenstange tige vastago stelo haste stang tloczysko 有杆腔 ロッド側"
+)
+#: The end of a cylinder that its rod leaves where the other is the cap; where the other is the rod end, the cap.
+_HEAD = "head"
+_PUMP = _words("pump pumpe pompe bomba pompa pomp 泵 ポンプ")
+#: A port is the pump's where it has a number, and the cylinder's where it is A or B.
+_PORT = "port"
 _OTHERS = _words(
     "tank supply versorgung system charge speisedruck speise accumulator speicher oil oel temp temperature temperatur "
     "force kraft current strom soll sollwert setpoint ist flow"
@@ -46,7 +65,7 @@ _OTHERS = _words(
 #: Words of a script that writes no blanks between words.
 _UNSPACED = frozenset(word for words in (*_WORDS.values(), _A, _B, _PUMP) for word in words if ord(word[0]) > 0x2E7F)
 #: How loggers write revolutions a minute, which as a unit of its own is a frequency.
-_TURNS = ("1/min", "min-1", "min^-1", "U/min")
+TURNS = ("1/min", "min-1", "min^-1", "min\u207b\u00b9", "/min", "U/min")
 _UNITS = {"position": "m", "command": "V", "speed": "rad/s", "angle": "rad", "leak": "m^3/s", "time": "s"}
 _CHANNELS = {"position": "x", "command": "u", "speed": "omega", "angle": "theta", "leak": "q_leak", "time": "t"}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
@@ -69,7 +88,8 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     of a name (``PA_bar``) becomes the column's unit.
     """
     own = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
-    guesses = [None if label.name.casefold() in own else _guess(label) for label in labels]
+    head = _side_of_head(labels)
+    guesses = [None if label.name.casefold() in own else _guess(label, head) for label in labels]
     candidates: dict[str, list[int]] = {}
     for column, guess in enumerate(guesses):
         for channel in () if guess is None else _channels(guess):
@@ -96,27 +116,60 @@ def map_options(channel_map: Mapping[str, str]) -> str:
 
 def _plain(text: str) -> str:
     """Return a name without accents, the umlauts as two letters."""
-    for umlaut, letters in zip("äöüßÄÖÜ", ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue"), strict=True):
+    for umlaut, letters in zip("äöüßÄÖÜłŁ", ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue", "l", "L"), strict=True):
         text = text.replace(umlaut, letters)
     return "".join(sign for sign in unicodedata.normalize("NFKD", text) if not unicodedata.combining(sign))
 
 
-def _guess(label: Label) -> _Guess | None:
+def is_time(label: Label) -> bool:
+    """Return whether a column's name says that it holds the time."""
+    guess = _guess(label, "")
+    return guess is not None and guess.kind == "time"
+
+
+def unit_of_time(label: Label) -> str | None:
+    """Return the unit that a time column states, in its heading or at the end of its name."""
+    guess = _guess(label, "")
+    return guess.unit if guess is not None and guess.kind == "time" else None
+
+
+def knows(text: str) -> bool:
+    """Return whether a text holds a known word of a script that writes no blanks between words."""
+    return any(word in text for word in _UNSPACED)
+
+
+def measures(text: str) -> bool:
+    """Return whether a heading says what is measured, in one of the languages known here."""
+    return _guess(Label.parse(text), "") is not None
+
+
+def _words_of(name: str) -> set[str]:
+    tokens = [token.casefold() for token in _TOKEN.findall(_plain(name))]
+    return {part for token in tokens for part in _parts(token)} | {word for word in _UNSPACED if word in name}
+
+
+def _side_of_head(labels: Sequence[Label]) -> str:
+    """Return which chamber the columns called head are of: A beside a rod, B beside a cap; empty where unknown."""
+    words = {word for label in labels if len(label.name) <= _LONGEST_NAME for word in _words_of(label.name)}
+    return "" if _HEAD not in words else "A" if words & (_B - {"b"}) else "B" if words & (_A - {"a"}) else ""
+
+
+def _guess(label: Label, head: str) -> _Guess | None:
+    """Return what a column's name tells; `head`: the chamber that the word head stands for."""
     if len(label.name) > _LONGEST_NAME:
         return None
-    tokens = [token.casefold() for token in _TOKEN.findall(_plain(label.name))]
     name, unit = _split_unit(label.name)
-    if label.unit is None and unit is not None:
-        tokens = [token.casefold() for token in _TOKEN.findall(_plain(name))]
-    words = {part for token in tokens for part in _parts(token)} | {word for word in _UNSPACED if word in label.name}
+    words = _words_of(name if label.unit is None and unit is not None else label.name)
     unit = label.unit if label.unit is not None else unit
-    side = _side(words)
+    side = head if _HEAD in words and head else _side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & _OTHERS else _Guess("pressure", side, unit)
     if words & _OTHERS - {"soll", "sollwert", "setpoint"}:
         return None
-    if unit in _TURNS and words & _WORDS["speed"]:
+    if unit in TURNS and words & _WORDS["speed"]:
         return _Guess("speed", side, "rpm")
+    if unit is not None and "s" in words and same_dimension(unit, "m"):  # the path in German books
+        return _Guess("position", side, unit)
     for kind, known in _WORDS.items():
         fits = unit is None or (kind in _UNITS and same_dimension(unit, _UNITS[kind]))
         if words & known and fits:
@@ -125,14 +178,16 @@ def _guess(label: Label) -> _Guess | None:
 
 
 def _parts(token: str) -> set[str]:
-    """Return a token and what is left of it after a leading p: `pa`, `pb`, `p1` are the pressure of a side."""
-    return {token, "p", token[1:]} if token in ("pa", "pb") else {token}
+    """Return a token, what is left of it after a leading p (`pa`), and the end of a compound (`zylinderweg`)."""
+    if token in ("pa", "pb"):
+        return {token, "p", token[1:]}
+    return {token, *(ending for ending in _ENDINGS if token.endswith(ending))}
 
 
 def _side(words: set[str]) -> str:
-    if words & _PUMP:
-        return next((f"pump {digit}" for digit in ("1", "2") if digit in words), "pump")
     cap, rod = bool(words & _A), bool(words & _B)
+    if words & _PUMP or (_PORT in words and cap == rod):
+        return next((f"pump {digit}" for digit in ("1", "2") if digit in words), "pump")
     if cap != rod:
         return "A" if cap else "B"
     return next((digit for digit in ("1", "2") if digit in words), "") if not cap else ""
@@ -148,7 +203,10 @@ def _channels(guess: _Guess) -> tuple[str, ...]:
 def _split_unit(name: str) -> tuple[str, str | None]:
     """Split `PA_bar` into name and unit; (name, None) where the last word is no unit of what a channel measures."""
     before, _, last = name.replace(" ", "_").rpartition("_")
-    if not before or not last or last in ("A", "B", "s", "m"):
+    if not before or not last or last in ("A", "B"):
+        return name, None
+    kind = {"s": "time", "m": "position"}.get(last)
+    if kind is not None and not _words_of(before) & _WORDS[kind]:  # x_s may as well be a set point
         return name, None
     try:
         parse_unit(last)
