@@ -154,7 +154,7 @@ def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> t
             repeated += count - len(kept)
         if not kept:
             continue
-        numbers = [number + i for i in kept]
+        numbers: Sequence[int] = [number + i for i in kept]
         rows = _rows([lines[i] for i in kept], numbers, layout, cut, place)
         usual = len(rows[-2]) if len(rows) > 1 else usual
         if cut and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
