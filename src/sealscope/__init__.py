@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.diagnosis.volume_balance.stream import SequentialBalance
     from sealscope.fmu.build import write_fmu
+    from sealscope.fmu.recording import record_fmu
     from sealscope.monitor.stream.watch import Watch, watch
     from sealscope.parameters import Rig, load_rig
     from sealscope.recordings import Recording, inspect, read, write
@@ -43,6 +44,7 @@ _HOMES = {
     "load_rig": "parameters",
     "prove": "simulation.simulate",
     "read": "recordings",
+    "record_fmu": "fmu.recording",
     "simulate": "simulation.simulate",
     "simulate_batch": "simulation.batch.batch",
     "simulate_with_truth": "simulation.simulate",
@@ -70,6 +72,7 @@ __all__ = [
     "load_rig",
     "prove",
     "read",
+    "record_fmu",
     "simulate",
     "simulate_batch",
     "simulate_with_truth",

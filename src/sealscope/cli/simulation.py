@@ -88,8 +88,20 @@ def simulate(
     truth: Annotated[
         Path | None, typer.Option("--truth", help="Write what was put in (leaks, onset) to this JSON file.")
     ] = None,
+    fmu: Annotated[
+        Path | None,
+        typer.Option(
+            "--fmu",
+            help="Record this unit (.fmu, a program that runs with your rights) instead of the rig, by the rig's "
+            "instruments.",
+        ),
+    ] = None,
+    maps: Annotated[
+        list[str] | None,
+        typer.Option("--map", metavar="CHANNEL=NAME", help="The unit's own name of a channel or an input; repeat."),
+    ] = None,
 ) -> None:
-    """Simulate the rig and record it as its instruments would."""
+    """Simulate the rig, or run somebody else's unit, and record it as the rig's instruments would."""
     from sealscope.recordings import write
     from sealscope.recordings.files import check_target
     from sealscope.simulation.experiment import Experiment
@@ -116,6 +128,18 @@ def simulate(
         error=error,
         allow_unresolved=allow_unresolved,
     )
+    if fmu is not None:
+        if truth is not None or prove:
+            raise InputError("--truth and --prove are of the rig, got them with --fmu")
+        from sealscope.fmu.recording import record_fmu
+
+        with progress() as report:
+            recording = record_fmu(fmu, experiment, map=_names(maps), progress=report)
+        write(recording, output)
+        typer.echo(f"{output}: {len(recording)} samples at {recording.rate:g} Hz, {experiment.command} ({fmu.name})")
+        return
+    if maps:
+        raise InputError("--map names the variables of a unit, got it without --fmu")
     with progress() as report:
         run = simulate_with_truth(experiment, report, prove=prove)
     write(run.recording, output)
@@ -134,6 +158,14 @@ def simulate(
         typer.echo(f"fault: {fault_}")
     if run.truth.leaks:
         typer.echo(f"mean leak while open: {run.truth.mean_leak_lpm:.5g} L/min")
+
+
+def _names(maps: Sequence[str] | None) -> dict[str, str]:
+    pairs = [text.partition("=") for text in maps or ()]
+    for channel, sign, name in pairs:
+        if not (channel and sign and name):
+            raise InputError(f"--map must be CHANNEL=NAME, got {channel}{sign}{name}")
+    return {channel.strip(): name.strip() for channel, _, name in pairs}
 
 
 def parameters(
