@@ -27,6 +27,7 @@ T = np.arange(N) / RATE
 P_A = 20.0 + np.sin(7.0 * T)  # bar
 P_B = 18.0 - np.sin(7.0 * T)
 X = 12.5 * np.sin(3.0 * T)  # mm
+SIGNALS = (("p_A", P_A, "bar"), ("p_B", P_B, "bar"), ("x", X, "mm"))
 START = dt.datetime(2024, 5, 31, 12, 0, 0, 250000, tzinfo=dt.UTC)
 Writer = Callable[[Path], Path]
 
@@ -106,12 +107,12 @@ def structure_with_time(folder: Path, version: str) -> Path:
     return matlab(folder, {"ScopeData": {"time": T[:, None], "signals": signals, "blockName": "rig/Scope"}}, version)
 
 
-def timeseries(name: str, values: Any, uniform: bool) -> Any:
+def timeseries(name: str, values: Any, uniform: bool, unit: str = "bar") -> Any:
     """Return an object with the properties that MATLAB's timeseries stores."""
     from matio.utils.matclass import MatlabOpaque
 
     info = {"Units": "seconds", "Start": 0.0, "Increment": 1 / RATE, "Length": float(N)}
-    properties = {"Name": name, "Data_": values[:, None], "TimeInfo": info, "DataInfo": {"Units": "bar"}}
+    properties = {"Name": name, "Data_": values[:, None], "TimeInfo": info, "DataInfo": {"Units": unit}}
     properties["Time_"] = np.empty((0, 0)) if uniform else T[:, None]
     return MatlabOpaque(properties, "timeseries")
 
@@ -227,6 +228,145 @@ FILES: dict[str, Writer] = {
 }
 
 
+def tdms_rate(folder: Path) -> Path:
+    """Write channels without a clock, and the rate as a property of their group."""
+    from nptdms import ChannelObject, GroupObject, TdmsWriter
+
+    with TdmsWriter(folder / "log.tdms") as writer:
+        channels = [ChannelObject("Log", name, values, {"unit_string": unit}) for name, values, unit in SIGNALS]
+        writer.write_segment([GroupObject("Log", {"SamplingRate": RATE}), *channels])
+    return folder / "log.tdms"
+
+
+def tdms_group_each(folder: Path) -> Path:
+    return tdms(folder, {name: {"Time": (T, "s"), "Data": (values, unit)} for name, values, unit in SIGNALS})
+
+
+def structs(fields: tuple[str, ...], rows: list[tuple[Any, ...]]) -> Any:
+    """Return an array of structs."""
+    members = np.zeros(len(rows), dtype=[(field, object) for field in fields])
+    for place, row in enumerate(rows):
+        members[place] = row
+    return members
+
+
+def matlab_logs(folder: Path, version: str) -> Path:
+    """Write what Simulink logs: a data set of signals, each a time series."""
+    from matio.utils.matclass import MatlabOpaque
+
+    members = np.empty((3, 1), dtype=object)
+    for place, (name, values, unit) in enumerate(SIGNALS):
+        held = {"Name": name, "BlockPath": f"rig/{name}", "Values": timeseries(name, values, False, unit)}
+        members[place, 0] = MatlabOpaque(held, "Simulink.SimulationData.Signal")
+    logs = MatlabOpaque({"Name": "logsout", "Storage": members}, "Simulink.SimulationData.Dataset")
+    return matlab(folder, {"logsout": logs}, version)
+
+
+MATRIX = np.column_stack([T, P_A, P_B, X])
+LABELS = np.array(["t [s]", "p_A [bar]", "p_B [bar]", "x [mm]"], dtype=object)
+#: How engineers keep signals in a MATLAB file.
+STRUCTS: dict[str, dict[str, Any]] = {
+    "value, unit and time": {name: {"value": values, "unit": unit, "time": T} for name, values, unit in SIGNALS},
+    "array of signals": {
+        "time": T,
+        "log": structs(("Name", "Data", "Unit"), [(name, values, unit) for name, values, unit in SIGNALS]),
+    },
+    "matrix with heads": {"log": {"data": MATRIX, "colheaders": LABELS}},
+    "matrix and names": {"data": MATRIX, "names": LABELS},
+    "units in a struct": {
+        "tout": T,
+        "units": {name: unit for name, _, unit in SIGNALS},
+        **{name: values for name, values, _ in SIGNALS},
+    },
+    "interval": {"Ts": 1 / RATE, **{name: {"value": values, "unit": unit} for name, values, unit in SIGNALS}},
+    "catman": {
+        key: value
+        for number, (name, values, unit) in enumerate(SIGNALS, start=1)
+        for key, value in (
+            (f"Channel_{number}_Header", {"SignalName": name, "Unit": unit, "dt": 1 / RATE}),
+            (f"Channel_{number}_Data", values[:, None]),
+        )
+    },
+}
+
+
+def mdf_other(folder: Path, compression: int = 0, prefix: str = "", text: str = "") -> Path:
+    """Write MDF 4: compressed, with names behind a `prefix`, or with a `text` for one value of a channel."""
+    from asammdf import MDF, Signal
+
+    with MDF(version="4.10") as file:
+        file.append([Signal(values, T, unit=unit, name=prefix + name) for name, values, unit in SIGNALS[:2]])
+        conversion = {"lower_0": X[100] - 1e-6, "upper_0": X[100] + 1e-6, "text_0": text} if text else None
+        file.append([Signal(X, T, unit="mm", name=f"{prefix}x", conversion=conversion)])
+        file.save(folder / "log.mf4", overwrite=True, compression=compression)
+    return folder / "log.mf4"
+
+
+def sheets(folder: Path, heads: list[list[Any]], times: Any = None, hidden: bool = False) -> Path:
+    """Write a workbook with these rows above the samples; `hidden`: and a longer sheet that is not shown."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    if hidden:
+        other = book.create_sheet("Old")
+        other.sheet_state = "hidden"
+        for row in [["t [s]", "p_A [bar]", "p_B [bar]", "x [mm]"], *[[k, 0.0, 0.0, 0.0] for k in range(2 * N)]]:
+            other.append(row)
+    for row in heads:
+        book.active.append(row)
+    for time, *values in zip(
+        T.tolist() if times is None else times, P_A.tolist(), P_B.tolist(), X.tolist(), strict=True
+    ):
+        book.active.append([time, *values])
+    book.save(folder / "log.xlsx")
+    return folder / "log.xlsx"
+
+
+def frame(folder: Path, index: str, ending: str = "parquet") -> Path:
+    """Write a data frame of pandas whose index is the time."""
+    import pandas as pd
+
+    columns = pd.DataFrame({f"{name} [{unit}]": values for name, values, unit in SIGNALS})
+    times = pd.to_timedelta((T * 1e9).round().astype("int64"), unit="ns")
+    if ending == "feather":
+        columns.assign(**{"t [s]": T}).to_feather(folder / "log.feather")
+    else:
+        named = pd.Timestamp("2024-05-31T12:00") + times if index == "moments" else times
+        columns.set_index(pd.Index(named, name="time" if index == "named" else None)).to_parquet(folder / "log.parquet")
+    return folder / f"log.{ending}"
+
+
+def hdf5_group_each(folder: Path) -> Path:
+    import h5py
+
+    with h5py.File(folder / "log.h5", "w") as file:
+        for name, values, unit in SIGNALS:
+            group = file.create_group(name)
+            group.create_dataset("time", data=T).attrs["unit"] = "s"
+            group.create_dataset("data", data=values).attrs["unit"] = unit
+    return folder / "log.h5"
+
+
+def hdf5_table(folder: Path) -> Path:
+    import h5py
+
+    held = np.rec.fromarrays(list(MATRIX.T), names=["t [s]", "p_A [bar]", "p_B [bar]", "x [mm]"])
+    with h5py.File(folder / "log.h5", "w") as file:
+        file["log"] = np.asarray(held)
+    return folder / "log.h5"
+
+
+def lvm_spaced(folder: Path) -> Path:
+    """Write a LabVIEW measurement in which each channel has a time, and the header leaves a cell for it."""
+    path = lvm(folder, "Multi")
+    spaced = ("Samples", "Date\t2024/05/31\t", "Time\t12:00:00.2500000", "Y_Unit", "X_Dim", "X0", "Delta_X")
+    lines = [
+        "\t\t".join(line.split("\t")).replace("\t\t", "\t", 1) if line.startswith(spaced) else line
+        for line in path.read_text().splitlines()
+    ]
+    path.write_text("\r\n".join(lines) + "\r\n", newline="")
+    return path
+
+
 class Dialect(NamedTuple):
     """How a log is written, what is said of it when it is read, and the last digit of its samples [bar, bar, mm]."""
 
@@ -289,6 +429,18 @@ def pack(content: bytes, folder: Path, ending: str) -> Path:
     else:
         path.write_bytes({"gz": gzip, "bz2": bz2, "xz": lzma}[ending].compress(content))
     return path
+
+
+def among_documents(folder: Path) -> Path:
+    """Write a log beside a report in an archive in an archive."""
+    import tarfile
+
+    content = log("t [s],p_A [bar],p_B [bar],x [mm]\n")(folder)
+    (folder / "report.pdf").write_bytes(b"%PDF-1.4")
+    with tarfile.open(folder / "log.tar.gz", "w:gz") as archive:
+        archive.add(content, "run/log.csv")
+        archive.add(folder / "report.pdf", "run/report.pdf")
+    return folder / "log.tar.gz"
 
 
 def packed(ending: str) -> Writer:
@@ -505,6 +657,41 @@ TEXTS: dict[str, Dialect] = {
 }
 DIALECTS: dict[str, Dialect] = {
     **{name: Dialect(write) for name, write in FILES.items()},
+    "TDMS, rate of the group": Dialect(tdms_rate),
+    "TDMS, a group each": Dialect(tdms_group_each),
+    **{
+        f"MATLAB {version}, Simulink's data set": Dialect(lambda folder, version=version: matlab_logs(folder, version))
+        for version in ("v7", "v7.3")
+    },
+    **{
+        f"MATLAB 5, {form}": Dialect(lambda folder, held=held: matlab(folder, held, "5"))
+        for form, held in STRUCTS.items()
+    },
+    "MDF 4.10, compressed": Dialect(lambda folder: mdf_other(folder, compression=2)),
+    "MDF 4.10, names with points": Dialect(lambda folder: mdf_other(folder, prefix="Rig.Cyl.")),
+    "MDF 4.10, text in a cell": Dialect(lambda folder: mdf_other(folder, text="SNA")),
+    "Excel, hidden sheet": Dialect(
+        lambda folder: sheets(folder, [["t [s]", "p_A [bar]", "p_B [bar]", "x [mm]"]], hidden=True)
+    ),
+    "Excel, merged heads": Dialect(
+        lambda folder: sheets(folder, [["Zeit", "Druck", None, "Weg"], [None, "A", "B"], ["s", "bar", "bar", "mm"]]),
+        {"channel_map": "auto"},
+    ),
+    "Excel, times of the day": Dialect(
+        lambda folder: sheets(
+            folder,
+            [["Uhrzeit", "p_A [bar]", "p_B [bar]", "x [mm]"]],
+            [m.time() for m in moments(2024, 5, 31, 23, 59, 59, 9)],
+        )
+    ),
+    "Parquet, index of moments": Dialect(lambda folder: frame(folder, "moments")),
+    "Parquet, index of times": Dialect(lambda folder: frame(folder, "")),
+    "Parquet, named index": Dialect(lambda folder: frame(folder, "named")),
+    "Feather": Dialect(lambda folder: frame(folder, "", "feather")),
+    "HDF5, a group each": Dialect(hdf5_group_each),
+    "HDF5, table": Dialect(hdf5_table),
+    "LabVIEW, a time each, spaced": Dialect(lvm_spaced),
+    "archive, tar.gz with a report": Dialect(among_documents, digit=1e-6),
     "Parquet": Dialect(parquet),
     "HDF5": Dialect(hdf5),
     **{name: own._replace(digit=1e-6) for name, own in TEXTS.items()},

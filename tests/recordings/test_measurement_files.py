@@ -72,7 +72,7 @@ def test_dialects_are_read_to_their_last_digit(name: str, tmp_path: Path) -> Non
 
 
 def test_there_are_forty_dialects() -> None:
-    assert len(DIALECTS) >= 40
+    assert len(DIALECTS) >= 130
 
 
 def test_the_group_that_holds_most_channels_is_read(tmp_path: Path) -> None:
@@ -129,6 +129,29 @@ def test_an_archive_of_two_files_names_them(tmp_path: Path) -> None:
         archive.writestr("b.csv", "t,p_A\n")
     with pytest.raises(UnreadableFile, match=r"must hold a single file, got 2: a\.csv, b\.csv"):
         read(tmp_path / "logs.zip")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "way_out"),
+    [
+        ("log.7z", b"7z\xbc\xaf\x27\x1c" + bytes(99), "got a 7z archive: unpack it"),
+        ("log.dat", b"|CF,2,1,1;|CK,1,3,1,1;" + P_A.tobytes(), "an imc FAMOS file: export it"),
+        ("log.dat", b"DIAEXTENDED  {@:ENGLISH\n", "a DIAdem header (.DAT): export it from DIAdem as TDMS or CSV"),
+        ("log.tdm", b'<?xml version="1.0"?><usi:tdm version="1.0"/>', "a DIAdem header (.tdm): export it as TDMS"),
+        ("log.tdx", P_A.tobytes(), "the samples of a DIAdem .tdm: export them"),
+        ("log.bin", P_A.tobytes(), "catman's: export it from catman as MATLAB, TDMS or ASCII"),
+        ("log.unv", b"    -1\n    58\np_A\n", "a universal file (UFF 58): export it as MATLAB or CSV"),
+        ("log.dxd", b"DEWESoft" + bytes(range(256)), "a Dewesoft file: export it from DewesoftX"),
+        ("log.json", b'[{"t": 0}]\n', "got JSON: export it as CSV"),
+        ("log.npy", b"\x93NUMPY\x01\0", "a NumPy array: export it as CSV"),
+    ],
+)
+def test_what_is_not_read_names_the_way_out(name: str, content: bytes, way_out: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UnreadableFile) as caught:
+        read(tmp_path / name)
+    assert way_out in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_what_an_archive_unpacks_to_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,10 +1,11 @@
-"""Recordings inside an archive (.gz, .bz2, .xz, .zst, .zip), unpacked into a private folder while they are read."""
+"""Recordings in an archive (.gz, .bz2, .xz, .zst, .zip, .tar), unpacked into a private folder while they are read."""
 
 from __future__ import annotations
 
+import tarfile
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, cast
@@ -15,6 +16,10 @@ from sealscope.storage.opening import open_regular, whole
 
 #: First bytes -> archive.
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "xz", b"\x28\xb5\x2f\xfd": "zstd", b"PK\x03\x04": "zip"}
+#: Where a tar archive says that it is one.
+_TAR_AT, _TAR = 257, b"ustar"
+#: What lies beside a recording in an archive and is none.
+_DOCUMENTS = (".pdf", ".md", ".png", ".jpg", ".jpeg", ".doc", ".docx", ".html", ".xml", ".json", ".toml", ".ini")
 #: A workbook is a ZIP archive with one of these members.
 _WORKBOOK = ("[Content_Types].xml", "mimetype")
 #: Most bytes that an archive may unpack to.
@@ -28,7 +33,9 @@ def archive_of(path: Path) -> str | None:
     Raises UnreadableFile for a damaged ZIP.
     """
     with open_regular(path, "a recording") as file:
-        head = file.read(8)
+        head = file.read(512)
+    if head[_TAR_AT : _TAR_AT + len(_TAR)] == _TAR:
+        return "tar"
     kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
     return None if kind == "zip" and _is_workbook(path) else kind
 
@@ -42,11 +49,11 @@ def _is_workbook(path: Path) -> bool:
 def unpacked(path: Path, kind: str) -> Iterator[Path]:
     """Unpack the single file of an archive, and remove it at the end.
 
-    Raises UnreadableFile where a ZIP holds no file or several, where the archive is damaged, and where it unpacks to
-    more than `LARGEST` bytes; MissingExtra for .zst without pyarrow.
+    Raises UnreadableFile where a ZIP or tar holds no recording or several, where the archive is damaged, and where it
+    unpacks to more than `LARGEST` bytes; MissingExtra for .zst without pyarrow.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
-        name = path.stem if path.suffix.lower() in (".gz", ".bz2", ".xz", ".zst", ".zip") else path.name
+        name = path.stem if path.suffix.lower() in (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz") else path.name
         with whole(f"a {kind} archive", path), _opened(path, kind) as (source, member):
             last = Path(member or name).name
             target = Path(folder) / (last if last.strip(".") else "recording")
@@ -58,15 +65,33 @@ def unpacked(path: Path, kind: str) -> Iterator[Path]:
 def _opened(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str]]:
     if kind == "zip":
         with zipfile.ZipFile(path) as archive:
-            members = [info for info in archive.infolist() if not info.is_dir() and "__MACOSX" not in info.filename]
-            if len(members) != 1:
-                names = ", ".join(info.filename[:40] for info in members[:6]) or "none"
-                raise UnreadableFile(f"an archive must hold a single file, got {len(members)}: {names} ({path})")
-            with archive.open(members[0]) as file:
-                yield file, members[0].filename
+            name = _only([info.filename for info in archive.infolist() if not info.is_dir()], path)
+            with archive.open(name) as file:
+                yield file, name
+        return
+    if kind == "tar":
+        with tarfile.open(path) as archive:
+            name = _only([member.name for member in archive.getmembers() if member.isfile()], path)
+            inner = archive.extractfile(name)
+            assert inner is not None
+            with inner:
+                yield inner, name
         return
     with cast("IO[bytes]", _stream(path, kind)) as file:
         yield file, ""
+
+
+def _only(names: Sequence[str], path: Path) -> str:
+    """Return the recording among the names of an archive's files, which documents may lie beside."""
+    names = [name for name in names if "__MACOSX" not in name and not Path(name).name.startswith(".")]
+    data = [name for name in names if Path(name).suffix.lower() not in _DOCUMENTS] if len(names) > 1 else names
+    data = [name for name in data if len(data) == 1 or not Path(name).stem.lower().startswith(("readme", "license"))]
+    if len(data) != 1:
+        shown = ", ".join(name[:40] for name in names[:6]) or "none"
+        raise UnreadableFile(
+            f"an archive must hold a single file, got {len(names)}: {shown}: unpack it, and name its files ({path})"
+        )
+    return data[0]
 
 
 def _stream(path: Path, kind: str) -> Any:

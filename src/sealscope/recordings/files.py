@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -20,7 +21,7 @@ from sealscope.recordings.formats.lvm import is_lvm
 from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.netcdf import OWN
 from sealscope.recordings.formats.table import Choose, RawTable
-from sealscope.recordings.formats.text_layout import SNIFF
+from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
 from sealscope.recordings.recording import Recording
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
@@ -66,6 +67,7 @@ _NAMES = {
 #: First bytes -> format.
 _MAGIC = {
     b"PAR1": "parquet",
+    b"ARROW1": "parquet",
     b"MATLAB 5.0": "matlab",
     b"MATLAB 7.": "matlab",
     b"TDSm": "tdms",
@@ -75,17 +77,51 @@ _MAGIC = {
     b"\xd0\xcf\x11\xe0": "spreadsheet",
     b"\x89HDF\r\n\x1a\n": "netcdf",
 }
+_CSV = "export it as CSV"
 #: First bytes of formats that are known and not read.
 _FOREIGN = {
     b"CDF\x01": "a NetCDF-3 file: convert it to NetCDF-4",
     b"CDF\x02": "a NetCDF-3 file: convert it to NetCDF-4",
     b"CDF\x05": "a NetCDF-3 file: convert it to NetCDF-4",
     b"%PDF": "a PDF document",
+    b"7z\xbc\xaf": "a 7z archive: unpack it",
+    b"Rar!": "a RAR archive: unpack it",
+    b"SQLite format 3": f"an SQLite data base: {_CSV}",
+    b"\x93NUMPY": f"a NumPy array: {_CSV}",
+    b"\x80\x04\x95": f"a Python pickle: {_CSV}",
+    b"\x80\x05\x95": f"a Python pickle: {_CSV}",
+    b"DIAEXTENDED": "a DIAdem header (.DAT): export it from DIAdem as TDMS or CSV",
+    b"|CF,": "an imc FAMOS file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
+    b"DEWESoft": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
+    b"LOGG": "a BLF log of a bus: export its decoded signals as MDF or CSV",
+    b"    -1\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
+    b"    -1\r\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
+    b"    -1\n   151": "a universal file (UFF): export it as MATLAB or CSV",
+    b"\x00\x01\x00\x00Standard": f"an Access data base: {_CSV}",
+    b"\x89PNG": "a picture",
+    b"\xff\xd8\xff": "a picture",
+    b"RIFF": f"a RIFF file, such as sound: {_CSV}",
+}
+#: Suffix of binary files that are known and not read -> what writes them, and the way out.
+_PROPRIETARY = {
+    ".bin": "a binary file such as catman's: export it from catman as MATLAB, TDMS or ASCII",
+    ".tst": "a catman test: export it from catman as MATLAB, TDMS or ASCII",
+    ".tdx": "the samples of a DIAdem .tdm: export them from DIAdem as TDMS or CSV",
+    ".dat": "a binary .dat: export it from the program that wrote it as TDMS, MATLAB or CSV",
+    ".raw": "an imc file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
+    ".dxd": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
+    ".d7d": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
+    ".unv": "a universal file: export it as MATLAB or CSV",
+    ".uff": "a universal file: export it as MATLAB or CSV",
+    ".wdf": "a file of a Yokogawa recorder: export it as CSV",
+    ".trc": "a file of an oscilloscope: export it as CSV",
 }
 #: Formats whose libraries end the process on some damaged files.
 _APART = ("matlab", "mdf")
 #: Longest time that such a file may take [s], and what is added for its size [bytes/s].
 _LONGEST, _SLOWEST = 10.0, 20e6
+#: Archives within archives that are unpacked.
+_DEEPEST_ARCHIVE = 3
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -103,8 +139,15 @@ def _format_of(path: Path) -> str:
             file.seek(offset)
             if file.read(8) == _HDF5:
                 return "netcdf"
+    if b"<usi:tdm" in head:
+        raise UnreadableFile(
+            f"a recording must be in a format that is read, got a DIAdem header (.tdm): export it as TDMS ({path})"
+        )
     if is_matlab_4(head):
         return "matlab"
+    if path.suffix.lower() in _PROPRIETARY and encoding_of(head) is None:
+        name = _PROPRIETARY[path.suffix.lower()]
+        raise UnreadableFile(f"a recording must be in a format that is read, got {name} ({path})")
     return "lvm" if is_lvm(head) else "text"
 
 
@@ -149,8 +192,8 @@ def read(
     r"""Read the recording in a file: the text of any logger, or the file of a measurement program.
 
     Formats: text, NetCDF-4, HDF5, Parquet, TDMS, MATLAB (v4 to v7.3), MDF 3 and 4, LabVIEW's .lvm and spreadsheets
-    (.xlsx, .xlsb, .xls, .ods), each also inside .gz, .bz2, .xz, .zst or .zip. Channels of different rates are brought
-    to the clock of the chamber pressures; the history says how.
+    (.xlsx, .xlsb, .xls, .ods), each also inside .gz, .bz2, .xz, .zst, .zip or .tar. Channels of different rates are
+    brought to the clock of the chamber pressures; the history says how.
 
     Parameters
     ----------
@@ -207,7 +250,11 @@ def read(
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UnreadableFile(f"a recording must be readable, got: {reason} ({file})") from error
-    with unpacked(file, archive) as inner:
+    with ExitStack() as folders:
+        inner, depth = file, 0
+        while archive is not None and depth < _DEEPEST_ARCHIVE:  # a .tar.gz is an archive in an archive
+            inner, depth = folders.enter_context(unpacked(inner, archive)), depth + 1
+            archive = archive_of(inner)
         try:
             return _read(inner, file.name, channel_map, rate, format)
         except UnreadableFile as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
@@ -37,6 +38,7 @@ _TIME_NAMES = {
     "t_ms": "ms",
     "milliseconds": "ms",
 }
+_PARTS = re.compile(r"[./\\\\:]")
 #: Names of a column of dates beside the time of the day.
 _DATE_NAMES = ("date", "datum", "day", "tag", "fecha", "data")
 
@@ -133,6 +135,17 @@ def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | No
     return None
 
 
+def _inside(labels: Sequence[Label], channel: str) -> int | None:
+    """Return the only column that bears a channel's name between points or strokes: `Rig.Cyl.p_A`."""
+    unit = CHANNEL_UNITS[channel]
+    matches = [
+        i
+        for i, label in enumerate(labels)
+        if channel in _PARTS.split(label.name) and label.unit is not None and same_dimension(label.unit, unit)
+    ]
+    return matches[0] if len(matches) == 1 else None
+
+
 def _mapped(labels: Sequence[Label], channel: str, foreign: str, place: str) -> tuple[int, str | None]:
     what = f"{foreign}, mapped to {channel},"
     column = _find(labels, foreign, what, place)
@@ -203,6 +216,7 @@ def choose_columns(
         notes.append(note or f"column {whole} read as {channel} in {unit}")
     for channel in CHANNEL_UNITS:
         own = None if channel in channels else _find(labels, channel, f"channel {channel}", place)
+        own = _inside(labels, channel) if own is None and channel not in channels else own
         if own is not None and own != time and own not in {column for column, _ in channels.values()}:
             unit, note = _checked_unit(channel, labels[own].unit, f"column {labels[own].whole}", place)
             channels[channel] = own, unit

@@ -97,9 +97,14 @@ def _packets(lines: Iterator[str], delimiter: str, above: int, place: str) -> It
             if len(packet.rows) % 2**16 == 0:
                 check_size(len(packet.rows), len(packet.names), place)
         else:
-            head[cells[0].casefold()] = cells[1:]
+            head[cells[0].casefold()] = _of_channels(cells[1:])
     if packet is not None:
         yield packet
+
+
+def _of_channels(cells: list[str]) -> list[str]:
+    """Return a header's cells, one a channel: where each has a time of its own, every second one is empty."""
+    return cells[::2] if len(cells) > 2 and cells[2] and not any(cells[1::2]) else cells
 
 
 def _channels(packets: Sequence[_Packet], multiple: bool, given: bool, comma: bool, place: str) -> list[Series]:

@@ -19,14 +19,30 @@ from numpy.typing import NDArray
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
-from sealscope.recordings.formats.series import Clock, Series, table_of
+from sealscope.recordings.formats.series import Clock, Series, table_of, uniform
 from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable
 
 #: Deepest nesting that is walked, and most columns of a matrix that are taken for series.
 _DEEPEST = 8
 _MOST_COLUMNS = 256
+#: Fields of a struct that name a signal, its unit and the columns of a matrix.
+_NAME_FIELDS = ("name", "signalname", "label", "title")
+_UNIT_FIELDS = ("unit", "units", "einheit", "einheiten")
+_HEADS = (
+    "colheaders",
+    "names",
+    "name",
+    "header",
+    "headers",
+    "labels",
+    "channels",
+    "channelnames",
+    "columns",
+    "varnames",
+)
 
 
 def is_matlab_4(head: bytes) -> bool:
@@ -59,10 +75,10 @@ def read_matlab(path: Path, choose: Choose) -> RawTable:
                 raise UnreadableFile(f"{name} must have at most {MAX_VALUES} values, got the shape {shape} ({place})")
         _refuse_elsewhere(path, place)
         held = matio.load_from_mat(path, add_table_attrs=True)
-    series = [
-        member for name, value in held.items() if not name.startswith("__") for member in _walk("", name, value, None)
-    ]
-    return table_of(series, choose, "MATLAB", place)
+    values = {name: value for name, value in held.items() if not name.startswith("__")}
+    series = list(_group("", "", values, None, -1))
+    scalars = {name: repr(number) for name, value in values.items() if (number := _number(value)) is not None}
+    return table_of(series, choose, "MATLAB", place, rate=stated_rate(scalars))
 
 
 def _refuse_elsewhere(path: Path, place: str) -> None:
@@ -130,16 +146,84 @@ def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None
             return
         if "data" in by_name:
             label = _text(by_name.get("name")) or name
-            unit = _text((_fields(by_name.get("datainfo")) or {}).get("Units"))
+            unit = _text((_fields(by_name.get("datainfo")) or {}).get("Units")) or _first_text(by_name, _UNIT_FIELDS)
+            unit = unit or None
             yield from _columns(group, label, np.asarray(by_name["data"]), unit, clock)
             return
         clock = None  # a struct of vectors beside a vector called time: that is a column like the others
+    elif (held := _vector_of(by_name)) is not None and _first_text(by_name, _UNIT_FIELDS) is not None:
+        # a signal with its name and unit beside its samples
+        own = by_name.get("time", by_name.get("t"))
+        if isinstance(own, np.ndarray) and own.dtype.kind in "fiu" and own.size == held.size:
+            clock = Clock((group, name, depth), partial(np.asarray, own.reshape(-1).astype(np.float64)))
+        yield from _columns(
+            group, _first_text(by_name, _NAME_FIELDS) or name, held, _first_text(by_name, _UNIT_FIELDS) or None, clock
+        )
+        return
     elif "values" in by_name and _text(by_name.get("name")):  # a signal of a Simulink log, named by the log
         yield from _walk(group, _text(by_name["name"]), by_name["values"], clock, depth + 1)
         return
     inner = f"{group}/{name}" if group else name
+    units = _texts_of(fields, _UNIT_FIELDS)
+    names = _column_names(fields)
     for key, value in fields.items():
-        yield from _walk(inner, key, value, clock, depth + 1)
+        if _catman(key, fields) is not None:
+            yield from _catman_channel(inner, key, fields)
+        elif names and isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == len(names):
+            for number, label in enumerate(names):
+                yield from _columns(inner, label, np.asarray(value[:, number]), None, clock)
+        elif key in units and isinstance(value, np.ndarray):
+            yield from _columns(inner, key, value, units[key], clock)
+        else:
+            yield from _walk(inner, key, value, clock, depth + 1)
+
+
+def _vector_of(by_name: Mapping[str, Any]) -> NDArray[Any] | None:
+    """Return the samples that a signal's fields hold under one of the usual names."""
+    for name in ("data", "value", "values", "samples", "y"):
+        value = by_name.get(name)
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
+            return value
+    return None
+
+
+def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
+    """Return the text of the first of these fields, empty where it holds none; None where no field has the name."""
+    return next((_text(by_name[name]) for name in names if name in by_name), None)
+
+
+def _texts_of(fields: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, str]:
+    """Return the texts of a struct called `units` beside the vectors: name of each -> unit."""
+    for key, value in fields.items():
+        held = _fields(value) if key.casefold() in names else None
+        if held is not None:
+            return {name: text for name, member in held.items() if (text := _text(member))}
+    return {}
+
+
+def _column_names(fields: Mapping[str, Any]) -> list[str]:
+    """Return the names of a matrix's columns, which a cell array of texts beside it holds."""
+    for key, value in fields.items():
+        if key.casefold() in _HEADS and isinstance(value, np.ndarray) and value.dtype.kind in "OU" and value.size > 1:
+            texts = [_text(cell) or str(cell) for cell in value.reshape(-1)]
+            if all(texts):
+                return texts
+    return []
+
+
+def _catman(key: str, fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the header of `Channel_3_Data`, as catman exports it; None for any other name."""
+    head, _, last = key.rpartition("_")
+    return _fields(fields.get(f"{head}_Header")) if last == "Data" else None
+
+
+def _catman_channel(group: str, key: str, fields: Mapping[str, Any]) -> Iterator[Series]:
+    header = _catman(key, fields) or {}
+    value = np.asarray(fields[key])
+    step = _number(header.get("dt"))
+    clock = None if not step or step <= 0.0 else uniform("catman", value.size, step)
+    label = _text(header.get("SignalName")) or key
+    yield from _columns(group, label, value, _text(header.get("Unit")) or None, clock)
 
 
 def _times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:

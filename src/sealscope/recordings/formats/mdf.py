@@ -16,7 +16,7 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.series import Clock, Series, table_of
-from sealscope.recordings.formats.table import Choose, RawTable
+from sealscope.recordings.formats.table import MOST_WORDS, Choose, RawTable
 
 
 def read_mdf(path: Path, choose: Choose) -> RawTable:
@@ -54,7 +54,17 @@ def _opened(MDF: Any, path: Path) -> Any:
 
 
 def _values(file: Any, group: int, index: int) -> NDArray[Any]:
-    return np.asarray(file.get(group=group, index=index).samples)
+    values = np.asarray(file.get(group=group, index=index).samples)
+    if values.dtype.kind not in "OSU":
+        return values
+    # a conversion has texts for some values (`SNA`): these are missing, and the others numbers
+    numbers = np.asarray(
+        file.get(group=group, index=index, raw=True).physical(ignore_value2text_conversions=True).samples
+    )
+    named = np.array([isinstance(cell, bytes | str) and bool(cell) for cell in values.tolist()])
+    if numbers.dtype.kind not in "fiu" or np.count_nonzero(named) > MOST_WORDS * named.size:
+        return values
+    return np.where(named, np.nan, numbers)
 
 
 def _seconds(file: Any, group: int) -> Array:

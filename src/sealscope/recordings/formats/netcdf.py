@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import entries, stated_rate
+from sealscope.recordings.formats.series import Series, table_of
 from sealscope.recordings.formats.table import (
     FORMAT_VERSION,
     Choose,
@@ -39,6 +42,8 @@ def read_netcdf(path: Path, choose: Choose) -> RawTable:
 
     place = str(path)
     with h5py.File(path, "r") as file:
+        if OWN not in file.attrs:
+            return _foreign(file, choose, place)
         names: list[str] = []
         file.visititems(lambda name, item: names.append(name) if _is_series(item) else None)
         names.sort(key=lambda name: (name.count("/"), _ORDER.get(name, len(_ORDER)), name))
@@ -58,6 +63,42 @@ def read_netcdf(path: Path, choose: Choose) -> RawTable:
         ]
         description = _description(file, place)
         return RawTable("NetCDF" if "_NCProperties" in file.attrs else "HDF5", choice, columns, description)
+
+
+def _foreign(file: Any, choose: Choose, place: str) -> RawTable:
+    """Read a file that others wrote: the data sets of all its groups, and the fields of its tables."""
+    names: list[str] = []
+    file.visititems(lambda name, item: names.append(name) if _is_series(item) else None)
+    names.sort(key=lambda name: (name.count("/"), _ORDER.get(name, len(_ORDER)), name))
+    series = []
+    for name in names:
+        data = file[name]
+        group, _, leaf = name.rpartition("/")
+        if data.dtype.names:
+            series += [
+                Series(name, Label.parse(field), data.size, partial(_field, data, name, field, place))
+                for field in data.dtype.names
+                if data.dtype[field].kind in "fiub"
+            ]
+            continue
+        label = _label(leaf, data)
+        series.append(Series(group, label, data.size, partial(_checked, data, name, place)))
+    about = entries((name, text) for name, value in file.attrs.items() if (text := _text(value)) is not None)
+    kind = "NetCDF" if "_NCProperties" in file.attrs else "HDF5"
+    return table_of(series, choose, kind, place, rate=stated_rate(about))
+
+
+def _field(data: Any, name: str, field: str, place: str) -> NDArray[Any]:
+    refuse_elsewhere(name, data, place)
+    check_size(data.size, len(data.dtype.names), place)
+    return np.asarray(data[field], dtype=np.float64)
+
+
+def _checked(data: Any, name: str, place: str) -> NDArray[Any]:
+    refuse_elsewhere(name, data, place)
+    if data.dtype.kind in "OSU":
+        return np.array(_texts(data, name, place), dtype=object)
+    return _values(data, name, False, place)
 
 
 def _is_series(item: Any) -> bool:

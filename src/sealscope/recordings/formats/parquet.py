@@ -27,6 +27,9 @@ def read_parquet(path: Path, choose: Choose) -> RawTable:
     """Read the chosen columns of a Parquet table; raise MissingExtra where pyarrow is absent."""
     _, parquet = _pyarrow()
     place = str(path)
+    with path.open("rb") as opened:
+        if opened.read(6) == b"ARROW1":
+            return _read_feather(path, choose)
     with parquet.ParquetFile(path) as file:
         schema = file.schema_arrow
         choice = choose([_label(field) for field in schema])
@@ -45,10 +48,32 @@ def read_parquet(path: Path, choose: Choose) -> RawTable:
     return RawTable("Parquet", choice, columns, parse_description(own, place) if own else None)
 
 
+def _read_feather(path: Path, choose: Choose) -> RawTable:
+    """Read the chosen columns of a Feather file, as Arrow writes tables beside Parquet."""
+    place = str(path)
+    table = library("pyarrow.feather", "Feather", "pyarrow").read_table(path)
+    choice = choose([_label(field) for field in table.schema])
+    fields = [table.schema.field(column) for column, _ in choice.columns]
+    check_size(table.num_rows, len(fields), place)
+    columns = [
+        _values(table.column(column), field, time, place)
+        for (column, time), field in zip(choice.columns, fields, strict=True)
+    ]
+    return RawTable("Feather", choice, columns)
+
+
 def _label(field: Any) -> Label:
     metadata = field.metadata or {}
     unit = next((metadata[key].decode("utf-8", "replace") for key in (b"units", b"unit") if key in metadata), None)
-    return Label.parse(field.name, unit)
+    if field.name.startswith("__index_level_") and _is_moment(field):  # the index of a data frame, without a name
+        return Label(field.name, "time", "s")
+    return Label.parse(field.name, "s" if _is_moment(field) else unit)
+
+
+def _is_moment(field: Any) -> bool:
+    import pyarrow
+
+    return bool(pyarrow.types.is_timestamp(field.type) or pyarrow.types.is_duration(field.type))
 
 
 def _is_text(field: Any) -> bool:
@@ -72,6 +97,9 @@ def _values(column: Any, field: Any, time: bool, place: str) -> NDArray[Any]:
     types = pyarrow.types
     if time and types.is_timestamp(field.type):
         return np.asarray(column.cast(pyarrow.timestamp("ns", field.type.tz)).to_numpy().astype("datetime64[ns]"))
+    if time and types.is_duration(field.type):
+        nanoseconds = column.cast(pyarrow.duration("ns")).cast(pyarrow.int64())
+        return np.asarray(nanoseconds.cast(pyarrow.float64(), safe=False).to_numpy(), dtype=np.float64) / 1e9
     if types.is_integer(field.type) or types.is_floating(field.type) or types.is_decimal(field.type):
         return np.asarray(column.cast(pyarrow.float64(), safe=False).to_numpy(), dtype=np.float64)
     if _is_text(field):

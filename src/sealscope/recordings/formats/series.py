@@ -21,8 +21,10 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, Array
 from sealscope.recordings.formats.columns import ColumnMap, listed
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.proposal import is_time
 from sealscope.recordings.formats.table import Choose, RawTable, check_size, from_text
 from sealscope.recordings.timebase import nominal_rate
+from sealscope.units import to_si
 
 #: The clock of a file among the columns: what stands for it where no column is mapped to `t`.
 _CLOCK_LABEL = Label("t [s]", "t", "s")
@@ -30,6 +32,10 @@ _CLOCK_LABEL = Label("t [s]", "t", "s")
 _BASE = ("p_A", "p_B", "p_1", "p_2")
 #: A slower series is not interpolated between samples that are this many of its usual intervals apart.
 _GAP = 3.0
+#: Clocks that differ by less than this share of an interval are one.
+_SAME = 1e-2
+#: Names that say nothing: the group's stands for them.
+_GENERIC = ("data", "value", "values", "wert", "werte", "signal", "y", "samples")
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,12 @@ def _uniform(count: int, step: float, first: float) -> Array:
 
 
 def table_of(
-    series: Sequence[Series], choose: Choose, kind: str, place: str, about: Mapping[str, str] | None = None
+    series: Sequence[Series],
+    choose: Choose,
+    kind: str,
+    place: str,
+    about: Mapping[str, str] | None = None,
+    rate: float | None = None,
 ) -> RawTable:
     """Return the table of the series that `choose` picks; raise UnreadableFile where they cannot be brought together.
 
@@ -91,11 +102,13 @@ def table_of(
         The file, for messages.
     about : mapping of str to str, optional
         What the file says of the recording.
+    rate : float, optional
+        Sampling rate that the file states [Hz], for series without a clock.
     """
-    series, notes = _distinct(series)
+    series, notes = _distinct(_timed(series))
     labels = [member.label for member in series]
     clocked = any(member.clock is not None for member in series) and not any(label.name == "t" for label in labels)
-    choice = choose([*labels, _CLOCK_LABEL] if clocked else labels)
+    choice = choose([*labels, _CLOCK_LABEL] if clocked else labels, rate)
     chosen = {column: series[column] for column, time in choice.columns if not time}
     check_size(max(member.count for member in chosen.values()), len(choice.columns), place)
     if choice.time == len(series):
@@ -111,6 +124,40 @@ def table_of(
             )
     columns = [_samples(chosen[column], time, place) for column, time in choice.columns]
     return RawTable(kind, choice, columns, notes=notes, about=about or {})
+
+
+def _timed(series: Sequence[Series]) -> list[Series]:
+    """Return series of which those without a clock have that of their group, where the groups hold times of their own.
+
+    A series called `data` or `value` beside them has its group's name.
+    """
+    times: dict[str, Series] = {}
+    for member in series:
+        if member.clock is None and is_time(member.label):
+            times.setdefault(member.group, member)
+    members = [member for member in series if not (len(times) > 1 and member is times.get(member.group))]
+    held = Counter(member.group for member in members)
+    result = []
+    for member in members:
+        group, label, clock = member.group, member.label, member.clock
+        if label.name.casefold() in _GENERIC and group and held[group] == 1:
+            last = group.rpartition("/")[2]
+            named = Label.parse(last, label.unit)
+            label = Label(label.whole, named.name, named.unit)
+        time = times.get(group) if len(times) > 1 else None
+        if time is not None and member.clock is None and time.count == member.count:
+            clock = Clock(("times of", group), partial(_seconds, time))
+        result.append(replace(member, label=label, clock=clock))
+    return result
+
+
+def _seconds(time: Series) -> Array:
+    values = time.values()
+    if values.dtype.kind == "M":
+        return np.asarray((values - values[0]) / np.timedelta64(1, "ns")) / 1e9
+    if values.dtype.kind == "m":
+        return np.asarray(values / np.timedelta64(1, "ns"), dtype=np.float64) / 1e9
+    return to_si(np.asarray(values, dtype=np.float64), time.label.unit or "s", "s", name=time.path)
 
 
 def _distinct(series: Sequence[Series]) -> tuple[list[Series], tuple[str, ...]]:
@@ -196,7 +243,7 @@ def _brought(values: Array, member: Series, t: Array, base: Series, place: str) 
     own = np.asarray(member.clock.seconds(), dtype=np.float64)
     if member.clock.start is not None and base.clock.start is not None:
         own = own + float((member.clock.start - base.clock.start) / np.timedelta64(1, "ns")) / 1e9
-    if own.shape == t.shape and np.array_equal(own, t):
+    if own.shape == t.shape and (np.array_equal(own, t) or _nearly(own, t)):
         return values, ""
     order = np.isfinite(own) & np.isfinite(values)
     own, values = own[order], values[order]
@@ -212,6 +259,13 @@ def _brought(values: Array, member: Series, t: Array, base: Series, place: str) 
     after = np.clip(np.searchsorted(own, t), 1, own.size - 1)
     result[(own[after] - own[after - 1] > _GAP * float(np.median(np.diff(own)))) & (own[after] != t)] = np.nan
     return result, f"at {rate:g} Hz: interpolated linearly to {wanted:g} Hz"
+
+
+def _nearly(own: Array, t: Array) -> bool:
+    """Return whether two clocks (n,) differ by less than can matter to a sample."""
+    steps = np.diff(t)
+    usual = float(np.median(steps)) if steps.size else 0.0
+    return usual > 0.0 and bool(np.all(np.abs(own - t) <= _SAME * usual))
 
 
 def _averaged(values: Array, own: Array, t: Array, step: float) -> Array:

@@ -13,20 +13,23 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.errors import UnreadableFile
+from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.table import Choose, RawTable, check_size
 from sealscope.recordings.formats.text import read_text
 
 
 def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen columns of the first sheet that holds them, sheets with most rows first.
+    """Read the chosen columns of the first sheet that holds them: hidden sheets last, those with most rows first.
 
     Raises MissingExtra where python-calamine is absent, and what the largest sheet lacks where no sheet holds a log.
     """
     place = str(path)
     workbook = library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(str(path))
     sheets = [workbook.get_sheet_by_name(name) for name in workbook.sheet_names]
-    sheets = sorted((sheet for sheet in sheets if sheet.total_height), key=lambda sheet: -sheet.total_height)
+    hidden = {member.name for member in workbook.sheets_metadata if not str(member.visible).endswith(".Visible")}
+    sheets = [sheet for sheet in sheets if sheet.total_height]
+    sheets.sort(key=lambda sheet: (sheet.name in hidden, -sheet.total_height))
     if not sheets:
         raise UnreadableFile(f"a workbook must have a sheet with rows, got none ({place})")
     reason: UnreadableFile | None = None
@@ -37,7 +40,8 @@ def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
         except UnreadableFile as error:
             reason = reason or error
             continue
-        notes = (f"sheet {sheet.name} of {len(workbook.sheet_names)}",) if len(workbook.sheet_names) > 1 else ()
+        others = [name for name in workbook.sheet_names if name != sheet.name]
+        notes = (f"sheet {sheet.name} read, not {listed(others, 4)}",) if others else ()
         return replace(table, kind="spreadsheet", notes=(*notes, *table.notes))
     assert reason is not None
     raise reason

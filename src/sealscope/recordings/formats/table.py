@@ -23,6 +23,8 @@ MAX_VALUES = 2**28
 _SMALL, _EXPANSION = 2**26, 4096
 _MOST_TEXTS, _WIDEST_TEXT, _MOST_TEXT = 2**22, 400, 2**29
 FORMAT_VERSION = 1
+#: Share of a column's cells that may hold a word, as loggers write where the input overflows.
+MOST_WORDS = 0.01
 #: Decides from a table's labels, and the rate that the file states where it does, which columns are read.
 Choose = Callable[..., ColumnMap]
 
@@ -125,11 +127,24 @@ def check_texts(cells: int, width: int, name: str, place: str) -> None:
 
 
 def from_text(cells: Sequence[str], time: bool, name: str, place: str) -> NDArray[Any]:
-    """Convert cells of text to doubles, or to stamps for the `time`; an empty cell is missing."""
+    """Convert cells of text to doubles, or to stamps for the `time`; an empty cell is missing, and a few words are."""
     try:
-        return stamps(cells) if time else np.array([float(cell) if cell else np.nan for cell in cells])
+        if time:
+            return stamps(cells)
+        values = np.array([_number(cell) for cell in cells])
     except ValueError as error:
         raise UnreadableFile(f"{name} must hold numbers, got text ({place})") from error
+    words = sum(1 for cell, value in zip(cells, values, strict=True) if cell and np.isnan(value))
+    if words > MOST_WORDS * len(cells):
+        raise UnreadableFile(f"{name} must hold numbers, got text ({place})")
+    return values
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell) if cell else np.nan
+    except ValueError:
+        return np.nan
 
 
 def description_of(rate: float, provenance: Mapping[str, Any], history: Sequence[str]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import entries
+from sealscope.recordings.formats.headings.preamble import entries, stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.series import Clock, Series, table_of, uniform
 from sealscope.recordings.formats.table import Choose, RawTable
@@ -25,6 +26,7 @@ def read_tdms(path: Path, choose: Choose) -> RawTable:
     A channel with the waveform's interval (``wf_increment``) has a clock; one without needs a time column or a rate.
     """
     nptdms = library("nptdms", "TDMS", "npTDMS")
+    library("nptdms.log", "TDMS", "npTDMS").log_manager.set_level(logging.ERROR)  # a last segment cut short is read
     with nptdms.TdmsFile.open(path) as file:
         series = [
             Series(
@@ -37,10 +39,14 @@ def read_tdms(path: Path, choose: Choose) -> RawTable:
             for group in file.groups()
             for channel in group.channels()
         ]
-        about = entries(
-            (name, value) for name, value in file.properties.items() if isinstance(value, str | int | float)
-        )
-        return table_of(series, choose, "TDMS", str(path), about)
+        about = _texts(file.properties)
+        stated = [stated_rate(_texts(member.properties)) for member in (file, *file.groups())]
+        rate = next((rate for rate in stated if rate is not None), None)
+        return table_of(series, choose, "TDMS", str(path), about, rate)
+
+
+def _texts(properties: Mapping[str, Any]) -> dict[str, str]:
+    return entries((name, value) for name, value in properties.items() if isinstance(value, str | int | float))
 
 
 def _values(channel: Any) -> NDArray[Any]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.columns import ColumnMap, counted
-from sealscope.recordings.formats.table import Choose, RawTable, check_size, parse_description
+from sealscope.recordings.formats.table import MOST_WORDS, Choose, RawTable, check_size, parse_description
 from sealscope.recordings.formats.text_layout import (
     COMMENTS,
     MISSING,
@@ -34,8 +34,6 @@ from sealscope.recordings.timebase import is_stamp, stamps
 _CHUNK = 8 * 1024 * 1024
 _LONGEST_OWN_LINE = 64 * 1024 * 1024
 _ROWS_WRITTEN_AT_ONCE = 8192
-#: Share of a column's cells that may hold a word, as loggers write where the input overflows.
-_MOST_WORDS = 0.01
 #: Most lines of text among the samples, however few these are: marks of events, a summary at the end.
 _MOST_REMARKS = 8
 _STAMP_RULE = "time must be a stamp such as 2024-05-31T12:00:00.002"
@@ -284,7 +282,7 @@ class _Words:
 
     def notes(self, rows: int) -> list[str]:
         """Return a line for the history; raise UnreadableFile where they are more than a few among `rows`."""
-        if self.count > max(_MOST_WORDS * rows, 0 if self.name else _MOST_REMARKS):
+        if self.count > max(MOST_WORDS * rows, 0 if self.name else _MOST_REMARKS):
             raise UnreadableFile(f"{self.rule}, got {self.first!r} {self.where}")
         if not self.count:
             return []

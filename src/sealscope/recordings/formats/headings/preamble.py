@@ -20,7 +20,7 @@ _RATE = re.compile(
     re.IGNORECASE,
 )
 _INTERVAL = re.compile(
-    r"(?:dt|delta[ _]?[tx]|\u0394t|sampl(?:e|ing)[ _-]?(?:interval|period|time)|abtast(?:zeit|intervall|periode)|"
+    r"(?:dt|ts|delta[ _]?[tx]|\u0394t|sampl(?:e|ing)[ _-]?(?:interval|period|time)|abtast(?:zeit|intervall|periode)|"
     r"horizontal interval|hresolution|increment|\u91c7\u6837(?:\u5468\u671f|\u95f4\u9694))",
     re.IGNORECASE,
 )

@@ -39,8 +39,8 @@ _WORDS: Mapping[str, frozenset[str]] = {
     "angle": _words("theta phi angle winkel motorwinkel encoder drehwinkel angulo angolo hoek kat 角度 转角"),
     "leak": _words("leak leakage leck leckage leckstrom fuite fuga trafilamento 泄漏 漏れ"),
     "time": _words(
-        "t time timestamp datetime zeit messzeit uhrzeit zeitstempel temps horodatage heure tiempo hora tempo ora "
-        "tijd tijdstip czas 时间 时刻 時間 時刻"
+        "t time tout timestamp timestamps datetime zeit messzeit uhrzeit zeitstempel temps horodatage heure tiempo "
+        "hora tempo ora tijd tijdstip czas 时间 时刻 時間 時刻"
     ),
 }
 #: Last words of German compounds (Zylinderweg, Messzeit), where a whole word is not known.
