@@ -296,8 +296,9 @@ def mdf_other(folder: Path, compression: int = 0, prefix: str = "", text: str = 
 
     with MDF(version="4.10") as file:
         file.append([Signal(values, T, unit=unit, name=prefix + name) for name, values, unit in SIGNALS[:2]])
-        conversion = {"lower_0": X[100] - 1e-6, "upper_0": X[100] + 1e-6, "text_0": text} if text else None
-        file.append([Signal(X, T, unit="mm", name=f"{prefix}x", conversion=conversion)])
+        conversion = {"lower_0": 9999.0, "upper_0": 9999.0, "text_0": text} if text else None
+        position = np.where((np.arange(N) == N // 2) & bool(text), 9999.0, X)
+        file.append([Signal(position, T, unit="mm", name=f"{prefix}x", conversion=conversion)])
         file.save(folder / "log.mf4", overwrite=True, compression=compression)
     return folder / "log.mf4"
 
