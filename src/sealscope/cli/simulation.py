@@ -52,6 +52,14 @@ def simulate(
         str | None,
         typer.Option("--load", help="Force against +x beside the rig's own, e.g. '2 kN', 'step 500 N at 3 s'."),
     ] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(
+            "--controller",
+            help="What follows a target: pi, flatness, fault-tolerant, fault-tolerant-flatness, or your own as "
+            "FILE.py:NAME or MODULE:NAME. [default: pi]",
+        ),
+    ] = None,
     leak: Annotated[
         list[str] | None, typer.Option("--leak", help="Leak, e.g. '0.0042 L/min from 90 s'; repeat to combine.")
     ] = None,
@@ -117,6 +125,7 @@ def simulate(
         rig=rig_with(rig, overrides),
         command=command,
         load=load,
+        controller=controller,
         leak=leak,
         fault=fault,
         duration=duration,

@@ -2,4 +2,11 @@
 
 from sealscope.control.controller import Controller as Controller
 from sealscope.control.controller import Measured as Measured
+from sealscope.control.drive import Drive as Drive
+from sealscope.control.fault_tolerant import FaultTolerant as FaultTolerant
+from sealscope.control.flatness import Flatness as Flatness
+from sealscope.control.leak_observer import Balance as Balance
+from sealscope.control.leak_observer import LeakObserver as LeakObserver
 from sealscope.control.position import PositionPI as PositionPI
+from sealscope.control.registry import CONTROLLERS as CONTROLLERS
+from sealscope.control.registry import controller_named as controller_named

@@ -10,7 +10,7 @@ class Measured(NamedTuple):
     """What a controller knows at a sample.
 
     Time [s]; target [m]; mean speed of the target [m/s] while the voltage will act; measured position [m] from
-    mid-stroke; measured pressures of the chambers [Pa].
+    mid-stroke; measured pressures of the chambers [Pa]; measured angle of the motor [rad].
     """
 
     t: float
@@ -19,6 +19,7 @@ class Measured(NamedTuple):
     x: float
     p_A: float
     p_B: float
+    theta: float = 0.0
 
 
 class Controller(Protocol):
@@ -28,6 +29,9 @@ class Controller(Protocol):
     measurement to the voltage that it leads to. A run calls `start` and then the function that it returns once a
     sample; what that function remembers belongs to the run alone, so that a run can be begun anew. The voltage is held
     until the next, and held within the converter's range by the rig. A frozen dataclass tells runs apart by its fields.
+
+    Where the function has an attribute `compensated`, the leakage flow [m^3/s] that it makes good at its last sample,
+    the recording has it as the channel `q_comp`, so that control does not hide the wear.
 
     Examples
     --------

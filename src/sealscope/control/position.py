@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 from sealscope.control.controller import Measured
-from sealscope.errors import InputError
+from sealscope.control.drive import Drive, check_numbers
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -47,25 +47,25 @@ class PositionPI:
 
     def __post_init__(self) -> None:
         positive = ("area_A", "area_B", "displacement", "omega_per_volt", "u_max", "rate")
-        for name in positive:
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"{name} of the controller must be > 0, got {getattr(self, name)}")
-        for name in ("drive_shortfall", "drive_corner", "k_v", "k_i", "dead_band", "delay"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise InputError(f"{name} of the controller must be >= 0, got {getattr(self, name)}")
+        rest = ("drive_shortfall", "drive_corner", "k_v", "k_i", "dead_band", "delay")
+        check_numbers(
+            "the controller",
+            {name: getattr(self, name) for name in positive},
+            {name: getattr(self, name) for name in rest},
+        )
 
     @classmethod
     def of(cls, rig: Rig, **gains: float) -> Self:
         """Return the controller for what a rig is said to be; `gains` are further fields."""
-        motor, cylinder = rig.motor, rig.cylinder
+        drive, cylinder = Drive.of(rig), rig.cylinder
         gains.setdefault("dead_band", 1.5 * rig.sensors.x.resolution)
         return cls(
             cylinder.A_A,
             cylinder.A_B,
-            rig.pump.q_b / (2.0 * math.pi),
-            motor.omega_per_volt,
-            motor.C_e / motor.k_p if motor.k_p > 0 else 0.0,
-            motor.K_i / motor.k_p if motor.k_p > 0 else 0.0,
+            drive.displacement,
+            drive.omega_per_volt,
+            drive.shortfall,
+            drive.corner,
             rig.daq.u_max,
             **gains,  # type: ignore[arg-type]
         )
@@ -73,19 +73,17 @@ class PositionPI:
     def start(self) -> Callable[[Measured], float]:
         """Return a function from what is measured to the voltage [V], for one run from its beginning."""
         T = 1.0 / self.rate
-        fading = math.exp(-self.drive_corner * T)
+        drive = Drive(self.displacement, self.omega_per_volt, self.drive_shortfall, self.drive_corner, 0.0)
+        inverse = drive.inverse(self.rate)
         averaged = 1.0 - math.exp(-T / _PRESSURE_LAG)
-        integral = omega_before = quick = dp = 0.0
+        integral = dp = 0.0
 
         def voltage(measured: Measured) -> float:
-            nonlocal integral, omega_before, quick, dp
+            nonlocal integral, dp
             dp += averaged * (measured.p_A - measured.p_B - dp)
             error = measured.target - measured.x
             velocity = measured.target_speed + self.k_v * error + integral
-            omega = velocity * (self.area_A if dp > 0.0 else self.area_B) / self.displacement
-            quick = fading * (quick + omega - omega_before)
-            omega_before = omega
-            u = (omega + self.drive_shortfall * quick) / self.omega_per_volt
+            u = inverse(velocity * (self.area_A if dp > 0.0 else self.area_B), 0.0)
             within = abs(error) <= self.dead_band
             if not within and (abs(u) < self.u_max or u * error < 0.0):
                 integral += self.k_i * T * error

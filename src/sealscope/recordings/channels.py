@@ -22,6 +22,7 @@ CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
         "p_A": "Pa",
         "p_B": "Pa",
         "q_leak": "m^3/s",
+        "q_comp": "m^3/s",
     }
 )
 #: What each channel, and the time, measures.
@@ -37,6 +38,7 @@ LONG_NAMES: Mapping[str, str] = MappingProxyType(
         "p_A": "pressure in chamber A",
         "p_B": "pressure in chamber B",
         "q_leak": "leakage flow",
+        "q_comp": "leakage flow that the controller makes good",
     }
 )
 #: Unit of a mapped channel that came without one: raw counts of a converter.

@@ -213,7 +213,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         return findings
     if constant(kept):
         # a command may rest, and a flow meter on a closed bypass reads one value; a pressure never does
-        severity: Severity = "note" if name in ("u", "q_leak") else "warning"
+        severity: Severity = "note" if name in ("u", "q_leak", "q_comp") else "warning"
         add("constant", severity, kept.size, int(present[0]), f"is constant at {kept[0]:g} {recording.units[name]}")
         return findings
     held = stuck(kept)
@@ -222,7 +222,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
             at_end = f"{counted(rail.samples, 'sample')} at the {rail.side} end"
             text = f"{at_end}, {rail.value:g} {recording.units[name]}: clipped"
             add("clipped", "warning", rail.samples, int(present[rail.first]), text)
-    if name not in ("u", "q_leak"):
+    if name not in ("u", "q_leak", "q_comp"):
         if name.startswith("p_"):  # at an end of its values it is clipped
             held = held[(kept[held[:, 0]] > kept.min()) & (kept[held[:, 0]] < kept.max())]
         if held.size:

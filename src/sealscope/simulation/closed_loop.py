@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -34,8 +35,8 @@ def outputs_per_sample(rate: float, controller_rate: float, least: int) -> int:
 class Feedback:
     """The voltage of a controller over a run, sample after sample.
 
-    Position and pressures are read as the rig's encoder and transducers do: whole counts, and the transducer's own
-    noise, from `seed`. `apart`: outputs of the solver between two samples of the controller.
+    Position, angle and pressures are read as the rig's encoders and transducers do: whole counts, and the transducer's
+    own noise, from `seed`. `apart`: outputs of the solver between two samples of the controller.
     """
 
     def __init__(
@@ -62,19 +63,27 @@ class Feedback:
         """Begin the run anew."""
         self._voltage = self._controller.start()
         self._volts = np.zeros(self._t.size + self._controller.delay)
+        self._compensated: Array | None = None
         self._sampled = 0
 
-    def sample(self, output: int, x: float, p_A: float, p_B: float) -> None:
-        """Let the controller see the state at an output of the solver, unless it has."""
+    def sample(self, output: int, y: Array) -> None:
+        """Let the controller see the state `y` at an output of the solver, unless it has."""
+        from sealscope.physics.state import P_A, P_B, POSITION, THETA
+
         k = output // self.apart
         if k < self._sampled:
             return
-        counts = self._rig.sensors.x.resolution
-        seen = np.floor(x / counts) * counts if counts > 0 else x
-        noise = self._noise[k]
+        sensors, (noise_A, noise_B) = self._rig.sensors, self._noise[k]
+        seen = _counted(float(y[POSITION]), sensors.x.resolution)
+        angle = _counted(float(y[THETA]), 2.0 * np.pi / sensors.theta.counts)
         aim = float(self._target[k]), float(self._speed[k])
-        measured = Measured(float(self._t[k]), *aim, float(seen), float(p_A + noise[0]), float(p_B + noise[1]))
-        volts = float(self._voltage(measured))
+        pressures = float(y[P_A] + noise_A), float(y[P_B] + noise_B)
+        volts = float(self._voltage(Measured(float(self._t[k]), *aim, seen, *pressures, angle)))
+        flow = getattr(self._voltage, "compensated", None)
+        if flow is not None:
+            if self._compensated is None:
+                self._compensated = np.zeros(self._t.size)
+            self._compensated[k] = flow
         if not np.isfinite(volts):
             raise SimulationFailed(f"the controller must give a finite voltage, got {volts} at t = {self._t[k]:.4g} s")
         limit = self._rig.daq.u_max
@@ -88,3 +97,13 @@ class Feedback:
     def volts(self, outputs: int) -> Array:
         """Return the voltages [V], (n,), at the first outputs of the solver."""
         return np.asarray(self._volts[np.arange(outputs) // self.apart])
+
+    def compensated(self, outputs: int) -> Array | None:
+        """Return the leakage flow [m^3/s] that is made good, at the first outputs; None where none is reported."""
+        if self._compensated is None:
+            return None
+        return np.asarray(self._compensated[np.arange(outputs) // self.apart])
+
+
+def _counted(value: float, count: float) -> float:
+    return math.floor(value / count) * count if count > 0 else value

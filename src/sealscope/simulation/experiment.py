@@ -165,7 +165,7 @@ class Experiment:
         error: float | str | None = None,
         allow_unresolved: bool = False,
         load: Force | str | None = None,
-        controller: Controller | None = None,
+        controller: Controller | str | None = None,
     ) -> Experiment:
         """Make an experiment of numbers in SI units and texts with units; the arguments are those of `simulate`.
 
@@ -194,6 +194,10 @@ class Experiment:
             raise InputError(f"load must be a text or a Force, got {load!r}")
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
             raise InputError(f"seed must be a whole number, got {seed!r}")
+        if isinstance(controller, str):
+            from sealscope.control import controller_named
+
+            controller = controller_named(controller, loaded)
         return cls(
             rig=loaded.with_overrides(overrides) if overrides else loaded,
             command=command,

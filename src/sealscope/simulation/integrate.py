@@ -55,7 +55,8 @@ class Trajectory:
     """Result of an integration: (n,) times [s] and (n, 19) outputs in the order of `sealscope.physics.state.OUTPUTS`.
 
     `error`: the estimated rms error [Pa] of the pressures, NaN where it was not checked. `volts`: (n,) a controller's
-    voltages [V], None where the command is known beforehand.
+    voltages [V], None where the command is known beforehand; `compensated`: (n,) the leakage flow [m^3/s] that it says
+    it makes good, None where it says nothing.
     """
 
     t: Array
@@ -64,6 +65,7 @@ class Trajectory:
     step: float
     error: float = math.nan
     volts: Array | None = None
+    compensated: Array | None = None
 
     def __getitem__(self, name: str) -> Array:
         from sealscope.physics.state import OUTPUTS
@@ -295,7 +297,9 @@ def integrate(
         h = 1.0 / (rate * every)
         if times <= 1.0 or every >= finest or (step is not None and allow_unresolved):
             volts = None if feedback is None else feedback.volts(n_out)
-            return Trajectory(np.arange(n_out) / rate, rows, run.method, h, judge.moved if checks else math.nan, volts)
+            flow = None if feedback is None else feedback.compensated(n_out)
+            moved = judge.moved if checks else math.nan
+            return Trajectory(np.arange(n_out) / rate, rows, run.method, h, moved, volts, flow)
         if step is not None:
             raise SimulationFailed(
                 f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves {judge.worst()}; take "
@@ -332,7 +336,7 @@ class _Run:
         from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
         from sealscope.physics.solvers.limits import longest_step, longest_step_on_stop
         from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
-        from sealscope.physics.state import P_A, P_B, POSITION, survey
+        from sealscope.physics.state import survey
 
         feedback, unloaded = self.feedback, np.zeros((0, 0))
         h = 1.0 / (self.rate * every)
@@ -345,7 +349,7 @@ class _Run:
             if feedback is not None:  # up to the controller's next sample
                 last = min((first // feedback.apart + 1) * feedback.apart, stop)
                 if first % feedback.apart == 0:
-                    feedback.sample(first, y[POSITION], y[P_A], y[P_B])
+                    feedback.sample(first, y)
             steps = np.arange(first * every, last * every, dtype=np.float64)
             u, G, C = self.inputs.at_nodes(steps * h, nodes * h)
             if feedback is not None:

@@ -14,7 +14,7 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.simulation.changes import ParameterDrift
 from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment, Method
 from sealscope.simulation.faults import Fault, Leak
@@ -179,7 +179,11 @@ def simulate_with_truth(experiment: Experiment, progress: Progress | None = None
         "solver": solver | {"error_found_pa": path.error},
     }
     history = (f"simulated with {path.method}, h = {path.step:.4g} s; sampled at {experiment.rate:g} Hz",)
-    recording = replace(recorded, provenance=provenance, history=history)
+    channels = dict(recorded.channels)
+    if path.compensated is not None:
+        channels["q_comp"] = path.compensated[: n * factor : factor]
+    units = {name: CHANNEL_UNITS[name] for name in channels}
+    recording = replace(recorded, channels=channels, units=units, provenance=provenance, history=history)
     outputs = {name: path[name][: n * factor : factor] for name in TRUE_OUTPUTS}
     dp, dp_0 = path["p_A"] - path["p_B"], experiment.rig.line.dp_0
     mean = sum(mean_while_open(leak, path.t, leak_flow(leak, path.t, dp, dp_0)) for leak in leaks) / LITRE_PER_MINUTE
@@ -302,7 +306,7 @@ def simulate(
     error: float | str | None = None,
     allow_unresolved: bool = False,
     load: Force | str | None = None,
-    controller: Controller | None = None,
+    controller: Controller | str | None = None,
 ) -> Recording:
     """Simulate a rig under a command and record it as its instruments would.
 
@@ -347,8 +351,9 @@ def simulate(
     load : str or Force, optional
         Force against +x beside the rig's own (``cylinder.F_l``), in a command's words: ``"2 kN"``, ``"500 N sin(2t)"``,
         ``"step 2 kN at 3 s"``.
-    controller : Controller, optional
-        What follows a target; by default `sealscope.control.PositionPI`, which assumes the rig as it is.
+    controller : Controller or str, optional
+        What follows a target: a controller, or the name of one (``"pi"``, ``"flatness"``, ``"fault-tolerant"``,
+        ``"FILE.py:NAME"`` of your own), which assumes the rig as it is; by default ``"pi"``.
 
     Returns
     -------

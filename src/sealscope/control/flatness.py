@@ -1,0 +1,101 @@
+"""Flatness-based control of the piston's position: the target alone says what every state of the machine must be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+from sealscope.control.controller import Measured
+from sealscope.control.drive import Drive, check_numbers
+from sealscope.control.position import PositionPI
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Time [s] over which the load that the pressures carry is averaged.
+_LOAD_LAG = 0.1
+
+
+@dataclass(frozen=True)
+class Flatness:
+    """Feed-forward of all that the target asks of the machine, beside the feedback of a PI controller.
+
+    The position is a flat output of the machine: with x = target, v and a its derivatives,
+    F = M a + F_f(v) + F_load, dp = F/A, Q = A v + G dp + dp'/(1/C), u = the drive's inverse of (Q, dp).
+    `feedback` gives the part A v and the correction; this adds the leakage of the pump `G` [m^3/(s Pa)], the compliance
+    `C` = V/(2 K) [m^3/Pa], and the speed that the drive loses under the torque of dp. F_f(v) = (`F_C` + `F_v` |v|)
+    sign(v), smooth within `v_th` [m/s]; F_load is averaged from the pressures. All numbers are the controller's own
+    assumptions: `M` [kg], `F_C` [N], `F_v` [N s/m].
+
+    A jump of the target has no derivative: at a speed above `v_max` [m/s] nothing is fed forward.
+
+    Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
+    """
+
+    feedback: PositionPI
+    drive: Drive
+    M: float
+    F_C: float
+    F_v: float
+    v_th: float
+    G: float
+    C: float
+    v_max: float
+
+    def __post_init__(self) -> None:
+        rest = {"M": self.M, "F_C": self.F_C, "F_v": self.F_v, "G": self.G, "C": self.C}
+        check_numbers("the controller", {"v_th": self.v_th, "v_max": self.v_max}, rest)
+
+    @classmethod
+    def of(cls, rig: Rig) -> Self:
+        """Return the controller for what a rig is said to be."""
+        cylinder, friction, drive = rig.cylinder, rig.friction, Drive.of(rig)
+        greatest = rig.daq.u_max * drive.omega_per_volt * drive.displacement / min(cylinder.A_A, cylinder.A_B)
+        return cls(
+            PositionPI.of(rig),
+            drive,
+            cylinder.M_eq,
+            friction.F_pr + 2.0 * friction.F_cfr * rig.fluid.p_charge,
+            friction.F_v,
+            friction.v_th,
+            rig.pump.G_pump,
+            cylinder.V / (2.0 * rig.fluid.K_oil),
+            greatest,
+        )
+
+    @property
+    def rate(self) -> float:
+        """Samples of the controller a second [Hz]."""
+        return self.feedback.rate
+
+    @property
+    def delay(self) -> int:
+        """Whole samples from a measurement to its voltage."""
+        return self.feedback.delay
+
+    def start(self) -> Callable[[Measured], float]:
+        """Return a function from what is measured to the voltage [V], for one run from its beginning."""
+        feedback, inverse, T = self.feedback.start(), self.drive.inverse(self.rate), 1.0 / self.rate
+        area_A, area_B, u_max = self.feedback.area_A, self.feedback.area_B, self.feedback.u_max
+        averaged = 1.0 - math.exp(-T / _LOAD_LAG)
+        v_before = dp_before = load = 0.0
+        first = True
+
+        def voltage(measured: Measured) -> float:
+            nonlocal v_before, dp_before, load, first
+            v = measured.target_speed if abs(measured.target_speed) <= self.v_max else 0.0
+            a = 0.0 if first else (v - v_before) / T
+            a = a if abs(a) * T < 0.1 * self.v_max else 0.0
+            force = self.M * a + self.F_C * math.tanh(v / self.v_th) + self.F_v * v
+            pushed = area_A * measured.p_A - area_B * measured.p_B
+            load += (1.0 if first else averaged) * (pushed - force - load)
+            area = area_A if load >= 0.0 else area_B
+            dp = (force + load) / area
+            rate = 0.0 if first else (dp - dp_before) / T
+            flow = self.G * dp + self.C * rate
+            v_before, dp_before, first = v, dp, False
+            return min(max(feedback(measured) + inverse(flow, dp), -u_max), u_max)
+
+        return voltage

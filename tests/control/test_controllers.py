@@ -1,0 +1,182 @@
+"""Controllers: the drive's inverse, flatness, the observer of the leak, tolerance of it, and names."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.control import CONTROLLERS, Drive, FaultTolerant, Flatness, LeakObserver, PositionPI, controller_named
+from sealscope.errors import InputError
+from sealscope.parameters import load_rig
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.integrate import trajectory
+
+RIG = load_rig("thesis-closed-loop")
+#: What the controllers do not know: friction up and stiffness down by 20 %; and a load of 2 kN.
+OFF = {"F_pr": 30.0, "F_cfr": 1.2e-6, "F_v": 360.0, "K_oil": 551e6, "F_l": 2000.0}
+#: 0.25 Hz within the drive's range of 10 V even with a leak of 0.5 L/min.
+SINE = f"position 40 mm sin({0.5 * math.pi}t)"
+OWN = Path(__file__).parents[2] / "docs" / "examples" / "own_controller.py"
+
+
+def conductance(lpm: float) -> float:
+    """Of a leak [L/min] under 2 kN."""
+    return lpm / 6e4 / (2000.0 / RIG.cylinder.A_A)
+
+
+def followed(controller, command: str, duration: float, lpm: float = 0.0, **options):
+    leak = f"G = {conductance(lpm)}" if lpm else None
+    experiment = Experiment.of(
+        rig=RIG, command=command, duration=duration, controller=controller, leak=leak, set=OFF, **options
+    )
+    run = trajectory(experiment, experiment.leaks)
+    return run, np.broadcast_to(experiment.target.at(run.t), run.t.shape) - run["x"]
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_the_inverse_of_a_drive_gives_the_flow_against_the_pressure():
+    """Closed form: k_p (omega_d - omega) + K_i I = C_e omega + R i at constant speed and current."""
+    drive, m = Drive.of(RIG), RIG.motor
+    omega, dp, rate = 30.0, 2e6, 500.0
+    inverse = drive.inverse(rate)
+    volts = np.array([inverse(omega * drive.displacement, dp) for _ in range(5000)])
+    omega_d = volts * drive.omega_per_volt
+    integral = np.cumsum(omega_d - omega) / rate
+    needed = m.C_e * omega + m.R_c * drive.displacement * dp / m.C_m
+    np.testing.assert_allclose(m.k_p * (omega_d - omega) + m.K_i * integral, needed, rtol=2e-3)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
+    balance = FaultTolerant.of(RIG).balance
+    observer, rate, G = LeakObserver(balance, 500.0), 500.0, 3e-13
+    t = np.arange(10_000) / rate
+    x, p = 0.05 * np.sin(1.5 * t), 1e6 + sign * 0.3e6 * np.sin(0.7 * t)
+    high, low = np.maximum(2.5e6 + 0.0 * p, p), p
+    p_A, p_B = (high, low) if sign > 0 else (low, high)
+    area = balance.area_A if sign > 0 else balance.area_B
+    theta = (area * x + G * np.cumsum(p_A - p_B) / rate) / balance.D
+    for sample in zip(theta, x, p_A, p_B, strict=True):
+        observer.update(*sample)
+    # left out above: oil is drawn at the low side's pressure, a share of dp/K of what the pump turns
+    assert abs(observer.G - G) < max(4.0 * observer.sd, 0.02 * G)
+    assert observer.blocks > 30
+
+
+def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlier_is_not():
+    balance = FaultTolerant.of(RIG).balance
+    observer, rate = LeakObserver(balance, 500.0), 500.0
+    G = np.repeat([0.0, 2.6e-12], 5000)
+    theta = np.cumsum(G * 3e6) / rate / balance.D
+    theta[2500:2600] += 1.0  # a slip of the encoder across the end of a block
+    seen = []
+    for angle in theta:
+        observer.update(angle, 0.0, 4e6, 1e6)
+        seen.append(observer.G)
+    assert np.abs(seen[:5000]).max() < 1e-14
+    assert seen[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)
+
+
+def test_without_a_leak_tolerance_costs_nothing_to_the_last_bit():
+    plain, _ = followed(PositionPI.of(RIG), SINE, 12.0, seed=4)
+    tolerant, _ = followed(FaultTolerant.of(RIG), SINE, 12.0, seed=4)
+    np.testing.assert_array_equal(plain.rows, tolerant.rows)
+    assert not tolerant.compensated.any()
+
+
+@pytest.mark.parametrize("lpm", [0.0042, pytest.param(0.05, marks=pytest.mark.slow), 0.5])
+def test_a_leak_under_2_kN_is_tracked_held_and_reported(lpm):
+    _, healthy = followed(PositionPI.of(RIG), SINE, 16.0)
+    run, error = followed(FaultTolerant.of(RIG), SINE, 16.0, lpm)
+    late = run.t > 8.0
+    assert rms(error[late]) < 1.1 * rms(healthy[late])
+    assert rms(error[late]) < 0.01 * 40e-3
+    flow = conductance(lpm) * (run["p_A"] - run["p_B"])
+    assert np.mean(run.compensated[late]) == pytest.approx(np.mean(flow[late]), rel=0.1)
+    held, error = followed(FaultTolerant.of(RIG), "position 0 mm sin(t)", 20.0, lpm)
+    still = held.t > 10.0
+    drift = np.polyfit(held.t[still], held["x"][still], 1)[0]
+    assert abs(drift) * 60e3 < 0.1  # mm/min
+    assert np.abs(error[still]).max() < 60e-6
+
+
+def test_stiffness_comes_back_to_that_of_a_machine_without_a_leak():
+    """A load that ends, 0.5 L/min: the fixed controller needs its integral for the leak, and deviates twice as much."""
+    deviation = {}
+    for name, controller, lpm in (
+        ("healthy", PositionPI.of(RIG), 0.0),
+        ("fixed", PositionPI.of(RIG), 0.5),
+        ("tolerant", FaultTolerant.of(RIG), 0.5),
+        ("ideal", FaultTolerant.of(RIG, known=conductance(0.5)), 0.5),
+    ):
+        run, error = followed(controller, "position 0 mm sin(t)", 16.0, lpm, load="step -2 kN at 10 s")
+        after = run.t > 10.0
+        deviation[name] = float(np.trapezoid(np.abs(error[after]), run.t[after]))
+    assert deviation["fixed"] > 1.5 * deviation["healthy"]
+    assert deviation["tolerant"] < 1.1 * deviation["healthy"]
+    assert deviation["tolerant"] == pytest.approx(deviation["ideal"], rel=0.05)
+
+
+def test_what_is_made_good_is_a_channel_of_the_recording(tmp_path):
+    recording = ss.simulate(
+        rig="thesis-closed-loop", command="position 20 mm sin(2t)", controller="fault-tolerant", duration=9.0,
+        load="2 kN", leak=f"G = {conductance(0.05)}",
+    )  # fmt: skip
+    assert recording.units["q_comp"] == "m^3/s"
+    assert recording["q_comp"][-1] * 6e4 == pytest.approx(0.05, rel=0.1)
+    ss.write(recording, tmp_path / "run.csv")
+    again = ss.read(tmp_path / "run.csv")
+    np.testing.assert_allclose(again["q_comp"], recording["q_comp"], atol=1e-12)
+    assert "q_comp" not in ss.simulate(rig="thesis-closed-loop", command="position 5 mm sin(2t)", duration=0.2)
+
+
+@pytest.mark.parametrize("force", [0.0, pytest.param(2000.0, marks=pytest.mark.slow)])
+def test_flatness_follows_within_1_percent(force):
+    run, error = followed(Flatness.of(RIG), f"position 50 mm sin({0.5 * math.pi}t)", 10.0, load=f"{force - 2000} N")
+    assert rms(error[run.t > 4.0]) < 0.01 * 50e-3
+    run, error = followed(Flatness.of(RIG), "position step 100 mm at 1 s", 12.0, load=f"{force - 2000} N")
+    assert np.abs(error[run.t > 9.0]).max() < 100e-6
+    assert run["x"].max() < 0.103
+
+
+def test_controllers_have_names_and_a_user_s_own_too():
+    for name in CONTROLLERS:
+        made = controller_named(name, RIG)
+        assert (made.rate, made.delay) == (500.0, 1)
+    own = f"{OWN}:Proportional"
+    recording = ss.simulate(rig="thesis-closed-loop", command="position 10 mm sin(2t)", controller=own, duration=4.0)
+    error = recording["x"] - 0.01 * np.sin(2.0 * recording.t)
+    assert rms(error[recording.t > 2.0]) < 1e-3
+    assert len(OWN.read_text().splitlines()) < 40
+
+
+@pytest.mark.parametrize(
+    ("name", "rule"),
+    [
+        ("flatnes", r"controller must be one of pi, .*got 'flatnes'.*flatness"),
+        ("none.py:Own", r"a controller's file must exist, got none.py"),
+        ("json:dumps", r"a controller must have rate, delay and start, got json:dumps without rate|could not be made"),
+        ("no_such_module:Own", r"controller no_such_module:Own could not be made: ModuleNotFoundError"),
+    ],
+)
+def test_a_wrong_name_is_one_line(name, rule):
+    with pytest.raises(InputError, match=rule) as refused:
+        controller_named(name, RIG)
+    assert "\n" not in str(refused.value)
+
+
+def test_numbers_that_cannot_be():
+    with pytest.raises(InputError, match="displacement of the drive must be > 0, got 0"):
+        replace(Drive.of(RIG), displacement=0.0)
+    with pytest.raises(InputError, match="v_max of the controller must be > 0, got 0"):
+        replace(Flatness.of(RIG), v_max=0.0)
+    with pytest.raises(InputError, match="known of the controller must be >= 0, got -1"):
+        FaultTolerant.of(RIG, known=-1.0)
