@@ -69,3 +69,12 @@ def test_a_file_that_exists_is_kept(call, tmp_path):
     assert call("rigs", "new", "press", *words).refused().endswith("which exists")
     assert path.read_text() == "mine"
     assert "name of a rig must be of letters" in call("rigs", "new", 'a"b', *words).refused()
+
+
+def test_margins_of_a_loop_are_printed(call):
+    done = call("rigs", "margins", "thesis-closed-loop", "--controller", "pi")
+    assert (done.status, done.err) == (0, "")
+    rows = [line.split() for line in done.out.splitlines()[2:]]
+    assert [float(row[0]) for row in rows] == [0.0, 0.01, 0.02, 0.05]
+    assert all(float(row[1]) > 6.0 and float(row[2]) > 45.0 for row in rows)
+    assert "controller must be one of pi" in call("rigs", "margins", "--controller", "pid").refused()

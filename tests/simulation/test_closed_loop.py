@@ -153,9 +153,23 @@ def test_words_of_targets_and_loads():
     np.testing.assert_allclose(parse_position("position step 0.1 m at 1 s").at(t), [0.0, 0.0, 0.1])
     np.testing.assert_allclose(parse_force("2 kN").at(t), 2000.0)
     np.testing.assert_allclose(parse_force("step 500[N] at 0.01 min").at(t), [0.0, 0.0, 500.0])
+    two = parse_position("position 50 mm sin(2t) + 5 mm sin(9t)").at(t)
+    np.testing.assert_allclose(two, 0.05 * np.sin(2 * t) + 0.005 * np.sin(9 * t))
+    trapezoid = parse_position("position trapezoid 40 mm within 1 s every 8 s")
+    np.testing.assert_allclose(trapezoid.at(np.array([0.0, 0.5, 3.0, 4.25, 6.0, 8.5])), [0, 0.02, 0.04, 0.03, 0, 0.02])
     assert parse_position("3 sin(4t)") is None
     for text in ("position 50 mm sin(2t)", "position ramp 100 mm from 1 s to 3 s"):
         assert str(parse_position(str(parse_position(text)))) == text
+
+
+def test_a_recorded_position_is_a_target(tmp_path):
+    t = np.arange(200) / 50.0
+    path = tmp_path / "moved.csv"
+    np.savetxt(path, np.c_[t, 10.0 * np.sin(t)], delimiter=",", header="t [s],x [mm]", comments="")
+    np.testing.assert_allclose(parse_position(f"position file {path}").at(t), 0.01 * np.sin(t), atol=1e-9)
+    path.write_text("t [s],p_A [Pa]\n0,1\n0.1,2\n0.2,3\n")
+    with pytest.raises(InputError, match="a recorded position must have the channel x"):
+        parse_position(f"position file {path}")
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,13 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.commands import (
     Chirp,
+    MultiSine,
     PseudoRandom,
     Ramp,
     Recorded,
     Sine,
     Step,
+    Trapezoid,
     check_command,
     parse_command,
     recorded_command,
@@ -30,6 +32,12 @@ commands = st.one_of(
     st.builds(Step, number, number),
     st.tuples(number, number, positive).map(lambda n: Ramp(n[0], n[1], np.nextafter(n[1] + n[2], np.inf))),
     st.builds(Chirp, number, st.floats(0, 1e4), st.floats(0, 1e4), positive),
+    st.lists(st.builds(Sine, number, number, number), min_size=1, max_size=3).flatmap(
+        lambda sines: st.builds(Sine, number, number, number, number).map(lambda last: MultiSine((*sines, last)))
+    ),
+    st.tuples(number, positive, st.floats(4.0, 9.0)).map(
+        lambda n: Trapezoid(n[0], n[1], np.nextafter(n[1] * n[2], np.inf))
+    ),
     st.builds(PseudoRandom, number, positive, st.integers(0, 2**40)),
 )
 
@@ -47,6 +55,8 @@ def test_a_command_s_words_read_back_as_the_same_command(command):
         ("SIN(t)", Sine(1.0, 1.0)),
         ("2.5 sin(4t + 0.5) - 1 V", Sine(2.5, 4.0, 0.5, -1.0)),
         ("2 sin(4t -1e-05)+1e-05", Sine(2.0, 4.0, -1e-5, 1e-5)),
+        ("2 sin(3t) - sin(7t+1) + 0.5 V", MultiSine((Sine(2.0, 3.0), Sine(-1.0, 7.0, 1.0, 0.5)))),
+        ("trapezoid 5 within 1 s every 8 s", Trapezoid(5.0, 1.0, 8.0)),
         ("step 5", Step(5.0, 0.0)),
         ("step -5 V at 1 s", Step(-5.0, 1.0)),
         ("ramp 5 from 1 s to 3 s", Ramp(5.0, 1.0, 3.0)),

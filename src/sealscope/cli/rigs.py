@@ -10,7 +10,9 @@ import typer
 from sealscope.cli.options import check_folder
 from sealscope.errors import InputError
 
-rigs = typer.Typer(name="rigs", help="List the packaged rigs; `rigs new` writes a file for another machine.")
+rigs = typer.Typer(
+    name="rigs", help="List the packaged rigs; `rigs new` writes another machine's file, `rigs margins` rates a loop."
+)
 
 
 @rigs.callback(invoke_without_command=True)
@@ -78,3 +80,32 @@ def new(
     loaded = load_rig(path)
     typer.echo(f"{path}: {loaded.title}")
     typer.echo(f"replace what is assumed (grep 'assumed:' {path}), then: sealscope simulate --rig {path} -o run.nc")
+
+
+@rigs.command("margins")
+def print_margins(
+    rig: Annotated[str, typer.Argument(help="Rig by name, or the path of a rig's TOML file.")] = "thesis-closed-loop",
+    controller: Annotated[
+        str, typer.Option("--controller", help="Controller by name, or your own as FILE.py:NAME or MODULE:NAME.")
+    ] = "pi",
+    load: Annotated[str, typer.Option("--load", help="Force against +x beside the rig's own [N].")] = "0",
+) -> None:
+    """Print gain, phase and delay margin of a position loop, at rest and at three speeds of the piston."""
+    import math
+
+    from sealscope.control import controller_named, margins
+    from sealscope.parameters import load_rig
+    from sealscope.units import parse_quantity
+
+    loaded, force = load_rig(rig), parse_quantity(load, "N", name="--load")
+    made = controller_named(controller, loaded)
+    typer.echo(f"{loaded.name}, {controller}, {made.rate:g} Hz, late by {made.delay} samples, load {force:g} N")
+    typer.echo("speed [m/s]  gain [dB]  phase [deg]  crossover [Hz]  delay [ms]  largest 1/|1+L|")
+    for speed in (0.0, 0.01, 0.02, 0.05):
+        m = margins(loaded, made, speed, force)
+        gain = "inf" if math.isinf(m.gain) else f"{20 * math.log10(m.gain):.1f}"
+        note = "" if m.damped else "  the rig alone is not damped here"
+        typer.echo(
+            f"{speed:11g}  {gain:>9}  {math.degrees(m.phase):11.0f}  {m.crossover:14.2f}  {1e3 * m.delay:10.1f}  "
+            f"{m.peak:15.2f}{note}"
+        )

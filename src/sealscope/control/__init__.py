@@ -7,6 +7,8 @@ from sealscope.control.fault_tolerant import FaultTolerant as FaultTolerant
 from sealscope.control.flatness import Flatness as Flatness
 from sealscope.control.leak_observer import Balance as Balance
 from sealscope.control.leak_observer import LeakObserver as LeakObserver
+from sealscope.control.margins import Margins as Margins
+from sealscope.control.margins import margins as margins
 from sealscope.control.position import PositionPI as PositionPI
 from sealscope.control.registry import CONTROLLERS as CONTROLLERS
 from sealscope.control.registry import controller_named as controller_named

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -49,6 +49,49 @@ class Sine:
             for value in (self.phase, self.offset)
         )
         return f"{number_text(self.amplitude)} sin({number_text(self.omega)}t{phase}){offset}"
+
+
+@dataclass(frozen=True)
+class MultiSine:
+    """u = the sum of two sines or more, the last of which may have an offset."""
+
+    parts: tuple[Sine, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.parts) < 2 or any(sine.offset for sine in self.parts[:-1]):
+            raise InputError(f"a multi-sine must be of two sines or more, an offset in the last alone, got {self}")
+
+    def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
+        return np.asarray(sum(sine.volts(t) for sine in self.parts))
+
+    def __str__(self) -> str:
+        return " + ".join(map(str, self.parts))
+
+
+@dataclass(frozen=True)
+class Trapezoid:
+    """u rises evenly from 0 to `level` within `rise` [s], rests, and falls back likewise, every `period` [s]."""
+
+    level: float
+    rise: float
+    period: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < 4.0 * self.rise <= self.period:
+            raise InputError(
+                f"a trapezoid must rise within a quarter of its period, got {self.rise:g} s of {self.period:g} s"
+            )
+
+    def volts(self, t: Array) -> Array:
+        """Return u [V] at times t [s]."""
+        since = np.mod(np.maximum(t, 0.0), self.period)
+        up, down = since / self.rise, (since - 0.5 * self.period) / self.rise
+        return np.asarray(self.level * (np.clip(up, 0.0, 1.0) - np.clip(down, 0.0, 1.0)))
+
+    def __str__(self) -> str:
+        level, rise, period = map(number_text, (self.level, self.rise, self.period))
+        return f"trapezoid {level} within {rise} s every {period} s"
 
 
 @dataclass(frozen=True)
@@ -230,6 +273,10 @@ _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
         rf"({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_SIGNED})?\s*\)\s*({_SIGNED})?\s*v?",
         lambda g: Sine(_number(g[0], 1.0), _number(g[1], 1.0), _number(g[2], 0.0), _number(g[3], 0.0)),
     ),
+    (
+        rf"trapezoid\s+({_N})\s*v?\s+within\s+({_T})\s+every\s+({_T})",
+        lambda g: Trapezoid(_number(g[0], 0.0), seconds(g[1]), seconds(g[2])),
+    ),
     (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda g: Step(_number(g[0], 0.0), seconds(g[1]))),
     (
         rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_T})\s+)?(?:to|over)\s+({_T})",
@@ -270,13 +317,30 @@ def plain_text(text: str, what: str) -> str:
     return " ".join(text.split())
 
 
+_SINES = re.compile(rf"\s*([-+])?\s*({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_SIGNED})?\s*\)", re.IGNORECASE)
+
+
+def _several_sines(text: str) -> MultiSine | None:
+    """Return the sum of sines that a text is, the offset after the last; None where it is no such sum."""
+    parts: list[Sine] = []
+    end = 0
+    while (match := _SINES.match(text, end)) is not None and (match[1] or not parts):
+        sign = -1.0 if match[1] == "-" else 1.0
+        parts.append(Sine(sign * _number(match[2], 1.0), _number(match[3], 1.0), _number(match[4], 0.0)))
+        end = match.end()
+    rest = re.fullmatch(rf"\s*({_SIGNED})?\s*v?", text[end:], re.IGNORECASE)
+    if rest is None or len(parts) < 2:
+        return None
+    return MultiSine((*parts[:-1], replace(parts[-1], offset=_number(rest[1], 0.0))))
+
+
 def parse_command(text: str) -> Command:
     """Read a command from text.
 
-    The forms are ``3 sin(4t)``, ``6 periods of 5 sin(2t), 10 periods of 3 sin(4t)`` (in turn, again and again),
-    ``step 5 at 1 s``, ``ramp 5 from 1 s to 3 s``, ``chirp 3 from 0.1 Hz to 5 Hz over 60 s``, ``prbs 2 every 0.5 s
-    seed 1``, and ``file LOG`` (the channel u of a recording). Raises InputError that shows the forms when the text is
-    none of them.
+    The forms are ``3 sin(4t)``, ``3 sin(4t) + 1 sin(9t)``, ``6 periods of 5 sin(2t), 10 periods of 3 sin(4t)`` (in
+    turn, again and again), ``step 5 at 1 s``, ``ramp 5 from 1 s to 3 s``, ``trapezoid 3 within 1 s every 8 s``,
+    ``chirp 3 from 0.1 Hz to 5 Hz over 60 s``, ``prbs 2 every 0.5 s seed 1``, and ``file LOG`` (the channel u of a
+    recording). Raises InputError that shows the forms when the text is none of them.
     """
     stripped = text.strip()
     if stripped.lower().startswith("file "):
@@ -291,6 +355,10 @@ def parse_command(text: str) -> Command:
         sines = [(int(part[1]), parse_command(part[2])) for part in parts if part]
         if len(sines) == len(parts) and all(isinstance(sine, Sine) for _, sine in sines):
             return Alternating(tuple(sines))  # type: ignore[arg-type]
+    if stripped.lower().count("sin(") > 1:
+        several = _several_sines(stripped)
+        if several is not None:
+            return several
     for pattern, make in _FORMS:
         match = re.fullmatch(pattern, stripped, re.IGNORECASE)
         if match:

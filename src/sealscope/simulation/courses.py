@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Sine, parse_command, plain_text
+from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Recorded, Sine, parse_command, plain_text
 
 _LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _FORCES = {"N": 1.0, "kN": 1e3}
@@ -65,12 +65,21 @@ def _course(words: str, units: Mapping[str, float], what: str) -> Command:
 def parse_position(text: str) -> Position | None:
     """Read a target such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``.
 
-    The words are those of `parse_command`, with a length in mm, cm or m. None where the text is no target.
+    The words are those of `parse_command`, with a length in mm, cm or m; ``position file LOG`` is the channel x of a
+    recording. None where the text is no target.
     """
     words = plain_text(text, "command")
     if not words.lower().startswith("position "):
         return None
     words = words[len("position ") :]
+    if words.lower().startswith("file "):
+        from sealscope.recordings import read
+
+        path = words[5:].strip()
+        recording = read(path)
+        if "x" not in recording or recording.units["x"] != "m":
+            raise InputError(f"a recorded position must have the channel x with a unit of length, got {path} without")
+        return Position(Recorded(recording.t - recording.t[0], recording["x"], path), words)
     return Position(_course(words, _LENGTHS, "position"), words)
 
 

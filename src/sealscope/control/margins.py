@@ -1,0 +1,168 @@
+"""Margins of a loop: how much gain, phase and delay it has in hand, from rig and controller as they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.control.controller import Controller, Measured
+from sealscope.errors import InputError
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+Array = NDArray[np.float64]
+#: Longest memory of a controller [s] that is followed.
+_MEMORY = 60.0
+#: Impulses that a controller is asked about: position [m], above any dead band, pressures [Pa], angle [rad].
+_IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
+#: Time [s] in which a moving piston settles before the rig is linearised.
+_SETTLING = 1.0
+_FREQUENCIES = 4000
+#: By how much each state is moved for a difference.
+_SIZES = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9)
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Margins of a loop at one speed of the piston.
+
+    `speed` [m/s]; `gain`: factor by which the loop's gain may grow, inf where none ends it; `phase` [rad]; `crossover`
+    [Hz]: the highest frequency at which the loop's gain is 1; `delay` [s]: what the loop may be later; `peak`: the
+    largest 1/|1 + L|; `damped`: whether the rig rings down by itself (at slow strokes its friction falls with speed,
+    and it may not: then gain and phase margin bound a loop that is not stable to begin with).
+    """
+
+    speed: float
+    gain: float
+    phase: float
+    crossover: float
+    delay: float
+    peak: float
+    damped: bool
+
+
+def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 0.0) -> Margins:
+    """Return the margins of the loop of a rig and a controller, cut at the voltage.
+
+    The rig is linearised over one sample of the controller, about a piston that moves at `speed` [m/s], 0: that rests,
+    under `load` [N] beside the rig's own: y(k+1) = A y(k) + B u(k), by differences of the solver's own steps. The
+    controller is what its answers to an impulse of each measurement say: C_j(z). Loop:
+    L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, j = x, p_A, p_B, theta. Raises InputError for a speed beyond the
+    drive.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> from sealscope.control import PositionPI, margins
+    >>> rig = ss.load_rig("thesis-closed-loop")
+    >>> found = margins(rig, PositionPI.of(rig), speed=0.05)
+    >>> found.gain > 2.0 and found.phase > 0.7
+    True
+    """
+    A, B, about = _linearised(rig, controller.rate, speed, load)
+    f = np.geomspace(0.05, 0.499 * controller.rate, _FREQUENCIES)
+    z = np.exp(2j * math.pi * f / controller.rate)
+    values, vectors = np.linalg.eig(A)
+    inputs = np.linalg.solve(vectors, B.astype(complex))
+    L = np.zeros(f.size, dtype=complex)
+    for row, answer in _answers(controller, about):
+        plant = (vectors[row] * inputs / (z[:, None] - values)).sum(axis=1)
+        L -= _of_impulse(answer, z) * plant
+    L *= z**-controller.delay
+    return _margins_of(f, L, speed, bool(np.abs(values).max() < 1.0 + 1e-6))
+
+
+def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
+    from sealscope.physics.rest import initial_state
+    from sealscope.physics.rig import rig_numbers
+    from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
+    from sealscope.physics.solvers.limits import longest_step
+    from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
+    from sealscope.physics.state import OUTPUTS, VELOCITY
+
+    p = rig_numbers(rig) if load == 0.0 else rig_numbers(rig)._replace(pushed=(True,))
+    nodes = len(IMEX_NODES if p.throttled else RK4_NODES)
+    steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))
+    h = 1.0 / (rate * steps)
+
+    def advanced(y: Array, u: float, samples: int = 1) -> Array:
+        n = samples * steps
+        after, rows = np.array(y), np.empty((samples, len(OUTPUTS)))
+        volts, none, force = np.full((n, nodes), u), np.zeros((n, nodes)), np.full((n, nodes), load)
+        if p.throttled:
+            advance_imex(after, h, volts, none, none, force, p, steps, rows)
+        else:
+            advance_rk4(after, h, volts, none, none, force, p, rig.motor.integrator == "euler", steps, rows)
+        return after
+
+    y, u = initial_state(rig, 0.0, load), 0.0
+    if speed != 0.0:
+        u = speed * rig.cylinder.A_A / (rig.pump.q_b / (2.0 * math.pi)) / rig.motor.omega_per_volt
+        for _ in range(4):  # the drive falls short of its command
+            moving = advanced(y, min(max(u, -rig.daq.u_max), rig.daq.u_max), round(_SETTLING * rate))
+            u *= min(max(speed / moving[VELOCITY], 0.2), 5.0) if moving[VELOCITY] * speed > 0.0 else 1.0
+        y = moving
+        if not abs(y[VELOCITY] - speed) < 0.2 * abs(speed):
+            raise InputError(f"speed must be one that the drive can give, got {speed:g} m/s")
+    columns: list[Array] = []
+    for k, size in enumerate(_SIZES):
+        moved = np.zeros(y.size)
+        moved[k] = size
+        columns.append((advanced(y + moved, u) - advanced(y - moved, u)) / (2.0 * size))
+    B = (advanced(y, u + 1e-3) - advanced(y, u - 1e-3)) / 2e-3
+    return np.stack(columns, axis=1), B, y
+
+
+def _answers(controller: Controller, about: Array) -> list[tuple[int, Array]]:
+    """Return, for each state that is measured, its row and the controller's answer to a unit impulse of it."""
+    from sealscope.physics.state import P_A, P_B, POSITION, THETA
+
+    rest = Measured(0.0, 0.0, 0.0, 0.0, float(about[P_A]), float(about[P_B]), 0.0)
+    n = round(_MEMORY * controller.rate)
+
+    def answer(first: Measured) -> Array:
+        voltage = controller.start()
+        for _ in range(round(controller.rate)):
+            voltage(rest)
+        return np.array([voltage(first), *(voltage(rest) for _ in range(n - 1))])
+
+    quiet = answer(rest)
+    asked = (
+        (POSITION, _IMPULSE_X, rest._replace(x=_IMPULSE_X)),
+        (P_A, _IMPULSE_P, rest._replace(p_A=rest.p_A + _IMPULSE_P)),
+        (P_B, _IMPULSE_P, rest._replace(p_B=rest.p_B + _IMPULSE_P)),
+        (THETA, _IMPULSE_THETA, rest._replace(theta=_IMPULSE_THETA)),
+    )
+    answers = [(row, (answer(first) - quiet) / size) for row, size, first in asked]
+    return [(row, values) for row, values in answers if np.any(values)]
+
+
+def _of_impulse(answer: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return sum_n a_n z^-n of an answer that stays at its last value: an integrator's."""
+    tail = answer[-1]
+    changing = answer - tail
+    last = int(np.flatnonzero(np.abs(changing) > 1e-9 * np.abs(answer).max())[-1]) + 1 if np.any(changing) else 0
+    total = np.zeros(z.size, dtype=complex)
+    for n in range(last - 1, -1, -1):  # Horner
+        total = total / z + changing[n]
+    return np.asarray(total + tail / (1.0 - 1.0 / z))
+
+
+def _margins_of(f: Array, L: NDArray[np.complex128], speed: float, damped: bool) -> Margins:
+    size, angle = np.abs(L), np.unwrap(np.angle(L))
+    angle -= 2.0 * math.pi * round((angle[0] + 0.5 * math.pi) / (2.0 * math.pi))  # an integrator begins at -90 or -180
+    over = np.flatnonzero((size[:-1] >= 1.0) & (size[1:] < 1.0))
+    phases = [(abs(math.remainder(angle[k] + math.pi, 2.0 * math.pi)), k) for k in over]
+    phase = min((value for value, _ in phases), default=math.inf)
+    late = min((((angle[k] + math.pi) % (2.0 * math.pi)) / (2.0 * math.pi * f[k]) for _, k in phases), default=math.inf)
+    turned = np.floor((angle + math.pi) / (2.0 * math.pi))
+    at = np.flatnonzero(np.diff(turned) != 0)
+    gains = [1.0 / size[k] for k in at if size[k] < 1.0]
+    crossover = float(f[over[-1]]) if over.size else 0.0
+    peak = float(np.max(1.0 / np.abs(1.0 + L)))
+    return Margins(speed, float(min(gains, default=math.inf)), phase, crossover, float(late), peak, damped)
