@@ -309,3 +309,19 @@ def test_scripts_may_fail_on_a_verdict(call, recordings):
     assert call("diagnose", *files, "--quiet", "--fail-on", "leak").status == 3
     assert call("diagnose", files[1], "--quiet", "--fail-on", "leak").status == 0
     assert call("diagnose", files[1], "--quiet", "--fail-on", "leak", "--fail-on", "no leak").status == 3
+    (leak,) = call("diagnose", files[0], "--format", "jsonl", "--rig", "thesis").objects
+    low, high = leak["severity"]["mL_per_min_interval"]
+    for limit, level in ((0.9 * low, "repair"), (1.1 * high, "plan"), (2.2 * high, "follow")):
+        for least, status in (("repair", 3 * (level == "repair")), ("plan", 3 * (level != "follow")), ("follow", 3)):
+            words = (
+                "diagnose",
+                files[0],
+                "--quiet",
+                "--rig",
+                "thesis",
+                "--limit",
+                f"{limit} mL/min",
+                "--fail-on",
+                least,
+            )
+            assert call(*words).status == status, (limit, least)

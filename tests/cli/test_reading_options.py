@@ -66,6 +66,22 @@ def test_a_map_is_kept_beside_the_rig_and_used_again(call, tmp_path):
     assert call("diagnose", own, "--rig", rig, "--area", "9 cm^2").status == 0
 
 
+def test_the_map_that_names_tell_is_kept(call, tmp_path):
+    log, rig = tmp_path / "log.csv", tmp_path / "press.toml"
+    log.write_text("Zeit [s],PA_bar,Druck B [bar],Weg\ns,,,mm\n" + LOG.split("\n", 1)[1].replace("\n", ",0\n"))
+    rig.write_text(RIG)
+    assert f"map kept in {rig}" in call("inspect", log, "--rig", rig, "--map", "auto", "--save-map").out
+    assert load_rig(rig).channel_map["p_A"] == "PA_bar[bar]"
+    assert load_rig(rig).channel_map["p_B"] == "Druck B [bar]"
+    words = ("diagnose", log, "--format", "jsonl", "--rig")
+    (kept,) = call(*words, rig).objects
+    (auto,) = call(*words, rig, "--map", "auto").objects
+    assert kept == auto
+    own = tmp_path / "own.csv"
+    assert call("convert", log, own, "--map", "auto").status == 0
+    assert "must have a map to keep" in call("inspect", own, "--rig", rig, "--map", "auto", "--save-map").refused(2)
+
+
 def test_another_map_takes_the_place_of_the_first(tmp_path):
     rig = tmp_path / "press.toml"
     rig.write_text(RIG + '\n[map]\np_A = "old"\n\n[pump]\nq_b = { value = 5, unit = "cm^3/rev", source = "plate" }\n')
@@ -93,7 +109,7 @@ def test_where_no_map_can_be_kept(call, tmp_path):
     log, rig = tmp_path / "log.csv", tmp_path / "press.toml"
     log.write_text(LOG)
     rig.write_text(RIG)
-    for words in ((*MAP,), ("--rig", rig), ("--rig", rig, "--map", "auto")):
+    for words in ((*MAP,), ("--rig", rig), ("--map", "auto")):
         assert "--save-map must stand with --rig" in call("inspect", log, *words, "--save-map").refused(2)
     assert "packaged rig thesis" in call("inspect", log, *MAP, "--rig", "thesis", "--save-map").refused(2)
     assert call("inspect", log, "--map", "p_A=Nichts", "--rig", rig, "--save-map").status == 1

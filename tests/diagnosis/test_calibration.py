@@ -12,7 +12,12 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.baseline.operating_point import OperatingPoint
-from sealscope.diagnosis.calibration.calibrated import DEFAULT_DETECTORS, calibrate_on, diagnose_calibrated
+from sealscope.diagnosis.calibration.calibrated import (
+    DEFAULT_DETECTORS,
+    calibrate_on,
+    default_detectors,
+    diagnose_calibrated,
+)
 from sealscope.diagnosis.calibration.scorers import SCORERS, Look, scorer
 from sealscope.diagnosis.calibration.thresholds import Place, as_dict, calibrate, grouped, load, save, with_judge
 from sealscope.errors import InputError, UnreadableFile
@@ -258,6 +263,14 @@ def test_a_spoilt_recording_has_no_place_in_a_calibration(sound_ones):
 def test_the_default_detectors_are_there():
     for name in DEFAULT_DETECTORS:
         assert scorer(name).threshold is None
+
+
+def test_the_channels_decide_which_detectors_are_calibrated(records):
+    whole = records(1, duration=20.0, throttled=True)
+    assert default_detectors([whole])[:2] == ("volume balance, calibrated", "rms change")
+    no_angle = whole.only([name for name in whole.channels if name not in ("theta", "omega")])
+    assert default_detectors([whole, no_angle])[0] == "rms change"  # the pressure model needs 40 s
+    assert default_detectors([whole.only(["p_A"])]) == ("rms change", "d3 of p_A changed", "d4 of p_A changed")
 
 
 def test_the_place_of_a_recording(records):

@@ -48,6 +48,13 @@ def test_a_leak_from_the_first_sample_is_stated(law: str) -> None:
     assert passage.pressure == pytest.approx(np.mean(np.abs(worn["p_A"] - worn["p_B"])), rel=0.02)
     assert passage.healthy_lpm is None
     assert not passage.healthy
+    assert evidence.course is not None
+    assert evidence.course.whole
+    if law == "laminar":
+        dp, seconds = np.abs(worn["p_A"] - worn["p_B"]), float(np.median(np.diff(evidence.course.t)))
+        means = [np.mean(dp[np.abs(worn.t - middle) < 0.5 * seconds]) for middle in evidence.course.t]
+        true = (PUMP + lost) * LPM * np.array(means)
+        assert np.mean((evidence.course.low <= true) & (true <= evidence.course.high)) > 0.9
 
 
 def test_the_smallest_step_is_found_and_half_of_it_is_not() -> None:

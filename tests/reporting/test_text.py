@@ -68,7 +68,7 @@ def test_another_cause_is_told_with_what_to_check(make_diagnosis):
     text = " ".join(diagnosis_text(found).split())
     assert "cause friction change" in text
     assert f"next {check}" in text
-    assert messages.headline(found) == "No leak found across the piston, but something changed: friction change"
+    assert messages.headline(found) == "Friction change (no leak across the piston)"
     leak = make_diagnosis(cause="piston leak", quality=())
     assert messages.headline(leak) == "Leak: oil bypasses the piston"
     assert messages.next_steps(leak)[0] == next_check("leak", "piston leak")

@@ -286,13 +286,13 @@ def calibrate(
 ) -> None:
     """Set thresholds from leak-free recordings of your own machine, for `diagnose --calibration`.
 
-    It takes 5 recordings or more of an operating point. By default rms change judges, with details of the pressures
-    beside it; a detector that judges by default is calibrated by name, --detector 'volume balance, calibrated'.
+    It takes 5 recordings or more of an operating point. By default the channels that are there decide: the volume
+    balance judges, else the pressure model, else rms change, with details of the pressures beside it.
     """
     from hashlib import sha256
 
     from sealscope import __version__
-    from sealscope.diagnosis.calibration.calibrated import DEFAULT_DETECTORS, calibrate_on
+    from sealscope.diagnosis.calibration.calibrated import calibrate_on
     from sealscope.diagnosis.calibration.thresholds import save
     from sealscope.evaluation.thresholds import FEWEST
     from sealscope.recordings import read
@@ -316,7 +316,7 @@ def calibrate(
     files = [{"file": path.name, "sha256": sha256(path.read_bytes()).hexdigest()} for path in baseline]
     calibration = calibrate_on(
         recordings,
-        tuple(detectors or DEFAULT_DETECTORS),
+        tuple(detectors or ()),
         false_alarm_probability=false_alarm,
         split_share=split,
         rig=assumed or "thesis",

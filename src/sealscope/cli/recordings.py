@@ -53,12 +53,23 @@ STANDARD_INPUT = Path("-")
 _FEWEST_SIDE_BY_SIDE = 4
 
 
-class Verdict(StrEnum):
-    """Verdicts, as `--fail-on` names them."""
+#: Levels of severity, each with those that are worse.
+_OR_WORSE = {"follow": ("follow", "plan", "repair"), "plan": ("plan", "repair"), "repair": ("repair",)}
+
+
+class FailOn(StrEnum):
+    """Verdicts and levels of severity, as `--fail-on` names them."""
 
     leak = "leak"
     no_leak = "no leak"
     cannot_tell = "cannot tell"
+    follow = "follow"
+    plan = "plan"
+    repair = "repair"
+
+    def holds(self, verdict: str, level: str | None) -> bool:
+        """Return whether a verdict is this one, or a leak's level this one or a worse one."""
+        return verdict == self.value or level in _OR_WORSE.get(self.value, ())
 
 
 class TextFormat(StrEnum):
@@ -228,8 +239,12 @@ def diagnose(
     limit: LimitOption = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
     fail_on: Annotated[
-        list[Verdict] | None,
-        typer.Option("--fail-on", help="End with status 3 where a file has this verdict; repeat."),
+        list[FailOn] | None,
+        typer.Option(
+            "--fail-on",
+            help="End with status 3 where a file has this verdict, or a leak of this level against --limit or a worse "
+            "one; repeat.",
+        ),
     ] = None,
 ) -> None:
     """Say for each file whether oil bypasses the piston; with -v by every method.
@@ -270,7 +285,7 @@ def diagnose(
             if verdict is None:
                 complete = False
             else:
-                failed |= verdict.verdict in (fail_on or ())
+                failed |= any(reason.holds(verdict.verdict, verdict.level) for reason in fail_on or ())
                 starts.append(verdict.start)
                 say(verdict.text)
     if form in ("short", "whole") and _in_time(files, starts):
@@ -293,9 +308,10 @@ def _in_time(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
 
 
 class SaidOfFile(NamedTuple):
-    """Verdict on a file, what is printed of it, and when it was recorded [s since 1970], None where not known."""
+    """Verdict on a file, its level of severity, what is printed, and when it was recorded [s since 1970], or None."""
 
     verdict: str
+    level: str | None
     text: str
     start: float | None
 
@@ -318,7 +334,8 @@ def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[Said
         else:
             text = diagnosis_text(diagnosis) if form == "whole" else short_text(diagnosis)
         text = text.partition("\n")[0] if form == "line" else text
-        yield SaidOfFile(diagnosis.verdict, text, start_seconds(result[0]))
+        level = None if diagnosis.severity is None else diagnosis.severity.level
+        yield SaidOfFile(diagnosis.verdict, level, text, start_seconds(result[0]))
 
 
 def _aside(
@@ -405,13 +422,15 @@ def inspect(
     """Show what a file holds and what is wrong with it; columns without a map are taken by their names."""
     from sealscope.parameters.load import save_channel_map
     from sealscope.recordings import inspect as inspected
+    from sealscope.recordings.formats.columns import map_taken
     from sealscope.reporting import overview_text
 
     complete = True
     _check_standard_input(files)
     reading = _Reading.of(maps, rate, assumed_rig(rig))
-    if save_map and (rig is None or not reading.channel_map or reading.channel_map == "auto"):
+    if save_map and (rig is None or not reading.channel_map):
         raise InputError("--save-map must stand with --rig and its file, and with the --map options to be kept")
+    kept = reading.channel_map
     if not (reading.channel_map or reading.beside_rig):
         reading = replace(reading, channel_map="auto")
     for file, recording in _read_parts(files, reading, join):
@@ -419,10 +438,16 @@ def inspect(
             complete = False
         else:
             say(overview_text(str(file), recording, inspected(recording)))
+            if isinstance(kept, str):  # a recording of our own keeps the columns of the file that it was made from
+                kept = map_taken(recording.provenance) if recording.provenance.get("file") == file.name else {}
     if not complete:
         raise typer.Exit(1)
-    if save_map and rig is not None and not isinstance(reading.channel_map, str):
-        save_channel_map(rig, reading.channel_map)
+    if save_map and rig is not None and not isinstance(kept, str):
+        if not kept:
+            raise InputError(
+                f"--save-map must have a map to keep, got columns with the channels' own names ({files[0]})"
+            )
+        save_channel_map(rig, kept)
         say(f"map kept in {rig}: later calls with --rig {rig} find it")
 
 

@@ -183,7 +183,8 @@ def course_charts(course: LeakCourse | None, *, height: int = 190) -> list[Chart
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high))
     lines = (ChartLine("leak", "a", course.lpm), ChartLine("low", "d1", low), ChartLine("high", "d1", high))
     limits = _limits(course.lpm, low, high)
-    return [Chart(COURSE, COURSE, "Leak past the piston", "L/min", lines, COURSE, height, band=True, limits=limits)]
+    title = "Passed by pump and piston together" if course.whole else "Leak past the piston"
+    return [Chart(COURSE, COURSE, title, "L/min", lines, COURSE, height, band=True, limits=limits)]
 
 
 def _limits(values: Array, low: Array, high: Array) -> tuple[float, float]:

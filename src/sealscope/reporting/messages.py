@@ -42,17 +42,20 @@ def clock(seconds: float | None) -> str:
     return f"{text} ({sign}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d})"
 
 
+#: A summary as a sentence; that of another cause is one.
+_SENTENCES: Mapping[str, str] = {
+    "leak": "Leak: oil bypasses the piston",
+    "no leak": "No leak found across the piston",
+    "cannot tell": "Cannot tell whether oil bypasses the piston",
+}
+
+
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one line."""
-    verdict = {
-        "leak": "Leak: oil bypasses the piston",
-        "no leak": "No leak found across the piston",
-        "cannot tell": "Cannot tell whether oil bypasses the piston",
-    }[diagnosis.verdict]
-    other = cause(diagnosis)
-    if diagnosis.verdict == "leak" and other == "piston or pump leak":
-        return f"{verdict}, or the pump"
-    return f"{verdict}, but something changed: {other}" if other and diagnosis.verdict != "leak" else verdict
+    """Return the verdict as the heading of page and card: the summary of the terminal and of JSON, as a sentence."""
+    summary = diagnosis.summary
+    if diagnosis.verdict == "leak" and diagnosis.cause == "piston or pump leak":
+        return "Leak: oil bypasses the piston, or the pump"
+    return _SENTENCES.get(summary, summary[0].upper() + summary[1:])
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
@@ -114,12 +117,12 @@ def machine_text(machine: AssumedMachine) -> str:
     if machine.stated_by == "recording":
         return f"piston {area} and pump {displacement} by the recording's own rig, {machine.rig}"
     if machine.stated:
-        by = f"rig {machine.rig}, as stated" if machine.stated_by == "call" else "as stated"
-        return f"piston {area} and pump {displacement} ({by})"
+        by = f"by rig {machine.rig}, as stated" if machine.stated_by == "call" else "as stated"
+        return f"piston {area} and pump {displacement} {by}"
     if machine.area_stated:
-        return f"piston {area} (as stated)"
+        return f"piston {area} as stated"
     if machine.displacement_stated:
-        return f"pump {displacement} (as stated)"
+        return f"pump {displacement} as stated"
     return f"assumed, for no rig was stated: piston {area} and pump {displacement} of rig {machine.rig}"
 
 
@@ -164,8 +167,13 @@ def passes(diagnosis: Diagnosis) -> str | None:
             text += f"; the smallest step that would have been found is {_percent(own.findable_share)}"
         return text
     low, high = own.interval_lpm
-    text = f"pump and piston together {number(own.lpm, 2)} L/min, between {number(low, 2)} and {number(high, 2)}, "
-    text += pressure
+    if not high > 0.0:
+        text = f"pump and piston together less than this recording measures, {pressure}"
+    elif not low > 0.0:
+        text = f"pump and piston together at most {number(high, 2)} L/min {pressure}"
+    else:
+        text = f"pump and piston together {number(own.lpm, 2)} L/min, between {number(low, 2)} and {number(high, 2)}, "
+        text += pressure
     if diagnosis.verdict != "leak" and (basis := rests_on(diagnosis)) is not None:
         text += f" ({basis})"
     if own.healthy_lpm is not None:
@@ -183,7 +191,8 @@ def how_sure(diagnosis: Diagnosis) -> str:
     """Return how many healthy recordings look like this, the score against its threshold, and what that means."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return "no score was formed"
-    odds = "" if diagnosis.odds is None else f"{diagnosis.odds}; "
+    said = _odds(diagnosis)
+    odds = "" if said is None else f"{said}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     other = cause(diagnosis)
     if diagnosis.verdict != "leak" and other is not None and diagnosis.alarmed:
@@ -197,7 +206,15 @@ def how_sure(diagnosis: Diagnosis) -> str:
 
 def in_short(diagnosis: Diagnosis) -> str:
     """Return how many healthy recordings look like this; where that is not stated, what the threshold was set for."""
-    return diagnosis.odds or false_alarms(diagnosis)
+    return _odds(diagnosis) or false_alarms(diagnosis)
+
+
+def _odds(diagnosis: Diagnosis) -> str | None:
+    """Return how many healthy recordings look like this; without a change, how many show as much of one."""
+    odds = diagnosis.odds
+    if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
+        return odds
+    return odds.replace("looks like this", "shows as much change").replace("look like this", "show as much change")
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:

@@ -83,7 +83,7 @@ def write_page(
     from sealscope.parameters import load_rig
 
     target = template.check_page(path)
-    known_rig = None if rig is None else load_rig(rig)
+    known_rig = _rig_of(diagnosis) if rig is None else load_rig(rig)
     if target.suffix.lower() == ".png":
         _check_samples(recording)
         all_marks = _all_marks(marks, truth_onset_s)
@@ -101,6 +101,15 @@ def write_page(
         pressure_unit=pressure_unit,
     )
     return template.write(target, page)
+
+
+def _rig_of(diagnosis: Diagnosis) -> Rig | None:
+    """Return the rig that the diagnosis states, by the call or by the recording; None where nobody stated one."""
+    from sealscope.parameters import load_rig, rig_names
+
+    machine = diagnosis.machine
+    known = machine is not None and machine.stated_by != "nobody" and machine.rig in rig_names()
+    return load_rig(machine.rig) if known and machine is not None else None
 
 
 def _check_samples(recording: Recording) -> None:
@@ -131,7 +140,7 @@ def render_page(
     from sealscope.parameters import load_rig
 
     _check_samples(recording)
-    known_rig = None if rig is None else load_rig(rig)
+    known_rig = _rig_of(diagnosis) if rig is None else load_rig(rig)
     all_marks = list(_all_marks(marks, truth_onset_s))
     details = [features.chamber_details(recording, name) for name in CHAMBERS]
     chambers = [chamber for chamber, _ in details if chamber is not None]

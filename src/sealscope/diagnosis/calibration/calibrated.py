@@ -8,8 +8,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from sealscope.diagnosis.baseline.inspection import inspected
-from sealscope.diagnosis.calibration.scorers import Look, Score, scorer, split_view
+from sealscope.diagnosis.calibration.scorers import CALIBRATED, Look, Score, scorer, split_view
 from sealscope.diagnosis.calibration.thresholds import BY_STROKES, Calibration, Group, Place, calibrate
+from sealscope.diagnosis.detector import unusable
+from sealscope.diagnosis.registry import detectors as registered
 from sealscope.diagnosis.rms_change.by_recordings import by_recordings
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
@@ -17,13 +19,31 @@ from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import FEWEST
+from sealscope.parameters.load import load_rig
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Detectors that a calibration holds unless others are named; the first makes the verdict.
+#: Detectors that a calibration holds unless others are named; the first makes the verdict where no judge is before it.
 DEFAULT_DETECTORS = ("rms change", "d3 of p_A changed", "d4 of p_A changed", "d3 of p_B changed", "d4 of p_B changed")
+
+
+#: Detectors that judge before them, most telling first, where every recording has the channels that they need.
+_RANKED = ("volume balance", "pressure model")
+
+
+def default_detectors(parts: Sequence[Recording], rig: Rig | str = "thesis") -> tuple[str, ...]:
+    """Return the detectors of a calibration by the channels that all its recordings have; the first judges."""
+    made = {name: registered()[name](load_rig(rig)) for name in _RANKED}
+    judges = [f"{name}{CALIBRATED}" for name in _RANKED if all(unusable(made[name], part) is None for part in parts)]
+    seen = [name for name in DEFAULT_DETECTORS if all(_has_chamber(name, part) for part in parts)]
+    return (*judges[:1], *seen)
+
+
+def _has_chamber(name: str, part: Recording) -> bool:
+    return not any(f" {chamber} " in name and chamber not in part for chamber in CHAMBERS)
 
 
 def look_at(part: Recording, split_share: float, false_alarm_probability: float, rig: Rig | str = "thesis") -> Look:
@@ -33,7 +53,7 @@ def look_at(part: Recording, split_share: float, false_alarm_probability: float,
 
 def calibrate_on(
     recordings: Mapping[str, Recording],
-    detectors: Sequence[str] = DEFAULT_DETECTORS,
+    detectors: Sequence[str] = (),
     *,
     false_alarm_probability: float,
     split_share: float = 0.5,
@@ -43,11 +63,13 @@ def calibrate_on(
     """Calibrate detectors on leak-free recordings of one machine.
 
     `recordings`: name -> recording; one that cannot be judged raises InputError with its name and the reason: what is
-    not leak-free data of the machine in good order has no place in a calibration. `rig`: what detectors may assume of
+    not leak-free data of the machine in good order has no place in a calibration. `detectors`: by default those for the
+    channels that all recordings have (`default_detectors`); `rig`: what detectors may assume of
     the machine; `options` as for `calibrate`.
     """
     if not 0.0 < split_share < 1.0:
         raise InputError(f"the split must be a share of the length between 0 and 1, got {split_share}")
+    detectors = detectors or default_detectors(list(recordings.values()), rig)
     scorers = [scorer(name) for name in detectors]
     places: list[Place] = []
     parts: list[Recording] = []

@@ -225,10 +225,8 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     near = near_best(z * np.abs(z), scatter**2)
     interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
     lpm, limits, law = _flow(followed, recording, inner.start + best, onset, scatter)
-    course = LeakCourse(
-        0.5 * (edges[:-1] + edges[1:]),
-        *(np.where(edges[:-1] < onset, 0.0, value) for value in (lpm, *limits)),
-    )
+    estimate, low, high = (np.where(edges[:-1] < onset, 0.0, value) for value in (lpm, *limits))
+    course = LeakCourse(0.5 * (edges[:-1] + edges[1:]), estimate, low, high)
     reason = f"the leakage conductance past piston or pump rose at {onset:.1f} s{law} ({figures})"
     if cause is not None:
         why = "the friction" if cause == "friction change" else "the oil's stiffness"

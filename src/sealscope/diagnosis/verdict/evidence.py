@@ -37,13 +37,15 @@ OFTEN = 0.2
 class LeakCourse:
     """Leak over a recording.
 
-    Estimates `lpm` (k,) [L/min] at the instants `t` (k,) [s], each with its 95 % interval `low`, `high` (k,).
+    Estimates `lpm` (k,) [L/min] at the instants `t` (k,) [s], each with its 95 % interval `low`, `high` (k,). `whole`:
+    they are all that pump and piston together pass, as where no leak began; else what came with the leak.
     """
 
     t: Array
     lpm: Array
     low: Array
     high: Array
+    whole: bool = False
 
 
 @dataclass(frozen=True)

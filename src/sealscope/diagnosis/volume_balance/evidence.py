@@ -140,7 +140,8 @@ def judge(
         return no_step(fit, step, None, 0.0)
     smallest = findable(fit, probability, step.noise)
     evidence = no_step(fit, step, search(fit, probability, sign=-1), smallest)
-    evidence = replace(evidence, passage=passage(fit, smallest, healthy), refuses=_refused(fit))
+    course = _whole_course(fit) if states_flow(fit) else None
+    evidence = replace(evidence, passage=passage(fit, smallest, healthy), refuses=_refused(fit), course=course)
     return _measured(_from_the_start(evidence, fit, probability), fit)
 
 
@@ -556,6 +557,15 @@ def _lost(fit: BalanceFit, step: DriftStep, shape: Array) -> float:
     deviation = float(np.sqrt(np.var(before, ddof=1) / before.size + np.var(after, ddof=1) / after.size))
     least = _LOST * step.size * float(fit.blocks.abs_dp.mean()) + 4.0 * deviation
     return lost if lost > least else 0.0
+
+
+def _whole_course(fit: BalanceFit) -> LeakCourse:
+    """Return what pump and piston together pass block by block; an interval holds what all blocks share, too."""
+    flow = fit.unit_flow("laminar") / LITRE_PER_MINUTE
+    g = fit.g + (fit.pump or 0.0)
+    shared = np.sum(fit.shared**2, axis=1)
+    half = 1.96 * np.sqrt(fit.sd**2 + shared + fit.pump_sd**2 + (_LEVEL**2 + _UNKNOWN_LAW**2) * g**2) * flow
+    return LeakCourse(fit.blocks.t, g * flow, g * flow - half, g * flow + half, whole=True)
 
 
 def _course(fit: BalanceFit, step: DriftStep, shape: Array, unit_flow: Array) -> LeakCourse:

@@ -171,6 +171,14 @@ def _checked_unit(channel: str, unit: str | None, what: str, place: str) -> tupl
     return unit, None
 
 
+def map_taken(provenance: Mapping[str, object]) -> dict[str, str]:
+    """Return channel -> column of a recording read by the names of its columns, as its provenance keeps them."""
+    names = provenance.get("columns")
+    columns = {str(channel): str(whole) for channel, whole in names.items()} if isinstance(names, Mapping) else {}
+    proposed = proposed_map([Label.parse(whole) for whole in columns.values()])
+    return {channel: proposed.get(channel, whole) for channel, whole in columns.items()}
+
+
 def _find_time(labels: Sequence[Label], place: str) -> int | None:
     if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
         _find(labels, "t", "t", place)
