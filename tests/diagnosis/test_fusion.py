@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.diagnosis import next_check
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse, Verdict
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence, LeakCourse, Passage, Verdict
 from sealscope.diagnosis.verdict.fusion import ORDER, fuse
 from sealscope.simulation.simulate import simulate
 
@@ -115,6 +115,19 @@ def test_no_leak_keeps_its_own_bound_and_dates_nothing() -> None:
     bound = replace(NONE, leak_lpm=1e-5, leak_interval_lpm=(-1e-4, 1e-4), onset_s=5.0, onset_interval_s=(4.0, 6.0))
     found = fused(volume_balance=bound, rms_change=replace(LEAK, onset_s=90.0, leak_lpm=0.1))
     assert (found.leak_lpm, found.onset_s, found.onset_interval_s) == (1e-5, None, None)
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.3, "cannot tell"), (0.01, "no leak"), (None, "no leak")])
+def test_no_leak_of_the_least_specific_needs_that_a_leak_would_have_shown(
+    share: float | None, verdict: Verdict
+) -> None:
+    passage = Passage(None, None, 1e5, findable_share=share)
+    blind = Evidence("cannot tell", "a leak of 2 % would not have shown", -9.0, 3.0, passage=passage)
+    found = fused(rms_change=NONE, volume_balance=blind)
+    assert (found.verdict, found.detector) == (verdict, RMS)
+    assert ("volume balance: a leak of 2 % would not have shown" in found.reason) == (verdict == "cannot tell")
+    assert fused(rms_change=LEAK, volume_balance=blind).verdict == "leak"
+    assert fused(pressure_model=NONE, volume_balance=blind).verdict == "no leak"  # which has its own eyes
 
 
 def test_disagreement_is_said() -> None:

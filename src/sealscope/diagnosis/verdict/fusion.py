@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sealscope.diagnosis.verdict.evidence import LEAKS, Evidence, Figure
+from sealscope.diagnosis.verdict.evidence import LEAK_WORTH_FINDING, LEAKS, Evidence, Figure
 
 #: The most specific first: what accounts for every litre, what models the pressures, what estimates a state, what sees
 #: that something changed. A user's own detectors follow in the order of their names.
@@ -22,7 +22,9 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
 
     The first of `ORDER` that does not abstain judges. Of a leak, onset and L/min are the judge's, else those of the
     next detector that found a leak, too, and has them, unless a detector refuses the figure; the cause is the judge's,
-    else the one that another detector names. Where others differ, the reason says so. `detector` of the result is the
+    else the one that another detector names. Where others differ, the reason says so. `no leak` of the least specific
+    detector, which states no size, becomes `cannot tell` where another one says that a leak worth finding would not
+    have shown. `detector` of the result is the
     judge, `parts` are the evidences, the judge's first.
     """
     ranked = sorted(evidences, key=lambda own: ORDER.index(own.detector) if own.detector in ORDER else len(ORDER))
@@ -39,6 +41,10 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
         reasons += lent
     else:
         fused = replace(judge, onset_s=None, onset_interval_s=None)
+        blind = next((own for own in others if _blind(own)), None)
+        if judge.verdict == "no leak" and judge.detector == ORDER[-1] and blind is not None:
+            fused = replace(fused, verdict="cannot tell", cause=judge.cause)
+            reasons.append(f"{blind.detector}: {blind.reason}")
         naming = next((own for own in others if _other_cause(own)), None)
         if judge.cause is None and naming is not None:
             fused = replace(fused, cause=naming.cause)
@@ -46,6 +52,12 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     return replace(
         fused, reason="; ".join(reasons), parts=(judge, *(own for own in ranked if own is not judge)), usable=True
     )
+
+
+def _blind(evidence: Evidence) -> bool:
+    """Whether a detector would not have seen a leak worth finding, and says so."""
+    passage = evidence.passage
+    return evidence.abstains and passage is not None and (passage.findable_share or 0.0) > LEAK_WORTH_FINDING
 
 
 def _other_cause(evidence: Evidence) -> bool:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.baseline.level import DayToDay, Level, against_baseline
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, DriftStep
 from sealscope.diagnosis.verdict.evidence import (
+    LEAK_WORTH_FINDING,
     LEAKS,
     Cause,
     Evidence,
@@ -68,9 +69,6 @@ _SLIPPED = 20.0
 _LOST = 0.6
 #: A step is the whole of what grew where it is over this share of it.
 _WHOLE = 0.6
-#: The smallest leak worth finding, as a share of the pump's flow. Assumed: makers state volumetric efficiencies of
-#: 95 to 98 %; what is below the least loss of these is no reason to act.
-_WORTH = 0.02
 #: A drift over this share of the conductance at the start is more than warm oil does within a recording.
 _LARGE_DRIFT = 0.5
 #: Conductances are the same within this share of their deviations: what was found in them holds.
@@ -412,7 +410,7 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
         "no change within this recording: the leakage conductance does not rise beyond its smooth drift "
         f"({_figures(step)})"
     )
-    if high * dp < -_WORTH * pump:
+    if high * dp < -LEAK_WORTH_FINDING * pump:
         verdict = "cannot tell"
         reason = "the balance gives a leak against the pressure: areas, displacement or the pressures' signs do not fit"
     elif rise > _LARGE_DRIFT * max(high - 0.5 * rise, 0.0) and rise > 6.0 * float(np.median(fit.sd)):
@@ -421,9 +419,12 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
             f"the conductance rises smoothly by {_flow_text(rise, fit)} over the recording, more than oil that "
             f"warms up explains: a growing leak would look alike ({_figures(step)})"
         )
-    elif smallest * dp > _WORTH * pump:
+    elif smallest * dp > LEAK_WORTH_FINDING * pump:
         verdict = "cannot tell"
-        reason += f"; but a leak of {_WORTH:.0%} of the pump's flow, the smallest worth finding, would not have shown"
+        reason += (
+            f"; but a leak of {LEAK_WORTH_FINDING:.0%} of the pump's flow, the smallest worth finding, would not have "
+            "shown"
+        )
     elif fall is not None and fall.alarm:
         reason = (
             f"the conductance falls at {fall.onset:.1f} s by {_flow_text(-fall.size, fit)}, which no "
