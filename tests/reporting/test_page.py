@@ -277,7 +277,7 @@ def test_machine_date_operator_and_oil_stand_under_the_title(recording, make_dia
     page = render_page(known, make_diagnosis())
     assert page.index("Press 7") < page.index('class="verdict') and "A. B." in page
     assert particulars_of(replace(recording, provenance={}), load_rig("thesis")).get("Date") is None
-    assert particulars_of(recording, load_rig("thesis")).get("Machine") == load_rig("thesis").title
+    assert particulars_of(recording, load_rig("thesis")).get("Machine") == "EHA test rig of the thesis"
 
 
 def test_no_legend_is_empty(page, reader):

@@ -14,9 +14,13 @@ from sealscope.reporting import messages, template
 _ORDER = ("leak", "cannot tell", "no leak")
 
 
-def severity(diagnosis: Diagnosis) -> tuple[int, float, str]:
-    """Return what pages are ordered by: leaks by their flow, then what cannot be told, then what holds."""
-    return (_ORDER.index(diagnosis.verdict), -(diagnosis.leak_lpm or 0.0), diagnosis.file)
+def severity(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
+    """Return what pages are ordered by: leaks by their size, then what cannot be told, then by what is passed."""
+    own = diagnosis.severity
+    size = 0.0 if own is None or own.of_limit is None else own.of_limit[0]
+    flow = diagnosis.passage.lpm if diagnosis.passage is not None else None
+    flow = flow if diagnosis.leak_lpm is None else diagnosis.leak_lpm
+    return (_ORDER.index(diagnosis.verdict), -size, -(flow or 0.0), diagnosis.file)
 
 
 def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
@@ -29,9 +33,10 @@ def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagno
             "href": quote(page.name),
             "file": Path(diagnosis.file).name,
             "verdict": diagnosis.verdict,
+            "summary": diagnosis.summary,
             "since": messages.since(diagnosis),
-            "how_much": messages.how_much(diagnosis),
-            "cause": messages.cause(diagnosis),
+            "how_much": messages.how_much(diagnosis) or messages.passes_in_short(diagnosis),
+            "cause": messages.cause(diagnosis) if diagnosis.verdict == "leak" else None,
             "action": diagnosis.reason if diagnosis.verdict == "cannot tell" else messages.next_steps(diagnosis)[0],
         }
         for page, diagnosis in ordered

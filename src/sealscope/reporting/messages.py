@@ -86,17 +86,33 @@ def how_much(diagnosis: Diagnosis) -> str | None:
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.leak_lpm is None:
-        if "leak_lpm" not in diagnosis.refuses:
-            return "not stated: the channels do not allow it"
-        if diagnosis.machine is None or diagnosis.machine.stated:
-            return "not stated: see the reason"
-        return "L/min not stated: the size of the machine is not known; " + (
-            "state --rig, or the piston's --area" if diagnosis.measured_ratio is not None else "state --rig"
-        )
+        own = diagnosis.severity
+        share = "" if own is None or own.pump_share is None else f"{_of_the_pump(own.pump_share[0])}; "
+        return share + _why_no_flow(diagnosis)
     text = f"{number(diagnosis.leak_lpm)} L/min"
     if interval is not None:
         text += f", between {number(interval[0])} and {number(interval[1])} L/min"
     return text
+
+
+def _of_the_pump(share: float) -> str:
+    return f"{number(100.0 * share, 2)} % of the pump's flow in this duty"
+
+
+def _why_no_flow(diagnosis: Diagnosis) -> str:
+    """Return why a leak has no L/min, and what would state it."""
+    ratio = diagnosis.measured_ratio
+    if "leak_lpm" not in diagnosis.refuses:
+        return "L/min not stated: the channels do not allow it"
+    if diagnosis.machine is not None and not diagnosis.machine.stated:
+        ask = "state --rig, or the piston's --area" if ratio is not None else "state --rig"
+        return f"L/min not stated: the size of the machine is not known; {ask}"
+    if diagnosis.machine is None or ratio is None:
+        return "not stated: see the reason"
+    return (
+        f"L/min not stated: displacement over area measures {number(ratio[0])} times that of rig "
+        f"{diagnosis.machine.rig}: check the rig and the units of x and theta"
+    )
 
 
 def _how_much_by_what(diagnosis: Diagnosis) -> str | None:
@@ -127,11 +143,14 @@ def machine_text(machine: AssumedMachine) -> str:
 
 
 #: What a level of severity means.
-_LEVELS: Mapping[Level, str] = {
-    "repair": "over the repair limit",
-    "plan": "it may take half of the repair limit or more",
-    "follow": "under half of the repair limit",
-}
+_LEVELS: Mapping[Level, str] = {"repair": "over the limit: ", "plan": "", "follow": "well within: "}
+
+
+def _between_shares(low: float, high: float) -> str:
+    """Return a range of shares in per cent, from ten on as multiples."""
+    if high >= 10.0:
+        return f"{number(low, 2)} to {number(high, 2)} times"
+    return f"{number(100.0 * low, 2)} to {number(100.0 * high, 2)} % of"
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
@@ -142,21 +161,25 @@ def how_bad(diagnosis: Diagnosis) -> str | None:
     parts = []
     if own.mL_per_min is not None:
         parts.append(f"{number(own.mL_per_min[0], 2)} mL/min")
-    if own.pump_share is not None:
-        parts.append(f"{number(100.0 * own.pump_share[0], 2)} % of the pump's flow in this duty")
+    if own.pump_share is not None and diagnosis.leak_lpm is not None:
+        parts.append(_of_the_pump(own.pump_share[0]))
     if own.creep_mm_per_min is not None:
         parts.append(f"as much as a piston that creeps by {number(own.creep_mm_per_min[0], 2)} mm/min")
     if own.level is not None and own.of_limit is not None:
-        low, high = (number(value, 2) for value in own.of_limit[1:])
         by = "" if diagnosis.limit.stated else ", the default"
-        parts.append(f"{_LEVELS[own.level]} ({low} to {high} times {diagnosis.limit}{by})")
+        parts.append(
+            f"{_LEVELS[own.level]}{_between_shares(*own.of_limit[1:])} the repair limit ({diagnosis.limit}{by})"
+        )
     elif diagnosis.limit.stated:
         parts.append(f"not held against the limit of {diagnosis.limit}, for that needs the machine's area (--area)")
     return "; ".join(parts)
 
 
-def passes(diagnosis: Diagnosis) -> str | None:
-    """Return what pump and piston together pass, and what of it would have shown; None where it is not known."""
+def passes(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
+    """Return what pump and piston together pass, and what of it would have shown; None where it is not known.
+
+    `basis`: with what L/min rests on.
+    """
     own = diagnosis.passage
     if own is None:
         return None
@@ -174,13 +197,29 @@ def passes(diagnosis: Diagnosis) -> str | None:
     else:
         text = f"pump and piston together {number(own.lpm, 2)} L/min, between {number(low, 2)} and {number(high, 2)}, "
         text += pressure
-    if diagnosis.verdict != "leak" and (basis := rests_on(diagnosis)) is not None:
-        text += f" ({basis})"
+    if basis and diagnosis.verdict != "leak" and (machine := rests_on(diagnosis)) is not None:
+        text += f" ({machine})"
     if own.healthy_lpm is not None:
         text += f"; a healthy machine at most {number(own.healthy_lpm, 2)} L/min"
     if own.findable_lpm is not None:
         text += f"; the smallest step that would have been found is {number(own.findable_lpm, 2)} L/min"
     return text
+
+
+def passes_in_short(diagnosis: Diagnosis) -> str | None:
+    """Return what pump and piston together pass, in a few words; None where it is not known or there is a leak."""
+    own = diagnosis.passage
+    if own is None or diagnosis.verdict == "leak":
+        return None
+    if own.lpm is None or own.interval_lpm is None:
+        return f"passes {_percent(own.pump_share)} of the pump's flow"
+    low, high = own.interval_lpm
+    return f"passes {number(own.lpm, 2)} L/min" if low > 0.0 else f"passes at most {number(high, 2)} L/min"
+
+
+def states_flow(diagnosis: Diagnosis) -> bool:
+    """Return whether the diagnosis states any L/min."""
+    return diagnosis.leak_lpm is not None or (diagnosis.passage is not None and diagnosis.passage.lpm is not None)
 
 
 def _percent(share: float | None) -> str:

@@ -56,6 +56,6 @@ def particulars_of(recording: Recording, rig: Rig | None = None) -> Particulars:
     if isinstance(start, str):
         known.setdefault("Date", re.sub(r"\.\d+", "", start).replace("T", " "))
     if rig is not None:
-        known.setdefault("Machine", rig.title or rig.name)
+        known.setdefault("Machine", (rig.title or rig.name).partition(":")[0])
     leading = tuple((label, known[label]) for label, _ in _NAMES if label in known)
     return Particulars(leading, tuple((name, text) for name, text in remarks.items() if name not in taken))

@@ -133,7 +133,13 @@ class Diagnosis(Evidence):
     @property
     def severity(self) -> Severity | None:
         """How bad the leak is; None where there is none, or nothing is known of its size."""
-        return severity(self, self.limit)
+        contradicted = (
+            "leak_lpm" in self.refuses
+            and self.machine is not None
+            and self.machine.stated
+            and self.measured_ratio is not None
+        )
+        return severity(self, self.limit, trusts_position=not contradicted)
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:

@@ -115,13 +115,16 @@ class Severity:
         return plain
 
 
-def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
-    """Return how bad the leak is that the evidence states; None where it states none, or nothing of its size."""
+def severity(evidence: Evidence, limit: RepairLimit, *, trusts_position: bool = True) -> Severity | None:
+    """Return how bad the leak is that the evidence states; None where it states none, or nothing of its size.
+
+    `trusts_position`: a speed of the piston is stated; not where the geometry as measured contradicts the stated one.
+    """
     relative = evidence.relative
     if evidence.verdict != "leak" or (evidence.leak_lpm is None and relative is None):
         return None
     flow = _triple(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)
-    creep = None if relative is None else _triple(relative.creep, relative.creep_interval, 1.0)
+    creep = None if relative is None or not trusts_position else _triple(relative.creep, relative.creep_interval, 1.0)
     share = None if relative is None else _triple(relative.pump_share, relative.pump_share_interval, 1.0)
     held = flow if limit.kind == "flow" else creep
     return Severity(

@@ -83,7 +83,7 @@
       const plot = new uPlot({
         width: box.clientWidth, height: c.height,
         scales: {x: {time: false}, y: {range: (u, min, max) => c.limits || (min == null ? [0, 1] : uPlot.rangeNum(min, max, 0.06, true))}},
-        axes: [Object.assign({size: 30, values: (u, list) => list.map((v) => v + " s")}, axis), Object.assign({size: 66, space: 22, values: (u, list) => list.map((v) => (v == null ? "" : (Math.abs(v) >= 1e5 ? v.toExponential().replace("e+", "e") : String(+v.toPrecision(6))).replace("-", "−")))}, axis)],
+        axes: [Object.assign({size: 30, values: (u, list) => list.map((v) => v + " s")}, axis), Object.assign({size: (u, list) => Math.max(66, 24 + 7 * Math.max(0, ...(list || []).map((v) => v.length))), space: 22, values: (u, list) => list.map((v) => (v == null ? "" : (Math.abs(v) >= 1e5 ? v.toExponential().replace("e+", "e") : String(+v.toPrecision(6))).replace("-", "−")))}, axis)],
         series: [{}].concat(series.map((s, i) => c.band && i < 2 ? Object.assign(pen(s), {width: 0, points: {show: false}}) : pen(s))),
         bands: c.band ? [{series: [2, 1], fill: color("--fill-a")}] : [],
         legend: {show: false},
