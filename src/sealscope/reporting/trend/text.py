@@ -56,6 +56,8 @@ def headline(trend: Trend) -> str:
     count = len(trend.points)
     span = f", {moment(trend, trend.points[0].day)} to {moment(trend, trend.points[-1].day)}" if count else ""
     own = since(trend)
+    if trend.verdict == "no leak" and trend.repairs:  # what was before is over
+        own = f"{moment(trend, trend.repairs[-1].day)}, when the level fell"
     return f"{trend.verdict} in {count} recording{'' if count == 1 else 's'}{span}{f', since {own}' if own else ''}"
 
 
@@ -63,7 +65,8 @@ def sentence(trend: Trend) -> str:
     """Return the verdict as a sentence."""
     wear = trend.wear
     if trend.verdict == "no leak":
-        return "The leakage does not grow"
+        fell = f", since {moment(trend, trend.repairs[-1].day)}" if trend.repairs else ""
+        return f"The leakage does not grow{fell}"
     if trend.verdict == "leak" and wear is not None and trend.alarm is not None:
         return "The leakage grows" if wear.step is None else "The leakage stepped up"
     if trend.alarm is not None:
