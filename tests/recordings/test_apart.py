@@ -8,10 +8,11 @@ import os
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sealscope.errors import UnreadableFile
-from sealscope.recordings import read
+from sealscope.recordings import Recording, read, write
 from sealscope.recordings.apart import CrashedApartError, apart
 
 
@@ -44,3 +45,17 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("sealscope.recordings.files.apart", lambda work, *_, limit: apart(work, limit=limit))
     with pytest.raises(UnreadableFile, match=r"must be whole, got: the library that reads it crashed.*log"):
         read(path)
+
+
+def test_hdf5_with_our_own_mark_is_read_apart_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, kinds = tmp_path / "run.nc", []
+
+    def seen(work: object, kind: str, *arguments: object, limit: float) -> object:
+        kinds.append(kind)
+        return apart(work, kind, *arguments, limit=limit)  # type: ignore[arg-type]
+
+    t = np.arange(100) / 100.0
+    write(Recording(t, {"p_A": np.sin(t)}, {"p_A": "Pa"}, 100.0), path)
+    monkeypatch.setattr("sealscope.recordings.files.apart", seen)
+    assert (read(path)["p_A"] == np.sin(t)).all()
+    assert kinds == ["netcdf"]  # anybody can write the mark

@@ -19,7 +19,6 @@ from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
 from sealscope.recordings.formats.lvm import is_lvm
 from sealscope.recordings.formats.matlab import is_matlab_4
-from sealscope.recordings.formats.netcdf import OWN
 from sealscope.recordings.formats.table import Choose, RawTable
 from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
 from sealscope.recordings.recording import Recording
@@ -117,7 +116,7 @@ _PROPRIETARY = {
     ".trc": "a file of an oscilloscope: export it as CSV",
 }
 #: Formats whose libraries end the process on some damaged files.
-_APART = ("matlab", "mdf")
+_APART = ("matlab", "mdf", "netcdf")
 #: Longest time that such a file may take [s], and what is added for its size [bytes/s].
 _LONGEST, _SLOWEST = 10.0, 20e6
 #: Archives within archives that are unpacked.
@@ -157,11 +156,8 @@ def _reader(kind: str) -> Reader:
 
 
 def _table(kind: str, file: Path, choose: Choose) -> RawTable:
-    """Read a table, by a process of its own where the format's C library crashes or loops on damaged files.
-
-    NetCDF files of our own mark are read here, as any number of them is read in campaigns.
-    """
-    if kind in _APART or (kind == "netcdf" and not _is_own(file)):
+    """Read a table, by a process of its own where the format's C library crashes or loops on damaged files."""
+    if kind in _APART:
         limit = _LONGEST + file.stat().st_size / _SLOWEST
         return apart(_read_here, kind, file.absolute(), choose, limit=limit)
     return _read_here(kind, file, choose)
@@ -169,11 +165,6 @@ def _table(kind: str, file: Path, choose: Choose) -> RawTable:
 
 def _read_here(kind: str, file: Path, choose: Choose) -> RawTable:
     return _reader(kind)(file, choose)
-
-
-def _is_own(file: Path) -> bool:
-    with file.open("rb") as opened:
-        return OWN.encode() in opened.read(SNIFF)
 
 
 def _writer(kind: str) -> Writer:
