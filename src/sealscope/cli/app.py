@@ -10,7 +10,18 @@ from typing import Annotated, Any
 
 import typer
 
-from sealscope.cli import campaign, fmu, monitoring, prediction, recordings, reproduction, rigs, simulation, trend
+from sealscope.cli import (
+    campaign,
+    fmu,
+    identification,
+    monitoring,
+    prediction,
+    recordings,
+    reproduction,
+    rigs,
+    simulation,
+    trend,
+)
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
@@ -33,6 +44,7 @@ for command in (
     trend.trend,
     simulation.parameters,
     prediction.predict,
+    identification.identify,
     recordings.inspect,
     recordings.convert,
     reproduction.reproduce,
