@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.identification import identify
+from sealscope.control.identification import identify
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth

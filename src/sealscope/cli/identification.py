@@ -20,8 +20,8 @@ def identify(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write a rig's file (.toml).")] = None,
 ) -> None:
     """Fit what recordings tell of a machine's parameters, with intervals of 95 %, and say what they cannot."""
-    from sealscope.identification import identified_rig_text
-    from sealscope.identification import identify as identified
+    from sealscope.control.identification import identified_rig_text
+    from sealscope.control.identification import identify as identified
     from sealscope.parameters import load_rig, rig_names
     from sealscope.parameters.fields import leaves, unit_of
     from sealscope.parameters.rig import Rig

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.identification.estimate import Estimate, instrumented
+from sealscope.control.identification.estimate import Estimate, instrumented
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:

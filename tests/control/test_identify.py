@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.control.identification import Estimate, identified_rig_text, identify
+from sealscope.control.identification.estimate import instrumented, least_squares, long_run
 from sealscope.errors import InputError
-from sealscope.identification import Estimate, identified_rig_text, identify
-from sealscope.identification.estimate import instrumented, least_squares, long_run
 from sealscope.parameters import load_rig
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "identification.py"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sealscope.identification.identify import Identification
+from sealscope.control.identification.identify import Identification
 from sealscope.parameters.fields import leaves, unit_of
 from sealscope.parameters.rig import Rig
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sealscope.calls import checked_call
+from sealscope.control.identification.balance import UNBALANCED, balanced
+from sealscope.control.identification.drive import drive_loop
+from sealscope.control.identification.estimate import Estimate
+from sealscope.control.identification.friction import friction
 from sealscope.errors import InputError
-from sealscope.identification.balance import UNBALANCED, balanced
-from sealscope.identification.drive import drive_loop
-from sealscope.identification.estimate import Estimate
-from sealscope.identification.friction import friction
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 
@@ -78,7 +78,7 @@ def identify(recordings: Sequence[Recording], rig: Rig | str | os.PathLike[str])
     Examples
     --------
     >>> import sealscope as ss
-    >>> from sealscope.identification import identify
+    >>> from sealscope.control.identification import identify
     >>> run = ss.simulate(rig="thesis-closed-loop", command="position 60 mm sin(1t) + 10 mm sin(5t)", duration=30.0)
     >>> found = identify([run], "thesis-closed-loop")
     >>> low, high = found["cylinder.A_A"].interval
