@@ -20,6 +20,7 @@ from sealscope.diagnosis.calibration.calibrated import (
 )
 from sealscope.diagnosis.calibration.scorers import SCORERS, Look, scorer
 from sealscope.diagnosis.calibration.thresholds import Place, as_dict, calibrate, grouped, load, save, with_judge
+from sealscope.diagnosis.diagnose import diagnose
 from sealscope.errors import InputError, UnreadableFile
 
 RATE = 0.1
@@ -271,6 +272,20 @@ def test_the_channels_decide_which_detectors_are_calibrated(records):
     no_angle = whole.only([name for name in whole.channels if name not in ("theta", "omega")])
     assert default_detectors([whole, no_angle])[0] == "rms change"  # the pressure model needs 40 s
     assert default_detectors([whole.only(["p_A"])]) == ("rms change", "d3 of p_A changed", "d4 of p_A changed")
+
+
+def test_a_calibrated_balance_states_its_figures(records):
+    sound = {f"sound-{seed}": records(seed, duration=20.0) for seed in range(5)}
+    calibration = calibrate_on(sound, ("volume balance, calibrated",), false_alarm_probability=RATE)
+    worn = records(60, duration=20.0, leak="0.02 L/min from 10 s")
+    by_itself = diagnose(worn)
+    found = diagnose_calibrated(worn, calibration)
+    assert found.verdict == by_itself.verdict == "leak"
+    assert (found.leak_lpm, found.onset_interval_s) == (by_itself.leak_lpm, by_itself.onset_interval_s)
+    assert found.threshold == calibration.groups[0].thresholds["volume balance, calibrated"].value
+    assert found.relative == by_itself.relative
+    healthy = diagnose_calibrated(records(61, duration=20.0), calibration)
+    assert healthy.passage is not None
 
 
 def test_the_place_of_a_recording(records):

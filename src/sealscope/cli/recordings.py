@@ -100,6 +100,11 @@ class _Reading:
 
     def read(self, file: Path) -> Recording:
         """Read a file, standard input for `-`; the rig's map is for files that have its columns."""
+        if file.is_dir():
+            raise UnreadableFile(
+                f"a recording must be a file, got a folder: name its files, or follow a machine by `sealscope trend` "
+                f"({file})"
+            )
         if file != STANDARD_INPUT:
             return self._read(file)
         with TemporaryDirectory() as folder:

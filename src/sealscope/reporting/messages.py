@@ -103,7 +103,8 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
     """Return why a leak has no L/min, and what would state it."""
     ratio = diagnosis.measured_ratio
     if "leak_lpm" not in diagnosis.refuses:
-        return "L/min not stated: the channels do not allow it"
+        small = diagnosis.passage is not None and diagnosis.passage.lpm is not None
+        return f"L/min not stated: {'it is too small for that' if small else 'the channels do not allow it'}"
     if diagnosis.machine is not None and not diagnosis.machine.stated:
         ask = "state --rig, or the piston's --area" if ratio is not None else "state --rig"
         return f"L/min not stated: the size of the machine is not known; {ask}"

@@ -124,8 +124,11 @@ def diagnose_calibrated(
                 own = by_recordings(judged.part, group.leak_free, probability)
                 methods.append(replace(own, parts=(), detector=name))
                 continue
-            score = scorer(detector).score(look.through(calibration.views[view]) if view else look)
-            methods.append(_evidence(name, score, group, probability))
+            seen = look.through(calibration.views[view]) if view else look
+            evidence = _evidence(name, scorer(detector).score(seen), group, probability)
+            if detector.endswith(CALIBRATED):
+                evidence = _with_figures(evidence, seen.evidence(detector.removesuffix(CALIBRATED)))
+            methods.append(evidence)
     return Diagnosis.of(
         replace(methods[0], parts=tuple(methods)),
         recording,
@@ -134,6 +137,32 @@ def diagnose_calibrated(
         false_alarm_probability=probability,
         quality=judged.findings,
         limit=repair,
+    )
+
+
+def _with_figures(judged: Evidence, own: Evidence) -> Evidence:
+    """Return the verdict by a calibrated threshold with the figures of the detector itself, which has one of its own.
+
+    A leak that the detector's own threshold does not show has no size.
+    """
+    if judged.verdict == "leak" == own.verdict:
+        return replace(
+            own,
+            reason=f"{own.reason}; {judged.reason}",
+            score=judged.score,
+            threshold=judged.threshold,
+            detector=judged.detector,
+            parts=(),
+            chance=None,
+        )
+    return replace(
+        judged,
+        course=own.course if judged.verdict == own.verdict == "no leak" else None,
+        passage=own.passage,
+        refuses=own.refuses,
+        ratio=own.ratio,
+        ratio_interval=own.ratio_interval,
+        share=own.share,
     )
 
 
