@@ -36,3 +36,14 @@ def test_wrong_settings_are_one_line(call, tmp_path):
     assert call("monitor", file).refused().startswith("actuator.0.name: Input should be a valid string, got '3'")
     file.write_text('database = "nowhere/monitor.db"\n[[actuator]]\nname = "a"\n')
     assert "nowhere" in call("monitor", file, "--once").refused()
+
+
+def test_a_dashboard_and_labelled_data_are_written(call, tmp_path):
+    done = call("monitor", "dashboard", "-o", tmp_path / "grafana.json")
+    assert (done.status, done.err) == (0, "")
+    assert json.loads((tmp_path / "grafana.json").read_text())["panels"]
+    settings = tmp_path / "monitor.toml"
+    call("monitor", "init", settings)
+    done = call("monitor", "export", settings, "-o", tmp_path / "labels")
+    assert (done.status, done.out) == (0, f"{tmp_path / 'labels'}: 0 alarms, 0 estimates\n")
+    assert (tmp_path / "labels" / "estimates.csv").read_text().startswith("actuator,t,status")

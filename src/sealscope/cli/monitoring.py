@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sealscope.monitor.service import Service
 
 #: Words after `monitor` that are no file of settings.
-COMMANDS = ("init", "run", "demo", "-h", "--help")
+COMMANDS = ("init", "run", "demo", "export", "dashboard", "-h", "--help")
 
 monitor = typer.Typer(
     name="monitor",
@@ -77,6 +77,40 @@ def demo(
         place = Path(temporary) if folder is None else folder
         make_folder(place)
         _serve(live_demo(place, port, speed, say))
+
+
+@monitor.command()
+def export(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Settings of the monitor.")],
+    folder: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where the tables are written.")],
+) -> None:
+    """Write what persons said of alarms as labelled data: alarms.csv and estimates.csv."""
+    from sealscope.monitor.memory.export import export_labels
+    from sealscope.monitor.memory.store import MonitorStore
+    from sealscope.monitor.settings import read_settings
+    from sealscope.storage.folders import make_folder
+
+    store = MonitorStore(read_settings(file).database)
+    make_folder(folder)
+    alarms, estimates = export_labels(store, folder)
+    typer.echo(f"{folder}: {alarms} alarms, {estimates} estimates")
+
+
+@monitor.command()
+def dashboard(
+    file: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write.")] = Path(
+        "grafana.json"
+    ),
+) -> None:
+    """Write a dashboard that Grafana imports, for the metrics of the page's /metrics."""
+    import json
+
+    from sealscope.monitor.outputs.grafana import dashboard as grafana
+    from sealscope.storage.atomic import atomic_write
+
+    with atomic_write(file) as temporary:
+        temporary.write_text(json.dumps(grafana(), indent=1) + "\n", encoding="utf-8")
+    typer.echo(f"{file}: written")
 
 
 def _serve(service: Service) -> None:

@@ -17,8 +17,9 @@ from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.outputs.lines import EventLines
+from sealscope.monitor.outputs.webhook import Webhook
 from sealscope.monitor.page.site import PageServer
-from sealscope.monitor.settings import MonitorSettings
+from sealscope.monitor.settings import MonitorSettings, secret_of
 from sealscope.monitor.sources.folder import WatchedFolder
 from sealscope.monitor.sources.lines import blocks_of_lines
 from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock
@@ -110,8 +111,12 @@ class Service:
 
             sources.append(broker_of(self.settings.mqtt))
         threads = [threading.Thread(target=self._guarded, args=(source,), daemon=True) for source in sources]
+        posting = None
+        if (hook := self.settings.webhook) is not None:
+            webhook = Webhook(self.store, hook.url, secret_of(hook.token_file, "webhook.token_file"), hook.timeout_s)
+            posting = threading.Thread(target=webhook.run, args=(self.stopping,), daemon=True)
         try:
-            for thread in threads:
+            for thread in threads if posting is None else [*threads, posting]:
                 thread.start()
             left = len(threads)
             while left and not self.stopping.is_set():
@@ -131,6 +136,8 @@ class Service:
                 self._pass_on()
         finally:
             self.stop()
+            if posting is not None and posting.is_alive():
+                posting.join(_LONGEST_PAUSE_S)
             if self.page is not None:
                 self.page.close()
             self._hold.close()

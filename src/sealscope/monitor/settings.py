@@ -72,6 +72,14 @@ class BrokerSettings(_Part):
     alarms_topic: str | None = "sealscope"
 
 
+class WebhookSettings(_Part):
+    """The address that events are posted to."""
+
+    url: Annotated[str, Field(pattern=r"^https?://[^\s@]+$", max_length=2000)]
+    token_file: Path | None = None
+    timeout_s: float = Field(default=10.0, gt=0, le=300)
+
+
 class MonitorSettings(_Part):
     """All settings of a monitor."""
 
@@ -82,6 +90,7 @@ class MonitorSettings(_Part):
     defaults: WatchSettings = Field(default_factory=WatchSettings)
     page: PageSettings | None = None
     mqtt: BrokerSettings | None = None
+    webhook: WebhookSettings | None = None
     actuator: list[ActuatorSettings] = Field(min_length=1, max_length=10_000)
 
     @model_validator(mode="before")
@@ -113,6 +122,10 @@ class MonitorSettings(_Part):
         return self
 
 
+#: Files that the parts of the settings name.
+_FILES = {"page": ("token_file",), "mqtt": ("password_file", "ca_file"), "webhook": ("token_file",)}
+
+
 def read_settings(path: Path) -> MonitorSettings:
     """Return the settings of a file, paths in it taken from its folder.
 
@@ -133,7 +146,13 @@ def read_settings(path: Path) -> MonitorSettings:
         one if one.folder is None else one.model_copy(update={"folder": folder / one.folder})
         for one in settings.actuator
     ]
-    return settings.model_copy(update={"database": database, "actuator": actuators})
+    changed: dict[str, Any] = {"database": database, "actuator": actuators}
+    for name, fields in _FILES.items():
+        part = getattr(settings, name)
+        if part is not None:
+            given = {field: getattr(part, field) for field in fields}
+            changed[name] = part.model_copy(update={f: folder / path for f, path in given.items() if path is not None})
+    return settings.model_copy(update=changed)
 
 
 def secret_of(path: Path | None, what: str) -> str | None:
@@ -180,6 +199,11 @@ port = 8765
 # tls = false
 # ca_file = "ca.pem"
 # alarms_topic = "sealscope"     # alarms go to sealscope/ACTUATOR/alarm, retained
+
+# [webhook]                      # each event is posted as the JSON object of its line
+# url = "https://example.com/alarms"
+# token_file = "hook-token.txt"  # sent as Authorization: Bearer
+# timeout_s = 10.0
 
 [[actuator]]
 name = "press 1"

@@ -257,6 +257,16 @@ class MonitorStore:
             query = select(*columns).where(chosen).group_by(group).order_by(group)
             return [dict(row._mapping) for row in connection.execute(query)]
 
+    def estimates(self) -> Iterator[dict[str, Any]]:
+        """Yield the estimates that are kept, by actuator in their order."""
+        from sqlalchemy import select
+
+        table = self.tables.estimates
+        query = select(table).order_by(table.c.actuator, table.c.number)
+        with self.engine.connect() as connection:
+            for row in connection.execution_options(yield_per=10_000).execute(query):
+                yield dict(row._mapping)
+
     def position(self, name: str) -> int:
         """Return the number of the last event that an output has passed on."""
         from sqlalchemy import select

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
-from typing import TextIO
+from typing import Any, TextIO
 
 from sealscope.monitor.memory.store import MonitorStore
 
 _NAME = "lines"
 #: Events that a shelved alarm keeps to itself.
 _BY_ITSELF = ("raised", "error", "warning", "returned")
+
+
+def announced(event: dict[str, Any]) -> bool:
+    """Whether an event goes out: what happens to a shelved alarm by itself does not, what a person does always."""
+    return event["event"] not in _BY_ITSELF or not event["alarm"]["shelved"]
 
 
 class EventLines:
@@ -29,8 +34,7 @@ class EventLines:
         if not events:
             return
         for number, event in events:
-            # what a person does is said all the same
-            if event["event"] not in _BY_ITSELF or not event["alarm"]["shelved"]:
+            if announced(event):
                 self._stream.write(json.dumps(event) + "\n")
             self._position = number
         self._stream.flush()
