@@ -90,7 +90,8 @@ def is_stamp(text: str) -> bool:
 def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
     """Read stamps (ISO, day.month.year, month/day/year) and times of a day as datetime64[ns]; an empty cell is NaT.
 
-    Dates with strokes begin with the month, but where the first number of any of them is over 12. Raises ValueError
+    Dates with strokes begin with the month, but where the first number of any of them is over 12; dates with hyphens
+    begin with the day, but where the second number is over 12. Raises ValueError
     with the index of the first cell that is no stamp.
     """
     matches = [_parsed_stamp(cell) for cell in cells]
@@ -140,7 +141,7 @@ def _date_of(match: re.Match[str], day_first: bool) -> str:
     """Return the date of a stamp as ISO writes it; 1970-01-01 for the time of a day alone."""
     if match["first"]:
         first, second = match["first"], match["second"]
-        day_first = day_first or match["stroke"] == "-"
+        day_first = day_first or (match["stroke"] == "-" and int(second) <= 12)
         year, month, day = match["year_last"], second if day_first else first, first if day_first else second
     elif match["basic"]:
         year, month, day = match["basic"][:4], match["basic"][4:6], match["basic"][6:]

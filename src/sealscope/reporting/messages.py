@@ -55,6 +55,8 @@ def headline(diagnosis: Diagnosis) -> str:
     summary = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause == "piston or pump leak":
         return "Leak: oil bypasses the piston, or the pump"
+    if summary == "no leak" and not diagnosis.known_healthy:  # one from the start would be hidden
+        return "No leak began within this recording"
     return _SENTENCES.get(summary, summary[0].upper() + summary[1:])
 
 
