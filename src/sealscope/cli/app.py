@@ -15,6 +15,7 @@ from sealscope.cli import (
     fmu,
     identification,
     monitoring,
+    plugin,
     prediction,
     recordings,
     reproduction,
@@ -55,6 +56,7 @@ for command in (
 app.add_typer(campaign.campaign)
 app.add_typer(rigs.rigs)
 app.add_typer(monitoring.monitor)
+app.add_typer(plugin.plugin)
 
 
 @app.callback(invoke_without_command=True)
