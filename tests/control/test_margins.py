@@ -48,9 +48,9 @@ class Late:
 
 
 def test_a_delay_within_the_margin_takes_its_share_of_the_phase():
-    m = margins(RIG, PI, 0.02)
+    m = margins(RIG, PI)
     samples = 10
-    later = margins(RIG, Late(PI, PI.delay + samples), 0.02)
+    later = margins(RIG, Late(PI, PI.delay + samples))
     assert m.phase - later.phase == pytest.approx(2.0 * math.pi * m.crossover * samples / PI.rate, rel=1e-3)
     assert m.delay - later.delay == pytest.approx(samples / PI.rate, rel=1e-3)
 

@@ -195,6 +195,7 @@ def test_the_table_of_claims_gathers_all_chapters_in_order() -> None:
         "chapter-3-claims": (claim("claim-3.2", "holds"),),
         "chapter-4-claims": (claim("claim-4.10", "holds"), claim("claim-4.2", "does not hold")),
         "detection-claims": (claim("claim-5.1.1", "holds in part"), claim("claim-a.1", "holds")),
+        "chapter-6-claims": (),
     }
 
     class Given:

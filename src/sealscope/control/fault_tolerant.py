@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Time [s] over which the pressures that the leak flows under are averaged.
-_PRESSURE_LAG = 0.01
+_PRESSURE_LAG = 0.005
 #: Time [s] over which a change of the estimate enters the control law, so that the integral can make room.
 _BLEND = 0.5
 #: A leak is compensated from so many deviations of its estimate on, and no longer below half of them.

@@ -21,7 +21,7 @@ _MEMORY = 60.0
 #: Impulses that a controller is asked about: position [m], above any dead band, pressures [Pa], angle [rad].
 _IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
 #: Time [s] in which a moving piston settles before the rig is linearised.
-_SETTLING = 1.0
+_SETTLING = 0.5
 _FREQUENCIES = 4000
 #: By how much each state is moved for a difference.
 _SIZES = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9)
@@ -83,7 +83,7 @@ def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array
     from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
-    from sealscope.physics.state import OUTPUTS, VELOCITY
+    from sealscope.physics.state import OUTPUTS, POSITION, VELOCITY
 
     p = rig_numbers(rig) if load == 0.0 else rig_numbers(rig)._replace(pushed=(True,))
     nodes = len(IMEX_NODES if p.throttled else RK4_NODES)
@@ -103,12 +103,23 @@ def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array
     y, u = initial_state(rig, 0.0, load), 0.0
     if speed != 0.0:
         u = speed * rig.cylinder.A_A / (rig.pump.q_b / (2.0 * math.pi)) / rig.motor.omega_per_volt
-        for _ in range(4):  # the drive falls short of its command
-            moving = advanced(y, min(max(u, -rig.daq.u_max), rig.daq.u_max), round(_SETTLING * rate))
-            u *= min(max(speed / moving[VELOCITY], 0.2), 5.0) if moving[VELOCITY] * speed > 0.0 else 1.0
-        y = moving
-        if not abs(y[VELOCITY] - speed) < 0.2 * abs(speed):
+        samples, limit = round(_SETTLING * rate), rig.daq.u_max
+
+        def moving(u: float) -> tuple[Array, float]:
+            """Return a state that moves, and its mean speed: it may ring."""
+            begun = advanced(y, u, samples)
+            ended = advanced(begun, u, samples)
+            return ended, float(ended[POSITION] - begun[POSITION]) * rate / samples
+
+        _, held = moving(0.0)  # the load may move a piston whose drive gives way
+        for _ in range(5):  # the drive falls short of its command
+            state, reached = moving(min(max(u, -limit), limit))
+            gained = reached - held
+            u *= min(max((speed - held) / gained, 0.2), 5.0) if gained * speed > 0.0 else 1.5
+        if not abs(reached - speed) < 0.2 * abs(speed):
             raise InputError(f"speed must be one that the drive can give, got {speed:g} m/s")
+        y = state
+        y[VELOCITY], y[POSITION] = speed, 0.0
     columns: list[Array] = []
     for k, size in enumerate(_SIZES):
         moved = np.zeros(y.size)

@@ -63,6 +63,6 @@ ITEMS: tuple[Item, ...] = (
         "table",
         "Every claim of the thesis and its verdict",
         table,
-        needs=("chapter-3-claims", "chapter-4-claims", "detection-claims"),
+        needs=("chapter-3-claims", "chapter-4-claims", "detection-claims", "chapter-6-claims"),
     ),
 )

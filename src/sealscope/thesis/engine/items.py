@@ -33,6 +33,8 @@ MODULES = (
     "identification",
     "chapters.appendix_c.success_rates",
     "claims.detection",
+    "chapters.chapter6",
+    "claims.chapter6",
 )
 _ID = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
 
