@@ -619,6 +619,7 @@ TEXTS: dict[str, Dialect] = {
         log("Time," + HEADS, [f"{m:%m/%d/%y %I:%M:%S}.{ms:03d} {m:%p}" for m, ms in MILLI])
     ),
     "text, named month": Dialect(log("Zeitstempel," + HEADS, [f"{m:%d-%b-%Y %H:%M:%S}.{ms:03d}" for m, ms in MILLI])),
+    "text, lengths of time": Dialect(log("Time," + HEADS, [f"0 days 00:00:{t:09.6f}" for t in T])),
     "text, basic ISO 8601": Dialect(log("Time," + HEADS, [f"{m:%Y%m%dT%H%M%S}.{ms:03d}" for m, ms in MILLI])),
     "text, Chinese date": Dialect(
         log("时间," + HEADS, [f"{m:%Y}年{m:%m}月{m:%d}日 {m:%H:%M:%S}.{ms:03d}" for m, ms in MILLI])
@@ -648,6 +649,10 @@ TEXTS: dict[str, Dialect] = {
             "Dutch": "Tijd (s),Druk A (bar),Druk B (bar),Positie (mm)",
             "Polish": "Czas [s],Ciśnienie A [bar],Ciśnienie B [bar],Położenie [mm]",
             "German compounds": "Messzeit in s,Zylinderdruck_A in bar,Zylinderdruck_B in bar,Zylinderweg in mm",
+            "Czech": "Čas [s],Tlak A [bar],Tlak B [bar],Poloha [mm]",
+            "Swedish": "Tid (s),Tryck A (bar),Tryck B (bar),Läge (mm)",
+            "Russian": "Время (с),Давление A (бар),Давление B (бар),Положение (мм)",
+            "Korean": "시간(s),A실압력(bar),B실압력(bar),변위(mm)",
             "cap and head": "Time (s),Cap Pressure (bar),Head Pressure (bar),Stroke (mm)",
             "head and rod": "Time (s),Head End Pressure (bar),Rod End Pressure (bar),Stroke (mm)",
             "extend and retract": "Time (s),Extend Pressure (bar),Retract Pressure (bar),LVDT (mm)",

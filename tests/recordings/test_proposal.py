@@ -37,6 +37,14 @@ from sealscope.recordings.formats.headings.proposal import proposed_map
             "时间 [s];无杆腔压力 [MPa];有杆腔压力 [MPa]",
             {"t": "时间 [s]", "p_A": "无杆腔压力 [MPa]", "p_B": "有杆腔压力 [MPa]"},
         ),
+        (
+            "Zeit [s];Druck A [bar];Druck B [bar];Weg Ist [mm];Weg Soll [mm]",
+            {"t": "Zeit [s]", "p_A": "Druck A [bar]", "p_B": "Druck B [bar]", "x": "Weg Ist [mm]"},
+        ),
+        (
+            "t;Pressure A [bar];Pressure A filtered [bar];Pressure B [bar];Position setpoint [mm];u cmd [V]",
+            {"t": "t", "p_A": "Pressure A [bar]", "p_B": "Pressure B [bar]", "u": "u cmd [V]"},
+        ),
         ("t;PG_1;PG_2;PG_tank", {"p_A": "PG_1", "p_B": "PG_2", "t": "t"}),
         (
             "s;pump pressure 1 [psi];pump pressure 2 [psi];Pressure A (psi);Pressure B (psi)",

@@ -16,6 +16,7 @@ from sealscope.units import to_si
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
 _STAMP = re.compile(
     r"(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2})|(?P<basic>(?:19|20)\d{6})(?=[T\s]|\Z)"
+    r"|(?P<days>\d{1,5}) days?,?(?=\s)"
     r"|(?P<year_cjk>\d{4})年(?P<month_cjk>\d{1,2})月(?P<day_cjk>\d{1,2})日"
     r"|(?P<day>\d{1,2})\.(?P<month>\d{1,2})\.(?P<year>\d{4}|\d{2})"
     r"|(?P<day_named>\d{1,2})[-. /]{1,2}(?P<name>[^\W\d_]{3,9})[-. /]{1,2}(?P<year_named>\d{4}|\d{2})"
@@ -25,7 +26,7 @@ _STAMP = re.compile(
     r"(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2})?"
 )
 #: Groups of which a stamp has at least one.
-_TELLING = ("date", "basic", "year_cjk", "year", "name", "name_first", "first", "clock")
+_TELLING = ("date", "days", "basic", "year_cjk", "year", "name", "name_first", "first", "clock")
 #: Beginnings of the months' names in English, German, French, Italian and Spanish.
 _MONTHS = {
     beginning: month
@@ -143,6 +144,8 @@ def _date_of(match: re.Match[str], day_first: bool) -> str:
         first, second = match["first"], match["second"]
         day_first = day_first or (match["stroke"] == "-" and int(second) <= 12)
         year, month, day = match["year_last"], second if day_first else first, first if day_first else second
+    elif match["days"]:  # a length of time, as pandas writes it
+        return str(np.datetime64(_NO_DATE) + int(match["days"]))
     elif match["basic"]:
         year, month, day = match["basic"][:4], match["basic"][4:6], match["basic"][6:]
     elif name := match["name"] or match["name_first"]:

@@ -19,15 +19,16 @@ def _words(text: str) -> frozenset[str]:
 
 
 #: What a column may measure -> words of its name: English, German, French, Spanish, Italian, Portuguese, Dutch, Polish,
-#: Chinese and Japanese.
+#: Czech, Swedish, Turkish, Russian, Chinese, Japanese and Korean.
 _WORDS: Mapping[str, frozenset[str]] = {
     "pressure": _words(
         "p pr pres press pressure druck kammerdruck zylinderdruck pression presion pressione pressao druk cisnienie "
-        "pg pt 压力 压强 圧力"
+        "pg pt tlak tryck basinc basınc давление 压力 压强 壓力 圧力 압력"
     ),
     "position": _words(
         "x pos position weg hub stroke displ displacement travel kolbenweg kolbenposition lvdt deplacement course "
-        "posicion carrera posizione corsa posicao curso positie slag polozenie skok 位移 行程 位置 変位 ストローク"
+        "posicion carrera posizione corsa posicao curso positie slag polozenie skok "
+        "poloha lage laege konum положение ход 位移 行程 位置 変位 ストローク 변위 위치"
     ),
     "command": _words(
         "u cmd command soll sollwert setpoint ref reference demand spannung voltage stellgroesse ansteuerung consigne "
@@ -40,18 +41,20 @@ _WORDS: Mapping[str, frozenset[str]] = {
     "leak": _words("leak leakage leck leckage leckstrom fuite fuga trafilamento 泄漏 漏れ"),
     "time": _words(
         "t time tout timestamp timestamps datetime zeit messzeit uhrzeit zeitstempel temps horodatage heure tiempo "
-        "hora tempo ora tijd tijdstip czas 时间 时刻 時間 時刻"
+        "hora tempo ora tijd tijdstip czas cas tid zaman время "
+        "时间 时刻 時間 時刻 시간"
     ),
 }
 #: Last words of German compounds (Zylinderweg, Messzeit), where a whole word is not known.
 _ENDINGS = ("druck", "weg", "hub", "position", "winkel", "drehzahl", "zeit", "druk")
 _A = _words(
     "a cap bore blind extend extension piston kolben kolbenseite kolbenseitig kolbenraum kolbenkammer bodenseite boden "
-    "bodem fond fondo fondello embolo zuiger tlok 无杆腔 ヘッド側 ボトム側 キャップ側"
+    "bodem fond fondo fondello embolo zuiger tlok 无杆腔 無桿腔 ヘッド側 "
+    "ボトム側 キャップ側"
 )
 _B = _words(
-    "b rod ring annulus annular retract retraction stange stangenseite stangenseitig stangenraum ringseite ringraum "
-    "kolbenstange tige vastago stelo haste stang tloczysko 有杆腔 ロッド側"
+    "b rod ring annulus annular retract retraction stange stangenseite stangenseitig stangenraum stangenkammer "
+    "ringseite ringraum ringkammer kolbenstange tige vastago stelo haste stang tloczysko 有杆腔 有桿腔 ロッド側"
 )
 #: The end of a cylinder that its rod leaves where the other is the cap; where the other is the rod end, the cap.
 _HEAD = "head"
@@ -60,12 +63,16 @@ _PUMP = _words("pump pumpe pompe bomba pompa pomp 泵 ポンプ")
 _PORT = "port"
 _OTHERS = _words(
     "tank supply versorgung system charge speisedruck speise accumulator speicher oil oel temp temperature temperatur "
-    "force kraft current strom soll sollwert setpoint ist flow"
+    "force kraft current strom flow"
 )
+#: Of what is wanted and not measured, unless it is a command; and of what is made from other columns.
+_WANTED = _words("soll sollwert setpoint set target demand reference ref cmd command consigne")
+_MADE = _words("filtered filt gefiltert filtre smoothed mean mittel avg average min max rms error fehler")
 #: Words of a script that writes no blanks between words.
 _UNSPACED = frozenset(word for words in (*_WORDS.values(), _A, _B, _PUMP) for word in words if ord(word[0]) > 0x2E7F)
 #: How loggers write revolutions a minute, which as a unit of its own is a frequency.
 TURNS = ("1/min", "min-1", "min^-1", "min\u207b\u00b9", "/min", "U/min")
+_MEASURED = ("pressure", "position", "speed", "angle")
 _UNITS = {"position": "m", "command": "V", "speed": "rad/s", "angle": "rad", "leak": "m^3/s", "time": "s"}
 _CHANNELS = {"position": "x", "command": "u", "speed": "omega", "angle": "theta", "leak": "q_leak", "time": "t"}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
@@ -101,6 +108,8 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     result = {}
     for channel in (*CHANNEL_UNITS, "t"):
         columns = candidates.get(channel, [])
+        if len(columns) > 1:  # what is made of another column gives way to it
+            columns = [column for column in columns if not _words_of(labels[column].name) & _MADE]
         if len(columns) == 1 and channel.casefold() not in own:
             guess, label = guesses[columns[0]], labels[columns[0]]
             assert guess is not None
@@ -163,8 +172,8 @@ def _guess(label: Label, head: str) -> _Guess | None:
     unit = label.unit if label.unit is not None else unit
     side = head if _HEAD in words and head else _side(words)
     if unit is not None and same_dimension(unit, "Pa"):
-        return None if words & _OTHERS else _Guess("pressure", side, unit)
-    if words & _OTHERS - {"soll", "sollwert", "setpoint"}:
+        return None if words & (_OTHERS | _WANTED) else _Guess("pressure", side, unit)
+    if words & _OTHERS or (words & _WANTED and any(words & _WORDS[kind] for kind in _MEASURED)):
         return None
     if unit in TURNS and words & _WORDS["speed"]:
         return _Guess("speed", side, "rpm")
