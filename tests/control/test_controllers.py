@@ -108,6 +108,38 @@ def test_a_leak_under_2_kN_is_tracked_held_and_reported(lpm):
     assert np.abs(error[still]).max() < 60e-6
 
 
+@pytest.mark.parametrize("lpm", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
+def test_a_single_rod_under_2_kN_is_served_as_well(lpm):
+    rig = load_rig("single-rod-eha")
+    G = lpm / 6e4 / (2000.0 / rig.cylinder.A_A)
+    runs = {}
+    for name in ("pi", "fault-tolerant"):
+        experiment = Experiment.of(
+            rig=rig, command=SINE, duration=12.0, controller=controller_named(name, rig),
+            leak=f"G = {G}" if lpm else None,
+            set={"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6, "F_l": 2000.0},
+        )  # fmt: skip
+        run = trajectory(experiment, experiment.leaks)
+        runs[name] = run, rms((experiment.target.at(run.t) - run["x"])[run.t > 8.0])
+    (fixed, missed), (tolerant, left) = runs.values()
+    if lpm == 0.0:
+        np.testing.assert_array_equal(fixed.rows, tolerant.rows)
+        return
+    assert left < 0.6 * missed
+    late = tolerant.t > 8.0
+    flow = G * (tolerant["p_A"] - tolerant["p_B"])[late]
+    assert np.mean(tolerant.compensated[late]) == pytest.approx(np.mean(flow), rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lpm", [0.0042, 0.5])
+def test_a_step_of_100_mm_under_2_kN_is_held_with_a_leak(lpm):
+    run, error = followed(FaultTolerant.of(RIG), "position step 100 mm at 1 s", 24.0, lpm)
+    assert np.abs(error[run.t > 12.0]).max() < 60e-6
+    assert abs(np.polyfit(run.t[run.t > 16.0], run["x"][run.t > 16.0], 1)[0]) * 60e3 < 0.1
+    assert run["x"].max() < 0.104
+
+
 def test_stiffness_comes_back_to_that_of_a_machine_without_a_leak():
     """A load that ends, 0.5 L/min: the fixed controller needs its integral for the leak, and deviates twice as much."""
     deviation = {}

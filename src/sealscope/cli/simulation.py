@@ -167,6 +167,9 @@ def simulate(
         typer.echo(f"fault: {fault_}")
     if run.truth.leaks:
         typer.echo(f"mean leak while open: {run.truth.mean_leak_lpm:.5g} L/min")
+    if "q_comp" in run.recording:
+        flow = float(run.recording["q_comp"][-max(1, round(experiment.rate)) :].mean())
+        typer.echo(f"the controller makes good: {flow * 6e4:.4g} L/min at the end (channel q_comp)")
 
 
 def _names(maps: Sequence[str] | None) -> dict[str, str]:

@@ -138,6 +138,7 @@ def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
         ("p_AB", "Chamber pressures", (("p_A", "a"), ("p_B", "b"))),
         ("p_12", "Pump port pressures", (("p_1", "a"), ("p_2", "b"))),
         ("q_leak", "Flow meter in the bypass", (("q_leak", "a"),)),
+        ("q_comp", "Leakage that the controller makes good", (("q_comp", "a"),)),
     ]
     charts = []
     for key, title, members in kinds:
