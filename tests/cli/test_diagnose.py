@@ -309,19 +309,14 @@ def test_scripts_may_fail_on_a_verdict(call, recordings):
     assert call("diagnose", *files, "--quiet", "--fail-on", "leak").status == 3
     assert call("diagnose", files[1], "--quiet", "--fail-on", "leak").status == 0
     assert call("diagnose", files[1], "--quiet", "--fail-on", "leak", "--fail-on", "no leak").status == 3
-    (leak,) = call("diagnose", files[0], "--format", "jsonl", "--rig", "thesis").objects
-    low, high = leak["severity"]["mL_per_min_interval"]
-    for limit, level in ((0.9 * low, "repair"), (1.1 * high, "plan"), (2.2 * high, "follow")):
-        for least, status in (("repair", 3 * (level == "repair")), ("plan", 3 * (level != "follow")), ("follow", 3)):
-            words = (
-                "diagnose",
-                files[0],
-                "--quiet",
-                "--rig",
-                "thesis",
-                "--limit",
-                f"{limit} mL/min",
-                "--fail-on",
-                least,
-            )
-            assert call(*words).status == status, (limit, least)
+    words = ("diagnose", files[0], "--quiet", "--rig", "thesis", "--limit")
+    assert call(*words, "0.1 mL/min", "--fail-on", "repair").status == 3
+    assert call(*words, "9 L/min", "--fail-on", "plan").status == 0
+
+
+def test_a_level_fails_on_itself_and_on_what_is_worse():
+    levels = ("follow", "plan", "repair")
+    failing = {least: [level for level in levels if FailOn(least).holds("leak", level)] for least in levels}
+    assert failing == {"follow": ["follow", "plan", "repair"], "plan": ["plan", "repair"], "repair": ["repair"]}
+    assert not FailOn("follow").holds("no leak", None)
+    assert FailOn("leak").holds("leak", None)
