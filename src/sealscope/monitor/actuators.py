@@ -5,15 +5,18 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from dataclasses import asdict, dataclass
+import time
+from collections import deque
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from sealscope.errors import InputError
 from sealscope.monitor.alarms.alarm import Alarm, status_word
 from sealscope.monitor.alarms.judging import AlarmJudge
+from sealscope.monitor.memory.sharing import Share
 from sealscope.monitor.memory.store import KEPT_IDENTITIES, PENDING_BLOCKS, PENDING_BYTES, MonitorStore
 from sealscope.monitor.settings import ActuatorSettings
-from sealscope.monitor.sources.source_block import SourceBlock
+from sealscope.monitor.sources.source_block import SourceBlock, nothing
 from sealscope.monitor.stream.baseline import plain_dataclass
 from sealscope.monitor.stream.watch import BlockEstimate, Watch, watch
 from sealscope.recordings.recording import Recording
@@ -22,6 +25,8 @@ _log = logging.getLogger(__name__)
 #: What a person may say of an alarm.
 MARKS = ("acknowledged", "comment", "shelved", "false", "repaired")
 _LONGEST_TEXT = 2000
+#: How long blocks of others' actuators are kept, in leases: until a takeover, with time to spare.
+_KEPT_LEASES = 4.0
 
 
 @dataclass
@@ -43,8 +48,15 @@ class WatchedActuators:
     `counters`: blocks that were dropped since the start, by reason.
     """
 
-    def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
-        self.store = store
+    def __init__(
+        self,
+        settings: list[ActuatorSettings],
+        store: MonitorStore,
+        keep_days: float = 90.0,
+        share: Share | None = None,
+    ) -> None:
+        self.store, self._share = store, share
+        self._elsewhere: dict[str, deque[tuple[float, SourceBlock]]] = {each.name: deque() for each in settings}
         self._keep_s = keep_days * 86_400.0
         self.counters: dict[str, int] = {}
         self.changes = threading.Condition()
@@ -52,7 +64,9 @@ class WatchedActuators:
         self.closed = False
         self._lock = threading.RLock()
         self._settings = {each.name: each for each in settings}
-        self._actuators = {name: self._restored(each) for name, each in self._settings.items()}
+        self._actuators: dict[str, _Actuator] = {}
+        if share is None:
+            self._actuators = {name: self._restored(each) for name, each in self._settings.items()}
 
     def _restored(self, settings: ActuatorSettings) -> _Actuator:
         """Return an actuator as its last transaction left it."""
@@ -89,6 +103,35 @@ class WatchedActuators:
         """Count something that was dropped."""
         self.counters[reason] = self.counters.get(reason, 0) + 1
 
+    def renew(self) -> None:
+        """Renew the share in the actuators; of one that is taken over the blocks since then are taken at once.
+
+        Raises what the database raises.
+        """
+        assert self._share is not None
+        with self._lock:
+            gained, lost = self._share.renew()
+            for name in gained | lost:
+                self._actuators.pop(name, None)  # the database knows better
+            for name in sorted(self._share.held & set(self._settings)):
+                self._taken_over(name)
+
+    def _taken_over(self, name: str) -> None:
+        """Take the blocks that came while another monitor watched an actuator; those it stored are passed over."""
+        waiting = self._elsewhere[name]
+        for _ in range(len(waiting)):
+            self._take(waiting[0][1])
+            waiting.popleft()
+
+    def _keep_elsewhere(self, block: SourceBlock) -> None:
+        """Keep a block of another monitor's actuator for as long as its takeover may last."""
+        assert self._share is not None
+        self.count("blocks of another monitor's actuator")
+        waiting, now = self._elsewhere[block.actuator], time.monotonic()
+        waiting.append((now, replace(block, done=nothing)))
+        while waiting and waiting[0][0] < now - _KEPT_LEASES * self._share.lease_s:
+            waiting.popleft()
+
     def take(self, block: SourceBlock) -> list[BlockEstimate]:
         """Take a block in one transaction: samples, estimates, alarms and the block's identity, or nothing of it.
 
@@ -98,9 +141,23 @@ class WatchedActuators:
             self.count("blocks of an actuator that is not in the settings")
             return []
         with self._lock:
+            if self._share is not None:
+                if block.actuator not in self._share.held:
+                    self._keep_elsewhere(block)
+                    return []
+                self._taken_over(block.actuator)
+            return self._take(block)
+
+    def _take(self, block: SourceBlock) -> list[BlockEstimate]:
+        """Take a block of an actuator that is this monitor's to watch."""
+        with self._lock:
             actuator = self._actuator(block.actuator)
             try:
                 with self.store.writing() as connection:
+                    if self._share is not None and not self._share.holds(connection, block.actuator):
+                        self._actuators.pop(block.actuator)
+                        self._keep_elsewhere(block)
+                        return []
                     if self.store.knows(connection, block.actuator, block.identity):
                         self.count("blocks stored already")
                         return []
@@ -109,7 +166,7 @@ class WatchedActuators:
                     estimates = [] if block.samples is None else self._taken(connection, actuator, block, block.samples)
             except BaseException:
                 # what the detector took is not stored: the next block begins at the last transaction
-                del self._actuators[block.actuator]
+                self._actuators.pop(block.actuator, None)
                 raise
         self._tell()
         return estimates
@@ -200,6 +257,8 @@ class WatchedActuators:
         with self._lock:
             if name not in self._settings:
                 raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
+            if self._share is not None and name not in self._share.held:
+                raise InputError(f"{name} is watched by another monitor; mark its alarm on that one's page")
             actuator = self._actuator(name)
             at = actuator.last.t if actuator.last is not None else 0.0
             try:

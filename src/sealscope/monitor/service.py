@@ -8,13 +8,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
+from sealscope.monitor.memory.sharing import Share
 from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.outputs.lines import EventLines
 from sealscope.monitor.outputs.webhook import Webhook
@@ -73,7 +74,13 @@ class Service:
             self._hold.enter_context(locked(Path(settings.database + ".lock"), busy))
         try:
             self.store = MonitorStore(settings.database)
-            self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days)
+            self._share = None
+            if (part := settings.share) is not None:
+                names = [actuator.name for actuator in settings.actuator]
+                self._share = Share(self.store, part.name, names, part.lease_s)
+            self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days, self._share)
+            if self._share is not None:
+                self.actuators.renew()
         except BaseException:
             self._hold.close()
             raise
@@ -101,6 +108,8 @@ class Service:
 
     def run(self) -> None:
         """Take blocks until the sources have ended and there is no page, or `stop` is called."""
+        from sqlalchemy.exc import DBAPIError
+
         sources = [*self._sources]
         if self.settings.lines:
             sources.append(_lines_of(self._stdin))
@@ -111,6 +120,8 @@ class Service:
 
             sources.append(broker_of(self.settings.mqtt))
         threads = [threading.Thread(target=self._guarded, args=(source,), daemon=True) for source in sources]
+        if self._share is not None:
+            threading.Thread(target=self._keep_share, args=(self._share,), daemon=True).start()
         posting = None
         if (hook := self.settings.webhook) is not None:
             webhook = Webhook(self.store, hook.url, secret_of(hook.token_file, "webhook.token_file"), hook.timeout_s)
@@ -138,6 +149,9 @@ class Service:
             self.stop()
             if posting is not None and posting.is_alive():
                 posting.join(_LONGEST_PAUSE_S)
+            if self._share is not None:
+                with suppress(DBAPIError):
+                    self._share.give_back()
             if self.page is not None:
                 self.page.close()
             self._hold.close()
@@ -145,6 +159,16 @@ class Service:
     def stop(self) -> None:
         """End `run` after the block at hand."""
         self.stopping.set()
+
+    def _keep_share(self, share: Share) -> None:
+        """Renew the share in the actuators four times a lease; where the database does not answer, the lease lapses."""
+        from sqlalchemy.exc import DBAPIError
+
+        while not self.stopping.wait(share.lease_s / 4.0):
+            try:
+                self.actuators.renew()
+            except DBAPIError as error:
+                _log.error("the share in the actuators is not renewed: %s", str(error.orig).splitlines()[0])
 
     def _guarded(self, source: Source) -> None:
         try:

@@ -80,6 +80,13 @@ class WebhookSettings(_Part):
     timeout_s: float = Field(default=10.0, gt=0, le=300)
 
 
+class ShareSettings(_Part):
+    """A monitor's part where several share the actuators of a database."""
+
+    name: _Text
+    lease_s: float = Field(default=12.0, ge=1, le=3600)
+
+
 class MonitorSettings(_Part):
     """All settings of a monitor."""
 
@@ -91,6 +98,7 @@ class MonitorSettings(_Part):
     page: PageSettings | None = None
     mqtt: BrokerSettings | None = None
     webhook: WebhookSettings | None = None
+    share: ShareSettings | None = None
     actuator: list[ActuatorSettings] = Field(min_length=1, max_length=10_000)
 
     @model_validator(mode="before")
@@ -116,6 +124,8 @@ class MonitorSettings(_Part):
                 raise ValueError(f"each actuator must have a topic of its own without wildcards, got {topic!r}")
         if topics and self.mqtt is None:
             raise ValueError("an actuator with a topic needs the table [mqtt]")
+        if self.share is not None and "://" not in self.database:
+            raise ValueError(f"monitors that share actuators need a database by URL, got the file {self.database!r}")
         local = self.page is None or self.page.host in ("127.0.0.1", "localhost", "::1")
         if self.page is not None and not local and self.page.token_file is None:
             raise ValueError(f"a page beyond this machine needs page.token_file, got host {self.page.host!r} without")
@@ -199,6 +209,10 @@ port = 8765
 # tls = false
 # ca_file = "ca.pem"
 # alarms_topic = "sealscope"     # alarms go to sealscope/ACTUATOR/alarm, retained
+
+# [share]                        # several monitors over one PostgreSQL, each with the same actuators
+# name = "monitor 1"             # its own
+# lease_s = 12.0                 # one that says nothing for so long [s] loses its actuators to the others
 
 # [webhook]                      # each event is posted as the JSON object of its line
 # url = "https://example.com/alarms"

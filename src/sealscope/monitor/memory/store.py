@@ -45,6 +45,7 @@ class MonitorStore:
         from sealscope.monitor.memory import tables
 
         self.tables = tables
+        self.sends = True  # False while another monitor that shares the database sends for all
         self._is_file = "://" not in database
         url = f"sqlite:///{Path(database)}" if self._is_file else database
         try:
@@ -132,7 +133,7 @@ class MonitorStore:
     def keep_alarm(self, connection: Connection, alarm: Alarm) -> None:
         """Store an alarm as it is now."""
         values = {"actuator": alarm.actuator, "state": alarm.state, "alarm": json.dumps(alarm.plain())}
-        self._put(connection, self.tables.alarms, {"id": alarm.id}, values)
+        self.put(connection, self.tables.alarms, {"id": alarm.id}, values)
 
     def keep_event(
         self, connection: Connection, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = ""
@@ -167,7 +168,7 @@ class MonitorStore:
             "checkpoint": json.dumps(checkpoint, allow_nan=False),
             "summary": json.dumps(summary),
         }
-        self._put(connection, self.tables.actuators, {"actuator": actuator}, values)
+        self.put(connection, self.tables.actuators, {"actuator": actuator}, values)
 
     def keep_summary(self, connection: Connection, actuator: str, summary: dict[str, Any]) -> None:
         """Store what an actuator shows now."""
@@ -278,10 +279,10 @@ class MonitorStore:
     def keep_position(self, name: str, number: int) -> None:
         """Store how far an output is."""
         with self.writing() as connection:
-            self._put(connection, self.tables.facts, {"name": name}, {"value": str(number)})
+            self.put(connection, self.tables.facts, {"name": name}, {"value": str(number)})
 
     @staticmethod
-    def _put(connection: Connection, table: Table, key: dict[str, Any], values: dict[str, Any]) -> None:
+    def put(connection: Connection, table: Table, key: dict[str, Any], values: dict[str, Any]) -> None:
         """Change the row of a key, or insert it."""
         statement = table.update()
         for name, value in key.items():

@@ -70,3 +70,14 @@ events = Table(
     Column("text", Text, nullable=False),
     Column("alarm", Text, nullable=False),
 )
+#: Monitors that share the database, and whose each actuator is, until when [s].
+monitors = Table(
+    "monitors", metadata, Column("name", String(120), primary_key=True), Column("until", Float(53), nullable=False)
+)
+leases = Table(
+    "leases",
+    metadata,
+    Column("actuator", String(120), primary_key=True),
+    Column("holder", String(120), nullable=False),
+    Column("until", Float(53), nullable=False),
+)

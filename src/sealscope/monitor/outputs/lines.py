@@ -26,16 +26,14 @@ class EventLines:
 
     def __init__(self, store: MonitorStore, stream: TextIO) -> None:
         self._store, self._stream = store, stream
-        self._position = store.position(_NAME)
 
     def pass_on(self) -> None:
         """Write what is new."""
-        events = self._store.events_since(self._position)
+        events = self._store.events_since(self._store.position(_NAME)) if self._store.sends else []
         if not events:
             return
-        for number, event in events:
+        for _, event in events:
             if announced(event):
                 self._stream.write(json.dumps(event) + "\n")
-            self._position = number
         self._stream.flush()
-        self._store.keep_position(_NAME, self._position)
+        self._store.keep_position(_NAME, events[-1][0])

@@ -45,7 +45,6 @@ class Webhook:
 
     def __init__(self, store: MonitorStore, url: str, token: str | None = None, timeout: float = 10.0) -> None:
         self._store, self._url, self._token, self._timeout = store, url, token, timeout
-        self._position = store.position(_NAME)
         self._pause, self._next = 0.0, 0.0
         self._opener = urllib.request.build_opener(_NoRedirect)
 
@@ -60,13 +59,12 @@ class Webhook:
         """Post what is new, unless a failure asks for a pause."""
         from sqlalchemy.exc import DBAPIError
 
-        if time.monotonic() < self._next:
+        if time.monotonic() < self._next or not self._store.sends:
             return
         try:
-            for number, event in self._store.events_since(self._position):
+            for number, event in self._store.events_since(self._store.position(_NAME)):
                 if announced(event):
                     self._post(number, event)
-                self._position = number
                 self._store.keep_position(_NAME, number)
                 self._pause = 0.0
         except (urllib.error.URLError, OSError, ValueError, DBAPIError) as error:

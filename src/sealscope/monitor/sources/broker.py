@@ -65,11 +65,10 @@ class _Connection:
         properties.MaximumPacketSize = _LARGEST
         self._client.connect_async(self._settings.host, self._settings.port, clean_start=False, properties=properties)
         self._client.loop_start()
-        position = self._service.store.position(_NAME)
         try:
             while not self._service.stopping.wait(0.2):
-                position = self._passed_on(position)
-            self._passed_on(position)
+                self._pass_on()
+            self._pass_on()
         finally:
             self._client.disconnect()
             self._client.loop_stop()
@@ -100,23 +99,21 @@ class _Connection:
             self._service.hand(InputError(f"{message.topic[:100]}: {error}"))
             done()  # it would be no better a second time
 
-    def _passed_on(self, position: int) -> int:
-        """Publish the alarms of new events, each retained, and return how far that went."""
+    def _pass_on(self) -> None:
+        """Publish the alarms of new events, each retained."""
         from sqlalchemy.exc import DBAPIError
 
-        topic = self._settings.alarms_topic
-        if topic is None or not self._client.is_connected():
-            return position
+        topic, store = self._settings.alarms_topic, self._service.store
+        if topic is None or not store.sends or not self._client.is_connected():
+            return
         try:
-            for number, event in self._service.store.events_since(position):
+            for number, event in store.events_since(store.position(_NAME)):
                 alarm = event["alarm"]
                 name = "".join("_" if letter in "+#/\0" else letter for letter in alarm["actuator"])
                 sent = self._client.publish(f"{topic}/{name}/alarm", json.dumps(alarm), qos=1, retain=True)
                 sent.wait_for_publish(timeout=5.0)
                 if not sent.is_published():
-                    return position
-                position = number
-                self._service.store.keep_position(_NAME, position)
+                    return
+                store.keep_position(_NAME, number)
         except (DBAPIError, RuntimeError, ValueError) as error:
             _log.warning("alarms wait for the broker or the database: %s", str(error).splitlines()[0])
-        return position
