@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,10 @@ from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import CampaignResult, prior_knowledge
+from sealscope.diagnosis.baseline.level import Level
+from sealscope.diagnosis.baseline.operating_point import OperatingPoint
+from sealscope.diagnosis.trend.reading import LeakReading
+from sealscope.diagnosis.trend.trend import Trend, trend_of
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.quality import Finding
@@ -147,3 +152,35 @@ def campaign_result(tmp_path_factory):
              for k in range(6)]  # fmt: skip
     judgement = judge(rows, plan.detectors, None, onset_s=plan.onset_s, hours=plan.duration_s / 3600)
     return CampaignResult(plan, tuple(rows), 0, judgement, known=prior_knowledge(plan))
+
+
+POINT = OperatingPoint(0, 11.0, 500.0, ("Pa", "Pa"), ("p_A", "p_B"), 2.1, 1.57)
+
+
+@pytest.fixture(scope="session")
+def trend() -> Trend:
+    """40 days: wear from day 10 on, a repair on day 30; days 20 to 22 of another duty; day 5 states nothing."""
+    random = np.random.default_rng(2)
+    days = []
+    for k in range(40):
+        level = 6.7e-13 * (1.0 + 0.05 * random.standard_normal() + (0.08 * (k - 10) if 10 < k < 30 else 0.0))
+        point = replace(POINT, command_rms=4.0) if 20 <= k <= 22 else POINT
+        days.append(
+            LeakReading(
+                f"<day> {k}.csv",
+                1.7e9 + 86400.0 * k,
+                60.0,
+                None if k == 5 else "volume balance",
+                Level(level, 1.3e-14),
+                True,
+                633e-6,
+                1.1e5,
+                None,
+                1.0,
+                None,
+                point,
+                bytes([k]),
+                "needs theta" if k == 5 else "",
+            )
+        )
+    return trend_of(days, healthy=5, limit="15 mL/min")

@@ -12,6 +12,7 @@ from sealscope.reporting.campaign.page import render_campaign_page
 from sealscope.reporting.printing import BROWSERS
 from sealscope.reporting.thesis.files import publish
 from sealscope.reporting.thesis.page import VERDICTS, render_thesis_page
+from sealscope.reporting.trend.page import render_trend_page
 from sealscope.thesis.engine.build import ItemStatus
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, ThesisTable
@@ -34,13 +35,14 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory, recording, make_diagnosis, no_verdict, campaign_result):
+def pages(tmp_path_factory, recording, make_diagnosis, no_verdict, campaign_result, trend):
     """Each kind of page: name -> file."""
     folder = tmp_path_factory.mktemp("pages")
     marks = [Mark(5, "cold")]
     texts = {
         "leak": render_page(recording, make_diagnosis(), rig="thesis-calibrated", truth_onset_s=20.0, marks=marks),
         "cannot tell": render_page(recording.only(["p_A", "x"]), no_verdict),
+        "trend": render_trend_page(trend),
         "campaign": render_campaign_page(campaign_result, ["table.csv", "rows.csv"]),
         "thesis": render_thesis_page(folder, _thesis(folder)),
     }
@@ -89,7 +91,7 @@ def faults(browser, page: Path, width: int, scheme: str) -> list[str]:
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1300, "light"), (400, "dark")])
-@pytest.mark.parametrize("name", ["leak", "cannot tell", "index", "campaign", "thesis"])
+@pytest.mark.parametrize("name", ["leak", "cannot tell", "index", "trend", "campaign", "thesis"])
 def test_no_serious_fault(browser, pages, name: str, width: int, scheme: str) -> None:
     assert faults(browser, pages[name], width, scheme) == []
 

@@ -11,44 +11,12 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.baseline.level import Level
-from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend, trend_of
 from sealscope.errors import InputError
 from sealscope.reporting.trend.chart import chart_of
 from sealscope.reporting.trend.page import render_trend_page, write_trend_page
 from sealscope.reporting.trend.text import trend_text
-
-POINT = OperatingPoint(0, 11.0, 500.0, ("Pa", "Pa"), ("p_A", "p_B"), 2.1, 1.57)
-
-
-@pytest.fixture(scope="module")
-def trend() -> Trend:
-    """40 days: wear from day 10 on, a repair on day 30; days 20 to 22 of another duty; day 5 states nothing."""
-    random = np.random.default_rng(2)
-    days = []
-    for k in range(40):
-        level = 6.7e-13 * (1.0 + 0.05 * random.standard_normal() + (0.08 * (k - 10) if 10 < k < 30 else 0.0))
-        point = replace(POINT, command_rms=4.0) if 20 <= k <= 22 else POINT
-        days.append(
-            LeakReading(
-                f"<day> {k}.csv",
-                1.7e9 + 86400.0 * k,
-                60.0,
-                None if k == 5 else "volume balance",
-                Level(level, 1.3e-14),
-                True,
-                633e-6,
-                1.1e5,
-                None,
-                1.0,
-                None,
-                point,
-                bytes([k]),
-                "needs theta" if k == 5 else "",
-            )
-        )
-    return trend_of(days, healthy=5, limit="15 mL/min")
 
 
 class Tags(HTMLParser):
