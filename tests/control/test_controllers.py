@@ -108,8 +108,10 @@ def test_a_leak_under_2_kN_is_tracked_held_and_reported(lpm):
     assert np.abs(error[still]).max() < 60e-6
 
 
-@pytest.mark.parametrize("lpm", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
-def test_a_single_rod_under_2_kN_is_served_as_well(lpm):
+@pytest.mark.parametrize(
+    ("lpm", "load"), [(0.5, 2000.0), (0.5, 0.0), *(pytest.param(0.0, F, marks=pytest.mark.slow) for F in (0.0, 2000.0))]
+)
+def test_a_single_rod_is_served_as_well(lpm, load):
     rig = load_rig("single-rod-eha")
     G = lpm / 6e4 / (2000.0 / rig.cylinder.A_A)
     runs = {}
@@ -117,7 +119,7 @@ def test_a_single_rod_under_2_kN_is_served_as_well(lpm):
         experiment = Experiment.of(
             rig=rig, command=SINE, duration=12.0, controller=controller_named(name, rig),
             leak=f"G = {G}" if lpm else None,
-            set={"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6, "F_l": 2000.0},
+            set={"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6, "F_l": load},
         )  # fmt: skip
         run = trajectory(experiment, experiment.leaks)
         runs[name] = run, rms((experiment.target.at(run.t) - run["x"])[run.t > 8.0])
@@ -125,7 +127,7 @@ def test_a_single_rod_under_2_kN_is_served_as_well(lpm):
     if lpm == 0.0:
         np.testing.assert_array_equal(fixed.rows, tolerant.rows)
         return
-    assert left < 0.6 * missed
+    assert left < (0.6 if load else 0.9) * missed
     late = tolerant.t > 8.0
     flow = G * (tolerant["p_A"] - tolerant["p_B"])[late]
     assert np.mean(tolerant.compensated[late]) == pytest.approx(np.mean(flow), rel=0.02)

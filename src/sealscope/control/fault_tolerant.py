@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self
 
 from sealscope.control.controller import Controller, Measured
 from sealscope.control.drive import Drive, check_numbers
-from sealscope.control.leak_observer import Balance, LeakObserver
+from sealscope.control.leak_observer import SHUT, Balance, LeakObserver
 from sealscope.control.position import PositionPI
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ class FaultTolerant:
     @classmethod
     def of(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
         """Return the controller for what a rig is said to be, around `inner`, by default `PositionPI`."""
-        c, sensors = rig.cylinder, rig.sensors
+        c, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
+        pilots = makeup.check_valves == "pilot-operated"
         balance = Balance(
             rig.pump.q_b / (2.0 * math.pi),
             c.A_A,
@@ -60,6 +61,7 @@ class FaultTolerant:
             rig.fluid.K_oil,
             sensors.x.resolution,
             math.hypot(max(sensors.p_A.noise, sensors.p_B.noise), sensors.common_noise),
+            SHUT * (makeup.p_crack + makeup.p_open) if pilots else 0.0,
         )
         return cls(inner or PositionPI.of(rig), Drive.of(rig), balance, rig.daq.u_max, rig.pump.G_pump, known)
 

@@ -11,6 +11,8 @@ import numpy as np
 BLOCK = 0.5
 #: Blocks are used where the mean difference of pressure is at least this [Pa].
 LEAST_DP = 20e3
+#: A pilot-operated valve is shut beyond so many times its pressures to open.
+SHUT = 2.0
 #: Prior deviations of the compliance and of the area, as shares, and of the conductance [m^3/(s Pa)].
 _SD_C, _SD_AREA, _SD_G = 0.3, 0.01, 1e-11
 #: Walks of the conductance, as a deviation a block: absolute [m^3/(s Pa)] and as a share of the estimate.
@@ -25,7 +27,8 @@ _LAG = 0.01
 class Balance:
     """What the observer assumes: displacement `D` [m^3/rad], areas [m^2], volumes at mid-stroke [m^3], `K` [Pa].
 
-    `x_step` [m]: a count of the encoder; `noise` [Pa]: deviation of a sample of the pressures.
+    `x_step` [m]: a count of the encoder; `noise` [Pa]: deviation of a sample of the pressures; `shut` [Pa]: the least
+    |p_A - p_B| at which the valve of the side with the higher pressure is shut.
     """
 
     D: float
@@ -36,6 +39,7 @@ class Balance:
     K: float
     x_step: float
     noise: float
+    shut: float = 0.0
 
 
 class LeakObserver:
@@ -94,6 +98,8 @@ class LeakObserver:
         b, begin = self._b, self._begin
         integral = total / self._rate
         if abs(integral) < LEAST_DP * self._length / self._rate or self._low * self._high <= 0.0:
+            return
+        if min(abs(self._low), abs(self._high)) < b.shut:
             return
         turned, moved = b.D * (end[0] - begin[0]), end[1] - begin[1]
         middle = 0.5 * (end[1] + begin[1])

@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 BLOCK, _HALF, _LEAST_DP = 0.25, 0.01, 20e3
 #: Blocks whose errors may follow each other, fewest blocks of a side.
 _LAGS, _FEWEST = 12, 20
+#: The pilot-operated valve of the side with the higher pressure is shut beyond so many times its pressures to open;
+#: an estimate of a few blocks in a loop must do with less, one of a whole recording need not.
+_SHUT = 3.0
 #: Share of the delivered volume that may be left over.
 UNBALANCED = 0.05
 
@@ -42,18 +45,23 @@ def balanced(recordings: Sequence[Recording], rig: Rig) -> Balanced | str:
     stated; A_A, A_B, K and G are found. The pressures at the ends are averaged twice, from the even and from the odd
     samples: the one is the column and the other its instrument, so that their noise biases nothing.
     """
-    first = _fitted(recordings, rig, rig.cylinder.A_A, rig.cylinder.A_B)
+    pilots = rig.makeup.check_valves == "pilot-operated"
+    held = _SHUT * (rig.makeup.p_crack + rig.makeup.p_open) if pilots else 0.0
+    first = _fitted(recordings, rig, rig.cylinder.A_A, rig.cylinder.A_B, held)
+    if isinstance(first, str) and held > 0.0:  # small pressures: then the valves may be open
+        held = 0.0
+        first = _fitted(recordings, rig, rig.cylinder.A_A, rig.cylinder.A_B, held)
     if isinstance(first, str):
         return first
     areas = {estimate.name: estimate.value for estimate in first.estimates}
     areas = {name: value for name, value in areas.items() if value > 0}
     A_A, A_B = areas.get("cylinder.A_A", rig.cylinder.A_A), areas.get("cylinder.A_B", rig.cylinder.A_B)
-    return _fitted(recordings, rig, A_A, A_B)
+    return _fitted(recordings, rig, A_A, A_B, held)
 
 
-def _fitted(recordings: Sequence[Recording], rig: Rig, A_A: float, A_B: float) -> Balanced | str:
-    """Return the estimates, the volumes moving with the piston by the areas A_A, A_B [m^2]."""
-    rows = [_rows(recording, rig, A_A, A_B) for recording in recordings]
+def _fitted(recordings: Sequence[Recording], rig: Rig, A_A: float, A_B: float, held: float) -> Balanced | str:
+    """Return the estimates, volumes moving by the areas A_A, A_B [m^2], from blocks in which |dp| >= `held` [Pa]."""
+    rows = [_rows(recording, rig, A_A, A_B, held) for recording in recordings]
     table = np.concatenate(rows) if rows else np.empty((0, 6))
     if len(table) < 2 * _FEWEST:
         return (
@@ -77,7 +85,7 @@ def _fitted(recordings: Sequence[Recording], rig: Rig, A_A: float, A_B: float) -
     return Balanced(tuple(estimates), left, int(np.count_nonzero(used)))
 
 
-def _rows(recording: Recording, rig: Rig, A_A: float, A_B: float) -> Array:
+def _rows(recording: Recording, rig: Rig, A_A: float, A_B: float, held: float) -> Array:
     rate, c = recording.rate, rig.cylinder
     D, moves = rig.pump.q_b / (2.0 * math.pi), c.volumes == "position"
     conserves = moves and c.balance == "mass"
@@ -92,7 +100,8 @@ def _rows(recording: Recording, rig: Rig, A_A: float, A_B: float) -> Array:
     rows = []
     for k in range(len(ends) - 1):
         part = slice(ends[k], ends[k + 1] + 1)
-        if smooth[part].min() * smooth[part].max() <= 0 or abs(smooth[part].mean()) < _LEAST_DP:
+        low, high = smooth[part].min(), smooth[part].max()
+        if low * high <= 0 or min(abs(low), abs(high)) < held or abs(smooth[part].mean()) < _LEAST_DP:
             continue
         sign = 1.0 if smooth[ends[k]] > 0 else -1.0
         p, V_0, area = (p_A, c.V + c.V_hose_A, A_A) if sign > 0 else (p_B, c.V - c.V_rod + c.V_hose_B, A_B)
