@@ -117,3 +117,18 @@ def test_the_readme_s_python_runs(tmp_path, monkeypatch, capsys):
     assert "import sealscope as ss" in code
     exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
     assert "leak" in capsys.readouterr().out
+
+
+def test_prose_wraps_at_120_columns() -> None:
+    root = Path(__file__).parents[1]
+    pages = [*root.glob("*.md"), *(root / "docs").rglob("*.md")]
+    long = []
+    for page in pages:
+        code = False
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+            code ^= line.startswith("```")
+            prose = not code and not line.lstrip().startswith("|") and " " in line[40:120]
+            if prose and len(line) > 120 and "generated" not in page.parts:
+                long.append(f"{page.relative_to(root)}:{number}")
+    assert len(pages) > 10
+    assert long == []
