@@ -11,6 +11,7 @@ import os
 import pickle
 import subprocess
 import sys
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from threading import Lock, Timer
@@ -27,6 +28,13 @@ MOST_MEMORY = 12 * 2**30
 
 class CrashedApartError(RuntimeError):
     """The process ended before it had an answer."""
+
+
+class _RaisedApart(Exception):  # noqa: N818 - it is raised by nobody: the cause that a traceback shows
+    """The traceback of what was raised in the other process."""
+
+    def __str__(self) -> str:
+        return f"\n{self.args[0]}"
 
 
 class _Server:
@@ -94,9 +102,9 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float) -> T:
     SealscopeError, RuntimeError
         What the function raised; other kinds are a RuntimeError of the same text.
     """
-    kind, value = _server.ask(pickle.dumps((work, arguments)), limit)
-    if kind == "raised":
-        raise value
+    value, where = _server.ask(pickle.dumps((work, arguments)), limit)
+    if where is not None:
+        raise value from _RaisedApart(where)
     return value  # type: ignore[no-any-return]
 
 
@@ -121,11 +129,11 @@ def _serve() -> None:
         while True:
             work, arguments = pickle.load(sys.stdin.buffer)
             try:
-                answer: tuple[str, Any] = ("returned", work(*arguments))
+                answer: tuple[Any, str | None] = (work(*arguments), None)
             except SealscopeError as error:
-                answer = ("raised", error)
+                answer = (error, traceback.format_exc())
             except Exception as error:
-                answer = ("raised", RuntimeError(" ".join(str(error).split()) or type(error).__name__))
+                answer = (RuntimeError(" ".join(str(error).split()) or type(error).__name__), traceback.format_exc())
             answers.write(pickle.dumps(answer, protocol=5))
             answers.flush()
 
