@@ -6,6 +6,7 @@ SQLite in WAL mode with full synchronisation, or any database that SQLAlchemy kn
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: Identities of blocks that are kept for each actuator: more than a day of messages of 1 s.
 KEPT_IDENTITIES = 100_000
+#: How often the tables are tried to be made where several monitors begin at once.
+_ATTEMPTS = 10
 _ESTIMATES = (
     "total_lpm",
     "total_low_lpm",
@@ -52,16 +55,31 @@ class MonitorStore:
             self.engine: Engine = sqlalchemy.create_engine(url)
             if self.engine.dialect.name == "sqlite":
                 sqlalchemy.event.listen(self.engine, "connect", _prepare_sqlite)
-            with self.engine.begin() as connection:
-                tables.metadata.create_all(connection)
-                known = connection.execute(sqlalchemy.select(tables.facts.c.value)).scalar()
-                if known is None:
-                    connection.execute(tables.facts.insert().values(name="schema", value=str(tables.SCHEMA)))
+            for attempt in range(_ATTEMPTS):
+                try:
+                    known = self._prepared()
+                    break
+                except (sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError):
+                    if attempt == _ATTEMPTS - 1:
+                        raise
+                    time.sleep(0.2)  # another monitor makes the tables at this moment
         except (sqlalchemy.exc.SQLAlchemyError, ImportError, ValueError) as error:
             reason = str(getattr(error, "orig", None) or error).splitlines()[0]
             raise InputError(f"the monitor's database must be a file of SQLite or a URL, got: {reason}") from None
         if known not in (None, str(tables.SCHEMA)):
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {known} ({database})")
+
+    def _prepared(self) -> str | None:
+        """Make the tables that are missing, and return the version of those that were there."""
+        from sqlalchemy import select
+
+        with self.engine.begin() as connection:
+            self.tables.metadata.create_all(connection)
+            facts = self.tables.facts
+            known = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
+            if known is None:
+                connection.execute(facts.insert().values(name="schema", value=str(self.tables.SCHEMA)))
+        return None if known is None else str(known)
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
