@@ -85,6 +85,7 @@ def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlie
     assert seen[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)
 
 
+@pytest.mark.slow
 def test_without_a_leak_tolerance_costs_nothing_to_the_last_bit():
     plain, _ = followed(PositionPI.of(RIG), SINE, 12.0, seed=4)
     tolerant, _ = followed(FaultTolerant.of(RIG), SINE, 12.0, seed=4)
@@ -142,6 +143,7 @@ def test_a_step_of_100_mm_under_2_kN_is_held_with_a_leak(lpm):
     assert run["x"].max() < 0.104
 
 
+@pytest.mark.slow
 def test_stiffness_comes_back_to_that_of_a_machine_without_a_leak():
     """A load that ends, 0.5 L/min: the fixed controller needs its integral for the leak, and deviates twice as much."""
     deviation = {}

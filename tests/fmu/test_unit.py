@@ -129,7 +129,9 @@ def test_a_unit_passes_the_checks_of_an_importer_and_keeps_its_state(folder, ver
     from fmpy.validation import validate_fmu
 
     path = folder / f"eha{version}.fmu"
-    ss.write_fmu(path, fmi=version, step=5e-4)
+    variables = ss.write_fmu(path, fmi=version, step=5e-4)
+    inputs = [variable.name for variable in variables if variable.causality == "input"]
+    assert inputs == ["u", "G", "C", "F", "G_ext_A", "G_ext_B"]  # as its example says
     assert validate_fmu(str(path)) == []
     unit = Unit(path, version).start(u=3.0, G=1e-12)
     for k in range(20):

@@ -200,10 +200,9 @@ def write_fmu(
 
     Examples
     --------
-    >>> import sealscope as ss, tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     variables = ss.write_fmu(f"{folder}/eha.fmu", step=5e-4)
-    >>> [variable.name for variable in variables if variable.causality == "input"]
+    >>> import sealscope as ss
+    >>> variables = ss.write_fmu("eha.fmu", step=5e-4)  # doctest: +SKIP
+    >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['u', 'G', 'C', 'F', 'G_ext_A', 'G_ext_B']
     """
     path = Path(path)
