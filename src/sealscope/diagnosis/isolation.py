@@ -272,13 +272,16 @@ def _alike(rows: Array) -> Array:
     return np.stack([before, np.append(1.0, np.sum(rest[2:] * rest[:-2], axis=1))], axis=1)
 
 
-def other_cause(seen: Signatures, onset_s: float, strict: float = 1.0) -> OtherCause | None:
+def other_cause(
+    seen: Signatures, onset_s: float, strict: float = 1.0, weighed: frozenset[Cause] = frozenset()
+) -> OtherCause | None:
     """Return what else stepped near `onset_s` [s], the most certain first; None where nothing did.
 
-    `strict`: factor on what a step must be over its deviation, and over what healthy machines show.
+    `strict`: factor on what a step must be over its deviation, and over what healthy machines show; causes that are
+    `weighed` already are not asked for.
     """
     causes = (find(seen, onset_s, strict) for find in (_duty, _sensor, _air, _friction, _lost))
-    return next((cause for cause in causes if cause is not None), None)
+    return next((cause for cause in causes if cause is not None and cause.cause not in weighed), None)
 
 
 def unasked(seen: Signatures) -> tuple[float, OtherCause] | None:
@@ -321,9 +324,11 @@ def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] =
         other = unlike(seen, known) if evidence.cause is None else None
     else:
         other = elsewhere(seen)
+        if other is not None and other.cause in evidence.weighed:
+            other = None
         if other is None and evidence.detector != BALANCED:
-            other = other_cause(seen, evidence.onset_s) or _readings(
-                seen, evidence.onset_s if evidence.cause is not None else None
+            other = other_cause(seen, evidence.onset_s, weighed=evidence.weighed) or _readings(
+                seen, evidence.onset_s if evidence.cause is not None else None, bool(evidence.weighed)
             )
         if other is None and evidence.cause is None:
             other = _anywhere(seen)
@@ -424,8 +429,12 @@ def _duty(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
     return None
 
 
-def _readings(seen: Signatures, onset: float | None) -> OtherCause | None:
-    """Return whether a sensor's filter stepped anywhere, or hum near `onset` [s], None: anywhere, too."""
+def _readings(seen: Signatures, onset: float | None, quiet: bool) -> OtherCause | None:
+    """Return whether a sensor's filter stepped anywhere, or hum near `onset` [s], None: anywhere, too.
+
+    Where the ringing may have become `quiet`, as by a large leak, hum stands out of what lies beside it and the
+    chambers' phase is lost; then the filter alone is asked for.
+    """
 
     def surest(values: Array, onset: float | None) -> tuple[float, float]:
         if onset is not None:
@@ -441,12 +450,12 @@ def _readings(seen: Signatures, onset: float | None) -> OtherCause | None:
             return OtherCause(
                 "sensor fault", f"the noise of {name} became {what}, so its filter or its sampling changed"
             )
-        for number, hertz in enumerate(seen.mains):
+        for number, hertz in enumerate(() if quiet else seen.mains):
             size, surely = surest(seen.hum[:, chamber, number], onset)
             if abs(size) > HUMS and abs(surely) > sure:
                 verb = "began" if size > 0 else "ended"
                 return OtherCause("sensor fault", f"hum of {hertz:g} Hz {verb} in {name}")
-    lag, surely = lag_step(seen, onset) if onset is not None else (0.0, 0.0)
+    lag, surely = lag_step(seen, onset) if onset is not None and not quiet else (0.0, 0.0)
     if abs(lag) >= LEAST_LAG and surely > LAGGED:
         return OtherCause("sensor fault", f"p_A is read {abs(lag) * 1e3:.1f} ms {'later' if lag > 0 else 'earlier'}")
     return None

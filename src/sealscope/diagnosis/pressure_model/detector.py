@@ -35,6 +35,9 @@ SHORTEST, SLOWEST_RATE, LEAST = 40.0, 250.0, 3
 STEADY, UNRULY = 1.2, 1.5
 #: A change of a parameter from the first to the last third that no healthy machine shows within a record, as a share.
 _OTHER_CAUSE = {"friction": 0.18, "stiffness": 0.15}
+#: What a machine that is fitted anew after the onset may have had, beside which a large leak is weighed. The command is
+#: the model's own, and how far a chamber's mean moves says nothing of what rings.
+_WEIGHED: frozenset[Cause] = frozenset({"friction change", "air in the oil", "changed duty"})
 #: From day to day the level of G moves by this much [m^3/(s Pa)], known as from five recordings: fits differ with the
 #: machine's friction.
 DAY_TO_DAY = DayToDay(2e-13, 4.0)
@@ -164,12 +167,13 @@ def _flow(
     Where both laws explain the record, the flow is the mean of theirs and the interval holds what either says.
     `scatter` of the blocks over their stated deviation.
     """
-    from sealscope.diagnosis.pressure_model.follow import PossibleLeak
     from sealscope.diagnosis.pressure_model.model import G
+    from sealscope.diagnosis.pressure_model.track import PossibleLeak
 
     steps = followed.steps
     leaks = followed.leaks or (PossibleLeak(G, after, float(steps.size[after]), float(steps.deviation[after]), 0.0),)
-    decisive = max(_DECISIVE, _DECISIVE_SHARE * float(np.max(steps.z)) ** 2)
+    explained = float(np.max(steps.z)) ** 2 if followed.large is None else followed.large.better
+    decisive = max(_DECISIVE, _DECISIVE_SHARE * explained)
     likely = [leak for leak in leaks if leak.cost <= leaks[0].cost + decisive]
     stated = []
     for leak in likely:
@@ -194,10 +198,12 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     best = int(np.argmax(z))
     excess = followed.excess
     scatter = float(np.sqrt(max(1.0, excess)))
-    score = float(z[best]) / scatter
+    large = followed.large
+    highest = float(z[best]) if large is None else large.z
+    score = highest / scatter
     threshold, chance = largest_normal(steps.correlation[inner, inner], probability, seed_of(z), score)
     cause = _other_cause(followed)
-    if excess > UNRULY:
+    if excess > UNRULY and large is None:
         seen = {
             None: "",
             "friction change": f"; the friction changed by {100.0 * followed.friction_change:.0f} %",
@@ -210,7 +216,7 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
             cause=cause,
         )
     edges = begin + followed.edges / recording.rate
-    onset = float(edges[inner.start + 1 + best])
+    onset = float(edges[inner.start + 1 + best]) if large is None else begin + large.onset / recording.rate
     figures = f"z {score:.2f}, threshold {threshold:.2f}"
     alarm = score > threshold
     part = Evidence("leak" if alarm else "no leak", "", score, threshold, detector="rise of G")
@@ -222,8 +228,11 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
             "air in the oil": f"the oil became softer, the leakage conductance did not change ({figures})",
         }[cause]
         return Evidence("no leak", reason, score, threshold, parts=(part,), cause=cause, chance=chance)
-    near = near_best(z * np.abs(z), scatter**2)
-    interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
+    if large is None:
+        near = near_best(z * np.abs(z), scatter**2)
+        interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
+    else:
+        interval = begin + large.limits[0] / recording.rate, begin + large.limits[1] / recording.rate
     lpm, limits, law = _flow(followed, recording, inner.start + best, onset, scatter)
     estimate, low, high = (np.where(edges[:-1] < onset, 0.0, value) for value in (lpm, *limits))
     course = LeakCourse(0.5 * (edges[:-1] + edges[1:]), estimate, low, high)
@@ -252,11 +261,17 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
         cause="piston or pump leak",
         course=course,
         chance=chance,
+        weighed=frozenset() if large is None else _WEIGHED,
     )
 
 
 def _other_cause(followed: Followed) -> Cause | None:
-    """Return what else changed more than a healthy machine's drift, or None."""
+    """Return what else changed more than a healthy machine's drift, or None.
+
+    Beside a large leak, which is weighed against such a change by itself, the parameters are known too badly to ask.
+    """
+    if followed.large is not None:
+        return None
     if abs(followed.friction_change) > _OTHER_CAUSE["friction"]:
         return "friction change"
     if followed.stiffness_change < -_OTHER_CAUSE["stiffness"]:

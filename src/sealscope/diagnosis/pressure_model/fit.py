@@ -49,6 +49,7 @@ LONG_WINDOW, SHORT_WINDOW = (12.0, 40.0, 75.0), (5.0, 18.0, 32.0)
 SETTLE = 0.8
 _GAINS = np.geomspace(0.35, 3.5, 11)
 _STIFFNESSES = np.geomspace(0.62, 1.4, 8)
+_INTEGRAL = 4
 #: Weight of the slow part: its samples hang together over some 30.
 _SLOW_WEIGHT = 1.0 / 30.0
 #: Dampings tried from one start, and from each of several.
@@ -125,6 +126,22 @@ class Window:
         return (_SLOW_WEIGHT if self.width > 0 else 1.0) / self.variance
 
 
+def noise_variance(dp: Array) -> float:
+    """Return the variance [Pa^2] of white noise on dp, from its third differences, which hardly hold the ringing."""
+    return float(np.var(np.diff(dp, 3)) / 20.0)
+
+
+def window_at(model: DrivenModel, dp: Array, theta: Array, first: int, length: int) -> Window:
+    """Return the window of `length` samples from `first` on; the model comes to it with parameters `theta` (13,)."""
+    state = np.zeros((1, STATES))
+    if first > 0:
+        model.part(0, first).run(theta[None], start=state)
+    integral = float(state[0, _INTEGRAL] / theta[GAIN])
+    settle = int(SETTLE * model.rate)
+    here = dp[first + settle : first + length]
+    return Window(model.part(first, length), here, settle, integral, noise_variance(dp))
+
+
 @dataclass(frozen=True, eq=False)
 class Prior:
     """A normal prior: centre and standard deviation (13,) of each parameter."""
@@ -147,7 +164,7 @@ def prior_of(centre: Array) -> Prior:
     return Prior(centre, deviation)
 
 
-def _fit(
+def minimise(
     window: Window, thetas: Array, prior: Prior, free: Sequence[int], most: int, enough: float
 ) -> tuple[Array, Array]:
     """Minimise the cost over the free parameters by Levenberg-Marquardt from several starts (m, 13) side by side.
@@ -215,7 +232,7 @@ def first_guess(short: Window, prior: Prior) -> Array:
     slowly = (GAIN, LEAD, BIAS, F_C, F_V, K_BRK)
     if np.all(np.isnan(misfit)):
         raise FloatingPointError("the model of the rig diverges")
-    fitted, _ = _fit(slow, starts[[int(np.nanargmin(misfit))]], prior, slowly, 12, 1e-2)
+    fitted, _ = minimise(slow, starts[[int(np.nanargmin(misfit))]], prior, slowly, 12, 1e-2)
     return np.asarray(fitted[0])
 
 
@@ -238,12 +255,12 @@ def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Arra
             np.argsort(misfit, axis=1, kind="stable")[:, :2] + len(_STROKES) * np.arange(_STIFFNESSES.size)[:, None]
         )
         starts = starts[likely.reshape(-1)]
-    starts, costs = _fit(short, starts, prior, (GAIN, LEAD, K, G, F_V, *((OFFSET,) if long else ())), 3, 3.0)
+    starts, costs = minimise(short, starts, prior, (GAIN, LEAD, K, G, F_V, *((OFFSET,) if long else ())), 3, 3.0)
     everything = range(SOUND)
-    tried, _ = _fit(short, starts[costs <= costs[0] + _NEAR], prior, everything, 8, 1.0)
+    tried, _ = minimise(short, starts[costs <= costs[0] + _NEAR], prior, everything, 8, 1.0)
     other = next((k for k in range(1, len(tried)) if abs(tried[k, K] / tried[0, K] - 1.0) > _SAME), None)
-    finalists, _ = _fit(window, tried[[0] if other is None else [0, other]], prior, everything, 4, 1.0)
-    (theta, *_), costs = _fit(window, finalists[:1], prior, everything, 20, 0.1)
+    finalists, _ = minimise(window, tried[[0] if other is None else [0, other]], prior, everything, 4, 1.0)
+    (theta, *_), costs = minimise(window, finalists[:1], prior, everything, 20, 0.1)
     plain = theta.copy()
     plain[[LEAD, BIAS]] = 0.0
     plain[[G, F_C, F_V, K_BRK, C_C, F_CFR]] = centre[[G, F_C, F_V, K_BRK, C_C, F_CFR]]
@@ -252,6 +269,6 @@ def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Arra
 
 def refit(window: Window, start: Array, prior: Prior) -> tuple[Array, float]:
     """Return the best fit that is reached from another start, and its cost per sample."""
-    fitted, _ = _fit(window, start[None], prior, (GAIN, K), 6, 1.0)
-    fitted, costs = _fit(window, fitted, prior, range(SOUND), 20, 0.1)
+    fitted, _ = minimise(window, start[None], prior, (GAIN, K), 6, 1.0)
+    fitted, costs = minimise(window, fitted, prior, range(SOUND), 20, 0.1)
     return fitted[0], float(costs[0]) / window.dp.size

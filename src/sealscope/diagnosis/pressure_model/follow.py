@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,20 +12,21 @@ from sealscope.diagnosis.baseline.level import Level
 from sealscope.diagnosis.pressure_model.fit import (
     LONG_WINDOW,
     PRIOR,
-    SETTLE,
     SHORT_WINDOW,
     USUAL_G,
+    Prior,
     Window,
     first_guess,
     fit,
     prior_of,
     refit,
+    window_at,
 )
 from sealscope.diagnosis.pressure_model.interference import advanced, lines_in, skew
+from sealscope.diagnosis.pressure_model.large import LargeLeak, large_leak
 from sealscope.diagnosis.pressure_model.model import (
     F_C,
     F_V,
-    GAIN,
     STATES,
     DrivenModel,
     G,
@@ -33,7 +34,16 @@ from sealscope.diagnosis.pressure_model.model import (
     assumed_numbers,
     nominal,
 )
-from sealscope.diagnosis.pressure_model.track import RISES, ConductanceSteps, Track, excess_of, steps_in, track
+from sealscope.diagnosis.pressure_model.track import (
+    DIVERGED,
+    RISES,
+    ConductanceSteps,
+    PossibleLeak,
+    Track,
+    excess_of,
+    steps_in,
+    track,
+)
 from sealscope.parameters import Rig
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording
@@ -44,29 +54,15 @@ EXPLAINED, FEWEST_BLOCKS = 0.9, 12
 BLOCK, FIRST = 6.0, 3.0
 #: The window begins at this share of the record: what a start leaves behind has decayed there.
 _WINDOW_AT = 0.55
-_INTEGRAL = 4
 _EARLY = 4
 #: A rise of G worth another look.
 _CLEAR = 2.7
+#: A rise of G so clear that it may be too large for linear blocks.
+_STRONG = 15.0
 #: A record that the model follows so badly is tried again from other first fits.
 RESTLESS = 1.15
 #: ... of which one is as good whose cost is higher by no more than this share.
 _AS_GOOD = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class PossibleLeak:
-    """A leak that would explain the record.
-
-    `rising`: its conductance G, or its coefficient as an orifice; `after` which block; `size`, `deviation`
-    [m^3/(s Pa)], of an orifice [m^3/(s Pa^0.5)]; `cost`: minus twice the log likelihood but for a constant.
-    """
-
-    rising: int
-    after: int
-    size: float
-    deviation: float
-    cost: float
 
 
 class _Look(NamedTuple):
@@ -85,7 +81,8 @@ class Followed:
     `theta` (13,): first fit; `path` (b, 13); `steps` of G; `leaks` that explain its largest, the likelier first;
     `excess`: chi square a degree of freedom of what scatters beside it; `edges` (b + 1,) [samples] from the first
     sample; `seconds` of a block; `level` [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to
-    the last third, as shares; `share` of the blocks that have no missing samples and count.
+    the last third, as shares; `share` of the blocks that have no missing samples and count;
+    `large`: a leak that linear blocks did not reach, beside which all this is then taken.
     """
 
     theta: Array
@@ -100,16 +97,12 @@ class Followed:
     stiffness_change: float
     command_rms: float
     share: float
+    large: LargeLeak | None = None
 
     @property
     def blocks(self) -> int:
         """Number of blocks."""
         return self.edges.size - 1
-
-
-def noise_variance(dp: Array) -> float:
-    """Return the variance [Pa^2] of white noise on dp, from its third differences, which hardly hold the ringing."""
-    return float(np.var(np.diff(dp, 3)) / 20.0)
 
 
 def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple[Window, Window]:
@@ -120,17 +113,9 @@ def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple
         for cycles, least, most in (LONG_WINDOW, SHORT_WINDOW)
     )
     first = max(0, min(int(_WINDOW_AT * n), n - long))
-    state = np.zeros((1, STATES))
-    if first > 0:
-        model.part(0, first).run(theta[None], start=state)
-    integral = float(state[0, _INTEGRAL] / theta[GAIN])
-    settle, noise = int(SETTLE * model.rate), noise_variance(dp)
-
-    def window(length: int) -> Window:
-        here = dp[first + settle : first + length]
-        return Window(model.part(first, length), here, settle, integral, noise)
-
-    return window(long), window(min(short, long))
+    whole = window_at(model, dp, theta, first, long)
+    length = min(short, long)
+    return whole, replace(whole, model=model.part(first, length), dp=whole.dp[: length - whole.settle])
 
 
 def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | str:
@@ -141,10 +126,10 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
     u, p_A, p_B, rate = recording["u"], recording["p_A"], recording["p_B"], recording.rate
     p_B = advanced(p_B, skew(p_A, p_B, rate), rate)
     dp = p_A - p_B
-    dp = dp * (1.0 if _same_sense(u, dp) else -1.0)
+    dp = raw = dp * (1.0 if _same_sense(u, dp) else -1.0)
     centre = nominal(rig)
     centre[G] = max(centre[G], USUAL_G)
-    model = DrivenModel.of(u, rate, assumed_numbers(rig), p_A + p_B)
+    model = plain = DrivenModel.of(u, rate, assumed_numbers(rig), p_A + p_B)
     span = BLOCK if cycle is None else cycle
     _, short = _windows(model, dp, centre, span)
     prior = prior_of(centre)
@@ -167,26 +152,54 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
     if counted.size < 3 or counted[-1] - counted[0] + 1 < FEWEST_BLOCKS:
         return f"too short: {counted.size} whole blocks of {length:.3g} s, {FEWEST_BLOCKS} are needed"
     edges, seen = edges[counted[0] : counted[-1] + 2], seen[counted[0] : counted[-1] + 1]
-    speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(u))
     skip = int(FIRST * rate)
-    look = _tracked(model, dp, edges, theta, skip, speed, seen)
+    look = _tracked(model, dp, edges, theta, skip, seen)
+    if isinstance(look, str) or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
+        large = _large(plain, raw, edges, seen, prior)
+        if large is not None:
+            return _seen_so(
+                _Look(large.track, large.steps, large.leaks, large.excess),
+                large.theta,
+                model,
+                edges,
+                length,
+                share,
+                large,
+            )
     if isinstance(look, str):
         return look
+    look = _looked_again(look, model, dp, edges, theta, skip, seen)
     if look.excess > RESTLESS:
         for first in anew:
             other, dearer = refit(long, first, prior)
             if dearer > cost * (1.0 + _AS_GOOD):
                 continue
-            again = _tracked(model, dp, edges, other, skip, speed, seen)
-            if not isinstance(again, str) and again.excess < look.excess - 0.05:
+            again = _tracked(model, dp, edges, other, skip, seen)
+            if isinstance(again, str):
+                continue
+            again = _looked_again(again, model, dp, edges, other, skip, seen)
+            if again.excess < look.excess - 0.05:
                 theta, look = other, again
-    followed = look.track
-    stiffness = float(np.mean(followed.path[:, K])) / centre[K]
+    stiffness = float(np.mean(look.track.path[:, K])) / centre[K]
     if stiffness > 1.0 + 3.0 * PRIOR[K]:
         return (
             f"the rig does not describe this machine: its oil would be {stiffness:.2g} times as stiff as the rig's; "
             "the fit has a ring too many in each reversal, or another --rig describes it"
         )
+    return _seen_so(look, theta, model, edges, length, share)
+
+
+def _seen_so(
+    look: _Look,
+    theta: Array,
+    model: DrivenModel,
+    edges: NDArray[np.int64],
+    seconds: float,
+    share: float,
+    large: LargeLeak | None = None,
+) -> Followed:
+    """Return the record as a look sees it."""
+    followed, speed = look.track, model.speed_amplitude(theta)
     third = max(1, len(followed.path) // 3)
     early, late = followed.path[:third].mean(axis=0), followed.path[-third:].mean(axis=0)
     friction = _friction(late, model, speed) / _friction(early, model, speed) - 1.0
@@ -197,12 +210,13 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
         look.leaks,
         look.excess,
         edges,
-        length,
+        seconds,
         Level(float(look.steps.level.mean()), float(look.steps.level_deviation.mean())),
         friction,
         float(late[K] / early[K] - 1.0),
-        float(np.std(u)),
+        float(np.std(model.u[: -1 : 2 * model.every])),
         share,
+        large,
     )
 
 
@@ -211,38 +225,66 @@ def _same_sense(u: Array, dp: Array) -> bool:
     return float(np.dot(u - u.mean(), dp - dp.mean())) >= 0.0
 
 
+def _large(
+    model: DrivenModel, dp: Array, edges: NDArray[np.int64], seen: NDArray[np.bool_], prior: Prior
+) -> LargeLeak | None:
+    """Return the leak that linear blocks do not reach, None where there is none or the model diverges."""
+    try:
+        return large_leak(model, dp, edges, seen, prior)
+    except FloatingPointError:
+        return None
+
+
 def _tracked(
     model: DrivenModel,
     dp: Array,
     edges: NDArray[np.int64],
     theta: Array,
     skip: int,
-    speed: float,
     seen: NDArray[np.bool_],
 ) -> _Look | str:
-    """Follow the record from a first fit; estimate the steps of G in it, and the leaks that may be the largest of them.
-
-    Where G seems to rise the blocks are linearised once more with that rise allowed, by either law: under the usual
-    leash a leak pulls friction and gain off their values, which makes it smaller than it is. Sizes and the scatter
-    beside the leak are taken from there; z, which a second look at what was chosen for being large would raise, is not.
-    """
-    followed, start = min(
-        ((track(model, dp, edges, theta, start, skip, seen=seen), start) for start in _starts(model, theta)),
-        key=lambda both: float(both[0].block_variance[:_EARLY].mean()),
-    )
+    """Follow the record from a first fit, and estimate the steps of G in it."""
+    try:
+        followed = min(
+            (track(model, dp, edges, theta, start, skip, seen=seen) for start in _starts(model, theta)),
+            key=lambda each: float(each.block_variance[:_EARLY].mean()),
+        )
+    except FloatingPointError:
+        return DIVERGED
     explained = 1.0 - followed.variance / float(np.var(dp))
     if not explained >= EXPLAINED:
         return (
             f"the model of the rig explains {100.0 * explained:.0f} % of the pressure difference, "
             f"{100.0 * EXPLAINED:.0f} % are needed; another --rig may describe this machine"
         )
-    steps = steps_in(followed, theta, speed)
+    steps = steps_in(followed, theta, model.speed_amplitude(theta))
+    return _Look(followed, steps, (), excess_of(steps))
+
+
+def _looked_again(
+    look: _Look,
+    model: DrivenModel,
+    dp: Array,
+    edges: NDArray[np.int64],
+    theta: Array,
+    skip: int,
+    seen: NDArray[np.bool_],
+) -> _Look:
+    """Return the look with the leaks that may be the largest of its steps.
+
+    Where G seems to rise the blocks are linearised once more with that rise allowed, by either law: under the usual
+    leash a leak pulls friction and gain off their values, which makes it smaller than it is. Sizes and the scatter
+    beside the leak are taken from there; z, which a second look at what was chosen for being large would raise, is not.
+    """
+    followed, steps = look.track, look.steps
     after = int(np.argmax(steps.z))
     if steps.z[after] < _CLEAR:
-        return _Look(followed, steps, (), excess_of(steps))
+        return look
+    speed = model.speed_amplitude(theta)
+    start = followed.start
     risen = [track(model, dp, edges, theta, start, skip, (rising, after), followed.path, seen=seen) for rising in RISES]
     variance = min(fresh.variance for fresh in risen)
-    leaks, excess = [], excess_of(steps)
+    leaks, excess = [], look.excess
     for rising, fresh in zip(RISES, risen, strict=True):
         again = steps_in(fresh, theta, speed, rising=rising)
         cost = fresh.misfit / variance + fresh.strain

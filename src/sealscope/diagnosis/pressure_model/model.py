@@ -242,6 +242,10 @@ class DrivenModel:
         """The piston's place (m,), A x / V."""
         return self.inputs[:, 2]
 
+    def speed_amplitude(self, theta: Array) -> float:
+        """Return the amplitude of the motor's speed [rad/s], as of a sine of the command's rms."""
+        return float(np.sqrt(2.0) * theta[GAIN] * np.std(self.u))
+
     def part(self, first: int, n: int) -> DrivenModel:
         """Return the model over n samples from `first` on."""
         return replace(self, inputs=self.inputs[2 * self.every * first : 2 * self.every * (first + n) + 1])

@@ -90,7 +90,8 @@ class Track:
     Blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 13) about which the model is
     linear; `N` (b, p, p), `r` (b, p) information in units of `units` (p,), the last a constant of dp; `rises` by
     parameter; `variance` [Pa^2] of the residual and of each block's (b,); `misfit` [Pa^2]: sum of squares of what is
-    left of dp; `strain`: chi square of the wandering.
+    left of dp; `strain`: chi square of the wandering; `start` (5,): the state at
+    the first sample.
     """
 
     edges: NDArray[np.int64]
@@ -105,18 +106,24 @@ class Track:
     seconds: float
     misfit: float
     strain: float
+    start: Array
 
 
 def _deviations(theta: Array, shares: dict[int, float], rest: dict[int, float]) -> Array:
     return np.array([shares.get(k, 0.0) * abs(theta[k]) + rest.get(k, 0.0) for k in range(SOUND)])
 
 
-def wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
-    """Return the standard deviation (p,) of the walk from block to block, in `units`."""
+def wandering(theta: Array, seconds: float, speed: float) -> Array:
+    """Return the standard deviation (12,) by which the parameters of a sound machine wander in so many seconds."""
     walk = _deviations(theta, WANDER, WANDER_REST)
     walk *= np.sqrt(seconds / _WANDER_SECONDS)
     walk[BIAS] = _WANDER_BIAS * speed * np.sqrt(seconds / 6.0)
-    return np.append(walk, 1500.0 * np.sqrt(seconds / _WANDER_SECONDS)) / units
+    return walk
+
+
+def wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
+    """Return the standard deviation (p,) of the walk from block to block, in `units`."""
+    return np.append(wandering(theta, seconds, speed), 1500.0 * np.sqrt(seconds / _WANDER_SECONDS)) / units
 
 
 def _anchor(theta: Array, units: Array) -> Array:
@@ -144,6 +151,7 @@ def track(
     from_path: Array | None = None,
     *,
     seen: NDArray[np.bool_] | None = None,
+    size: float = 0.0,
 ) -> Track:
     """Follow the parameters from the first fit `theta` (13,) through blocks between `edges` of the whole record.
 
@@ -159,7 +167,7 @@ def track(
     h = steps_of(theta)
     units = np.append(h[:SOUND], 1.0)
     seconds = float(np.median(np.diff(edges))) / model.rate
-    speed = float(np.sqrt(2.0) * theta[GAIN] * np.std(model.u))
+    speed = model.speed_amplitude(theta)
     walk = np.tile(wander(theta, units, seconds, speed), (blocks - 1, 1))
     anchor = _anchor(theta, units)
     leashes = _LEASHES if from_path is None else _LEASHES[-1:]
@@ -170,7 +178,7 @@ def track(
     risen = np.zeros(path.shape)
     if rise is not None:
         risen[rise[1] + 1 :, rise[0]] = h[rise[0]]
-    size = 0.0
+        size /= h[rise[0]]
 
     def misfits(shown: Array) -> Array:
         rests = (dp[block] - shown[block] for block in limits)
@@ -224,6 +232,7 @@ def track(
             seconds,
             misfit,
             strain(path, allowed),
+            start,
         )
         chain, right = Chain(followed.N, allowed, anchor), right_sides(followed.r, anchor, centre).reshape(-1, 1)
         if rise is None:
@@ -325,6 +334,21 @@ def _held(path: Array, theta: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class PossibleLeak:
+    """A leak that would explain the record.
+
+    `rising`: its conductance G, or its coefficient as an orifice; `after` which block; `size`, `deviation`
+    [m^3/(s Pa)], of an orifice [m^3/(s Pa^0.5)]; `cost`: minus twice the log likelihood but for a constant.
+    """
+
+    rising: int
+    after: int
+    size: float
+    deviation: float
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
 class ConductanceSteps:
     """A step of what a leak makes rise, after each block.
 
@@ -350,15 +374,26 @@ def excess_of(steps: ConductanceSteps) -> float:
 
 
 def steps_in(
-    followed: Track, theta: Array, speed: float, scales: Sequence[float] = SCALES, rising: int = G
+    followed: Track,
+    theta: Array,
+    speed: float,
+    scales: Sequence[float] = SCALES,
+    rising: int = G,
+    beside: PossibleLeak | None = None,
 ) -> ConductanceSteps:
     """Estimate a step of the `rising` parameter after each block.
 
-    Everything else is free to wander as far as the likelihood chooses.
+    Everything else is free to wander as far as the likelihood chooses. `beside` a leak of the same law, which is taken
+    away first, the steps are further ones.
     """
     anchor, centre = np.split(followed.anchor, 2)
     walk = np.tile(wander(theta, followed.units, followed.seconds, speed), (len(followed.N) - 1, 1))
-    right = right_sides(followed.r, anchor, centre).reshape(-1, 1)
+    rise, r = followed.rises[rising], followed.r
+    rise_right = rise.right
+    if beside is not None:
+        size = np.where(np.arange(len(r)) > beside.after, beside.size / rise.unit, 0.0)
+        r, rise_right = r - size[:, None] * rise.cross, rise_right - size * rise.own
+    right = right_sides(r, anchor, centre).reshape(-1, 1)
     blocks = len(followed.N)
     best: tuple[float, float, Chain, float] | None = None
     for scale in scales:
@@ -371,11 +406,10 @@ def steps_in(
     assert best is not None
     _, scale, chain, fit = best
     free, ranks = float(np.sum(anchor * centre**2)), 0
-    for N, r in zip(followed.N, followed.r, strict=True):
-        solution, _, rank, _ = np.linalg.lstsq(N, r, rcond=1e-12)
-        free += float(r @ solution)
+    for N, r_block in zip(followed.N, r, strict=True):
+        solution, _, rank, _ = np.linalg.lstsq(N, r_block, rcond=1e-12)
+        free += float(r_block @ solution)
         ranks += int(rank)
-    rise = followed.rises[rising]
     later_blocks = np.zeros((blocks, SIZE, blocks - 1))
     for k in range(1, blocks):
         later_blocks[k:, :, k - 1] = rise.cross[k:]
@@ -387,7 +421,7 @@ def steps_in(
     later = np.cumsum(rise.own[::-1])[::-1]
     at = np.arange(1, blocks)
     information = later[np.maximum(at[:, None], at[None, :])] - inner.T @ steps
-    right_sum = np.cumsum(rise.right[::-1])[::-1][1:]
+    right_sum = np.cumsum(rise_right[::-1])[::-1][1:]
     score = right_sum - inner.T @ middle
     own = np.sqrt(np.diagonal(information))
     unit = followed.units[G]

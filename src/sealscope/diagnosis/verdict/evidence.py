@@ -148,6 +148,8 @@ class Evidence:
         also where L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
         Displacement over area as measured, over the assumed one, and its 95 % interval, where the detector measures it.
+    weighed : frozenset of str
+        Causes against which the detector has weighed the leak itself; what else stepped cannot be one of these.
     """
 
     verdict: Verdict
@@ -170,6 +172,7 @@ class Evidence:
     relative: RelativeLeak | None = None
     ratio: float | None = None
     ratio_interval: tuple[float, float] | None = None
+    weighed: frozenset[Cause] = frozenset()
 
     @property
     def alarmed(self) -> bool:
