@@ -13,8 +13,9 @@ from sealscope.simulation.simulate import simulate_with_truth
 SIZES = (0.001, 0.0042, 0.02, 0.1, 0.2, 0.4)
 #: A score may be below the highest of all smaller leaks by this share: noise, and the saturation of a likelihood ratio.
 TOLERANCE = 0.2
-#: Largest leak [L/min] that a detector's model follows on this rig; beyond, it says `cannot tell` and that it does not.
-FOLLOWS = {"pressure model": 0.02, "observer": 0.02}
+#: Largest leak [L/min] up to which a detector's score grows on this rig. Beyond, the observer does not follow; to the
+#: pressure model a leak of half of the pump's flow is less and less unlike another friction, and its score saturates.
+FOLLOWS = {"pressure model": 0.2, "observer": 0.02}
 THROTTLES = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"}
 
 

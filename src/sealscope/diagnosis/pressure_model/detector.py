@@ -137,7 +137,9 @@ class PressureModel:
         from sealscope.diagnosis.pressure_model.follow import follow
 
         cycle = find_cycle(recording)
-        return follow(self.rig, recording, cycle)
+        # parameters that are tried and make the model diverge are left again
+        with np.errstate(over="ignore", invalid="ignore"):
+            return follow(self.rig, recording, cycle)
 
 
 def _comparable(followed: Followed, other: Followed) -> bool:
@@ -237,11 +239,15 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     estimate, low, high = (np.where(edges[:-1] < onset, 0.0, value) for value in (lpm, *limits))
     course = LeakCourse(0.5 * (edges[:-1] + edges[1:]), estimate, low, high)
     reason = f"the leakage conductance past piston or pump rose at {onset:.1f} s{law} ({figures})"
-    if cause is not None:
-        why = "the friction" if cause == "friction change" else "the oil's stiffness"
+    if cause is not None or followed.another:
+        why = {
+            "friction change": "the friction changed more than it does in a healthy machine",
+            "air in the oil": "the oil's stiffness changed more than it does in a healthy machine",
+            None: "another drive, friction and oil from then on explain the record better than a leak",
+        }[cause]
         return Evidence(
             "cannot tell",
-            f"{reason}, but {why} changed more than it does in a healthy machine",
+            f"{reason}, but {why}",
             score,
             threshold,
             parts=(part,),

@@ -23,7 +23,7 @@ from sealscope.diagnosis.pressure_model.fit import (
     window_at,
 )
 from sealscope.diagnosis.pressure_model.interference import advanced, lines_in, skew
-from sealscope.diagnosis.pressure_model.large import LargeLeak, large_leak
+from sealscope.diagnosis.pressure_model.large import BETTER, WORSE, LargeLeak, large_leak
 from sealscope.diagnosis.pressure_model.model import (
     F_C,
     F_V,
@@ -82,7 +82,8 @@ class Followed:
     `excess`: chi square a degree of freedom of what scatters beside it; `edges` (b + 1,) [samples] from the first
     sample; `seconds` of a block; `level` [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to
     the last third, as shares; `share` of the blocks that have no missing samples and count;
-    `large`: a leak that linear blocks did not reach, beside which all this is then taken.
+    `large`: a leak that linear blocks did not reach, beside which all this is then taken; `another`: a leak
+    would be large, but another machine from its onset on explains the record far better.
     """
 
     theta: Array
@@ -98,6 +99,7 @@ class Followed:
     command_rms: float
     share: float
     large: LargeLeak | None = None
+    another: bool = False
 
     @property
     def blocks(self) -> int:
@@ -153,10 +155,10 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
         return f"too short: {counted.size} whole blocks of {length:.3g} s, {FEWEST_BLOCKS} are needed"
     edges, seen = edges[counted[0] : counted[-1] + 2], seen[counted[0] : counted[-1] + 1]
     skip = int(FIRST * rate)
-    look = _tracked(model, dp, edges, theta, skip, seen)
+    look, large = _tracked(model, dp, edges, theta, skip, seen), None
     if isinstance(look, str) or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
         large = _large(plain, raw, edges, seen, prior)
-        if large is not None:
+        if large is not None and large.better > BETTER:
             return _seen_so(
                 _Look(large.track, large.steps, large.leaks, large.excess),
                 large.theta,
@@ -186,7 +188,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
             f"the rig does not describe this machine: its oil would be {stiffness:.2g} times as stiff as the rig's; "
             "the fit has a ring too many in each reversal, or another --rig describes it"
         )
-    return _seen_so(look, theta, model, edges, length, share)
+    followed = _seen_so(look, theta, model, edges, length, share)
+    return followed if large is None else replace(followed, another=large.better < WORSE)
 
 
 def _seen_so(

@@ -20,6 +20,7 @@ from sealscope.diagnosis.pressure_model.fit import (
     LONG_WINDOW,
     SHORT_WINDOW,
     Prior,
+    Window,
     first_guess,
     fit,
     minimise,
@@ -50,12 +51,13 @@ _NEAR = np.concatenate([[0.0], np.geomspace(0.6, 1.6, 15)])
 _DIVERGED = 1e24
 #: The misfit must fall by this share, and by so many variances of the noise, for a second look.
 _FALL, _FALL_COST = 0.03, 200.0
-#: Within a record the drive's gain and the oil's stiffness may change by these shares (standard deviation). Without
-#: limits nothing tells a laminar leak from a slower drive on stiffer oil: to dp, either is a shorter stroke.
-_GAIN_CHANGE, _STIFFNESS_CHANGE = 0.03, 0.15
-#: Least difference of cost to another machine, and the largest excess: a model that is off by some per cent misses more
-#: of a larger leak than of what wanders in a sound machine.
-_BETTER, _LARGEST_EXCESS = 16.0, 2.5
+#: Another machine's gain of the drive and stiffness of the oil, as shares of those before (standard deviation). The
+#: pressures hardly tell a laminar leak from a slower drive on stiffer oil: of either the strokes become shorter.
+_GAIN_CHANGE, _STIFFNESS_CHANGE = 0.15, 0.1
+#: Difference of cost to another machine from which the leak is the better explanation, and from which the other is.
+BETTER, WORSE = 8.0, -100.0
+#: The largest excess: a model that is off by some per cent misses more of a large leak than of what wanders.
+_LARGEST_EXCESS = 4.0
 #: Least z: a leak that linear blocks do not reach is at least as clear as those that they do.
 _CLEAR = 10.0
 #: The onset is anywhere where the cost is within this of the least, and that much [s] before and after.
@@ -85,7 +87,9 @@ class LargeLeak:
 def large_leak(
     model: DrivenModel, dp: Array, edges: NDArray[np.int64], seen: NDArray[np.bool_], prior: Prior
 ) -> LargeLeak | None:
-    """Return the leak that begins within a record and explains it better than another machine does, or None.
+    """Return the leak that begins within a record, None where none explains it.
+
+    Whether it, or another machine, explains the record better is for the caller to ask (`LargeLeak.better`).
 
     dp (n,) [Pa]; blocks between `edges` (b + 1,) [samples], of which those `seen` (b,) count; `prior` of the machine.
     """
@@ -108,14 +112,19 @@ def large_leak(
     if tried is None:
         return None
     block, best = tried
-    start = np.zeros(STATES)
+    after = _After.of(model, dp, int(edges[block + 1]), theta)
+    fitted = {law: after.leaking(law, size) for law, size in best.items()}
     counted = seen & (np.arange(blocks) != block)
-    skip = int(edges[0])
-    path = np.tile(theta, (blocks, 1))
-    followed = {
-        law: track(model, dp, edges, theta, start, skip, (law, block - 1), path, seen=counted, size=size)
-        for law, size in best.items()
-    }
+    followed = {}
+    for law, (leaking, _) in fitted.items():
+        path = np.tile(theta, (blocks, 1))
+        path[block:] = leaking
+        path[block:, law] = theta[law]
+        size = float(leaking[law] - theta[law])
+        rise = law, block - 1
+        followed[law] = track(
+            model, dp, edges, theta, np.zeros(STATES), int(edges[0]), rise, path, seen=counted, size=size
+        )
     variance = min(each.variance for each in followed.values())
     speed = model.speed_amplitude(theta)
     leaks = []
@@ -128,10 +137,11 @@ def large_leak(
     likely = leaks[0]
     there = followed[likely.rising]
     steps = steps_in(there, theta, speed, rising=likely.rising, beside=likely)
-    better, z = _explained(model, dp, int(edges[block + 1]), theta, likely)
-    excess = excess_of(steps)
-    if not (better > _BETTER and z > _CLEAR and excess <= _LARGEST_EXCESS):
+    cost, excess = fitted[likely.rising][1], excess_of(steps)
+    z = float(np.sqrt(max(0.0, after.sound() - cost)))
+    if not (z > _CLEAR and excess <= _LARGEST_EXCESS):
         return None
+    better = after.another() - cost
     onset, limits = _onset(model, dp, edges, there, likely)
     return LargeLeak(theta, there, steps, tuple(leaks), z, better, onset, limits, excess)
 
@@ -153,9 +163,7 @@ def _ladder(
     for law, sizes in tried.items():
         sets = np.tile(theta, (sizes.size, 1))
         sets[:, law] += sizes
-        with np.errstate(over="ignore", invalid="ignore"):
-            squares = np.nan_to_num((dp - model.run(sets)) ** 2, nan=_DIVERGED)
-        squares = np.minimum(squares, _DIVERGED)
+        squares = np.minimum(np.nan_to_num((dp - model.run(sets)) ** 2, nan=_DIVERGED), _DIVERGED)
         misfit = np.add.reduceat(squares, edges[:-1], axis=1)
         misfit[:, -1] -= squares[:, edges[-1] :].sum(axis=1)
         misfit = misfit * seen
@@ -184,27 +192,53 @@ def _refitted(model: DrivenModel, dp: Array, until: int, theta: Array, prior: Pr
     return refit(window_at(model, dp, theta, until - length, length), theta, prior)[0]
 
 
-def _explained(model: DrivenModel, dp: Array, since: int, theta: Array, leak: PossibleLeak) -> tuple[float, float]:
-    """Return by how much a leak explains what comes after better than another machine does, and z of the leak.
+@dataclass(frozen=True, eq=False)
+class _After:
+    """What comes after a leak: a window of it and a shorter one, the machine `theta` (13,) from before, its `wander`.
 
-    The first is a difference of cost, minus twice the log likelihood. The other machine does not leak; its parameters
-    are free within a prior about those of the machine before. z is the root of the difference to the sound machine,
-    whose parameters may wander as those of the leaking one.
+    Costs are minus twice the log likelihood.
     """
-    rest = dp.size - since
-    length, short = (min(rest, int(seconds * model.rate)) for seconds in (LONG_WINDOW[-1], SHORT_WINDOW[-1]))
-    window = window_at(model, dp, theta, since, length)
-    deviation = np.append(wandering(theta, model.samples / model.rate, model.speed_amplitude(theta)), 0.0)
-    another = prior_of(theta)
-    another.deviation[[GAIN, K, G]] = _GAIN_CHANGE * theta[GAIN], _STIFFNESS_CHANGE * theta[K], deviation[G]
-    _, other, _ = fit(window, window_at(model, dp, theta, since, short), another, theta)
-    _, sound = minimise(window, theta[None], Prior(theta, deviation), range(SOUND), 10, 1.0)
-    leaking, apart = theta.copy(), deviation.copy()
-    leaking[leak.rising] += leak.size
-    apart[leak.rising] = max(leak.size, deviation[leak.rising])
-    free = [*range(SOUND), *([ORIFICE] if leak.rising == ORIFICE else [])]
-    _, costs = minimise(window, leaking[None], Prior(leaking, apart), free, 10, 1.0)
-    return float(other * window.dp.size - costs[0]), float(np.sqrt(max(0.0, sound[0] - costs[0])))
+
+    window: Window
+    short: Window
+    theta: Array
+    wander: Array
+
+    @staticmethod
+    def of(model: DrivenModel, dp: Array, since: int, theta: Array) -> _After:
+        rest = dp.size - since
+        window, short = (
+            window_at(model, dp, theta, since, min(rest, int(seconds * model.rate)))
+            for seconds in (LONG_WINDOW[-1], SHORT_WINDOW[-1])
+        )
+        wander = wandering(theta, model.samples / model.rate, model.speed_amplitude(theta))
+        return _After(window, short, theta, np.append(wander, 0.0))
+
+    def sound(self) -> float:
+        """Return the cost of the machine from before, its parameters free to wander."""
+        return float(
+            minimise(self.window, self.theta[None], Prior(self.theta, self.wander), range(SOUND), 10, 1.0)[1][0]
+        )
+
+    def leaking(self, law: int, size: float) -> tuple[Array, float]:
+        """Return the machine from before with a leak of about that size, as free to wander, and its cost."""
+        start, deviation = self.theta.copy(), self.wander.copy()
+        start[law] += size
+        deviation[law] = max(size, deviation[law])
+        free = [*range(SOUND), *([ORIFICE] if law == ORIFICE else [])]
+        fitted, costs = minimise(self.window, start[None], Prior(start, deviation), free, 20, 1.0)
+        return fitted[0], float(costs[0])
+
+    def another(self) -> float:
+        """Return the cost of another machine, which does not leak: all else is free within a prior about that before.
+
+        A machine with another gain is far off, so a fit begins at the gain that suits best, too.
+        """
+        prior = prior_of(self.theta)
+        gain, stiffness = _GAIN_CHANGE * self.theta[GAIN], _STIFFNESS_CHANGE * self.theta[K]
+        prior.deviation[[GAIN, K, G]] = gain, stiffness, self.wander[G]
+        guesses = self.theta, first_guess(self.short, prior)
+        return self.window.dp.size * min(fit(self.window, self.short, prior, guess)[1] for guess in guesses)
 
 
 def _onset(

@@ -1,0 +1,81 @@
+"""Leaks too large for blocks that are linear about a sound machine, from pressures and command; and what looks like
+one: a machine that is another one from half on, with a slower drive, other friction and other oil."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.diagnosis.pressure_machine import ONSET, recorded
+
+from sealscope.diagnosis.diagnose import Examination
+from sealscope.diagnosis.pressure_model.detector import PressureModel
+from sealscope.parameters import load_rig
+from sealscope.recordings.recording import Recording
+
+P = 0.01
+
+
+@pytest.fixture(scope="module")
+def detector() -> PressureModel:
+    return PressureModel(load_rig("thesis"))
+
+
+def spliced(first: Recording, second: Recording) -> Recording:
+    """The first recording up to the onset, the second from there on."""
+    late = first.t >= ONSET
+    channels = {name: np.where(late, second[name], first[name]) for name in first.channels}
+    return Recording(first.t, channels, first.units, first.rate)
+
+
+@pytest.mark.parametrize(
+    ("lpm", "law", "command"),
+    [
+        (0.1, "", "3 sin(4t)"),
+        (0.4, "orifice ", "5 sin(2t)"),
+        pytest.param(0.4, "", "3 sin(4t)", marks=pytest.mark.slow),
+        pytest.param(0.1, "orifice ", "7 sin(4t)", marks=pytest.mark.slow),
+        pytest.param(1.0, "", "7 sin(4t)", marks=pytest.mark.slow),
+        pytest.param(1.0, "orifice ", "7 sin(4t)", marks=pytest.mark.slow),
+    ],
+)
+def test_a_large_leak_is_found_dated_sized_and_its_law_told(
+    lpm: float, law: str, command: str, detector: PressureModel
+) -> None:
+    evidence = detector.examine(recorded(1, command=command, leak=f"{lpm} L/min {law}from {ONSET:g} s"), [], P)
+    assert evidence.verdict == "leak", evidence.reason
+    assert evidence.onset_s == pytest.approx(ONSET, abs=1.0)
+    low, high = evidence.onset_interval_s
+    assert low <= ONSET <= high
+    assert ("as of an orifice" if law else "as of a worn seal") in evidence.reason
+    low, high = evidence.leak_interval_lpm
+    assert low <= lpm <= high
+    assert evidence.leak_lpm == pytest.approx(lpm, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"motor__omega_per_volt": 0.9},
+        pytest.param({"motor__omega_per_volt": 0.8}, marks=pytest.mark.slow),
+        pytest.param({"friction__F_v": 2.0, "friction__F_pr": 1.5}, marks=pytest.mark.slow),
+        pytest.param({"fluid__K_oil": 0.7, "friction__F_v": 1.3}, marks=pytest.mark.slow),
+        pytest.param({"motor__omega_per_volt": 0.9, "fluid__K_oil": 1.1}, marks=pytest.mark.slow),
+        pytest.param({"cylinder__M_eq": 1.5}, marks=pytest.mark.slow),
+    ],
+    ids=lambda change: ", ".join(f"{name} x{factor:g}" for name, factor in change.items()),
+)
+def test_another_machine_from_half_on_is_no_leak(change: dict[str, float], detector: PressureModel) -> None:
+    rig = load_rig("thesis")
+    values = {name: factor * float(rig[name.replace("__", ".")]) for name, factor in change.items()}
+    recording = spliced(recorded(1, command="3 sin(4t)"), recorded(2, command="3 sin(4t)", **values))
+    evidence = detector.examine(recording, [], P)
+    assert evidence.verdict != "leak", evidence.reason
+    assert evidence.leak_lpm is None
+
+
+def test_what_the_leak_was_weighed_against_does_not_take_its_verdict() -> None:
+    """A leak of 0.4 L/min lowers the strokes' pressure difference, as less friction does: that is no objection."""
+    recording = recorded(1, command="5 sin(2t)", leak=f"0.4 L/min orifice from {ONSET:g} s")
+    evidence = Examination(recording, false_alarm_probability=P).evidence("pressure model")
+    assert evidence.verdict == "leak", evidence.reason
+    assert "friction change" in evidence.weighed
