@@ -13,6 +13,7 @@ import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
+from sealscope.diagnosis import registry
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.integrate import Trajectory, integrate
 
@@ -35,6 +36,13 @@ def pytest_configure() -> None:
     threadpool_limits(limits=1)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def two_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let diagnoses in this process run the volume balance and `rms change` alone: for what does not ask who judges."""
+    kept = {name: registry.DETECTORS[name] for name in ("volume balance", "rms change")}
+    monkeypatch.setattr(registry, "DETECTORS", kept)
 
 
 @pytest.fixture(scope="session")

@@ -83,6 +83,7 @@ def test_jsonl_is_one_object_a_line_and_nothing_else(call, recordings):
     assert healthy["onset_s"] is None
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_what_detectors_may_assume_is_a_rig_by_name_or_file(call, recordings, tmp_path):
     words = ("diagnose", recordings / "leak.nc", "--format", "jsonl")
     (plain,) = call(*words).objects
@@ -112,6 +113,7 @@ def test_a_process_of_its_own_prints_the_same(shell, call, recordings):
     assert shell("sealscope", *words) == call(*words)
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_the_false_alarm_probability_sets_the_threshold(call, recordings):
     thresholds = [
         call("diagnose", recordings / "leak.nc", "--format", "jsonl", "--false-alarm", p).objects[0]["threshold"]
@@ -121,6 +123,7 @@ def test_the_false_alarm_probability_sets_the_threshold(call, recordings):
     assert len(set(thresholds)) == 3
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_baselines_after_one_flag_or_one_flag_each(call, recordings):
     leak, *healthy = (recordings / name for name in ("leak.nc", "healthy_1.nc", "healthy_2.nc", "healthy_3.nc"))
     one = call("diagnose", leak, "--baseline", *healthy, "--format", "jsonl")
@@ -133,6 +136,7 @@ def test_baselines_after_one_flag_or_one_flag_each(call, recordings):
     assert "3 comparable leak-free recordings" in said(found, "rms change")
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_a_baseline_is_not_its_own_baseline(call, recordings):
     files = [recordings / f"healthy_{k}.nc" for k in (1, 2, 3)]
     done = call("diagnose", *files, "--baseline", *files, "--format", "jsonl")
@@ -145,6 +149,7 @@ def test_a_baseline_is_not_its_own_baseline(call, recordings):
     assert alone.out == ""  # a wrong call gives no verdict at all
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_two_words_after_baseline_and_no_other_are_a_baseline_and_a_file(call, recordings):
     baseline, file = recordings / "healthy_1.nc", recordings / "healthy_2.nc"
     done = call("diagnose", "--format", "jsonl", "--baseline", baseline, file)
@@ -176,6 +181,7 @@ def test_how_baselines_are_spread(words, spread):
     assert spread_baselines(words.split()) == spread.split()
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_a_missing_file_among_good_ones_costs_the_others_nothing(call, recordings, untouched):
     files = [recordings / "leak.nc", "absent.csv", recordings / "healthy_1.nc"]
     done = call("diagnose", *files, "--format", "jsonl")
@@ -183,6 +189,7 @@ def test_a_missing_file_among_good_ones_costs_the_others_nothing(call, recording
     assert [one["verdict"] for one in done.objects] == ["leak", "no leak"]
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_a_missing_baseline_among_good_ones(call, recordings, untouched):
     healthy = recordings / "healthy_1.nc"
     done = call("diagnose", recordings / "leak.nc", "--baseline", "absent.csv", healthy, "--format", "jsonl")
@@ -305,6 +312,7 @@ def test_five_lines_by_default_all_with_v_one_when_quiet(call, shell, recordings
     assert line.out == short.out.splitlines()[0] + "\n" == f"{recordings / 'leak.nc'}: leak\n"
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_scripts_may_fail_on_a_verdict(call, recordings):
     files = (recordings / "leak.nc", recordings / "healthy_1.nc")
     assert call("diagnose", *files, "--quiet", "--fail-on", "leak").status == 3

@@ -110,7 +110,11 @@ def test_a_leak_under_2_kN_is_tracked_held_and_reported(lpm):
 
 
 @pytest.mark.parametrize(
-    ("lpm", "load"), [(0.5, 2000.0), (0.5, 0.0), *(pytest.param(0.0, F, marks=pytest.mark.slow) for F in (0.0, 2000.0))]
+    ("lpm", "load"),
+    [
+        (0.5, 2000.0),
+        *(pytest.param(lpm, F, marks=pytest.mark.slow) for lpm, F in ((0.5, 0.0), (0.0, 0.0), (0.0, 2000.0))),
+    ],
 )
 def test_a_single_rod_is_served_as_well(lpm, load):
     rig = load_rig("single-rod-eha")

@@ -31,6 +31,7 @@ def verdicts(diagnosis: Diagnosis) -> list[tuple[str, str, str, float | None, fl
     return [(own.detector, own.verdict, own.reason, own.score, own.threshold) for own in diagnosis.methods]
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_a_baseline_equal_to_the_recording_is_refused(healthy: list[Recording]) -> None:
     recording = healthy[0]
     for baseline in (recording, [recording], [copied(recording)]):
@@ -67,6 +68,7 @@ def test_of_copies_the_one_with_the_most_channels_is_kept(healthy: list[Recordin
         assert comparable(inspected(healthy[0]), baseline).parts == (whole,)
 
 
+@pytest.mark.usefixtures("two_methods")
 @pytest.mark.parametrize("fault", ["stuck", "clipped", "constant", "too short", "other rate"])
 def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, healthy: list[Recording]) -> None:
     recording, leak_free, other = healthy
@@ -179,6 +181,7 @@ def test_wrong_arguments_are_named(healthy: list[Recording], tmp_path: Path) -> 
             diagnose(*args, **keywords)  # type: ignore[arg-type]
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_rig_is_a_rig_a_name_or_a_path(healthy: list[Recording], tmp_path: Path) -> None:
     from sealscope.parameters import load_rig
 

@@ -271,7 +271,7 @@ def simulated(words: str, command: str) -> Recording:
         ("pump leak G = 5e-13", None),
         ("rod seal A 0.01 L/min", "external leak"),
         ("friction +20 %", "friction change"),
-        ("air 1 %", "air in the oil"),
+        pytest.param("air 1 %", "air in the oil", marks=pytest.mark.slow),
         ("sensor p_A offset 5 psi", "sensor fault"),
         ("sensor p_B gain 2 %", "sensor fault"),
         ("duty amplitude x1.1", "changed duty"),

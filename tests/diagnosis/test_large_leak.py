@@ -73,6 +73,7 @@ def test_another_machine_from_half_on_is_no_leak(change: dict[str, float], detec
     assert evidence.leak_lpm is None
 
 
+@pytest.mark.slow
 def test_what_the_leak_was_weighed_against_does_not_take_its_verdict() -> None:
     """A leak of 0.4 L/min lowers the strokes' pressure difference, as less friction does: that is no objection."""
     recording = recorded(1, command="5 sin(2t)", leak=f"0.4 L/min orifice from {ONSET:g} s")

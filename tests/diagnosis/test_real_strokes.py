@@ -102,7 +102,7 @@ def without_time(stroke: Recording) -> Recording:
     ("name", "times", "every"),
     [
         (SESSIONS[1], True, 2),
-        (SESSIONS[0], False, 6),
+        pytest.param(SESSIONS[0], False, 6, marks=pytest.mark.slow),
         pytest.param(SESSIONS[0], False, 2, marks=pytest.mark.slow),
         pytest.param(SESSIONS[1], False, 2, marks=pytest.mark.slow),
         pytest.param(SESSIONS[0], True, 2, marks=pytest.mark.slow),

@@ -54,6 +54,12 @@ def assert_same(a: Recording, b: Recording) -> None:
     assert a.history == b.history
 
 
+def test_marks_of_other_formats_within_our_own_are_text(tmp_path: Path) -> None:
+    made = Recording([0.0, 0.1], {"u": [0.0, 1.0]}, {"u": "V"}, 10.0, history=("***End_of_Header***", "TDSm", "MDF"))
+    write(made, tmp_path / "log.csv")
+    assert_same(read(tmp_path / "log.csv"), made)
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(recording=recordings())

@@ -35,8 +35,8 @@ class _Packet:
 
 
 def is_lvm(head: bytes) -> bool:
-    """Return whether a file that begins with `head` is a LabVIEW measurement file."""
-    return END.encode() in head or (END.encode("utf-16-le") in head)
+    """Return whether a file that begins with `head` is a LabVIEW measurement file: the mark begins a line."""
+    return any(f"{end}{END}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
 
 
 def read_lvm(path: Path, choose: Choose) -> RawTable:
