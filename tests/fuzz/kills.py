@@ -96,7 +96,7 @@ def attack(call: str, folder: Path, kills: int, seed: int) -> Kills:
         process = _start(call, folder / "whole")
         message = process.communicate()[1]
         assert process.returncode == 0, message.decode()
-        length = length or time.monotonic() - begin
+        length = time.monotonic() - begin
         expected = results(folder / "whole" / "out")
     count.files = len(expected)
     round_ = 0
