@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.parameters import load_rig
+from sealscope.parameters.new_rig import rig_text
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth
 
@@ -92,3 +94,23 @@ def test_the_simulated_single_rod_is_diagnosed(load: str, law: str) -> None:
         assert evidence.verdict == "leak"
         assert evidence.onset_s == pytest.approx(60.0, abs=0.5 if law == "laminar" else 1.0)
         assert evidence.leak_lpm == pytest.approx(worn.truth.mean_leak_lpm, rel=0.03)
+
+
+def test_where_the_circuit_swings_between_its_valves_a_leak_is_seen_and_not_sized(tmp_path: Path) -> None:
+    """0.1 L/min was 0.068 (0.062 to 0.074): under this load either side carries in turn, faster than samples tell."""
+    path = tmp_path / "press.toml"
+    path.write_text(rig_text("press", 19.6e-4, 13.5e-4, 0.3, 8e-6))
+    rig = load_rig(path)
+    evidence = {}
+    for load in ("250 N", "500 N"):
+        experiment = Experiment.of(
+            rig=rig, command="3 sin(2t)", load=load, duration=60.0, leak="0.1 L/min from 30 s", seed=1
+        )
+        evidence[load] = VolumeBalance(rig).examine(simulate_with_truth(experiment).recording, [], P)
+        assert evidence[load].verdict == "leak"
+        assert evidence[load].onset_s == pytest.approx(30.0, abs=1.0)
+    assert evidence["250 N"].leak_lpm == pytest.approx(0.1, rel=0.03)
+    assert evidence["500 N"].leak_lpm is None
+    assert evidence["500 N"].relative is None
+    assert "leak_lpm" in evidence["500 N"].refuses
+    assert "the higher pressure changes sides" in evidence["500 N"].reason

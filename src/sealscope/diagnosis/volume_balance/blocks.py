@@ -47,7 +47,8 @@ class BalanceBlocks:
     flow, smoothed, by the assumed displacement [m^3/s]; `lift` (n,): the share by which noise
     lifts that root where dp is not smoothed; `motion` (n,): mean of dp times the piston's velocity; `walk` (n,):
     variance of the conductance, over its square, that the noise of dp makes in the integral; `filled` (n,): by how much
-    the sum of both pressures rises from the first tenth of a block to its last; `noise`, `noise_12` (n,):
+    the sum of both pressures rises from the first tenth of a block to its last; `swinging` (n,): share of the way that
+    the piston goes while dp has another sign than dp smoothed; `noise`, `noise_12` (n,):
     variance of the noise of dp, of dp_12; `samples`: samples of a block; `seconds`: its length.
     """
 
@@ -62,6 +63,7 @@ class BalanceBlocks:
     motion: Array
     walk: Array
     filled: Array
+    swinging: Array
     noise: Array
     noise_12: Array
     samples: int
@@ -236,6 +238,17 @@ def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple
     return np.stack(columns, axis=1), dp, smooth
 
 
+def _swinging(x: Array, dp: Array, smooth: Array) -> Array:
+    """Return the share (n,) of the way x (n, L) gone while dp has another sign than its means over `SMOOTH_SECONDS`.
+
+    On a single rod the higher pressure says whose area moves oil. Noise changes the sign near zero, and is passed
+    quickly; a circuit that swings between its valves changes it faster than the samples, or their means, can tell.
+    """
+    way = np.abs(np.gradient(x, axis=1))
+    other = np.sum(way * (np.sign(dp) != np.sign(smooth)), axis=1)
+    return np.asarray(other / np.maximum(way.sum(axis=1), np.finfo(float).tiny))
+
+
 def _passed_over(
     t: Array, samples: Mapping[str, Array], moving: NDArray[np.bool_], stopped: NDArray[np.bool_], rate: float
 ) -> tuple[Array, Array, dict[str, Array]]:
@@ -309,6 +322,7 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
         lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root, np.finfo(float).tiny) - 1.0,
         motion=np.sum(0.5 * (dp[:, 1:] + dp[:, :-1]) * np.diff(x, axis=1), axis=1) / (length * step),
         walk=noise * _walk(rest[:, I_AB], step),
+        swinging=_swinging(x, dp, smooth),
         filled=both[:, -tenth:].mean(axis=1) - both[:, :tenth].mean(axis=1),
         noise=noise,
         noise_12=_noise(columns[:, DP_12]) if "p_1" in cut else np.zeros_like(noise),

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 1
+STATE_VERSION = 2
 #: The duty's cycle is looked for in so long a run without a hole [s].
 _LEARN_SECONDS = 60.0
 #: Blocks that the frozen balance is fitted to, at most.
