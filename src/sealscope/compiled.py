@@ -24,6 +24,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import numba
@@ -123,6 +124,9 @@ def cache_directory() -> Path | None:
     return None
 
 
+_one_at_a_time = Lock()
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     """numba's cache, where a file that cannot be read or written is a cache miss."""
 
@@ -150,15 +154,17 @@ def kernel(function: _F) -> _F:
     dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
     if directory is None:
         return dispatcher  # type: ignore[no-any-return]
-    # numba reads the folder when the decorator runs; other users of numba in this process keep theirs
-    before = config.CACHE_DIR
-    config.CACHE_DIR = str(directory)
-    try:
-        dispatcher._cache = _Cache(function)  # as `cache=True` does
-    except (OSError, RuntimeError) as error:  # the folder is gone
-        _log.debug("cannot cache compiled code in %s: %s", directory, error)
-    finally:
-        config.CACHE_DIR = before
+    # numba reads the folder when the decorator runs; other users of numba in this process keep theirs. Two threads that
+    # import kernels at once would take each other's setting: none at all is the working directory.
+    with _one_at_a_time:
+        before = config.CACHE_DIR
+        config.CACHE_DIR = str(directory)
+        try:
+            dispatcher._cache = _Cache(function)  # as `cache=True` does
+        except (OSError, RuntimeError) as error:  # the folder is gone
+            _log.debug("cannot cache compiled code in %s: %s", directory, error)
+        finally:
+            config.CACHE_DIR = before
     return dispatcher  # type: ignore[no-any-return]
 
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numba
@@ -13,6 +16,7 @@ import pytest
 from numba.core import config
 
 import sealscope
+from sealscope import compiled
 from sealscope.compiled import source_hash
 
 PACKAGE = Path(sealscope.__file__).parent
@@ -199,6 +203,26 @@ def test_numba_s_own_setting_is_left_as_it_was():
     assert twice(2.0) == 4.0
     assert before == config.CACHE_DIR
     assert before == numba.config.CACHE_DIR
+
+
+def test_threads_that_import_kernels_at_once_cache_them_in_the_user_s_folder(tmp_path, monkeypatch):
+    """The setting of one thread was taken back under another's hands: code went to the working directory, and came from
+    there."""
+    folder = compiled.cache_directory()
+    if folder is None:
+        pytest.skip("compiled code is not cached here")
+    monkeypatch.chdir(tmp_path)
+
+    class Slow(compiled._Cache):
+        def __init__(self, function):
+            time.sleep(random.uniform(0.0, 0.01))
+            super().__init__(function)
+
+    monkeypatch.setattr(compiled, "_Cache", Slow)
+    with ThreadPoolExecutor(4) as threads:
+        kernels = list(threads.map(lambda _: compiled.kernel(compiled.source_hash), range(48)))
+    assert {Path(kernel._cache.cache_path).parent for kernel in kernels} == {folder}
+    assert not list(tmp_path.iterdir())
 
 
 def test_compiled_division_by_zero_follows_ieee_754():
