@@ -63,6 +63,34 @@ def test_a_real_interrupt_of_a_long_simulation(untouched, surroundings):
     assert (child.returncode, err.removeprefix("\n")) == (130, "sealscope: interrupted\n")
 
 
+def test_an_interrupt_within_a_finalizer_is_not_lost(untouched, surroundings):
+    """Python prints and ignores what a finalizer raises: the run went on for its hour, and ended with status 0."""
+    tell = (
+        "import time, sealscope.simulation.integrate as module, sealscope.cli\n"
+        "class Finalized:\n"
+        "    def __del__(self):\n"
+        "        print('finalizing', flush=True)\n"
+        "        time.sleep(2)\n"
+        "def integrate(*arguments, **options):\n"
+        "    Finalized()\n"
+        "    time.sleep(50)\n"
+        "module.integrate = integrate\n"
+        "sealscope.cli.main()\n"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", tell, "simulate", "-o", "run.nc"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=surroundings,
+    )
+    assert child.stdout.readline() == "finalizing\n"
+    time.sleep(0.2)
+    child.send_signal(signal.SIGINT)
+    _, err = child.communicate(timeout=40)
+    assert (child.returncode, err.removeprefix("\n")) == (130, "sealscope: interrupted\n")
+
+
 SEALSCOPE = '"$PYTHON" -m sealscope'
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from threading import Timer
 from typing import Annotated, Any
 
 import typer
@@ -27,6 +30,8 @@ from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
 _WRONG_CALL, _INTERRUPTED = 2, 130
+#: An interrupt that Python ignored is sent again after this time [s].
+_AGAIN = 0.05
 
 app = typer.Typer(
     rich_markup_mode="markdown",
@@ -145,8 +150,9 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # a terminal without the character shows its code instead
             stream.reconfigure(errors="backslashreplace")
     try:
-        status = app(arguments_of(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
-        sys.stdout.flush()
+        with _no_interrupt_lost():
+            status = app(arguments_of(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
+            sys.stdout.flush()
     except typer.Exit as error:
         status = error.exit_code
     except wrong_call as error:
@@ -166,6 +172,26 @@ def main() -> None:
         complain("interrupted")
     _let_go_of_output()
     sys.exit(status if isinstance(status, int) else 0)
+
+
+@contextmanager
+def _no_interrupt_lost() -> Iterator[None]:
+    """Send an interrupt again that came where Python ignores exceptions, such as in a finalizer of the compiler."""
+    usual = sys.unraisablehook
+
+    def again(unraisable: Any) -> None:
+        if unraisable.exc_type is not KeyboardInterrupt:
+            usual(unraisable)
+            return
+        timer = Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT))
+        timer.daemon = True
+        timer.start()
+
+    sys.unraisablehook = again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
 
 
 def _let_go_of_output() -> None:
