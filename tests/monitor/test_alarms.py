@@ -108,3 +108,24 @@ def test_a_shelved_alarm_keeps_its_changes_to_itself(tmp_path: Path):
     assert through(judge, [0.02] * 40) == []
     assert judge.alarm.updated_s == pytest.approx(117.0)
     assert status_word([judge.alarm]) == 6
+
+
+def test_an_actuator_s_latest_events_are_shown_however_many_there_are(tmp_path: Path) -> None:
+    """The page took the last 200 of the first 1000: after these nothing new was seen."""
+    store = MonitorStore(f"sqlite:///{tmp_path / 'memory.db'}")
+    rows = [
+        {
+            "actuator": ("press", "saw")[number % 2],
+            "t": float(number),
+            "kind": "alarm",
+            "alarm_id": "1",
+            "by_whom": "",
+            "text": "",
+            "alarm": "{}",
+        }
+        for number in range(2600)
+    ]
+    with store.writing() as connection:
+        connection.execute(store.tables.events.insert(), rows)
+    shown = store.last_events("saw")
+    assert [event["t"] for event in shown] == [2599.0 - 2 * k for k in range(200)]

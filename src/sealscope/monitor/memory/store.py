@@ -228,31 +228,23 @@ class MonitorStore:
             values = [json.loads(text) for (text,) in connection.execute(query)]
         return sorted(values, key=lambda alarm: -float(alarm["raised_s"]))
 
-    def events_since(
-        self, number: int, most: int = 1000, *, actuator: str | None = None
-    ) -> list[tuple[int, dict[str, Any]]]:
+    def events_since(self, number: int, most: int = 1000) -> list[tuple[int, dict[str, Any]]]:
         """Return events beyond a number with their own numbers, in their order."""
         from sqlalchemy import select
 
         events = self.tables.events
         query = select(events).where(events.c.number > number).order_by(events.c.number).limit(most)
-        if actuator is not None:
-            query = query.where(events.c.actuator == actuator)
         with self.engine.connect() as connection:
-            return [
-                (
-                    row.number,
-                    {
-                        "number": row.number,
-                        "event": row.kind,
-                        "t": row._mapping["t"],
-                        "by": row.by_whom,
-                        "text": row.text,
-                        "alarm": json.loads(row.alarm),
-                    },
-                )
-                for row in connection.execute(query)
-            ]
+            return [(row.number, _event(row)) for row in connection.execute(query)]
+
+    def last_events(self, actuator: str, most: int = 200) -> list[dict[str, Any]]:
+        """Return the latest events of an actuator, the last one first."""
+        from sqlalchemy import select
+
+        events = self.tables.events
+        query = select(events).where(events.c.actuator == actuator).order_by(events.c.number.desc()).limit(most)
+        with self.engine.connect() as connection:
+            return [_event(row) for row in connection.execute(query)]
 
     def course(self, actuator: str, most: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
         """Return the estimates of an actuator, means of successive ones where there are more than `most`.
@@ -307,6 +299,17 @@ class MonitorStore:
             statement = statement.where(table.c[name] == value)
         if connection.execute(statement.values(**values)).rowcount == 0:
             connection.execute(table.insert().values(**key, **values))
+
+
+def _event(row: Any) -> dict[str, Any]:
+    return {
+        "number": row.number,
+        "event": row.kind,
+        "t": row._mapping["t"],
+        "by": row.by_whom,
+        "text": row.text,
+        "alarm": json.loads(row.alarm),
+    }
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:

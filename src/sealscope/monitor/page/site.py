@@ -83,14 +83,13 @@ def site(actuators: WatchedActuators, settings: PageSettings, token: str | None)
             return JSONResponse({"error": "no such actuator"}, 404)
         span = request.query_params.get("hours", "")
         seconds = float(span) * 3600.0 if span.replace(".", "", 1).isdigit() and len(span) < 10 else None
-        events = [event for _, event in store.events_since(0, actuator=name)][-200:]
         return JSONResponse(
             {
                 "name": name,
                 "summary": actuators.plain()[name],
                 "course": store.course(name, seconds=seconds),
                 "alarms": store.alarms(actuator=name)[:50],
-                "events": events[::-1],
+                "events": store.last_events(name),
             }
         )
 
