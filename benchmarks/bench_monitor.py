@@ -1,31 +1,37 @@
 """What watching costs: processor time a block, actuators a core, bytes of state, and time from message to store.
 
-    python benchmarks/bench_monitor.py [--seconds 900] [--actuators 20]
+    python benchmarks/bench_monitor.py [--seconds 600] [--actuators 20] [--paced 0]
 
 Simulated actuators (p_A, p_B, x, theta at 500 Hz, blocks of about 3 s in messages of 1 s) are watched by the library
-alone, then by the service with its database in a temporary folder: each message is one transaction with full
-synchronisation. The share of blocks that were searched for a rise is part of the cost.
+alone, then by a service on one core, from the bytes of the messages (JSON, then CBOR) to the database in a temporary
+folder with full synchronisation. Its threads are fed as fast as they take; with `--paced N` N actuators then send a
+message each second for a minute, and the time from message to stored is what an alarm waits. The share of blocks that
+were searched for a rise is part of the cost.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
+import os
 import tempfile
 import time
 from pathlib import Path
 
+import cbor2
 import numpy as np
 
 import sealscope as ss
-from sealscope.monitor.actuators import WatchedActuators
-from sealscope.monitor.memory.store import MonitorStore
-from sealscope.monitor.settings import ActuatorSettings
-from sealscope.monitor.sources.source_block import SourceBlock
+from sealscope.monitor.service import Service
+from sealscope.monitor.settings import MonitorSettings
+from sealscope.monitor.sources.source_block import decoded
 from sealscope.monitor.stream import decisions
 
 CHANNELS = ("p_A", "p_B", "x", "theta")
 LEARN_H = 100.0 / 3600.0
+#: Messages until the baseline is learned, and how long the paced ones are measured [s].
+LEARNED, PACED_S = 180, 60.0
 
 
 def pieces(seconds: float, seed: int, leak: str | None = None) -> list[ss.Recording]:
@@ -37,8 +43,9 @@ def pieces(seconds: float, seed: int, leak: str | None = None) -> list[ss.Record
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=900.0, help="simulated time of each actuator")
+    parser.add_argument("--seconds", type=float, default=600.0, help="simulated time of each actuator")
     parser.add_argument("--actuators", type=int, default=20, help="actuators in the service")
+    parser.add_argument("--paced", type=int, default=0, help="actuators that send at their own pace")
     chosen = parser.parse_args()
 
     messages = pieces(chosen.seconds, 0)
@@ -65,24 +72,97 @@ def main() -> None:
     print(f"{blocks / spent:.0f} blocks/s, {(len(messages) - warm) / spent:.0f} actuators a core", end="; ")
     print(f"{searched} of {blocks} blocks searched; state {len(state)} bytes as JSON")
 
-    names = [f"press {k}" for k in range(chosen.actuators)]
-    settings = [ActuatorSettings(name=name, learn_hours=LEARN_H) for name in names]
-    with tempfile.TemporaryDirectory() as folder:
-        store = MonitorStore(str(Path(folder) / "monitor.db"))
-        actuators = WatchedActuators(settings, store)
-        took = []
-        start = time.process_time()
-        for number, samples in enumerate(messages[: 60 + int(chosen.seconds // 4)]):
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    forms = {"JSON": lambda values: json.dumps(values).encode(), "CBOR": cbor2.dumps, "CBOR, typed arrays": typed}
+    for form, dumps in forms.items():
+        payloads = [dumps(message(samples)) for samples in messages]
+        spent, took, _ = served(payloads, chosen.actuators, 0.0)
+        print(
+            f"service, {form} of {len(payloads[-1])} bytes: {1e3 * spent:.2f} ms of processor a message of 1 s",
+            end="; ",
+        )
+        print(f"{1.0 / spent:.0f} actuators a core; as fast as it takes {1.0 / took:.0f} messages/s", flush=True)
+    if chosen.paced:
+        spent, _, waits = served(payloads, chosen.paced, PACED_S)
+        median, rare = np.percentile(waits, [50, 99])
+        print(f"{chosen.paced} actuators, {form}, a message each second for {PACED_S:.0f} s:", end=" ")
+        print(
+            f"{100.0 * spent * chosen.paced:.0f} % of a core; message to stored: median {1e3 * median:.0f} ms", end=", "
+        )
+        print(f"p99 {1e3 * rare:.0f} ms, most {max(waits):.2f} s; resident {resident() / 1e6:.0f} MB")
+
+
+def message(samples: ss.Recording) -> dict[str, object]:
+    """Samples as a message of 9 digits."""
+    channels = {name: [float(f"{value:.9g}") for value in samples[name]] for name in CHANNELS}
+    return {"t": float(samples.t[0]), "rate": samples.rate, **channels}
+
+
+def typed(values: dict[str, object]) -> bytes:
+    """A message as CBOR with its channels as arrays of floats (RFC 8746)."""
+    arrays = {name: cbor2.CBORTag(86, np.array(values[name], "<f8").tobytes()) for name in CHANNELS}
+    return cbor2.dumps({**values, **arrays})
+
+
+def resident() -> int:
+    """Resident bytes of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def served(payloads: list[bytes], count: int, paced: float) -> tuple[float, float, list[float]]:
+    """Return processor time and time a message [s] of a service that has learned, and how long each message took.
+
+    `paced`: each actuator sends a message a second for so long [s]; 0: as fast as the service takes them.
+    """
+    names = [f"press {k}" for k in range(count)]
+    waits: list[float] = []
+    measured: list[float] = []
+
+    def source(service: object) -> None:
+        done = [0]
+
+        def send(name: str, payload: bytes, kept: bool) -> None:
+            began = time.perf_counter()
+
+            def stored() -> None:
+                done[0] += 1
+                if kept:
+                    waits.append(time.perf_counter() - began)
+
+            service.hand(decoded(payload, name, stored))  # type: ignore[attr-defined]
+
+        def settle(number: int) -> None:
+            while done[0] < number:
+                time.sleep(0.01)
+
+        rounds = int(paced) or min(100, len(payloads) - LEARNED)
+        for payload in payloads[:LEARNED]:
             for name in names:
-                began = time.perf_counter()
-                actuators.take(SourceBlock(name, str(number), samples))
-                took.append(time.perf_counter() - began)
-        spent = time.process_time() - start
-        rows = len(took)
-        median, rare = (1e3 * value for value in np.percentile(took, [50, 99]))
-        print(f"service: {1e3 * spent / rows:.2f} ms of processor a message of 1 s, {rows / spent:.0f}", end=" ")
-        print(f"actuators a core; message to stored: median {median:.1f} ms, p99 {rare:.1f} ms, most {max(took):.2f} s")
-        store.engine.dispose()
+                send(name, payload, False)
+        settle(LEARNED * count)
+        began, clock = time.process_time(), time.perf_counter()
+        for k, payload in enumerate(payloads[LEARNED : LEARNED + rounds]):
+            for n, name in enumerate(names):
+                if paced:
+                    time.sleep(max(0.0, clock + k + n / count - time.perf_counter()))
+                send(name, payload, True)
+        settle((LEARNED + rounds) * count)
+        total = rounds * count
+        measured.extend([(time.process_time() - began) / total, (time.perf_counter() - clock) / total])
+
+    with tempfile.TemporaryDirectory() as folder:
+        settings = MonitorSettings.model_validate(
+            {
+                "database": str(Path(folder) / "monitor.db"),
+                "defaults": {"learn_hours": LEARN_H},
+                "actuator": [{"name": name} for name in names],
+            }
+        )
+        service = Service(settings, stdout=io.StringIO(), sources=[source])
+        service.run()
+        service.store.engine.dispose()
+    return measured[0], measured[1], waits
 
 
 if __name__ == "__main__":

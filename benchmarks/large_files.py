@@ -1,8 +1,8 @@
-"""How memory and time grow with a log's size: read, convert and, with --diagnose, diagnose text logs of two sizes.
+"""How memory and time grow with a log's size: read, convert, cut into parts and, with --diagnose, diagnose text logs.
 
-``python benchmarks/large_files.py [--minutes 20] [--diagnose]`` writes a log of so many minutes at 500 Hz (7 columns)
-and one of twice as many into a temporary folder, and prints for each command the bytes that each further value needs at
-the peak, and the ratio of the times: 2 where both grow with the file and no faster.
+``python benchmarks/large_files.py [--minutes 20] [--diagnose] [--parts-alone]`` writes a log of so many minutes at
+500 Hz (7 columns) and one of twice as many into a temporary folder, and prints for each command the bytes that each
+further value needs at the peak, and the ratio of the times: 2 where both grow with the file and no faster.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=20.0)
     parser.add_argument("--diagnose", action="store_true", help="diagnose the logs, too: takes long")
+    parser.add_argument("--parts-alone", action="store_true", help="convert into parts of ten minutes, nothing else")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         logs = [Path(name) / "one.csv", Path(name) / "two.csv"]
@@ -62,9 +63,12 @@ def main() -> None:
         ]
         print(f"{values[0]} and {values[1]} values in {logs[0].stat().st_size} and {logs[1].stat().st_size} bytes")
         commands = {"inspect": lambda log: ("inspect", log), "convert": lambda log: ("convert", log, f"{log}.nc")}
+        commands["parts"] = lambda log: ("convert", log, f"{log}.parts", "--every", "10 min")
+        if options.parts_alone:
+            commands = {"parts": commands["parts"]}
         if options.diagnose:
             commands["diagnose"] = lambda log: ("diagnose", log)
-        run("inspect", str(logs[0]))  # kernels are compiled
+        run("--version")
         for command, words in commands.items():
             one, two = (run(*words(str(log))) for log in logs)
             further = (two[1] - one[1]) / (values[1] - values[0])

@@ -1,33 +1,42 @@
-"""False alarms per 1000 operating hours of watched actuators that drift, and delays of leaks, in compressed time.
+"""A month of watched actuators that drift: false alarms per 1000 operating hours, and delays of leaks.
 
-    python benchmarks/monitor_months.py [--hours 300] [--actuators 4] [--rate 20] [--minutes 8] [--leaks]
+    python benchmarks/monitor_months.py [--actuators 50] [--days 30] [--minutes-a-day 96] [--rate 1] [--stop-after 8]
 
-A library of blocks is cut from a simulated recording of the thesis's rig (20 min, other noise in each block). An
-operating hour is made of them by their sums of products: a conductance g takes g times the integral of dp from the
-displaced volume, and friction scales dp, both exactly. So an hour costs half a second in place of minutes, and no
-sample is shared with what the tests were made on. Each actuator runs two shifts of 8 h a day and rests at night. Its
-conductance is
+Libraries of blocks are cut from simulated recordings of the thesis's rig (20 min each, other noise in each block), at
+three charge pressures and two levels of the pressures' noise. An operating hour is made of them by their sums of
+products: a conductance g takes g times the integral of dp from the displaced volume, and friction scales dp, both
+exactly. So an hour costs a third of a second in place of minutes, and no sample is shared with what the tests were made
+on. Each actuator works in two shifts of 8 h a day. Of these, `--minutes-a-day` in one piece, drawn anew for each day,
+are watched: time is compressed by that, and a delay is stated in watched hours too. Of the first day it is the first
+shift, over which the baseline is learned. The conductance is
 
     g(t) = g_0 4^((T - 20 K)/30 K) (1 + slow(t)),
 
 where the oil warms from 20 to 50 C with a time constant of 1 to 3 h each morning and cools at night, slow is an
-Ornstein-Uhlenbeck process of 3 % and 40 min, friction (dp) another of 10 % and 3 h. g_0 is drawn for 0.0004 to 0.003
-L/min of cold oil. The baseline is learned over the first 8 h. Nobody says when a leak begins; an alarm is false where
-none is there, and is dismissed as a person would.
+Ornstein-Uhlenbeck process of 3 % and 40 min, friction (dp) another of 10 % and 3 h, charge pressure a third of 20 % and
+6 h, and noise changes from one day to the next. g_0 is drawn for 0.0004 to 0.003 L/min of cold oil. Nobody says when a
+leak begins; an alarm is false where none is there, and is dismissed as a person would.
 
-With `--leaks` each actuator gets one leak after ten operating hours: steps of 0.002, 0.0042, 0.015 L/min, and a growth
-from 0 to 0.005 L/min in a week.
+Five of the actuators leak from the tenth day on: a growth from 0 to 0.005 L/min in a week, steps of 0.002, 0.0042 and
+0.015 L/min, and 0.0042 L/min past a rod seal to the outside (blocks of a recording with that fault).
+
+Each actuator is a row of `results/monitor_months.csv`; a second call goes on with those that are missing, and the sum
+over all rows with the same settings is printed.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import math
 import time
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy.special import gammaincinv
+from threadpoolctl import threadpool_limits
 
 import sealscope as ss
 from sealscope.diagnosis.volume_balance.blocks import I_AB, I_ROOT, BalanceBlocks, Y, balance_channels, block_samples
@@ -35,19 +44,47 @@ from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.diagnosis.volume_balance.growth import WARMEST
 from sealscope.units import LITRE_PER_MINUTE
 
+RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0
-STEPS = (0.002, 0.0042, 0.015)
-WEEK_LPM = 0.005
-ONSET_S = 10 * 3600.0
+LEARN_H = 8.0
+STEPS = {"step 0.002": 0.002, "step 0.0042": 0.0042, "step 0.015": 0.015}
+GROWTH, WEEK_LPM, OUTSIDE, OUTSIDE_LPM = "growth to 0.005 in a week", 0.005, "outside 0.0042", 0.0042
+KINDS = (GROWTH, *STEPS, OUTSIDE)
+#: The day on which leaks begin, in the midst of what is watched of it.
+ONSET_DAY = 10
+#: Charge pressures [MPa] and factors of the pressures' noise of the libraries.
+CHARGES, NOISES = (0.24, 0.3, 0.36), (1.0, 1.6)
+NOISE_PSI = {"p_A": 0.92829, "p_B": 1.26445}
+COLUMNS = (
+    *("seed", "actuator", "rate", "days", "minutes_a_day", "kind", "operating_hours", "false_alarms", "by_test"),
+    *("delay_h", "delay_watched_h", "test", "true_lpm", "stated_lpm", "stated_low_lpm", "stated_high_lpm"),
+)
+Libraries = dict[tuple[float, float] | str, list[BalanceBlocks]]
 
 
-def library(seed: int) -> tuple[ss.Recording, list[BalanceBlocks]]:
-    """Return a recording and its blocks, each with its own noise."""
-    recording = ss.simulate(command="3 sin(4t)", duration=1200.0, seed=seed).only(("x", "theta", "p_A", "p_B"))
-    detector = VolumeBalance(ss.load_rig("thesis"))
-    length = block_samples(recording.between(0.0, 60.0), 3.0)
-    blocks = detector.blocks(recording, length, balance_channels(recording))
-    return recording, [blocks.chosen(np.array([k])) for k in range(25, len(blocks))]
+def libraries(seed: int) -> tuple[ss.Recording, Libraries]:
+    """Return a recording, and blocks, each with its own noise, by charge pressure and noise, and of an outer leak."""
+    detector, made = VolumeBalance(ss.load_rig("thesis")), Libraries()
+    first = None
+    for number, key in enumerate([*((charge, noise) for charge in CHARGES for noise in NOISES), OUTSIDE]):
+        charge, noise = key if isinstance(key, tuple) else (CHARGES[1], NOISES[0])
+        recording = ss.simulate(
+            command="3 sin(4t)",
+            duration=1200.0,
+            seed=100 * seed + number,
+            set={
+                "makeup.check_valves": "present",  # else a leak to the outside empties the circuit
+                "p_charge": f"{charge} MPa",
+                **{f"sensors.{name}.noise": f"{noise * psi} psi" for name, psi in NOISE_PSI.items()},
+            },
+            fault=f"rod seal A {OUTSIDE_LPM} L/min" if key == OUTSIDE else None,
+        ).only(("x", "theta", "p_A", "p_B"))
+        first = first or recording
+        length = block_samples(recording.between(0.0, 60.0), 3.0)
+        blocks = detector.blocks(recording, length, balance_channels(recording))
+        made[key] = [blocks.chosen(np.array([k])) for k in range(25, len(blocks))]
+    assert first is not None
+    return first, made
 
 
 def changed(block: BalanceBlocks, t: float, g: float, friction: float) -> BalanceBlocks:
@@ -80,77 +117,145 @@ class Wander:
         return self.value
 
 
+def warmed(warm: float, seconds: float, tau: float) -> float:
+    """Return how warm the oil is, from 0 to 1, after so many seconds of work."""
+    return 1.0 - (1.0 - warm) * math.exp(-seconds / tau)
+
+
+class Life:
+    """One actuator over a month."""
+
+    def __init__(self, recording: ss.Recording, made: Libraries, chosen: argparse.Namespace, number: int) -> None:
+        self.random = np.random.default_rng([chosen.seed, number])
+        usual = made[CHARGES[1], NOISES[0]]
+        self.seconds = usual[0].seconds
+        self.flow = float(np.mean([block.abs_dp[0] for block in usual])) / LITRE_PER_MINUTE
+        self.made, self.chosen = made, chosen
+        self.kind = KINDS[number] if number < len(KINDS) else ""
+        self.watch = ss.watch("thesis", false_alarms_per_1000_h=chosen.rate, learn_hours=LEARN_H)
+        self.watch.update(recording.between(0.0, 61.0))
+        self.watch.dismiss()
+
+    def lpm(self, since: float) -> float:
+        """Return the leak at so many seconds since its onset."""
+        if since <= 0.0 or self.kind in ("", OUTSIDE):
+            return 0.0
+        return STEPS[self.kind] if self.kind in STEPS else min(1.0, since / (7 * DAY_S)) * WEEK_LPM
+
+    def lived(self) -> dict[str, object]:
+        """Return what happened."""
+        random, watch, flow = self.random, self.watch, self.flow
+        cold, tau = random.uniform(0.0004, 0.003) / flow, random.uniform(1.0, 3.0) * 3600.0
+        slow, friction = Wander(random, 0.03, 2400.0), Wander(random, 0.1, 3 * 3600.0)
+        charge, noise, warm, before = Wander(random, 0.2, 6 * 3600.0), NOISES[0], 0.0, 0.0
+        onset = math.inf
+        ran, leaked, false = 0.0, 0.0, Counter[str]()
+        for day in range(round(self.chosen.days)):
+            piece = 60.0 * self.chosen.minutes_a_day if day else 3600.0 * LEARN_H
+            start = day * DAY_S + (random.uniform(0.0, SHIFT_S - piece) if day else 0.0)
+            noise = NOISES[random.integers(len(NOISES))]
+            if day:
+                warm = math.exp((SHIFT_S - DAY_S) / tau) * warmed(warm, SHIFT_S - before % DAY_S, tau)
+            warm = warmed(warm, start % DAY_S, tau)
+            if day == ONSET_DAY:
+                onset = start + 0.5 * piece
+            for k in range(math.floor(piece / self.seconds)):
+                clock = start + k * self.seconds
+                passed = clock - before
+                if k:
+                    warm = warmed(warm, passed, tau)
+                before = clock
+                scaled = math.exp(friction.after(passed))
+                level = CHARGES[1] * (1.0 + charge.after(passed))
+                nearest = min(CHARGES, key=lambda value: abs(value - level))
+                outside = self.kind == OUTSIDE and clock > onset
+                blocks = self.made[OUTSIDE if outside else (nearest, noise)]
+                lpm = self.lpm(clock - onset)
+                g = cold * WARMEST**warm * (1.0 + slow.after(passed)) + lpm / flow
+                block = changed(blocks[random.integers(len(blocks))], 1000.0 + clock, g, scaled)
+                estimate = watch.judged(block, 1000.0 + clock + 0.5 * self.seconds)
+                leaked = ran if clock <= onset else leaked
+                ran += self.seconds
+                if watch.leak is None:
+                    continue
+                if self.kind and clock > onset:
+                    low, high = estimate.leak_interval_lpm or ("", "")
+                    return {
+                        **self.row(ran, false),
+                        "delay_h": (clock + self.seconds - onset) / 3600.0,
+                        "delay_watched_h": (ran - leaked) / 3600.0,
+                        "test": watch.leak.test,
+                        "true_lpm": OUTSIDE_LPM if outside else lpm * scaled,
+                        "stated_lpm": estimate.leak_lpm,
+                        "stated_low_lpm": low,
+                        "stated_high_lpm": high,
+                    }
+                false[watch.leak.test] += 1
+                watch.dismiss()
+        return self.row(ran, false)
+
+    def row(self, ran: float, false: Counter[str]) -> dict[str, object]:
+        """Return the columns of every actuator."""
+        tests = " ".join(f"{test}:{count}" for test, count in sorted(false.items()))
+        return {
+            "kind": self.kind or "healthy",
+            "operating_hours": f"{ran / 3600.0:.2f}",
+            "false_alarms": false.total(),
+            "by_test": tests,
+        }
+
+
 def main() -> None:
-    """Watch, and print the counts."""
+    """Watch, write a row an actuator, and print the sum."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--hours", type=float, default=300.0, help="operating hours of each actuator")
-    parser.add_argument("--actuators", type=int, default=4)
-    parser.add_argument("--rate", type=float, default=20.0, help="stated false alarms per 1000 h")
-    parser.add_argument("--minutes", type=float, default=8.0, help="no further actuator is begun after so long")
-    parser.add_argument("--leaks", action="store_true", help="each actuator gets a leak after ten hours")
+    parser.add_argument("--actuators", type=int, default=50)
+    parser.add_argument("--days", type=float, default=30.0)
+    parser.add_argument("--minutes-a-day", type=float, default=96.0, help="that are watched, of 16 hours of operation")
+    parser.add_argument("--rate", type=float, default=1.0, help="stated false alarms per 1000 h")
+    parser.add_argument("--stop-after", type=float, default=8.0, help="no actuator is begun after so many minutes")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    recording, blocks = library(chosen.seed)
-    flow = float(np.mean([block.abs_dp[0] for block in blocks])) / LITRE_PER_MINUTE
-    began, hours, false = time.monotonic(), 0.0, 0
-    by_test: dict[str, int] = {}
-    for number in range(chosen.actuators):
-        if time.monotonic() - began > 60.0 * chosen.minutes:
-            break
-        random = np.random.default_rng([chosen.seed, number])
-        cold = random.uniform(0.0004, 0.003) / flow
-        tau = random.uniform(1.0, 3.0) * 3600.0
-        slow, friction = Wander(random, 0.03, 2400.0), Wander(random, 0.1, 3 * 3600.0)
-        watch = ss.watch("thesis", false_alarms_per_1000_h=chosen.rate, learn_hours=8.0)
-        watch.update(recording.between(0.0, 61.0))
-        watch.dismiss()
-        seconds = blocks[0].seconds
-        day_s = warm = ran = 0.0
-        day, opened = 0, 0.0
-        kind = number % (len(STEPS) + 1)
-        while ran < chosen.hours * 3600.0:
-            day_s += seconds
-            if day_s > SHIFT_S:
-                day, day_s = day + 1, 0.0
-                warm *= math.exp(-(DAY_S - SHIFT_S) / tau)
-            ran += seconds
-            clock = 1000.0 + day * DAY_S + day_s
-            warm += (1.0 - warm) * (1.0 - math.exp(-seconds / tau))
-            g = cold * WARMEST**warm * (1.0 + slow.after(seconds))
-            lpm = 0.0
-            if chosen.leaks and ran > ONSET_S:
-                opened = opened or clock
-                since = clock - opened
-                lpm = STEPS[kind] if kind < len(STEPS) else min(1.0, since / (7 * DAY_S)) * WEEK_LPM
-            scaled = math.exp(friction.after(seconds))
-            block = changed(blocks[random.integers(len(blocks))], clock, g + lpm / flow, scaled)
-            estimate = watch.judged(block, clock + 0.5 * seconds)
-            if watch.leak is None:
-                continue
-            leak = watch.leak
-            if lpm > 0.0:
-                size = "no L/min" if leak.leak_lpm is None else f"{estimate.leak_lpm:.4f} L/min"
-                low, high = estimate.leak_interval_lpm or (math.nan, math.nan)
-                after = (clock - opened) / 3600.0
-                print(
-                    f"actuator {number}: true {lpm * scaled:.4f} L/min, alarm ({leak.test}) {after:.3f} h"
-                    f" after the onset, states {size} ({low:.4f} to {high:.4f})"
-                )
-                break
-            false += 1
-            by_test[leak.test] = by_test.get(leak.test, 0) + 1
-            watch.dismiss()
-        else:
-            if chosen.leaks:
-                print(f"actuator {number}: true {lpm:.4f} L/min at the end, no alarm")
-        hours += ran / 3600.0
-        print(f"actuator {number}: {ran / 3600:.0f} h, {false} false alarms so far {by_test}", flush=True)
+    same = {"rate": chosen.rate, "days": chosen.days, "minutes_a_day": chosen.minutes_a_day}
+    if not RESULTS.exists():
+        RESULTS.write_text(",".join(COLUMNS) + "\n")
+    with threadpool_limits(limits=1):
+        watch_all(chosen, same)
+    rows = [row for row in rows_of_results() if all(float(row[name]) == value for name, value in same.items())]
+    hours = sum(float(row["operating_hours"]) for row in rows)
+    false = sum(int(row["false_alarms"]) for row in rows)
     low = float(gammaincinv(false, 0.025)) if false else 0.0
     high = float(gammaincinv(false + 1, 0.975))
     print(
-        f"{false} false alarms in {hours:.0f} h: {1000 * false / hours:.2f} per 1000 h "
+        f"{len(rows)} actuators: {false} false alarms in {hours:.0f} h: {1000 * false / hours:.2f} per 1000 h "
         f"(95 %: {1000 * low / hours:.2f} to {1000 * high / hours:.2f}), stated {chosen.rate:g}"
     )
+
+
+def rows_of_results() -> list[dict[str, str]]:
+    """Return the rows that are written."""
+    with RESULTS.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def watch_all(chosen: argparse.Namespace, same: dict[str, float]) -> None:
+    """Watch the actuators that no row tells of yet."""
+    done = {
+        (int(row["seed"]), int(row["actuator"]))
+        for row in rows_of_results()
+        if all(float(row[name]) == value for name, value in same.items())
+    }
+    left = [number for number in range(chosen.actuators) if (chosen.seed, number) not in done]
+    if not left:
+        return
+    began = time.monotonic()
+    recording, made = libraries(chosen.seed)
+    for number in left:
+        if time.monotonic() - began > 60.0 * chosen.stop_after:
+            break
+        row = {"seed": chosen.seed, "actuator": number, **same, **Life(recording, made, chosen, number).lived()}
+        with RESULTS.open("a", newline="") as file:
+            csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n").writerow(row)
+        print(row, flush=True)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import os
+import re
+from importlib import import_module
 from importlib.metadata import version as version_of
 from pathlib import Path
+from types import ModuleType
 
 import typer.main
 from myst_nb.core import render
@@ -36,6 +41,14 @@ nb_merge_streams = True
 autodoc_typehints = "none"
 napoleon_google_docstring = False
 napoleon_use_rtype = False
+napoleon_preprocess_types = True
+
+# every type that a docstring names is a link, or one of these
+nitpicky = True
+_OUTSIDE = "array_like|callable|iterable|iterator|mapping|ndarray|path|path-like|sequence|JSON value"
+_OUTSIDE += "|pair|floats|two floats"  # `pair of floats`
+_OUTSIDE += r"|shape .*|(?:pandas|xarray|pathlib)\..*"
+nitpick_ignore_regex = [("py:class", f"(?:{_OUTSIDE})"), ("py:obj", "True|False")]
 
 os.environ.setdefault("COLUMNS", "84")  # of what commands print in the tutorials
 _GENERATED = Path(__file__).parent / "reference" / "generated"
@@ -72,15 +85,63 @@ def public_names() -> str:
     for name in sorted(set(sealscope.__all__) - {"__version__"}, key=str.lower):
         value = getattr(sealscope, name)
         kind = "autoclass" if isinstance(value, type) else "autofunction"
-        members = ["   :members:"] if kind == "autoclass" else []
-        home = f"{value.__module__}.{value.__qualname__}"
+        kind = "automodule" if isinstance(value, ModuleType) else kind
+        members = [] if kind == "autofunction" else ["   :members:"]
+        home = value.__name__ if kind == "automodule" else f"{value.__module__}.{value.__qualname__}"
         lines += [f"## {name}", "", "```{eval-rst}", f".. {kind}:: {home}", *members, "```", ""]
+    return "\n".join(lines)
+
+
+def _classes() -> dict[str, str]:
+    """Return the home of every public class of the package by its name."""
+    root = Path(sealscope.__file__).parent
+    homes = {}
+    for path in sorted(root.rglob("*.py")):
+        module = ".".join(("sealscope", *path.relative_to(root).with_suffix("").parts)).removesuffix(".__init__")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes[node.name] = f"{module}.{node.name}"
+    return homes
+
+
+def _docstrings(value: object) -> list[str]:
+    """Return the docstring of a public name, and those of the members of a class or a module."""
+    members = vars(value).values() if isinstance(value, type | ModuleType) else ()
+    inner = [getattr(member, "__func__", member) for member in members]
+    return [inspect.getdoc(own) or "" for own in (value, *(own for own in inner if callable(own)))]
+
+
+def types() -> list[str]:
+    """Return the homes of the classes that are no public names, and that parameters, results or errors are of."""
+    homes = _classes()
+    shown = {name: getattr(sealscope, name) for name in sealscope.__all__}
+    modules = {name for name, value in shown.items() if isinstance(value, ModuleType)}  # show their own classes
+    waiting, found = list(shown.values()), {}
+    while waiting:
+        for text in _docstrings(waiting.pop()):
+            stated = re.findall(r"^[\w*, ]+ : (.*)|^(\w[\w ,.]*)$(?=\n {4}\S)", text, re.MULTILINE)
+            names = set(re.findall(r"(?<![.\w])[A-Z]\w+", " ".join(map(" ".join, stated)))) & homes.keys()
+            for name in sorted(names - shown.keys() - found.keys()):
+                module, _, own = homes[name].rpartition(".")
+                found[name] = homes[name]
+                waiting.append(getattr(import_module(module), own))
+    return [found[name] for name in sorted(found) if found[name].split(".")[1] not in modules]
+
+
+napoleon_type_aliases = {name: f"~{home}" for name, home in _classes().items()}
+
+
+def type_reference() -> str:
+    """Return the reference of the types that public names take, return or raise."""
+    lines = ["# Types", "", "What public names take, return and raise, beside one another.", ""]
+    for home in types():
+        lines += [f"## {home.rpartition('.')[2]}", "", "```{eval-rst}", f".. autoclass:: {home}", "```", ""]
     return "\n".join(lines)
 
 
 def _write(_app: object) -> None:
     _GENERATED.mkdir(exist_ok=True)
-    for name, text in (("cli.md", command_line()), ("api.md", public_names())):
+    for name, text in (("cli.md", command_line()), ("api.md", public_names()), ("types.md", type_reference())):
         (_GENERATED / name).write_text(text, encoding="utf-8")
 
 

@@ -132,3 +132,20 @@ def test_prose_wraps_at_120_columns() -> None:
                 long.append(f"{page.relative_to(root)}:{number}")
     assert len(pages) > 10
     assert long == []
+
+
+#: Most lines of a decision record: a page. Longer tables stand in `docs/notes` and `docs/results.md`.
+PAGE = 60
+DECISIONS = sorted((ROOT / "docs" / "decisions").glob("0*.md"))
+
+
+@pytest.mark.parametrize("path", DECISIONS, ids=lambda path: path.stem)
+def test_a_decision_is_a_page(path):
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= PAGE
+    assert lines[0].startswith(f"# {int(path.stem[:4])}. ")
+    assert any(re.match(r"(?:\*\*|## )(?:Decision|Choice)\b", line) for line in lines)
+
+
+def test_decisions_are_numbered_without_gaps():
+    assert [int(path.stem[:4]) for path in DECISIONS] == list(range(1, len(DECISIONS) + 1))

@@ -1,4 +1,4 @@
-"""The public names: each is there and documents every parameter, and its examples are true."""
+"""The public names: each documents every parameter and shows an example, and all examples are true."""
 
 from __future__ import annotations
 
@@ -10,7 +10,20 @@ import pytest
 
 import sealscope as ss
 
-PUBLIC = sorted(set(ss.__all__) - {"__version__"})
+
+def public() -> dict[str, object]:
+    """Public names and their values; the functions of a public module stand beside it."""
+    values = {name: getattr(ss, name) for name in ss.__all__ if name != "__version__"}
+    for name, module in list(values.items()):
+        if inspect.ismodule(module):
+            functions = inspect.getmembers(module, inspect.isfunction)
+            own = {member: value for member, value in functions if value.__module__ == module.__name__}
+            values |= {f"{name}.{member}": value for member, value in own.items() if not member.startswith("_")}
+    return values
+
+
+VALUES = public()
+PUBLIC = sorted(VALUES)
 
 
 def section(docstring: str, title: str) -> str:
@@ -27,24 +40,38 @@ def documented(docstring: str) -> list[str]:
 
 @pytest.mark.parametrize("name", PUBLIC)
 def test_every_parameter_and_result_is_documented(name):
-    value = getattr(ss, name)
+    value = VALUES[name]
     docstring = inspect.getdoc(value) or ""
     assert docstring.splitlines()[0].endswith(".")
-    if inspect.isclass(value) or not callable(value):
-        return
-    assert documented(docstring) == list(inspect.signature(value).parameters)
-    returns = inspect.signature(value).return_annotation
-    assert bool(section(docstring, "Returns")) == (returns not in (None, "None"))
+    if inspect.isclass(value):
+        lineage = [inspect.cleandoc(ancestor.__doc__ or "") for ancestor in value.__mro__[:-1]]
+        described = {parameter for text in lineage for parameter in documented(text)}
+        assert set(inspect.signature(value).parameters) - described == set()
+    elif callable(value):
+        assert documented(docstring) == list(inspect.signature(value).parameters)
+        returns = inspect.signature(value).return_annotation
+        assert bool(section(docstring, "Returns") or section(docstring, "Yields")) == (returns not in (None, "None"))
+
+
+@pytest.mark.parametrize("name", [name for name in PUBLIC if inspect.isclass(VALUES[name])])
+def test_every_public_member_of_a_class_is_documented(name):
+    value = VALUES[name]
+    members = {
+        member: inspect.getdoc(getattr(value, member))
+        for member, own in vars(value).items()
+        if not member.startswith("_") and (callable(own) or isinstance(own, property | classmethod | staticmethod))
+    }
+    assert [member for member, text in members.items() if not text] == []
 
 
 @pytest.mark.parametrize("name", PUBLIC)
 def test_the_examples_are_true(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    value = getattr(ss, name)
-    examples = doctest.DocTestFinder(recurse=False).find(value, name, globs={})
+    value = VALUES[name]
+    examples = doctest.DocTestFinder(recurse=inspect.isclass(value)).find(value, name, globs={})
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
     for example in examples:
         runner.run(example)
     assert runner.summarize(verbose=False).failed == 0
-    if inspect.isfunction(value):
-        assert sum(len(example.examples) for example in examples) > 0
+    # a class shows in its own docstring how it is used, whatever its methods show
+    assert sum(len(example.examples) for example in examples if example.name == name) > 0

@@ -11,16 +11,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sealscope import datasets
     from sealscope.diagnosis.diagnose import diagnose
     from sealscope.diagnosis.fleet.fleet import Fleet
     from sealscope.diagnosis.trend.trend import Trend, trend
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.diagnosis.volume_balance.stream import SequentialBalance
-    from sealscope.fmu.build import write_fmu
+    from sealscope.fmu.build import write_fmu, write_sensor_fmu
     from sealscope.fmu.recording import record_fmu
     from sealscope.monitor.stream.watch import Watch, watch
     from sealscope.parameters import Rig, load_rig
-    from sealscope.recordings import Recording, inspect, read, write
+    from sealscope.recordings import Recording, inspect, read, read_parts, write
     from sealscope.reporting import write_page
     from sealscope.signals.streams import DetailStream
     from sealscope.signals.windows import RmsStream
@@ -44,6 +45,7 @@ _HOMES = {
     "load_rig": "parameters",
     "prove": "simulation.simulate",
     "read": "recordings",
+    "read_parts": "recordings",
     "record_fmu": "fmu.recording",
     "simulate": "simulation.simulate",
     "simulate_batch": "simulation.batch.batch",
@@ -52,6 +54,7 @@ _HOMES = {
     "watch": "monitor.stream.watch",
     "write": "recordings",
     "write_fmu": "fmu.build",
+    "write_sensor_fmu": "fmu.build",
     "write_page": "reporting",
 }
 
@@ -67,11 +70,13 @@ __all__ = [
     "Trend",
     "Watch",
     "__version__",
+    "datasets",
     "diagnose",
     "inspect",
     "load_rig",
     "prove",
     "read",
+    "read_parts",
     "record_fmu",
     "simulate",
     "simulate_batch",
@@ -81,6 +86,7 @@ __all__ = [
     "write",
     "write_fmu",
     "write_page",
+    "write_sensor_fmu",
 ]
 
 
@@ -89,6 +95,8 @@ def _load(name: str) -> Any:
         from importlib.metadata import version
 
         return version("sealscope")
+    if name == "datasets":
+        return import_module("sealscope.datasets")
     if name in _HOMES:
         return getattr(import_module(f"sealscope.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -22,7 +22,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
@@ -30,6 +30,8 @@ from typing import Any, TypeVar
 import numba
 from numba.core import config
 from numba.core.caching import FunctionCache
+from numba.core.registry import CPUDispatcher
+from numba.extending import intrinsic
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _COMPILED_ROOMS = ("compiled.py", "physics", "signals", "simulation", "diagnosis")
@@ -148,10 +150,10 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             _log.debug("cannot save compiled code in %s: %s", self.cache_path, error)
 
 
-def kernel(function: _F) -> _F:
+def kernel(function: _F, fastmath: Any = False) -> _F:
     """Compile `function` (no Python objects, GIL released) with the safe cache; errors in floats follow IEEE 754."""
     directory = cache_directory()
-    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+    dispatcher = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=fastmath)(function)
     if directory is None:
         return dispatcher  # type: ignore[no-any-return]
     # numba reads the folder when the decorator runs; other users of numba in this process keep theirs. Two threads that
@@ -168,9 +170,37 @@ def kernel(function: _F) -> _F:
     return dispatcher  # type: ignore[no-any-return]
 
 
+class _Law(CPUDispatcher):  # type: ignore[misc]
+    """A function that other compiled functions take in whole: made without the code by which Python calls it.
+
+    That code unpacks and checks each argument and takes more time to make than the law itself. A law called from Python
+    after all is compiled a second time, as a kernel is.
+    """
+
+    def add_overload(self, cres: Any) -> None:
+        """Keep compiled code for other compiled functions; nothing that Python could call."""
+        self.overloads[tuple(cres.signature.args)] = cres
+
+    @cached_property
+    def _for_python(self) -> Any:
+        return kernel(self.py_func, self.targetoptions["fastmath"])
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """Call from Python."""
+        return self._for_python(*arguments, **named)
+
+
+def _law(function: _F, fastmath: Any) -> _F:
+    if config.DISABLE_JIT:
+        return function
+    options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": True}
+    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return _Law(function, targetoptions=options)  # type: ignore[return-value]
+
+
 def law(function: _F) -> _F:
     """Compile a small law that only other compiled functions call: inlined there, cached with them, never alone."""
-    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)  # type: ignore[no-any-return]
+    return _law(function, False)
 
 
 def contracted(function: _F) -> _F:
@@ -179,7 +209,21 @@ def contracted(function: _F) -> _F:
     Divisions by what does not change may become products. Last digits depend on the processor, never on the block or
     the lane.
     """
-    return numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "arcp"}, forceinline=True)(function)  # type: ignore[no-any-return]
+    return _law(function, {"contract", "arcp"})
+
+
+@intrinsic  # type: ignore[misc]
+def pointer_at(context: Any, pointer: Any, offset: Any) -> Any:
+    """Return the pointer to the double `offset` places behind that of `pointer`, in code for `plain_code`.
+
+    With `numba.carray` it makes arrays of parts of a block of numbers without counting of references.
+    """
+
+    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        double = target.get_value_type(numba.float64)
+        return builder.gep(values[0], [values[1]], source_etype=double)
+
+    return pointer(pointer, numba.int64), generate
 
 
 def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]:
@@ -194,7 +238,7 @@ def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]
         function
     )
     (compiled,) = dispatcher.overloads.values()
-    text = compiled.library.get_llvm_str()
+    text = dispatcher.inspect_llvm(compiled.signature.args)
     # numba's counting of references comes with every module; nothing calls it here, and it is for one processor only
     text = re.sub(r"^define linkonce_odr void @NRT_decref\(.*?^}\n", "", text, flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r"^declare .* @(NRT_MemInfo_call_dtor|llvm\.x86\.[\w.]+)\(.*\n", "", text, flags=re.MULTILINE)

@@ -19,13 +19,20 @@ from sealscope.errors import InputError
 DRAWN = {
     "a90-bench": "5c64ff06f5c84936",
     "a90-still": "0e044672371d0c85",
+    "bench-closed-loop": "c4c952f2f6132e55",
+    "bench-closed-loop-development": "f7ad3aaaab8b6493",
     "bench-detectors": "c14436aede0a4bfe",
     "bench-faults": "fe66e262367aaedd",
+    "bench-load": "8f873b29dd0e4b27",
+    "bench-load-development": "e4d8a6226d020574",
     "bench-pressures": "a725a60b2a529fb9",
     "bench-quick": "5e2c6ad77f0da6f0",
+    "bench-single-rod": "7ed0e63b533648d9",
+    "bench-single-rod-development": "fad6b4d692c86f36",
     "bench-strangers": "f4613fe47fdbe6c2",
     "bench-strangers-development": "778e5fc7b49f54f0",
     "bench-thesis": "e034193cb0b6574f",
+    "bench-valve": "c2065dbf8536fac1",
     "bench-volume": "afca12e9d27e4824",
 }
 

@@ -54,6 +54,12 @@ def test_start_keeps_the_widest_sweep_off_the_caps(rig: Rig) -> None:
     assert -0.3 < experiment.x_0 < -0.15
     assert np.abs(simulate_with_truth(experiment).truth.outputs["x"]).max() < 0.28
     assert experiment_for(rig, "8 sin(t)", 20.0, 0.01).x_0 == 0.01
+    with pytest.raises(InputError, match=r"a prediction must be of a pump-controlled rig .* got servo-valve"):
+        experiment_for(load_rig("servo-valve"), "8 sin(t)", 20.0)
+    with pytest.raises(
+        InputError, match=r"a prediction must be of a command in volts .* got a target \(position 20 mm"
+    ):
+        experiment_for(rig, "position 20 mm sin(2t)", 20.0)
 
 
 def test_throttles_are_told_in_words(rig: Rig) -> None:

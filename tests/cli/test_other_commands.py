@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
+import shutil
+import sys
 from importlib.metadata import version
 
 import numpy as np
@@ -147,6 +150,40 @@ def test_the_shell_s_script_calls_the_command_back(shell):
     done = shell("sealscope", _SEALSCOPE_COMPLETE="source_bash")
     assert "complete_bash" in done.out
     assert re.search(r"^complete .* sealscope$", done.out, re.MULTILINE)
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+def test_bash_completes_with_the_script_that_is_shown(shell, tmp_path):
+    """As a person presses Tab: bash evaluates what `--show-completion` prints, and calls the function it registers."""
+    command = tmp_path / "sealscope"
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m sealscope "$@"\n')
+    command.chmod(0o755)
+    script = """
+        eval "$(sealscope --show-completion)"
+        pressed() {
+            COMP_WORDS=("$@") COMP_CWORD=$(($# - 1))
+            COMPREPLY=()
+            $(complete -p sealscope | sed 's/.*-F \\([^ ]*\\) .*/\\1/') sealscope
+            echo "${COMPREPLY[*]}"
+        }
+        pressed sealscope diag
+        pressed sealscope simulate --rig thesis-
+        pressed sealscope datasets zem
+    """
+    done = shell("bash", "-c", script, PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    assert (done.status, done.err) == (0, "")
+    first, second, third = done.out.splitlines()
+    assert (first, third) == ("diagnose", "zema-hydraulic")
+    assert "thesis-calibrated" in second.split()
+
+
+@pytest.mark.parametrize("kind", ["zsh", "fish"])
+def test_other_shells_are_answered(kind, shell):
+    asked = {"_TYPER_COMPLETE_ARGS": "sealscope dem", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    done = shell("sealscope", _SEALSCOPE_COMPLETE=f"complete_{kind}", **asked)
+    assert done.err == ""
+    assert "demo" in done.out
+    assert "diagnose" not in done.out
 
 
 def test_inspect_shows_what_a_foreign_file_holds_and_what_is_wrong(call, tmp_path):

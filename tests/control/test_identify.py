@@ -89,6 +89,7 @@ def test_a_rig_s_file_is_written_with_intervals_as_sources(recording, tmp_path):
     assert "# not told: pump.q_b" in path.read_text()
 
 
+@pytest.mark.slow
 def test_another_kind_of_machine_is_said(recording):
     words = {"command": "position 60 mm sin(0.9t)", "duration": 15.0}
     single = identify([ss.simulate(rig="thesis-closed-loop", **words)], "single-rod-eha")

@@ -55,6 +55,7 @@ def test_a_delay_within_the_margin_takes_its_share_of_the_phase():
     assert m.delay - later.delay == pytest.approx(samples / PI.rate, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_tolerance_costs_no_margin_without_a_leak_and_little_with_one():
     assert margins(RIG, FaultTolerant.of(RIG), 0.02) == margins(RIG, PI, 0.02)
     with_one = margins(RIG, FaultTolerant.of(RIG, known=2.6e-12), 0.02)

@@ -63,7 +63,7 @@ def test_swapped_chambers_are_no_leak_and_nothing_is_written(names: tuple[str, .
     assert tuple(capfd.readouterr()) == ("", "")
 
 
-@pytest.mark.parametrize("names", [CHAMBERS, ("u", *CHAMBERS)])
+@pytest.mark.parametrize("names", [CHAMBERS, pytest.param(("u", *CHAMBERS), marks=pytest.mark.slow)])
 def test_a_leak_is_still_found(names: tuple[str, ...], records) -> None:  # type: ignore[no-untyped-def]
     leaking = records(1, leak="0.05 L/min from 61 s", duration=120.0, throttled=True)
     assert diagnose(leaking.only(names)).verdict == "leak"
@@ -110,3 +110,6 @@ def test_from_three_baseline_recordings_on_their_scatter_counts(records) -> None
     hum = signatures(OTHERS["hum"][0](own))
     assert hum is not None
     assert unlike(seen, [hum] * 3) is not None
+    little = replace(seen, hum=seen.hum + 0.85)  # too little in either chamber, but it is in both
+    assert "hum of 50 Hz in both" in unlike(seen, [little] * 3).text
+    assert unlike(seen, [replace(seen, hum=seen.hum + np.array([0.85, 0.0])[None, :, None])] * 3) is None

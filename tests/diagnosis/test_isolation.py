@@ -10,7 +10,7 @@ import pytest
 
 from sealscope.diagnosis import registry
 from sealscope.diagnosis.diagnose import Examination, diagnose
-from sealscope.diagnosis.isolation import isolated, lag_step, other_cause, signatures, unasked
+from sealscope.diagnosis.isolation import elsewhere, isolated, lag_step, other_cause, signatures, unasked
 from sealscope.diagnosis.verdict.diagnosis import next_check
 from sealscope.diagnosis.verdict.evidence import Evidence, Passage
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
@@ -49,6 +49,44 @@ def made(
         "p_B": drift - 0.5 * swing - ring + mean_B * late + noise[1],
     }
     return Recording(t, channels, CHANNEL_UNITS, RATE)
+
+
+def uncovered() -> Recording:
+    """A ringing of 62 Hz that a leak damps at `ONSET`, and hum of 60 Hz in p_A all along."""
+    bare = made(ringing=0.0)
+    late = bare.t >= ONSET
+    ring = np.exp(-8.0 * np.mod(bare.t, np.pi / 4.0)) * np.sin(2 * np.pi * 62.0 * np.mod(bare.t, np.pi / 4.0))
+    ring *= np.where(late, 0.05, 1.0) * 1e5
+    hum = 4e3 * np.sin(2 * np.pi * 60.0 * bare.t)
+    return replace(bare, channels={**bare.channels, "p_A": bare["p_A"] + ring + hum, "p_B": bare["p_B"] - ring})
+
+
+def test_hum_that_a_leak_uncovers_did_not_begin() -> None:
+    """A leak that damps a ringing beside the mains makes hum stand out that was there all along."""
+    seen = signatures(uncovered())
+    assert seen is not None
+    before, after = (float(seen.hum[half, 0, 1].mean()) for half in (seen.t < ONSET, seen.t > ONSET))
+    assert after - before > 1.5
+    assert isolated(FOUND, seen).verdict == "leak"
+
+
+@pytest.mark.parametrize("omega", [0.25, 0.3])
+def test_a_load_that_swings_slowly_is_no_swapped_sensor(omega: float) -> None:
+    """The pressure difference falls in one block and rises in the next where the load turns: it was called a swap."""
+    bare = made()
+    pushed = 4e5 * np.sin(omega * bare.t)
+    loaded = replace(bare, channels={**bare.channels, "p_A": bare["p_A"] + pushed, "p_B": bare["p_B"] - pushed})
+    seen = signatures(loaded)
+    assert seen is not None
+    assert elsewhere(seen) is None
+    half = len(bare) // 2
+    swapped = {
+        name: np.concatenate([loaded[name][:half], loaded[other][half:]])
+        for name, other in (("p_A", "p_B"), ("p_B", "p_A"))
+    }
+    seen = signatures(replace(loaded, channels={**loaded.channels, **swapped}))
+    assert seen is not None
+    assert elsewhere(seen) is not None
 
 
 def cause_of(recording: Recording, onset: float = ONSET) -> str | None:
@@ -283,12 +321,22 @@ def test_simulated_faults(words: str, cause: str | None, command: str) -> None:
         assert cause_of(recording.only(["u", "p_A", "p_B"]), onset) == cause
 
 
+def test_air_is_asked_for_beside_a_large_leak_too() -> None:
+    """With 2 % of air a leak was told at z = 230: the machine that is weighed against it knows no such oil."""
+    from sealscope.diagnosis.pressure_model.detector import _WEIGHED
+
+    leak = Evidence("leak", "rose", 230.0, 3.3, 60.0, (59.0, 61.0), cause="piston or pump leak", weighed=_WEIGHED)
+    for words, cause in (("air 2 %", "air in the oil"), ("0.4 L/min", "piston or pump leak")):
+        recording = simulated(words, "3 sin(4t)").only(["u", "p_A", "p_B"])
+        assert isolated(leak, signatures(recording)).cause == cause
+
+
 @pytest.mark.parametrize(
     ("words", "cause"),
     [
         ("rod seal A 0.01 L/min", "external leak"),
         ("friction +20 %", "friction change"),
-        ("air 1 %", "air in the oil"),
+        pytest.param("air 1 %", "air in the oil", marks=pytest.mark.slow),
         ("sensor p_A offset 5 psi", "sensor fault"),
         ("duty amplitude x1.1", "changed duty"),
     ],

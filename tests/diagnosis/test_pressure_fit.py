@@ -47,7 +47,7 @@ def truth_of(rig: Rig) -> np.ndarray:
 
 def driven(rig: Rig, u: np.ndarray, slope: np.ndarray, h: float, every: int) -> DrivenModel:
     """The model in mid-stroke under a command and its slope at every half step."""
-    return DrivenModel(np.column_stack([u, slope, np.zeros((u.size, 2))]), h, every, assumed_numbers(rig))
+    return DrivenModel(np.column_stack([u, slope, np.zeros((u.size, 3))]), h, every, assumed_numbers(rig))
 
 
 def followed(rig: Rig, recording: Recording) -> Followed:

@@ -101,8 +101,7 @@ def without_time(stroke: Recording) -> Recording:
 @pytest.mark.parametrize(
     ("name", "times", "every"),
     [
-        (SESSIONS[1], True, 2),
-        pytest.param(SESSIONS[0], False, 6, marks=pytest.mark.slow),
+        (SESSIONS[1], True, 3),
         pytest.param(SESSIONS[0], False, 2, marks=pytest.mark.slow),
         pytest.param(SESSIONS[1], False, 2, marks=pytest.mark.slow),
         pytest.param(SESSIONS[0], True, 2, marks=pytest.mark.slow),
@@ -114,7 +113,7 @@ def test_later_strokes_of_a_session_are_no_leak(
     """The first 20 strokes as baseline: 43 % of the later ones were `leak` while strokes counted as exchangeable."""
     strokes = sessions[name] if times else [without_time(one) for one in sessions[name]]
     verdicts = Counter(diagnose(stroke, strokes[:20]).verdict for stroke in strokes[20::every])
-    assert verdicts["leak"] <= 1  # of 42, or 14
+    assert verdicts["leak"] <= 1  # of 42 or 28
     assert (verdicts["no leak"] > 10) == times  # nothing is said to be healthy where the session is not known
 
 
@@ -123,7 +122,7 @@ def test_another_healthy_specimen_is_no_leak(times: bool, sessions: dict[str, li
     """75 % of the strokes of one specimen were `leak` against the other, with no word of another machine."""
     for name, other in (SESSIONS, SESSIONS[::-1]):
         baseline = sessions[name] if times else [without_time(one) for one in sessions[name]]
-        for stroke in sessions[other][::12]:
+        for stroke in sessions[other][::24]:
             found = diagnose(stroke if times else without_time(stroke), baseline)
             assert found.verdict == "cannot tell"
             assert any(reason in found.reason for reason in ("another machine", "cannot be trusted", "pressure level"))

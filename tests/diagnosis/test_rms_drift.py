@@ -3,11 +3,13 @@ drift and do not leak."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sealscope.diagnosis.rms_change.blocks import QUANTITIES, RmsBlocks, excess
-from sealscope.diagnosis.rms_change.detector import within
+from sealscope.diagnosis.rms_change.detector import RmsChange, within
 from sealscope.diagnosis.rms_change.drift import (
     LEAST_SHARE,
     MACHINE_WANDER,
@@ -17,6 +19,10 @@ from sealscope.diagnosis.rms_change.drift import (
     drift_of,
     own_shares,
 )
+from sealscope.simulation.bench.machines import draw
+from sealscope.simulation.commands import parse_command
+from sealscope.simulation.courses import parse_force
+from sealscope.simulation.simulate import simulate, simulate_with_truth
 
 BLOCK = 1.5
 #: Deviation of a block's log RMS of d1..d4 and d3d4 where it is white noise at 500 Hz.
@@ -116,7 +122,31 @@ def test_a_machine_that_drifts_and_does_not_leak_is_not_called_leaky() -> None:
     assert verdicts.count("leak") <= 5  # of 16 at 10 %: more has a probability of 0.3 %
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [103, 107])
+def test_a_loaded_machine_that_wanders_is_not_called_leaky(seed: int) -> None:
+    """Under 800 N the ringing follows friction twice as much as it does unloaded; both were called a leak."""
+    machine = replace(draw("load", seed, rig="thesis-closed-loop", duration=120.0), command=parse_command("5 sin(2t)"))
+    run = simulate_with_truth(machine.experiment(load=parse_force("800 N")))
+    evidence = RmsChange().examine(run.recording.only(["u", "p_A", "p_B"]), (), 0.01)
+    assert evidence.verdict == "cannot tell"
+    assert "wander 4 times as much as those of a healthy machine" in evidence.reason
+
+
 def test_a_leak_is_found_beside_that_drift() -> None:
     random = np.random.default_rng(6)
     verdicts = [within(drifting(random, leak=0.5), 0.1).verdict for _ in range(6)]
     assert verdicts.count("leak") >= 5
+
+
+@pytest.mark.parametrize("rate", [100.0, 200.0])
+def test_a_rate_that_does_not_show_the_ringing_shows_no_absence_of_a_leak(rate: float) -> None:
+    """0.5 L/min read `no leak` in 2 of 6 records at 100 Hz, 5 of 6 at 200 Hz: details follow the strokes there."""
+    record = {"command": "8 sin(t)", "rate": rate, "duration": "60 s", "seed": 1}
+    for leak in ("0.5 L/min from 30 s", ()):
+        recording = simulate(**record, leak=leak).only(["u", "p_A", "p_B"])
+        own = RmsChange().examine(recording, [], 0.01)
+        assert own.verdict == "cannot tell"
+        assert own.score is not None and own.threshold is not None
+        if own.score < own.threshold:
+            assert f"at {rate:g} Hz the details end at {rate / 4:g} Hz" in own.reason

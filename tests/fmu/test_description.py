@@ -61,6 +61,10 @@ def test_references_and_names_are_unique_and_outputs_are_listed(describe):
         ({"platforms": ["amiga"]}, "a platform of FMI 2 must be one of linux, windows, macos, got 'amiga'"),
         ({"platforms": ["macos-arm"]}, "a platform of FMI 2 must be one of linux, windows, macos, got 'macos-arm'"),
         ({"step": 0.0}, "step must be > 0 s, got 0.0"),
+        (
+            {"rig": "servo-valve"},
+            "a unit must be of a pump-controlled rig (valve.spool = absent), got servo-valve",
+        ),
     ],
 )
 def test_wrong_options_are_one_line_and_write_nothing(tmp_path, monkeypatch, options, rule):

@@ -6,6 +6,7 @@ import ctypes
 import shutil
 import subprocess
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -233,8 +234,8 @@ int main(int argc, char **argv) {
     void *library = dlopen(argv[1], RTLD_NOW);
     fmi2CallbackFunctions calls = {logger, calloc, free, NULL, NULL};
     fmi2ValueReference u = atoi(argv[3]), outputs[2] = {atoi(argv[4]), atoi(argv[5])};
-    fmi2Real volts = 3.0, values[2];
-    int k;
+    fmi2Real volts = atof(argv[6]), span = atof(argv[7]), values[2];
+    int k, steps = atoi(argv[8]);
     (void)argc;
     if (!library) return 1;
     TAKE(make, fmi2Instantiate)
@@ -248,8 +249,8 @@ int main(int argc, char **argv) {
     fmi2Component c = make("c", fmi2CoSimulation, argv[2], "", &calls, fmi2False, fmi2False);
     if (!c) return 2;
     if (setup(c, fmi2False, 0, 0, fmi2False, 0) || enter(c) || leave(c) || set(c, &u, 1, &volts)) return 3;
-    for (k = 0; k < 1000; k++)
-        if (step(c, k * 1e-3, 1e-3, fmi2True)) return 4;
+    for (k = 0; k < steps; k++)
+        if (step(c, k * span, span, fmi2True)) return 4;
     if (get(c, outputs, 2, values)) return 5;
     printf("%.17g %.17g\n", values[0], values[1]);
     volts = 0.0 / 0.0;
@@ -263,34 +264,47 @@ int main(int argc, char **argv) {
 @pytest.mark.skipif(
     shutil.which("gcc") is None or this_platform() != "linux", reason="a master in C needs gcc on Linux"
 )
-def test_a_master_in_c_runs_the_unit(folder, tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "given", "value", "span", "steps", "outputs"),
+    [
+        ("machine", "u", 3.0, 1e-3, 1000, ("p_A", "x")),
+        ("sensor", "p_A", 1e5, 2e-3, 20_000, ("conductance", "misfit")),
+    ],
+)
+def test_a_master_in_c_runs_the_unit(kind, given, value, span, steps, outputs, folder, tmp_path):
     path = folder / "c.fmu"
-    ss.write_fmu(path, step=5e-4)
-    unit = Unit(path, 2).start(u=3.0)
-    for k in range(1000):
-        unit.step(k * 1e-3, 1e-3)
+    if kind == "machine":
+        ss.write_fmu(path, step=5e-4)
+    else:
+        ss.write_sensor_fmu(path)
+    unit = Unit(path, 2).start(**{given: value})
+    for k in range(steps):
+        unit.step(k * span, span)
     place = fmpy.extract(str(path))
     (tmp_path / "master.c").write_text(MASTER)
     headers = f"-I{place}/sources/headers"
     subprocess.run(["gcc", headers, tmp_path / "master.c", "-ldl", "-o", tmp_path / "master"], check=True, timeout=60)
-    references = [str(unit.references[name]) for name in ("u", "p_A", "x")]
+    references = [str(unit.references[name]) for name in (given, *outputs)]
+    call = [tmp_path / "master", f"{place}/binaries/linux64/c.so", unit.description.guid, *references]
     done = subprocess.run(
-        [tmp_path / "master", f"{place}/binaries/linux64/c.so", unit.description.guid, *references],
-        capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
+        [*call, repr(value), repr(span), str(steps)], capture_output=True, text=True, timeout=60, check=True
+    )
     numbers, refusal = done.stdout.splitlines()
-    assert [float(word) for word in numbers.split()] == list(unit.get("p_A", "x"))
+    ours = [float(word) for word in numbers.split()]
+    assert ours == list(unit.get(*outputs))
+    assert any(ours)
     assert refusal.startswith("c: a value must be finite")
     unit.free()
 
 
 @pytest.mark.skipif(not compiler()[1], reason="other systems need the compiler of pip install 'sealscope[fmu]'")
-def test_units_are_built_for_other_systems(folder):
+@pytest.mark.parametrize("write", [partial(ss.write_fmu, step=5e-4), partial(ss.write_sensor_fmu, sensor="command")])
+def test_units_are_built_for_other_systems(write, folder):
     import zipfile
 
     marks = {"linux": b"\x7fELF", "linux-arm": b"\x7fELF", "windows": b"MZ", "macos": b"\xcf\xfa\xed\xfe"}
     path = folder / "all.fmu"
-    ss.write_fmu(path, fmi=3, platforms=list(PLATFORMS), step=5e-4)
+    write(path, fmi=3, platforms=list(PLATFORMS))
     with zipfile.ZipFile(path) as archive:
         for name, platform in PLATFORMS.items():
             library = archive.read(f"binaries/{platform.folders[3]}/all{platform.suffix}")

@@ -13,23 +13,22 @@ import traceback
 import warnings
 from pathlib import Path
 
-from .runs import attack, peak_memory
-from .targets import TARGETS
+from .runs import KINDS, attack, peak_memory
 
 
 def main() -> None:
     words = argparse.ArgumentParser(description=__doc__)
-    words.add_argument("kinds", nargs="*", help=f"some of: {', '.join(TARGETS)}")
-    words.add_argument("--seconds", type=float, default=600.0, help="processor time for all kinds together")
+    words.add_argument("kinds", nargs="*", help=f"some of: {', '.join(KINDS)}")
+    words.add_argument("--seconds", type=float, default=600.0, help="time for all kinds together")
     words.add_argument("--seed", type=int, default=1)
     given = words.parse_args()
     warnings.simplefilter("ignore")
-    kinds = given.kinds or list(TARGETS)
+    kinds = given.kinds or list(KINDS)
     escapes, here = 0, Path.cwd()
     for kind in kinds:
         with tempfile.TemporaryDirectory() as name:
             before = peak_memory()
-            until = time.process_time() + given.seconds / len(kinds)
+            until = time.perf_counter() + given.seconds / len(kinds)
             first = given.seed * 10**9
             count = attack(kind, Path(name), range(first, first + 10**8), until, stop=False)
             more = (peak_memory() - before) / 1e6

@@ -9,8 +9,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from .recordings import RECORDINGS
 from .targets import TARGETS
 
+#: What can be attacked: kind -> what makes, in a folder, the use of an input.
+KINDS = TARGETS | RECORDINGS
 #: Longest time that an input may take [s of this process], and most memory [bytes] that all of them may add.
 LONGEST, MOST_MEMORY = 2.0, 1e9
 
@@ -31,12 +34,12 @@ class Count:
 
 
 def attack(kind: str, folder: Path, seeds: range, until: float = float("inf"), *, stop: bool = True) -> Count:
-    """Use an input of each seed, until a time [s of this process]; raise what escapes, or note it unless `stop`."""
-    use, count = TARGETS[kind](folder), Count(escaped={})
+    """Use an input of each seed, until a time [s of `perf_counter`]; raise what escapes, or note it unless `stop`."""
+    use, count = KINDS[kind](folder), Count(escaped={})
     for seed in seeds:
-        begin = time.process_time()
-        if begin > until:
+        if time.perf_counter() > until:
             break
+        begin = time.process_time()
         try:
             if use(random.Random(seed)):
                 count.taken += 1

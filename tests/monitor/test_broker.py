@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
-import socket
-import subprocess
+import random
+import sqlite3
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from paho.mqtt import publish, subscribe
 from paho.mqtt.enums import MQTTProtocolVersion
+from starlette.testclient import TestClient
 
+from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import MonitorSettings, read_settings
+from sealscope.monitor.settings import MonitorSettings, PageSettings, read_settings
+from sealscope.monitor.sources.source_block import WRONG_ACTUATOR
 
-from .plant import rows_of, served, settings_in
+from .plant import rows_of, served, settings_in, until
+from .servers import MOSQUITTO, Broker
+from .test_hostile_service import BRIEF, FORGED, UNKNOWN
 from .test_service import LINES
 
-MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")]
 SETTINGS = """
 database = "monitor.db"
@@ -42,33 +46,6 @@ topic = "plant/press 2"
 """
 
 
-class Broker:
-    """A broker whose sessions survive its restart."""
-
-    def __init__(self, folder: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = int(free.getsockname()[1])
-        self._config = folder / "mosquitto.conf"
-        self._config.write_text(
-            f"listener {self.port} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 0\n"
-            f"persistence true\npersistence_location {folder}/\nuser root\n"
-        )
-        self.start()
-
-    def start(self) -> None:
-        self._process = subprocess.Popen([str(MOSQUITTO), "-c", str(self._config)], stderr=subprocess.DEVNULL)
-        for _ in range(100):
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
-                    return
-            time.sleep(0.05)
-
-    def stop(self) -> None:
-        self._process.terminate()
-        self._process.wait()
-
-
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
     broker = Broker(tmp_path)
@@ -81,6 +58,11 @@ def port(broker: Broker) -> int:
     return broker.port
 
 
+def kept(broker: Broker) -> None:
+    """Let the broker keep what comes for the monitor of `SETTINGS` from now on."""
+    broker.keep("sealscope-monitor", ("plant/press 1", "plant/press 2"))
+
+
 class Running:
     """A service in a thread."""
 
@@ -90,9 +72,7 @@ class Running:
         self.thread.start()
 
     def until(self, blocks: int) -> None:
-        deadline = time.monotonic() + 60.0
-        while time.monotonic() < deadline and len(rows_of(self.service.settings.database)["blocks"]) < blocks:
-            time.sleep(0.1)
+        until(lambda: len(rows_of(self.service.settings.database)["blocks"]) >= blocks)
 
     def end(self) -> None:
         self.service.stop()
@@ -106,7 +86,7 @@ def send(port: int, lines: list[bytes]) -> None:
     publish.multiple(messages, hostname="127.0.0.1", port=port, protocol=MQTTProtocolVersion.MQTTv5)
 
 
-def test_what_comes_while_the_monitor_is_away_is_stored_once(port: int, tmp_path: Path):
+def test_what_comes_while_the_monitor_is_away_is_stored_once(broker: Broker, port: int, tmp_path: Path):
     plain = tmp_path / "plain"
     plain.mkdir()
     served(settings_in(plain), LINES)
@@ -114,8 +94,8 @@ def test_what_comes_while_the_monitor_is_away_is_stored_once(port: int, tmp_path
     file.write_text(SETTINGS.format(port=port))
     settings, lines = read_settings(file), LINES.splitlines()
     third = len(lines) // 3
+    kept(broker)
     first = Running(settings)
-    time.sleep(0.5)  # it subscribes
     send(port, [b"not a block for press 1".join([b'{"actuator": "press 1", "x": "', b'"}'])])
     send(port, lines[:third])
     first.until(third)
@@ -125,7 +105,7 @@ def test_what_comes_while_the_monitor_is_away_is_stored_once(port: int, tmp_path
     second.until(2 * third)
     send(port, lines[2 * third :])
     second.until(len(lines))
-    time.sleep(0.5)
+    until(lambda: second.service.store.position("mqtt") > 0)
     second.end()
     assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
     retained = subscribe.simple("sealscope/press 1/alarm", hostname="127.0.0.1", port=port)
@@ -140,14 +120,147 @@ def test_a_broker_that_restarts_loses_nothing(broker: Broker, tmp_path: Path):
     file = tmp_path / "monitor.toml"
     file.write_text(SETTINGS.format(port=broker.port))
     lines = LINES.splitlines()
+    kept(broker)
     running = Running(read_settings(file))
-    time.sleep(0.5)
     for start in range(0, len(lines), 30):
         send(broker.port, lines[start : start + 30])
+        if start == 0:
+            running.until(30)  # it is connected
         broker.stop()
         time.sleep(0.2)
         broker.start()
     running.until(len(lines))
     running.end()
     assert rows_of(running.service.settings.database) == rows_of(str(plain / "monitor.db"))
-    assert running.service.actuators.counters.get("messages that hold no block") is None
+    assert set(running.service.actuators.counters) <= {"blocks stored already"}
+    reached, number, seconds = running.service.outages.totals()["broker"]
+    assert reached
+    assert 1 <= number <= len(range(0, len(lines), 30))  # fewer, where it was back before it was tried again
+    assert seconds > 0.2 * number
+
+
+def test_a_broker_that_is_away_stands_on_page_and_metrics(broker: Broker, tmp_path: Path, caplog):
+    file = tmp_path / "monitor.toml"
+    file.write_text(SETTINGS.format(port=broker.port))
+    kept(broker)
+    running = Running(read_settings(file))
+    page = TestClient(site(running.service.actuators, PageSettings(), None))
+    try:
+        send(broker.port, LINES.splitlines()[:1])
+        running.until(1)  # it is connected
+        assert page.get("/api/fleet").json()["outages"] == []
+        assert 'sealscope_reached{part="broker"} 1.0' in page.get("/metrics").text
+        broker.stop()
+        until(running.service.outages.plain)
+        (outage,) = page.get("/api/fleet").json()["outages"]
+        assert (outage["part"], outage["reason"][:27]) == ("broker", "the connection to 127.0.0.1")
+        assert 'sealscope_reached{part="broker"} 0.0' in page.get("/metrics").text
+        broker.start()
+        until(lambda: not page.get("/api/fleet").json()["outages"])
+        assert 'sealscope_outages_total{part="broker"} 1.0' in page.get("/metrics").text
+    finally:
+        running.end()
+    assert "the broker is reached again after" in caplog.text
+
+
+def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_the_rest(
+    broker: Broker, tmp_path: Path, monkeypatch
+):
+    """A locked database stops the storing for longer than the broker would wait for a client that is silent."""
+    monkeypatch.setattr("sealscope.monitor.sources.broker.KEEP_ALIVE_S", 2)
+    monkeypatch.setattr("sealscope.monitor.service._WAITING", 8)
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    served(settings_in(plain), LINES)
+    file = tmp_path / "monitor.toml"
+    file.write_text(SETTINGS.format(port=broker.port))
+    settings, lines = read_settings(file), LINES.splitlines()
+    kept(broker)
+    running = Running(settings)
+    lock = sqlite3.connect(settings.database, isolation_level=None)
+    lock.execute("begin immediate")
+    counters = running.service.actuators
+    dropped, refused = "messages of QoS 0 that found no room", "messages that are no JSON or CBOR"
+    try:
+        send(broker.port, lines)  # more than the queue and those in flight
+        until(running.service.outages.plain)
+        flood = [{"topic": "plant/press 1", "payload": b"{", "qos": 0, "retain": False}] * 2000
+        publish.multiple(flood, hostname="127.0.0.1", port=broker.port, protocol=MQTTProtocolVersion.MQTTv5)
+        until(lambda: counters.counters.get(dropped, 0) > 1000 and running.service.outages.plain())
+        time.sleep(4.0)  # over what the broker would wait for
+        assert running.service.waits()[0] >= 8  # and those at hand
+        assert [outage["part"] for outage in running.service.outages.plain()] == ["database"]
+        assert running.service.outages.totals()["broker"][:2] == (True, 0)
+    finally:
+        lock.execute("rollback")
+        lock.close()
+    running.until(len(lines))
+    until(lambda: counters.counters[dropped] + counters.counters.get(refused, 0) == 2000)
+    running.end()
+    assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
+
+
+def test_a_broker_that_sends_more_than_agreed_is_asked_again(broker: Broker, tmp_path: Path, monkeypatch):
+    """The room is less than what the broker is asked for at a time."""
+    monkeypatch.setattr("sealscope.monitor.sources.broker._ASSURED_ROOM", 20)
+    monkeypatch.setattr("sealscope.monitor.service._WAITING", 1)
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    served(settings_in(plain), LINES)
+    file = tmp_path / "monitor.toml"
+    file.write_text(SETTINGS.format(port=broker.port))
+    settings, lines = read_settings(file), LINES.splitlines()
+    running = Running(settings)
+    time.sleep(0.5)
+    lock = sqlite3.connect(settings.database, isolation_level=None)
+    lock.execute("begin immediate")
+    send(broker.port, lines)
+    time.sleep(1.0)
+    lock.execute("rollback")
+    lock.close()
+    running.until(len(lines))
+    running.end()
+    assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
+    assert running.service.actuators.counters["messages of QoS 1 that found no room and were asked for again"] > 20
+    assert running.service.outages.totals()["broker"][:2] == (True, 0)
+
+
+def test_forged_messages_over_the_broker_are_counted(broker: Broker, tmp_path: Path):
+    """What names another actuator than its topic is refused; one that is too large does not come through."""
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    served(settings_in(plain), LINES)
+    file = tmp_path / "monitor.toml"
+    file.write_text(SETTINGS.format(port=broker.port))
+    settings, lines = read_settings(file), LINES.splitlines()
+    chance, sent = random.Random(1), Counter()
+    messages: list[bytes] = []
+    for line in lines:
+        messages.append(line)
+        for _ in range(20):
+            reason, wrong = chance.choice(FORGED)
+            sent[WRONG_ACTUATOR if reason == UNKNOWN or wrong.get("actuator", 0) is None else reason] += 1
+            messages.append(json.dumps({**BRIEF, **wrong}).encode())
+    kept(broker)
+    running = Running(settings)
+    for start in range(0, len(messages), 200):
+        batch = messages[start : start + 200]
+        publish.multiple(
+            [{"topic": topic_of(message), "payload": message, "qos": 1, "retain": False} for message in batch],
+            hostname="127.0.0.1",
+            port=broker.port,
+            protocol=MQTTProtocolVersion.MQTTv5,
+        )
+    publish.single("plant/press 1", b" " * 16_000_001, qos=0, hostname="127.0.0.1", port=broker.port)
+    running.until(len(lines))
+    until(lambda: sum(running.service.actuators.counters.values()) >= sum(sent.values()))
+    running.end()
+    assert running.service.actuators.counters == dict(sent)
+    assert running.service.outages.totals()["broker"][:2] == (True, 0)
+    assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
+
+
+def topic_of(message: bytes) -> str:
+    """The topic of the actuator that a message names; that of the first where it names none."""
+    name = json.loads(message)["actuator"]
+    return "plant/press 2" if name == "press 2" else "plant/press 1"

@@ -27,6 +27,10 @@ ODD = (
     b'{"t": 1, "rate": 1e308, "x": [1], "actuator": "a"}',
     b'{"t": 9007199254740993, "rate": 50, "x": [1]}',
     b'{"t": 0, "rate": 50, "x": [1, [2]], "actuator": "a"}',
+    b'{"t": 0, "rate": 50, "x": [1, 1e999], "actuator": "a"}',
+    b'{"t": 0, "rate": 50, "x": [1, -Infinity], "actuator": "a"}',
+    b'{"t": 0, "rate": 50, "x": [' + b"9" * 400 + b'], "actuator": "a"}',
+    b'{"t": 0, "rate": 50, "x": [' + b"9" * 5000 + b'], "actuator": "a"}',
     b'{"t": 0, "rate": 50, "x": [], "actuator": "a"}',
     b'{"t": 0, "rate": 50, "x": {"0": 1}, "actuator": "a"}',
     b'{"t": 0, "rate": 50, "x": ["1e5"], "actuator": ["a"]}',
@@ -56,6 +60,21 @@ def taken(payload: bytes) -> str:
 def test_an_odd_message_is_refused_in_one_line(payload: bytes):
     # samples at 1e308 Hz are a block, which the stream counts and drops
     assert taken(payload) == ("block" if b"1e308" in payload else "refused")
+
+
+@pytest.mark.parametrize(("tag", "kind"), [(81, ">f4"), (82, ">f8"), (85, "<f4"), (86, "<f8")])
+def test_typed_arrays_are_lists_of_numbers(tag: int, kind: str):
+    arrays = {name: np.array(GOOD[name], dtype=kind) for name in ("p_A", "p_B", "x", "theta")}
+    arrays["x"][3] = np.nan
+    tagged = {name: cbor2.CBORTag(tag, values.tobytes()) for name, values in arrays.items()}
+    samples = decoded(cbor2.dumps({**GOOD, **tagged})).samples
+    assert samples is not None
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(samples[name], values.astype(float))
+    damaged = (b"abc", "abcdefgh", np.full(20, np.inf, kind).tobytes(), b"")
+    for value in damaged:
+        assert taken(cbor2.dumps({**GOOD, "x": cbor2.CBORTag(tag, value)})) == "refused"
+    assert taken(cbor2.dumps({**GOOD, "x": cbor2.CBORTag(64, b"abcd")})) == "refused"  # of bytes: no samples
 
 
 def mutated(random: np.random.Generator) -> bytes:

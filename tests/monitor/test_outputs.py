@@ -106,7 +106,7 @@ def test_an_address_of_another_kind_is_refused(tmp_path, url):
 
 
 def test_the_dashboard_asks_for_metrics_that_there_are(watched):
-    text = metrics_text(watched.actuators.plain(), {"messages that hold no block": 2})
+    text = metrics_text(watched.actuators.plain(), {"oversized messages": 2}, {"broker": (True, 1, 2.5)})
     summary = {name: dict(values, counters={"gap": 1}) for name, values in watched.actuators.plain().items()}
     families = set(re.findall(r"^# TYPE (\S+)", text + metrics_text(summary, {}), re.MULTILINE))
     board = json.loads(json.dumps(dashboard()))

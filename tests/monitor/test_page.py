@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -91,6 +92,11 @@ def test_a_mark_needs_the_page_and_an_alarm(page: TestClient):
     )
     for body in (b"{", b"[]", b'{"mark": 3}', b'{"mark": "' + b"x" * 20_000 + b'"}', b'{"mark": "away"}'):
         assert page.post(address, content=body, headers=header).status_code == 400
+    for text in ("a\0b", "\ud800"):
+        unstorable = page.post(
+            f"{of(HOSTILE)}/mark", content=json.dumps({"mark": "comment", "text": text}), headers=header
+        )
+        assert (unstorable.status_code, unstorable.json()["error"][:24]) == (400, "a comment must be text, ")
     comment = {"mark": "comment", "text": "<script>alert(1)</script>", "by": "Ada"}
     assert page.post(f"{of(HOSTILE)}/mark", json=comment, headers=header).status_code == 200
     assert page.get(of(HOSTILE)).json()["events"][0]["text"] == comment["text"]
@@ -175,6 +181,12 @@ def test_the_page_in_a_browser(service: Service):
                     view.locator("#alarm-title", has_text="acknowledged").wait_for()
                 assert "acknowledged" in (view.text_content("#alarm-title") or "")
                 assert errors == []
+                service.outages.lost("broker", "<b>gone</b>")
+                view.locator("#outages", has_text="The broker is not reached").wait_for()
+                assert "<b>gone</b>" in (view.text_content("#outages") or "")
+                assert view.evaluate("document.documentElement.scrollWidth") <= width
+                service.outages.back("broker")
+                view.locator("#outages").wait_for(state="hidden")
                 view.close()
             browser.close()
     finally:

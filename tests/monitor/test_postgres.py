@@ -2,56 +2,51 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
 import signal
-import socket
-import subprocess
 import tempfile
+import threading
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, text
+from sqlalchemy import create_engine, inspect, text
+from sqlalchemy.exc import OperationalError
+from starlette.testclient import TestClient
 
 from sealscope.errors import InputError
+from sealscope.monitor.memory.store import MonitorStore, away
 from sealscope.monitor.memory.tables import metadata
+from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
+from sealscope.monitor.settings import PageSettings
 
-from .plant import kill_often, lines_of, rows_of, served, settings_in
+from .plant import kill_often, lines_of, rows_of, served, settings_in, until
+from .servers import NO_POSTGRESQL, PostgreSQL
 from .test_service import LINES, SOUND, WORN
 
-BINARIES = sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
-ROOT = os.geteuid() == 0
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not BINARIES, reason="PostgreSQL is not installed"),
-    pytest.mark.skipif(ROOT and shutil.which("runuser") is None, reason="PostgreSQL does not run as root"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(NO_POSTGRESQL is not None, reason=NO_POSTGRESQL or "")]
 
 
 @pytest.fixture(scope="module")
-def url() -> Iterator[str]:
+def server() -> Iterator[PostgreSQL]:
     pytest.importorskip("psycopg", reason="psycopg is not installed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = int(free.getsockname()[1])
     folder = tempfile.mkdtemp(prefix="sealscope-pg-")
-    as_user = ["runuser", "-u", "postgres", "--"] if ROOT else []
-    if ROOT:
-        shutil.chown(folder, "postgres")
-
-    def call(*words: str) -> None:
-        subprocess.run([*as_user, *words], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd="/")
-
-    data, control = f"{folder}/data", str(BINARIES[0] / "pg_ctl")
-    call(str(BINARIES[0] / "initdb"), "-D", data, "-A", "trust", "-U", "monitor", "-E", "UTF8", "--no-sync")
-    call(control, "-D", data, "-w", "-l", f"{folder}/log", "-o", f"-p {port} -h 127.0.0.1 -k {folder}", "start")
-    yield f"postgresql+psycopg://monitor@127.0.0.1:{port}/postgres"
-    call(control, "-D", data, "-m", "immediate", "stop")
+    server = PostgreSQL(folder)
+    yield server
+    server.stop()
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def url(server: PostgreSQL) -> str:
+    return server.url
 
 
 def test_kills_change_no_row_in_postgresql(url: str, tmp_path: Path):
@@ -100,29 +95,40 @@ def test_three_monitors_share_the_actuators_and_take_over_those_of_a_killed_one(
         os.close(reading)
         children[name], writers[name] = child, writing
     killed, holder = "", "select actuator, holder from leases where until > extract(epoch from clock_timestamp())"
-    time.sleep(3.0)  # until each has its share
+
+    def holders() -> dict[str, str]:
+        with engine.connect() as connection:
+            if not inspect(connection).has_table("leases"):
+                return {}
+            return {row.actuator: row.holder for row in connection.execute(text(holder))}
+
+    def shared() -> bool:
+        return set(holders()) == {"", *FOUR} and len(set(holders().values())) == 3
+
+    until(shared)
     for k, line in enumerate(lines):
         for name, writing in writers.items():
             if name != killed:
                 os.write(writing, line)
         time.sleep(10.0 / len(lines))
         if k == len(lines) // 2:
-            with engine.connect() as connection:
-                held = {row.actuator: row.holder for row in connection.execute(text(holder))}
-            assert set(held) == {"", *FOUR}
-            assert len(set(held.values())) == 3
-            killed = held["press 1"]
+            until(shared)
+            killed = holders()["press 1"]
             os.kill(children[killed], signal.SIGKILL)
             since = time.monotonic()
     while time.monotonic() - since < 30.0:  # asked: taken over within 30 s
-        with engine.connect() as connection:
-            held = {row.actuator: row.holder for row in connection.execute(text(holder))}
+        held = holders()
         if set(held) == {"", *FOUR} and killed not in held.values():
             break
         time.sleep(0.2)
     else:
         raise AssertionError(f"not taken over: {held}")
-    time.sleep(3.0)
+
+    def stored() -> int:
+        with engine.connect() as connection:
+            return int(connection.execute(text("select count(*) from blocks")).scalar() or 0)
+
+    until(lambda: stored() == len(lines))
     for name, writing in writers.items():
         os.close(writing)
         if name != killed:
@@ -135,6 +141,135 @@ def test_three_monitors_share_the_actuators_and_take_over_those_of_a_killed_one(
     events = sorted({json.loads(line)["number"] for line in said})
     assert len(events) == len(theirs["events"])  # none is left out; the last before the kill may come twice
     engine.dispose()
+
+
+def test_while_postgresql_is_away_the_page_says_so_and_nothing_is_lost(server: PostgreSQL, tmp_path: Path):
+    engine = create_engine(server.url)
+    metadata.drop_all(engine)
+    engine.dispose()
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    served(settings_in(plain), LINES)
+    settings = settings_in(tmp_path, "[page]\nport = 0\n", database=server.url)
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as stream, os.fdopen(writing, "wb", buffering=0) as wire:
+        service = Service(settings, stdin=stream, stdout=io.StringIO())
+        thread = threading.Thread(target=service.run)
+        thread.start()
+        assert service.page is not None
+
+        def asked(address: str) -> tuple[int, str]:
+            try:
+                with urllib.request.urlopen(service.page.address + address, timeout=20.0) as answer:
+                    return int(answer.status), answer.read().decode()
+            except urllib.error.HTTPError as error:
+                return error.code, error.read().decode()
+
+        lines = LINES.splitlines(keepends=True)
+        try:
+            for line in lines[: len(lines) // 2]:
+                wire.write(line)
+            assert asked("api/fleet")[0] == asked("metrics")[0] == 200
+            server.stop()
+            try:
+                for line in lines[len(lines) // 2 :]:
+                    wire.write(line)
+                for address in ("api/fleet", "api/actuator/press%201"):
+                    status, text_ = asked(address)
+                    assert status == 503
+                    assert json.loads(text_)["error"].startswith("the database does not answer: ")
+                    assert [outage["part"] for outage in json.loads(text_)["outages"]] == ["database"]
+                status, text_ = asked("metrics")
+                assert (status, text_[:31]) == (503, "# the database does not answer:")
+                assert 'sealscope_reached{part="database"} 0.0' in text_
+                time.sleep(2.0)
+                assert asked("metrics")[0] == 503
+            finally:
+                server.start()
+            reached, deadline = 'sealscope_reached{part="database"} 1.0', time.monotonic() + 60.0
+            while time.monotonic() < deadline and (
+                reached not in asked("metrics")[1] or len(rows_of(server.url)["blocks"]) < len(lines)
+            ):
+                time.sleep(0.1)
+            status, text_ = asked("metrics")
+            assert status == 200
+            assert reached in text_
+            assert service.waits()[0] == 0
+            assert 'sealscope_outages_total{part="database"} 1.0' in text_
+        finally:
+            service.stop()
+            wire.close()
+            thread.join()
+    ours, theirs = rows_of(server.url), rows_of(str(plain / "monitor.db"))
+    for table in theirs:
+        assert ours[table] == theirs[table], table
+
+
+def test_a_postgresql_that_hangs_is_said_and_costs_nothing(server: PostgreSQL, tmp_path: Path, monkeypatch, caplog):
+    """Its processes are stopped: connections are accepted, packets confirmed, and nothing is answered."""
+    monkeypatch.setattr("sealscope.monitor.memory.postgresql.ANSWER_S", 1.0)
+    monkeypatch.setattr("sealscope.monitor.memory.postgresql.CONNECT_S", 2)
+    engine = create_engine(server.url)
+    metadata.drop_all(engine)
+    engine.dispose()
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    served(settings_in(plain), LINES)
+    settings = settings_in(tmp_path, database=server.url)
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as stream, os.fdopen(writing, "wb", buffering=0) as wire:
+        service = Service(settings, stdin=stream, stdout=io.StringIO())
+        page = TestClient(site(service.actuators, PageSettings(), None, service.waits))
+        thread = threading.Thread(target=service.run)
+        thread.start()
+        lines = LINES.splitlines(keepends=True)
+        try:
+            wire.write(b"".join(lines[:10]))
+            until(lambda: service.waits()[0] == 0 and page.get("/metrics").status_code == 200)
+            before = service.store.engine.connect()
+            server.hang()
+            try:
+                wire.write(b"".join(lines[10:]))
+                until(lambda: bool(service.outages.plain()))
+                (outage,) = service.outages.plain()
+                assert outage["part"] == "database"
+                assert outage["reason"] in ("connection timeout expired", "PostgreSQL has not answered for 1 s")
+                with pytest.raises(OperationalError, match="PostgreSQL has not answered for 1 s"):
+                    before.execute(text("select 1"))
+                answer = page.get("/api/fleet")
+                assert answer.status_code == 503
+                assert answer.json()["error"].startswith("the database does not answer: ")
+                assert answer.json()["waiting"] > 0
+                assert page.get("/metrics").status_code == 503
+            finally:
+                server.go_on()
+            until(lambda: not service.outages.plain() and service.waits()[0] == 0)
+        finally:
+            wire.close()
+            thread.join()
+            before.close()
+    assert service.outages.totals()["database"][0]
+    assert "the database is not reached: " in caplog.text
+    ours, theirs = rows_of(server.url), rows_of(str(plain / "monitor.db"))
+    for table in theirs:
+        assert ours[table] == theirs[table], table
+
+
+def test_a_statement_that_waits_for_a_lock_is_ended_by_the_server(server: PostgreSQL, monkeypatch):
+    """Else each new try would leave a process that waits in the server."""
+    monkeypatch.setattr("sealscope.monitor.memory.postgresql.STATEMENT_S", 0.3)
+    store = MonitorStore(server.url)
+    other = create_engine(server.url)
+    try:
+        with other.connect() as connection:
+            connection.execute(text("lock table facts in access exclusive mode"))
+            with pytest.raises(OperationalError, match="statement timeout") as raised:
+                store.position("nobody")
+            assert away(raised.value) == "canceling statement due to statement timeout"
+        assert store.position("nobody") == 0
+    finally:
+        store.engine.dispose()
+        other.dispose()
 
 
 def test_monitors_that_share_a_file_are_refused(tmp_path: Path):

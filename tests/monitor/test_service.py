@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DataError, OperationalError
 
 from sealscope.errors import InputError
 from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import TEMPLATE, read_settings
+from sealscope.monitor.sources.source_block import digest_of
 
 from ..diagnosis.balance_machine import machine, step
 from .plant import kill_often, lines_of, message, rows_of, served, settings_in, write_files
@@ -78,20 +79,38 @@ def test_many_kills_change_no_row(undisturbed, tmp_path, seed):
 
 
 @pytest.mark.slow
-def test_errors_of_the_database_change_no_row(undisturbed, tmp_path, monkeypatch):
+@pytest.mark.parametrize("together", [1, 3])
+def test_errors_of_the_database_change_no_row(undisturbed, tmp_path, monkeypatch, together):
     """Every tenth write fails after the detector has taken the block."""
     settings = settings_in(tmp_path)
-    keep, calls = MonitorStore.keep_estimates, iter(range(10_000))
+    keep, calls = MonitorStore.keep_rows, iter(range(10_000))
 
     def failing(self: MonitorStore, *arguments: Any) -> None:
         keep(self, *arguments)
         if next(calls) % 10 == 7:
             raise OperationalError("insert", {}, sqlite3.OperationalError("database or disk is full"))
 
-    monkeypatch.setattr(MonitorStore, "keep_estimates", failing)
+    monkeypatch.setattr(MonitorStore, "keep_rows", failing)
+    monkeypatch.setattr("sealscope.monitor.service._TOGETHER", together)
     service, _ = served(settings, LINES)
     assert rows_of(settings.database) == undisturbed[0]
-    assert service.actuators.counters["waits for the database"] > 5
+    assert service.actuators.counters["waits for the database"] > 5 / together
+
+
+@pytest.mark.parametrize("error", [ValueError("no such thing"), DataError("insert", {}, ValueError("NUL"))])
+def test_a_block_that_raises_an_error_is_dropped_and_the_others_go_on(tmp_path, monkeypatch, caplog, error):
+    keep, bad = MonitorStore.keep_blocks, digest_of(LINES.splitlines()[14])
+
+    def failing(self: MonitorStore, connection: Any, blocks: list[tuple[str, str, int]]) -> None:
+        if any(identity == bad for _, identity, _ in blocks):
+            raise error
+        keep(self, connection, blocks)
+
+    monkeypatch.setattr(MonitorStore, "keep_blocks", failing)
+    service, _ = served(settings_in(tmp_path), LINES)
+    assert service.actuators.counters == {"blocks that raised an error": 1}
+    assert len(rows_of(service.settings.database)["blocks"]) == len(LINES.splitlines()) - 1
+    assert "is dropped" in caplog.text
 
 
 def test_files_that_appear_are_read_once_and_in_order(tmp_path):
@@ -143,11 +162,18 @@ def test_lines_without_a_block_are_counted(tmp_path, caplog):
         b'{"t": 0, "rate": 500, "x": [1]}',
         b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "valve": 3}',
         b"\xff\xfe",
+        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "id": "a\\u0000"}',
+        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "id": "\\ud800"}',
     ]
     other = good.replace("press 1", "<script>alert(1)</script>").encode()
     service, _ = served(settings_in(tmp_path), b"\n".join([*bad, other, b"", good.encode()]))
     assert service.actuators.counters == {
-        "messages that hold no block": len(bad),
+        "messages that are no JSON or CBOR": 4,
+        "messages that are no mapping of known names": 1,
+        "messages without a clock, a rate or a sound identity": 3,
+        "messages whose channels are no lists of numbers of one length": 2,
+        "messages with units of another dimension": 1,
+        "messages without an actuator, or with another one than their topic": 1,
         "blocks of an actuator that is not in the settings": 1,
     }
     assert len(rows_of(service.settings.database)["blocks"]) == 1

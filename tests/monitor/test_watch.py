@@ -11,9 +11,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.changepoint.smooth_drift import find_step
+from sealscope.diagnosis.changepoint.smooth_drift import find_step, share_of_threshold
 from sealscope.errors import InputError
-from sealscope.monitor.stream.decisions import worth_a_search
+from sealscope.monitor.stream.baseline import WatchBaseline
+from sealscope.monitor.stream.decisions import level_rise_of, near_an_alarm, worth_a_search
 from sealscope.monitor.stream.watch import BlockEstimate, Watch
 from sealscope.recordings.recording import Recording
 
@@ -159,6 +160,18 @@ def test_warm_oil_and_another_duty_are_no_leak():
     assert watch.leak is None
 
 
+def test_a_level_is_stated_with_what_warm_oil_may_have_of_it():
+    place = {"version": 1, "learned_s": 0.0, "hours": 8.0, "lpm": None, "low_lpm": None, "high_lpm": None}
+    duty = {"duty_low": (0.0, 0.0), "duty_high": (0.0, 0.0)}
+    baseline = WatchBaseline(level=2e-13, low=1e-13, high=3e-13, **place, **duty)
+    rise = level_rise_of(1e5, 6e-13, 1e-15, baseline, 1e-6)
+    assert rise is not None
+    assert rise.size == pytest.approx(4e-13)
+    assert rise.size - 1.96 * rise.size_sd <= 2e-13  # the oil may be as warm as it gets, or as cold as it was
+    assert rise.size + 1.96 * rise.size_sd >= 5e-13
+    assert level_rise_of(1e5, 3.9e-13, 1e-15, baseline, 1e-6) is None
+
+
 def test_a_machine_at_rest_is_not_judged():
     still = machine(4, speed=lambda t: np.where(t < 130.0, 12.0 * np.sin(4.0 * t), 0.0), duration=170.0, rate=50.0)
     watch, estimates = run(still, [1000])
@@ -219,9 +232,15 @@ def test_no_alarm_is_lost_by_searching_only_where_it_is_worth_it():
         walk, n = (0.0, 1e-2, 0.1, 1.0, 4.0)[k % 5], (20, 40, 50, 60)[k % 4]
         g = random.standard_normal(n) + np.sqrt(walk) * np.cumsum(random.standard_normal(n))
         g[random.integers(3, n - 2) :] += random.uniform(3.0, 14.0) * (1.0 + np.sqrt(walk))
-        if find_step(np.arange(n, dtype=float), g, np.ones(n), 1e-6).alarm:
+        step = find_step(t := np.arange(n, dtype=float), g, np.ones(n), 1e-6)
+        if n % 4 == 0 and step.score > 0.0:
+            assert share_of_threshold(g, 1e-6) >= step.score / step.threshold - 1e-9
+        if step.alarm:
             alarms += 1
             assert worth_a_search(g)
+            assert near_an_alarm(t, g, 1e-6)
     assert alarms > 30
     quiet = [worth_a_search(random.standard_normal(60)) for _ in range(200)]
+    assert np.mean(quiet) < 0.05
+    quiet = [near_an_alarm(np.arange(60.0), 10.0 + random.standard_normal(60), 4e-7) for _ in range(50)]
     assert np.mean(quiet) < 0.05

@@ -14,7 +14,7 @@ THESIS = (Path(sealscope.parameters.__file__).parent / "rigs" / "thesis.toml").r
 EXTENDS = '[rig]\nextends = "thesis"\n'
 GOOD = 'V_1 = { value = 50, unit = "cm^3", source = "measured" }\n'
 
-PACKAGED = "single-rod-eha, thesis, thesis-calibrated, thesis-closed-loop"
+PACKAGED = "servo-valve, single-rod-eha, thesis, thesis-calibrated, thesis-closed-loop"
 
 
 def write(folder: Path, text: str, name: str = "lab.toml") -> Path:

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 from numba.core import config
 
@@ -229,3 +230,16 @@ def test_compiled_division_by_zero_follows_ieee_754():
     from sealscope.physics.cylinder import pressure_rate
 
     assert pressure_rate(1.0, 0.0, 1.0) == float("inf")
+
+
+def test_a_law_is_the_same_from_python_as_within_compiled_code():
+    @compiled.law
+    def doubled(x):
+        return 2.0 * x
+
+    @numba.njit
+    def within(x):
+        return doubled(x) + 1.0
+
+    assert within(3.0) == doubled(3.0) + 1.0 == doubled(x=3.0) + 1.0 == 7.0
+    assert doubled(np.float32(0.25)) == 0.5  # of another type than within

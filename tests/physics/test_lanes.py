@@ -152,7 +152,7 @@ def test_every_lane_has_numbers_of_its_own(check_rig, drive):
         np.testing.assert_allclose(pressures[0, :, 0, lane], alone["p_A"], rtol=0, atol=1e-4)
         assert account[0, LEAST, lane] == pytest.approx(min(alone["p_A"].min(), alone["p_B"].min()), abs=1e-4)
     assert np.ptp(pressures[0, -1, 0]) > 1000.0
-    assert len(OUTPUTS) == 19
+    assert len(OUTPUTS) == 21
 
 
 def test_the_machine_code_works_on_whole_registers():

@@ -1,6 +1,7 @@
 """Logs in the dialects of test benches: written by the libraries of the formats, or by hand from their descriptions.
 
-``python tests/recordings/dialects.py`` writes each, reads it, and prints how far each channel is from what was written.
+``python -m tests.recordings.dialects`` writes each, and each of `exports`, reads it, and prints how far each channel is
+from what was written.
 """
 
 from __future__ import annotations
@@ -715,13 +716,16 @@ def main() -> None:
     print(
         f"{'dialect':<40}{'samples':>8}{'missing':>8}{'rate [Hz]':>10}{'p_A [bar]':>11}{'p_B [bar]':>11}{'x [mm]':>11}"
     )
-    for name, dialect in DIALECTS.items():
+    from .exports import EXPORTS
+
+    every = {**DIALECTS, **EXPORTS}
+    for name, dialect in every.items():
         with tempfile.TemporaryDirectory() as folder:
             recording = read(dialect.write(Path(folder)), **dialect.options)
         missing = sum(int(np.isnan(recording[channel]).sum()) for channel in ("p_A", "p_B", "x"))
         figures = "".join(f"{value:>11.1e}" for value in deviations(recording).values())
         print(f"{name:<40}{len(recording):>8}{missing:>8}{recording.rate:>11g}{figures}")
-    print(f"{len(DIALECTS)} dialects")
+    print(f"{len(every)} dialects")
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def refused(path: Path, **options: object) -> str:
         ("t [s],p_A [Pa]\n0,1\n", "time must increase between some samples (FILE)"),
         ("t [s],p_A [Pa]\n3,1\n3,1\n3,1\n", "time must increase between some samples (FILE)"),
         ("Date,p_A [Pa]\n5/31/24,1\n6/1/24,2\n",
-         "a recording must have a time column such as t [s] or be given a rate, got columns Date, p_A [Pa] (FILE)"),
+         "a recording must have a time column such as t [s] or be given a rate, got dates alone in column Date (FILE)"),
         ("Timestamp,p_A [Pa]\n2024-05-31T10:00:00,1\nyesterday,2\n2024-05-31T10:00:02,3\n",
          "time must be a stamp such as 2024-05-31T12:00:00.002, got 'yesterday' (line 3, column Timestamp, FILE)"),
         ("# sealscope: {broken\nt [s],p_A [Pa]\n0,1\n1,2\n",
@@ -181,7 +181,7 @@ def test_missing_mapped_column(tmp_path: Path) -> None:
         ({"rate": float("nan")}, "rate must be > 0 Hz, got nan"),
         (
             {"format": "xlsx"},
-            "format must be one of lvm, matlab, .*, text, got xlsx",
+            "format must be one of json, lvm, matlab, .*, text, got xlsx",
         ),
         ({"channel_map": {"P_X": "a"}}, "a mapped channel must be one of"),
     ],

@@ -61,6 +61,28 @@ def test_a_machine_passes(recording: Recording, names: tuple[str, ...] | None) -
     assert no_machine(recording if names is None else recording.only(names)) is None
 
 
+def under_load(recording: Recording, swing: float, omega: float) -> Recording:
+    """A load that swings at `omega` [rad/s] in a closed loop: pressures of +-`swing` [Pa] beside those of friction."""
+    pushed = swing * np.sin(omega * recording.t)
+    return put(recording, p_A=1e6 + recording["p_A"] + pushed, p_B=1e6 + recording["p_B"] - pushed)
+
+
+@pytest.mark.parametrize("names", [("u", "p_A", "p_B"), ("x", "p_A", "p_B"), None])
+@pytest.mark.parametrize(("swing", "omega", "period"), [(8e5, 0.3, 3.1), (1e6, 2.0, 4.0), (9e5, 1.3, 6.3)])
+def test_a_machine_under_a_load_that_swings_passes(
+    swing: float, omega: float, period: float, names: tuple[str, ...] | None
+) -> None:
+    recording = under_load(machine(period=period), swing, omega)
+    assert no_machine(recording if names is None else recording.only(names)) is None
+
+
+@pytest.mark.parametrize("period", [2.3, 5.0])
+def test_under_a_load_as_well_the_motion_of_another_machine_is_named(period: float) -> None:
+    recording, other = under_load(machine(period=3.1), 5e5, 0.3), machine(seed=1, period=period)
+    strange = put(recording, **{name: other[name] for name in ("u", "x", "theta", "omega")})
+    assert "does not follow u, omega, theta, x" in (no_machine(strange) or "")
+
+
 GARBAGE: dict[str, tuple[Callable[[Recording], Recording], str]] = {
     "noise": (lambda r: put(r, p_A=3e5 + 5e4 * RANDOM.standard_normal(N)), "p_A is noise"),
     "noisy copy": (lambda r: put(r, p_B=r["p_A"] + 4e3 * RANDOM.standard_normal(N)), "p_A - p_B is noise"),

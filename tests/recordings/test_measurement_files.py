@@ -142,7 +142,8 @@ def test_an_archive_of_two_files_names_them(tmp_path: Path) -> None:
         ("log.bin", P_A.tobytes(), "catman's: export it from catman as MATLAB, TDMS or ASCII"),
         ("log.unv", b"    -1\n    58\np_A\n", "a universal file (UFF 58): export it as MATLAB or CSV"),
         ("log.dxd", b"DEWESoft" + bytes(range(256)), "a Dewesoft file: export it from DewesoftX"),
-        ("log.json", b'[{"t": 0}]\n', "got JSON: export it as CSV"),
+        ("log.json", b'[{"t": 0}]\n', "a recording must have a channel"),
+        ("log.csv", b"{rig 3}\n[0]\n", "got JSON: export it as CSV"),
         ("log.npy", b"\x93NUMPY\x01\0", "a NumPy array: export it as CSV"),
     ],
 )

@@ -256,6 +256,14 @@ def test_the_drawing_is_the_machines_own(recording):
     assert (unknown.cylinder, unknown.throttles) == ("cylinder", False)
 
 
+def test_a_servo_valve_is_drawn_between_supply_and_return(recording):
+    drawing = circuit_of(load_rig("servo-valve"), recording)
+    text = Reader(schematic(recording, _judged(), drawing)).text
+    assert "servo valve" in text and "pressure of the supply, p_1" in text and "pressure of the return, p_2" in text
+    assert "servo drive" not in text and "port 1" not in text
+    assert "A servo valve joins the chambers A and B of a double-rod cylinder to a supply and a return." in text
+
+
 def test_sensors_carry_the_files_own_names(recording, make_diagnosis):
     named = replace(recording, provenance={"columns": {"p_A": "Druck A [bar]", "q": "no channel"}})
     text = Reader(render_page(named, make_diagnosis())).text

@@ -267,3 +267,25 @@ def test_late_channels_are_read_late(check_rig):
     np.testing.assert_allclose(batch.rms[0], rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-6)
     np.testing.assert_allclose(batch.rms[1], rms_of(simulate_with_truth(prompt).recording, bounds), rtol=1e-6)
     assert np.abs(batch.rms[0] / batch.rms[1] - 1.0).max() > 1e-5
+
+
+@pytest.mark.slow
+def test_valve_controlled_runs_side_by_side_are_what_they_are_by_themselves():
+    bounds = [0.0, 2.5, 5.0]
+    experiments = [
+        Experiment.of(
+            rig="servo-valve",
+            command=f"{1 + 0.1 * k} sin(4t)",
+            leak="G = 6e-13 from 2 s" if k % 2 else None,
+            duration=5.0,
+            seed=k,
+            set={**QUIET, "o_PA": 1e-6 * k, "p_set": 7e6 + 1e5 * k},
+            **(COMMON | {"step": 2.5e-4}),
+        )
+        for k in range(9)
+    ]
+    batch = simulate_batch(experiments, bounds=bounds)
+    for k, one in enumerate(experiments):
+        alone = simulate_with_truth(one)
+        np.testing.assert_allclose(batch.rms[k], rms_of(alone.recording, bounds), rtol=1e-6)
+        assert batch.mean_leak_lpm[k] == pytest.approx(alone.truth.mean_leak_lpm, rel=1e-4, abs=1e-12)

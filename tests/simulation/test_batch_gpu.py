@@ -79,8 +79,8 @@ from sealscope.simulation.experiment import Experiment
 def rows(axes, kind=types.float64):
     return types.Array(kind, axes, "C")
 
-def advance(values, own):
-    numbers = numba.typeof(left_to_table(rig_numbers(Experiment.of(set=values).rig), own, choices=True))
+def advance(values, own, rig="thesis"):
+    numbers = numba.typeof(left_to_table(rig_numbers(Experiment.of(rig=rig, set=values).rig), own, choices=True))
     return (rows(3), types.float64, types.int64, rows(1), rows(2), rows(3), rows(3), rows(4), rows(1, types.int64),
             numbers, types.int64, rows(4), types.int64, rows(3))
 
@@ -92,6 +92,7 @@ wanted = {
     "rk4": (batch_gpu._advance_rk4, advance({}, ["F_v", "K_oil"])),
     "imex": (batch_gpu._advance_imex, advance({"line.orifices": "present"}, ["F_v", "K_oil"])),
     "air": (batch_gpu._advance_imex, advance({"line.orifices": "present", "fluid.air": 0.01}, [])),
+    "valve": (batch_gpu._advance_rk4, advance({}, ["F_v", "o_PA", "p_set"], "servo-valve")),
     "sense": (batch_gpu._sense, sense),
 }
 for name, (kernel, kinds) in wanted.items():
@@ -128,7 +129,7 @@ def machine_code(compiler, tmp_path_factory):
 
 def test_the_kernels_compile_for_a_gpu_that_is_not_there(machine_code):
     code, _ = machine_code
-    assert set(code) == {"rk4", "imex", "air", "sense"}
+    assert set(code) == {"rk4", "imex", "air", "valve", "sense"}
     for text in code.values():
         assert ".target sm_90" in text
         arithmetic = re.findall(r"\b(?:add|sub|mul|fma\.rn|div\.rn|sqrt\.rn)\.f(32|64)", text)

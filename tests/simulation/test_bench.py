@@ -167,6 +167,24 @@ def test_strokes_lie_about_the_middle(command):
     assert np.ptp(x) > 0.05
 
 
+def test_strokes_behind_a_valve_lie_about_the_middle():
+    rig, command = load_rig("servo-valve"), "8 sin(t)"
+    x_0 = centred_start(rig, command, 14.0)
+    x = simulate_with_truth(Experiment.of(rig=rig, command=command, duration=14.0, x_0=x_0)).truth.outputs["x"]
+    assert abs(x.max() + x.min()) < 0.05 * np.ptp(x)  # friction and the supply take a little
+    assert 0.3 < np.ptp(x) < 0.55
+
+
+def test_a_machine_behind_a_valve_differs_in_its_supply_and_its_edges():
+    built = draw("valve", 4, rig="servo-valve", duration=2.0, family="servo valve").experiment(command="2 sin(3t)")
+    assert 0.97 * 7e6 <= built.rig["supply.p_set"] <= 1.03 * 7e6
+    assert built.rig["supply.p_set"] != 7e6
+    overlaps = {built.rig[f"valve.{name}"] for name in ("o_PA", "o_AT", "o_PB", "o_BT")}
+    assert len(overlaps) == 4
+    assert max(map(abs, overlaps)) <= 5e-6
+    assert any(drift.parameter == "supply.p_set" for drift in built.drifts)
+
+
 # -- profiles of one's own ------------------------------------------------------------------------------------------
 
 SMALL = """
@@ -239,7 +257,9 @@ def test_a_profile_with_a_slip_is_refused_in_one_line_with_its_place(tmp_path, o
 
 
 def test_an_unknown_or_unreadable_profile_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"'banch' is no packaged profile \(bench, strangers\)"):
+    with pytest.raises(
+        InputError, match=r"'banch' is no packaged profile \(bench, closed-loop, load, single-rod, strangers, valve\)"
+    ):
         load_profile("banch")
     with pytest.raises(InputError, match="profile must be readable, got: No such file"):
         load_profile(tmp_path / "none.toml")

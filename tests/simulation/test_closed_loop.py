@@ -39,7 +39,7 @@ def followed(rig: str, target: str, duration: float, **options):
     ("rig", "force"),
     [
         pytest.param("thesis-closed-loop", 0.0, marks=pytest.mark.slow),
-        ("thesis-closed-loop", 2000.0),
+        pytest.param("thesis-closed-loop", 2000.0, marks=pytest.mark.slow),
         pytest.param("single-rod-eha", 0.0, marks=pytest.mark.slow),
         pytest.param("single-rod-eha", 2000.0, marks=pytest.mark.slow),
     ],

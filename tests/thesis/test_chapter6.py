@@ -39,14 +39,27 @@ class Given:
     quick = True
 
     def __init__(self, **changed: float) -> None:
-        size = {"fixed": 0.05, "tolerant": 0.05, "stiff": 6000.0, "unharmed": 0.05, "drift": 0.01} | changed
+        size = {
+            "fixed": 0.05,
+            "tolerant": 0.05,
+            "stiff": 6000.0,
+            "unharmed": 0.05,
+            "drift": 0.01,
+            "valve": 4.0,
+        } | changed
         rows = [
             ("pi", 0.0, 0.05, 20.0, 50.0, 6000.0, 0.0),
             ("pi", 0.5, size["fixed"], 20.0, 50.0, 1500.0, 0.0),
             ("fault-tolerant", 0.0, size["unharmed"], 20.0, 50.0, 6000.0, 0.0),
             ("fault-tolerant", 0.5, size["tolerant"], 20.0, 50.0, size["stiff"], 0.5),
         ]
+        by_source = [
+            (source, "pi", lpm, error, 20.0, 6000.0, 60.0, 20.0, efficiency, 90.0)
+            for source, error, efficiency in (("pump", 0.05, 85.0), ("valve", 0.02, size["valve"]))
+            for lpm in (0.0, 0.5)
+        ]
         self.tables = {
+            "sec-6.2-valve": ThesisTable("v", "", chapter6.VALVE_COLUMNS, tuple(by_source)),
             "sec-6.2-controllers": ThesisTable("c", "", chapter6.COLUMNS, tuple(rows)),
             "sec-6.2-open-loop": ThesisTable(
                 "o", "", ("",) * 6, ((0.0, 38.0, -8.0, 0.0, 0.0, 0.0), (0.5, 37.0, -800.0, -790.0, size["drift"], 0.0))
@@ -61,11 +74,12 @@ class Given:
 @pytest.mark.parametrize(
     ("changed", "verdicts"),
     [
-        ({}, ("holds", "holds", "does not hold", "cannot be tested")),
-        ({"drift": 5.0}, ("does not hold", "holds", "does not hold", "cannot be tested")),
-        ({"tolerant": 0.08}, ("holds", "holds in part", "does not hold", "cannot be tested")),
-        ({"stiff": 2000.0}, ("holds", "holds in part", "does not hold", "cannot be tested")),
-        ({"unharmed": 0.051}, ("holds", "holds in part", "does not hold", "cannot be tested")),
+        ({}, ("holds", "holds", "does not hold", "holds")),
+        ({"drift": 5.0}, ("does not hold", "holds", "does not hold", "holds")),
+        ({"tolerant": 0.08}, ("holds", "holds in part", "does not hold", "holds")),
+        ({"stiff": 2000.0}, ("holds", "holds in part", "does not hold", "holds")),
+        ({"unharmed": 0.051}, ("holds", "holds in part", "does not hold", "holds")),
+        ({"valve": 80.0}, ("holds", "holds", "does not hold", "holds in part")),
     ],
 )
 def test_claims_follow_their_tables(changed, verdicts):
@@ -85,3 +99,26 @@ def test_the_tables_are_made():
     (opened,) = chapter6.open_loop_table(Quick(), by_id["sec-6.2-open-loop"])
     assert abs(opened.rows[1][3]) > 600.0
     assert abs(opened.rows[1][4]) < 0.1
+
+
+@pytest.mark.slow
+def test_the_comparison_of_pump_and_valve_is_made():
+    class Quick:
+        quick = True
+
+    table, figure = chapter6.valve_table(Quick(), next(item for item in chapter6.ITEMS if item.id == "sec-6.2-valve"))
+    assert len(table.rows) == 8
+    assert len(figure.panels) == 2
+    by = {row[:3]: row[3:] for row in table.rows}
+    pump, valve = by["pump", "pi", 0.0], by["valve", "pi", 0.0]
+    assert pump[5] > 60.0
+    # 7.35 L/min at 7.5 MPa all the time: the supply's own power is what it costs
+    assert valve[4] == pytest.approx(4.9e-6 * 25 * 7.2e6 * 4.0, rel=0.05)
+    assert valve[5] < valve[6] < 50.0
+    # the root of the pressures: half of what a cylinder without a load takes is lost at each of two edges
+    assert valve[6] < pump[6]
+
+
+def test_a_valve_draws_what_its_open_edge_passes():
+    run = {"x_s": np.array([1e-4, -1e-4]), "Q_A": np.array([2e-5, -3e-5]), "Q_B": np.array([1e-5, -4e-5])}
+    np.testing.assert_allclose(chapter6.drawn(run), [2e-5, 4e-5])

@@ -15,6 +15,7 @@ import typer
 
 from sealscope.cli import (
     campaign,
+    datasets,
     fmu,
     identification,
     monitoring,
@@ -53,6 +54,7 @@ for command in (
     identification.identify,
     recordings.inspect,
     recordings.convert,
+    datasets.datasets,
     reproduction.reproduce,
     fmu.fmu,
     campaign.calibrate,

@@ -461,11 +461,23 @@ def convert(
     target: Annotated[Path, typer.Argument(help="Recording to write; its suffix tells the format.")],
     maps: MapOption = None,
     rate: RateOption = None,
+    every: Annotated[
+        str | None,
+        typer.Option(
+            "--every",
+            metavar="TIME",
+            help="Cut a long log into parts of this length (1h): TARGET is a folder, made for them, of NetCDF files. "
+            "A text log of any size is read in bounded memory; `sealscope trend` follows the parts.",
+        ),
+    ] = None,
 ) -> None:
     """Rewrite a recording in another format, with Sealscope's channel names and units."""
     from sealscope.recordings import inspect, write
     from sealscope.recordings.files import check_target
 
+    if every is not None:
+        _convert_parts(source, target, _Reading.of(maps, rate, None), every)
+        return
     check_target(target)
     check_folder(target)
     recording = _Reading.of(maps, rate, None).read(source)
@@ -473,3 +485,24 @@ def convert(
     say(f"{target}: {len(recording)} samples at {recording.rate:g} Hz, channels {', '.join(recording.channels)}")
     for finding in inspect(recording):
         say(f"{finding.severity}: {finding.text}")
+
+
+def _convert_parts(source: Path, folder: Path, reading: _Reading, every: str) -> None:
+    """Write the parts of a long recording into a new folder; each file is whole or absent."""
+    from sealscope.recordings import inspect, read_parts, write
+    from sealscope.recordings.formats.columns import counted
+    from sealscope.units import parse_quantity
+
+    length = parse_quantity(every, "s", name="--every")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"with --every, TARGET must be a new or empty folder, got {folder}")
+    count, samples = 0, 0
+    for part in read_parts(source, length, channel_map=reading.channel_map or None, rate=reading.rate):
+        if not count:
+            folder.mkdir(exist_ok=True)
+        count, samples = count + 1, samples + len(part)
+        file = folder / f"{source.stem}_{count:04d}.nc"
+        write(part, file)
+        findings = "".join(f"; {finding.text}" for finding in inspect(part) if finding.severity != "note")
+        say(f"{file}: {part.duration:g} s from t = {part.t[0]:g} s{findings}")
+    say(f"{folder}: {counted(count, 'part')}, {samples} samples")

@@ -1,16 +1,20 @@
-"""What a drive must be told so that its pump gives a flow: the inverse of its own speed loop."""
+"""What a drive must be told so that it gives a flow: the inverse of a pump's speed loop, or of a servo valve."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+
+
+#: Least share of the supply that a controller assumes across a valve: beyond, a load is more than it can move.
+_LEAST_ACROSS = 0.1
 
 
 def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str, float]) -> None:
@@ -21,6 +25,22 @@ def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str,
     for name, value in not_negative.items():
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"{name} of {what} must be >= 0, got {value}")
+
+
+class FlowSource(Protocol):
+    """What gives the cylinder its flow, as a controller assumes it."""
+
+    def inverse(self, rate: float) -> Callable[[float, float], float]:
+        """Return a function of a flow [m^3/s] and a pressure difference [Pa], called at `rate` [Hz]: the voltage."""
+        ...
+
+    def steady(self, flow: float) -> float:
+        """Return the voltage [V] of a flow [m^3/s] that lasts, without a load."""
+        ...
+
+    def largest(self, u_max: float) -> float:
+        """Return the flow [m^3/s] at the voltage `u_max` [V], without a load."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -46,7 +66,12 @@ class Drive:
 
     @classmethod
     def of(cls, rig: Rig) -> Self:
-        """Return the drive that a rig is said to have."""
+        """Return the drive that a rig is said to have; InputError for a valve-controlled one."""
+        if rig.valve.spool == "present":
+            raise InputError(
+                f"a pump's drive must have a pump-controlled rig (valve.spool = absent), got {rig.name}; ValvePI and "
+                "ValveDrive are for a servo valve"
+            )
         motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)
         shortfall, corner = (motor.C_e / motor.k_p, motor.K_i / motor.k_p) if motor.k_p > 0 else (0.0, 0.0)
         droop = motor.R_c * displacement / (motor.C_m * motor.C_e)
@@ -69,3 +94,65 @@ class Drive:
             return (omega + self.shortfall * quick) / self.omega_per_volt
 
         return voltage
+
+    def steady(self, flow: float) -> float:
+        """Return the voltage [V] of a flow [m^3/s] that lasts, of a drive that reaches its commanded speed."""
+        return flow / self.displacement / self.omega_per_volt
+
+    def largest(self, u_max: float) -> float:
+        """Return the flow [m^3/s] at the voltage `u_max` [V]."""
+        return u_max * self.omega_per_volt * self.displacement
+
+
+@dataclass(frozen=True)
+class ValveDrive:
+    """What a controller assumes of a servo valve and its supply.
+
+    Q = Q_N u/u_N sqrt((p_s - sign(Q) dp)/(2 dp_N)) of a valve with equal edges, half of the pressure lost at each of
+    the two that are open (Merritt, Hydraulic Control Systems, 1967, section 5.2); its spool is taken to be where the
+    command wants it. `Q_N` [m^3/s] at `dp_N` [Pa] an edge and `u_N` [V]; `p_s` [Pa]: supply less return.
+    """
+
+    Q_N: float
+    dp_N: float
+    u_N: float
+    p_s: float
+
+    def __post_init__(self) -> None:
+        positive = {"Q_N": self.Q_N, "dp_N": self.dp_N, "u_N": self.u_N, "p_s": self.p_s}
+        check_numbers("the valve", positive, {})
+
+    @classmethod
+    def of(cls, rig: Rig) -> Self:
+        """Return the valve that a rig is said to have; InputError for a pump-controlled one."""
+        valve, supply = rig.valve, rig.supply
+        if valve.spool == "absent":
+            raise InputError(f"a valve's drive must have a servo valve (valve.spool = present), got rig {rig.name}")
+        pumped = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P
+        return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pumped / supply.G_set)
+
+    def inverse(self, rate: float) -> Callable[[float, float], float]:
+        """Return a function of a flow [m^3/s] and a pressure difference [Pa], called at `rate` [Hz]: the voltage [V].
+
+        The voltage makes the valve give the flow against the pressure difference (p_A - p_B).
+        """
+        least = _LEAST_ACROSS * self.p_s
+
+        def voltage(flow: float, dp: float) -> float:
+            across = max(self.p_s - math.copysign(dp, dp * flow), least)
+            return self.u_N * flow / (self.Q_N * math.sqrt(0.5 * across / self.dp_N))
+
+        return voltage
+
+    def steady(self, flow: float) -> float:
+        """Return the voltage [V] of a flow [m^3/s] without a load."""
+        return self.inverse(1.0)(flow, 0.0)
+
+    def largest(self, u_max: float) -> float:
+        """Return the flow [m^3/s] at the voltage `u_max` [V], without a load."""
+        return u_max / self.steady(1.0)
+
+
+def drive_of(rig: Rig) -> Drive | ValveDrive:
+    """Return what a rig is said to give its cylinder's flow by."""
+    return Drive.of(rig) if rig.valve.spool == "absent" else ValveDrive.of(rig)

@@ -11,6 +11,7 @@ from sealscope.control.controller import Controller, Measured
 from sealscope.control.drive import Drive, check_numbers
 from sealscope.control.leak_observer import SHUT, Balance, LeakObserver
 from sealscope.control.position import PositionPI
+from sealscope.errors import InputError
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -51,6 +52,11 @@ class FaultTolerant:
     def of(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
         """Return the controller for what a rig is said to be, around `inner`, by default `PositionPI`."""
         c, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
+        if rig.valve.spool == "present":
+            raise InputError(
+                "a fault-tolerant controller must have a pump whose angle it reads (valve.spool = absent), got rig "
+                f"{rig.name}"
+            )
         pilots = makeup.check_valves == "pilot-operated"
         balance = Balance(
             rig.pump.q_b / (2.0 * math.pi),

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 from sealscope.control.controller import Measured
-from sealscope.control.drive import Drive, check_numbers
-from sealscope.control.position import PositionPI
+from sealscope.control.drive import Drive, ValveDrive, check_numbers, drive_of
+from sealscope.control.position import PositionPI, ValvePI, position_controller
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -34,8 +34,8 @@ class Flatness:
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """
 
-    feedback: PositionPI
-    drive: Drive
+    feedback: PositionPI | ValvePI
+    drive: Drive | ValveDrive
     M: float
     F_C: float
     F_v: float
@@ -51,16 +51,18 @@ class Flatness:
     @classmethod
     def of(cls, rig: Rig) -> Self:
         """Return the controller for what a rig is said to be."""
-        cylinder, friction, drive = rig.cylinder, rig.friction, Drive.of(rig)
-        greatest = rig.daq.u_max * drive.omega_per_volt * drive.displacement / min(cylinder.A_A, cylinder.A_B)
+        cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
+        greatest = drive.largest(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
+        by_valve = rig.valve.spool == "present"
+        charge = 0.5 * (drive.p_s + 2.0 * rig.supply.p_return) if isinstance(drive, ValveDrive) else rig.fluid.p_charge
         return cls(
-            PositionPI.of(rig),
+            position_controller(rig),
             drive,
             cylinder.M_eq,
-            friction.F_pr + 2.0 * friction.F_cfr * rig.fluid.p_charge,
+            friction.F_pr + 2.0 * friction.F_cfr * charge,
             friction.F_v,
             friction.v_th,
-            rig.pump.G_pump,
+            0.0 if by_valve else rig.pump.G_pump,
             cylinder.V / (2.0 * rig.fluid.K_oil),
             greatest,
         )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.control.controller import Controller, Measured
+from sealscope.control.drive import drive_of
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ _IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
 _SETTLING = 0.5
 _FREQUENCIES = 4000
 #: By how much each state is moved for a difference.
-_SIZES = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9)
+_SIZES = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9, 1e-7, 1e-4)
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array
 
     y, u = initial_state(rig, 0.0, load), 0.0
     if speed != 0.0:
-        u = speed * rig.cylinder.A_A / (rig.pump.q_b / (2.0 * math.pi)) / rig.motor.omega_per_volt
+        u = drive_of(rig).steady(speed * rig.cylinder.A_A)
         samples, limit = round(_SETTLING * rate), rig.daq.u_max
 
         def moving(u: float) -> tuple[Array, float]:

@@ -14,7 +14,7 @@ from sealscope.calls import closest
 from sealscope.control.controller import Controller
 from sealscope.control.fault_tolerant import FaultTolerant
 from sealscope.control.flatness import Flatness
-from sealscope.control.position import PositionPI
+from sealscope.control.position import position_controller
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 #: What makes each built-in controller for what a rig is said to be.
 CONTROLLERS: Mapping[str, Callable[[Rig], Controller]] = {
-    "pi": PositionPI.of,
+    "pi": position_controller,
     "flatness": Flatness.of,
     "fault-tolerant": FaultTolerant.of,
     "fault-tolerant-flatness": lambda rig: FaultTolerant.of(rig, Flatness.of(rig)),
@@ -63,6 +63,14 @@ def controller_named(name: str, rig: Rig) -> Controller:
     if missing:
         raise InputError(f"a controller must have rate, delay and start, got {name} without {', '.join(missing)}")
     return made  # type: ignore[no-any-return]
+
+
+def source_of(name: str) -> Path | None:
+    """Return the file that a user's own controller is written in, None for a built-in one."""
+    place = name.rpartition(":")[0]
+    if name in CONTROLLERS or not place:
+        return None
+    return Path(getattr(_module(place), "__file__", None) or place)
 
 
 def _module(place: str) -> Any:

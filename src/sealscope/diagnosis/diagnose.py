@@ -18,7 +18,7 @@ from sealscope.diagnosis.isolation import Signatures, elsewhere, isolated, signa
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.verdict.fusion import fuse
+from sealscope.diagnosis.verdict.fusion import ORDER, fuse
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
@@ -36,6 +36,8 @@ _PROBABILITIES = (1e-4, 0.2)
 WHOLE = 0.95
 #: Detectors that name a cause by the pressures: they do so of nothing that another cause explains, alone either.
 _ISOLATED = ("pressure model", "observer")
+#: Why the change of RMS alone does not call a valve-controlled machine sound.
+_DAMPED = "behind a servo valve, whose edges damp the ringing as well, that shows few leaks"
 
 
 def check_probability(probability: float) -> None:
@@ -138,6 +140,8 @@ class Examination:
                 evidence = replace(evidence, reason=f"{evidence.reason}; {self.no_baseline}")
             else:
                 evidence = replace(evidence, verdict="cannot tell", reason=self.no_baseline)
+        if self._behind_valve and name == ORDER[-1] and evidence.verdict == "no leak":
+            evidence = replace(evidence, verdict="cannot tell", reason=f"{evidence.reason}; {_DAMPED}")
         return self._isolated(evidence) if name in _ISOLATED else evidence
 
     def _with_share(self, evidence: Evidence) -> Evidence:
@@ -190,19 +194,25 @@ class Examination:
             return isolated(evidence, self._signatures, self._known if evidence.onset_s is None else ())
 
     @cached_property
+    def _behind_valve(self) -> bool:
+        from sealscope.parameters import load_rig
+
+        return load_rig(self.rig).valve.spool == "present"
+
+    @cached_property
     def _signatures(self) -> Signatures | None:
-        return _signatures(self.recording)
+        return _signatures(self.recording, self._behind_valve)
 
     @cached_property
     def _known(self) -> list[Signatures]:
         """Signatures of the baseline."""
-        return [seen for own in self.baseline if (seen := _signatures(own)) is not None]
+        return [seen for own in self.baseline if (seen := _signatures(own, self._behind_valve)) is not None]
 
 
-def _signatures(recording: Recording) -> Signatures | None:
+def _signatures(recording: Recording, behind_valve: bool) -> Signatures | None:
     try:
         with np.errstate(all="ignore"):
-            return signatures(recording)
+            return signatures(recording, behind_valve=behind_valve)
     except (ArithmeticError, np.linalg.LinAlgError):
         _log.debug("what else stepped cannot be computed", exc_info=True)
         return None

@@ -58,8 +58,11 @@ LOWEST, HIGHEST, NOISE = 16.0, 0.36, 0.38
 MAINS, HUM_BESIDE = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0), (1.5, 6.0)
 #: Bands of noise whose ratio shows the sensor's filter: from these shares of the rate, so wide.
 TILT, TILT_WIDTH = (0.30, 0.42), 0.07
-#: Steps that matter, as logarithms: of that ratio, of a hum line over what lies beside it; no leak moves either so far.
-FILTERED, HUMS = 0.5, 1.2
+#: Steps that matter, as logarithms: of that ratio, of a hum line over what lies beside it, of the mean of such lines
+#: of both chambers; no leak moves any of them so far.
+FILTERED, HUMS, HUMS_BOTH = 0.5, 1.2, 0.7
+#: ... and of a hum line itself: half of that over what lies beside it.
+HUMS_OWN = 0.6
 #: A sure step anywhere in the recording; blocks of one duty correlate by more than the one, of another phase by less
 #: than the other.
 SURE_ANYWHERE, SAME_PHASE, OTHER_PHASE = 6.0, 0.7, 0.35
@@ -107,9 +110,10 @@ class Signatures:
     over it, None without a command; `power` (n, b) of p_A - p_B in bands about `frequency` (b,) [Hz]; `noise` (n,)
     power of its noise in one line of the spectrum, `lines` (b,) of each band; `motion`: where the strokes changed;
     `tilt` (n, 2) log power of the noise of p_A and p_B near half the rate over that at two thirds of it; `hum` (n, 2,
-    h) log power in lines of mains frequencies over what lies beside them, `mains` (h,) [Hz]; `alike` (n - 1, 2)
-    correlation of p_A - p_B in each block with that one and two blocks before, None where the duty does not repeat;
-    `together`: how p_A and p_B ring together.
+    h) log power in lines of mains frequencies over what lies beside them, `line` (n, 2, h) that in the lines alone,
+    `mains` (h,) [Hz]; `alike` (n - 1, 2) correlation of p_A - p_B in each block with that one and two blocks before
+    (`_alike`), None where the duty does not repeat; `together`: how p_A and p_B ring together; `scale` [Pa]: what steps
+    of a chamber's mean are measured by, and `measure`, its name.
     """
 
     t: Array
@@ -124,13 +128,21 @@ class Signatures:
     motion: tuple[StrokeChange, ...]
     tilt: Array
     hum: Array
+    line: Array
     mains: Array
     alike: Array | None
     together: Together
+    scale: float
+    measure: str
 
 
-def signatures(recording: Recording) -> Signatures | None:
-    """Return the signatures of a recording; None without both chambers or where it is too short for a step."""
+def signatures(recording: Recording, *, behind_valve: bool = False) -> Signatures | None:
+    """Return the signatures of a recording; None without both chambers or where it is too short for a step.
+
+    A pump holds both chambers' means, which are measured by the strokes' pressure difference, and they ring against
+    each other. `behind_valve` the means are the supply's and move with it, so they are measured by its pressure; each
+    chamber rings by its own volume, so that a delay between them is not asked for.
+    """
     if any(name not in recording for name in CHAMBERS) or len(recording) < 2 * FEWEST * _SHORTEST:
         return None
     rate = recording.rate
@@ -163,7 +175,11 @@ def signatures(recording: Recording) -> Signatures | None:
     duty = None if duty is None else duty[whole]
     f: Array = np.fft.rfftfreq(length, 1.0 / rate).astype(np.float64)
     spectra = [np.fft.rfft((own - own.mean(axis=1, keepdims=True)) * np.hanning(length), axis=1) for own in (p_A, p_B)]
-    tilt, hum, mains = _sensors(spectra, f, rate)
+    tilt, hum, line, mains = _sensors(spectra, f, rate)
+    together = _together([own[whole] for own in spectra], f if not behind_valve else np.zeros(f.size), rate)
+    scale, measure = float(np.exp(np.median(swing))), "the strokes' pressure difference"
+    if behind_valve:
+        scale, measure = float(np.median(mean.sum(axis=1))), "the supply's pressure"
     return Signatures(
         t,
         0.5 * length / rate,
@@ -177,9 +193,12 @@ def signatures(recording: Recording) -> Signatures | None:
         duty_changes(recording),
         tilt[whole],
         hum[whole],
+        line[whole],
         mains,
         None if find_cycle(recording) is None else _alike(_smooth(dp, rate)[whole]),
-        _together([own[whole] for own in spectra], f, rate),
+        together,
+        max(scale, np.finfo(float).tiny),
+        measure,
     )
 
 
@@ -213,27 +232,29 @@ def _together(spectra: Sequence[NDArray[np.complex128]], f: Array, rate: float) 
     return Together(f[here], a * np.conj(b), np.stack([np.abs(a) ** 2, np.abs(b) ** 2]))
 
 
-def _sensors(spectra: Sequence[NDArray[np.complex128]], f: Array, rate: float) -> tuple[Array, Array, Array]:
-    """Return what shows a change of a sensor's filter or of its wiring: tilt, hum and mains of `Signatures`.
+def _sensors(spectra: Sequence[NDArray[np.complex128]], f: Array, rate: float) -> tuple[Array, Array, Array, Array]:
+    """Return what shows a change of a sensor's filter or of its wiring: tilt, hum, line and mains of `Signatures`.
 
     `spectra` of p_A and p_B (n, f.size) at the frequencies `f` [Hz].
     """
     mains = np.array([hertz for hertz in MAINS if hertz + HUM_BESIDE[1] < 0.5 * rate])
     own = np.searchsorted(f, mains) if HUM_BESIDE[0] > 2.0 * f[1] else np.empty(0, dtype=np.intp)
     mains = mains[: own.size]
-    tilts, hums = [], []
+    tilts, hums, own_lines = [], [], []
     for values in spectra:
         spectrum = np.abs(values) ** 2
         low, high = ((f > share * rate) & (f <= (share + TILT_WIDTH) * rate) for share in TILT)
         with np.errstate(divide="ignore", invalid="ignore"):
             tilts.append(np.log(np.median(spectrum[:, high], axis=1) / np.median(spectrum[:, low], axis=1)))
-            lines = []
+            lines, besides = [], []
             for hertz, line in zip(mains, own, strict=True):
                 off = np.abs(f - hertz)
-                beside = spectrum[:, (off > HUM_BESIDE[0]) & (off <= HUM_BESIDE[1])]
-                lines.append(np.log(spectrum[:, line - 1 : line + 2].max(axis=1) / beside.mean(axis=1)))
-        hums.append(np.reshape(lines, (len(lines), len(values))).T)
-    return np.stack(tilts, axis=1), np.stack(hums, axis=1), mains
+                lines.append(np.log(spectrum[:, line - 1 : line + 2].max(axis=1)))
+                besides.append(np.log(spectrum[:, (off > HUM_BESIDE[0]) & (off <= HUM_BESIDE[1])].mean(axis=1)))
+            shape = len(lines), len(values)
+            own_lines.append(np.reshape(lines, shape).T)
+            hums.append(own_lines[-1] - np.reshape(besides, shape).T)
+    return np.stack(tilts, axis=1), np.stack(hums, axis=1), np.stack(own_lines, axis=1), mains
 
 
 def lag_step(seen: Signatures, onset: float) -> tuple[float, float]:
@@ -265,10 +286,19 @@ def lag_step(seen: Signatures, onset: float) -> tuple[float, float]:
 
 
 def _alike(rows: Array) -> Array:
-    """Return the correlation (n - 1, 2) of each row but the first with that one, and two, before it."""
+    """Return the correlation (n - 1, 2) of each row but the first with that one, and two, before it.
+
+    With the one before, of what is left of each beside its line: a load that swings slowly turns the line about.
+    """
+
+    def unit(rest: Array) -> Array:
+        size = np.sqrt(np.sum(rest**2, axis=1, keepdims=True))
+        return np.asarray(rest / np.maximum(size, np.finfo(float).tiny))
+
     rest = rows - rows.mean(axis=1, keepdims=True)
-    rest = rest / np.maximum(np.sqrt(np.sum(rest**2, axis=1, keepdims=True)), np.finfo(float).tiny)
-    before = np.sum(rest[1:] * rest[:-1], axis=1)
+    line = np.arange(rows.shape[1]) - 0.5 * (rows.shape[1] - 1)
+    bent, rest = unit(rest - np.outer(rest @ line, line) / (line @ line)), unit(rest)
+    before = np.sum(bent[1:] * bent[:-1], axis=1)
     return np.stack([before, np.append(1.0, np.sum(rest[2:] * rest[:-2], axis=1))], axis=1)
 
 
@@ -385,17 +415,20 @@ def unlike(seen: Signatures, known: Sequence[Signatures]) -> OtherCause | None:
                 return OtherCause(
                     "sensor fault", f"there is {which} hum of {hertz:g} Hz in {name} than in the baseline"
                 )
+    for hertz, change in zip(seen.mains, hum.mean(axis=0), strict=True):
+        if abs(change) > HUMS_BOTH:
+            which = "more" if change > 0 else "less"
+            return OtherCause("sensor fault", f"there is {which} hum of {hertz:g} Hz in both than in the baseline")
     if len(known) >= FEWEST_RECORDINGS:
         return None
-    scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
-    mean = outside(seen.mean / scale, [other.mean / scale for other in known])
+    mean = outside(seen.mean / seen.scale, [other.mean / seen.scale for other in known])
     swing = float(outside(seen.swing, [other.swing for other in known]))
     with np.errstate(divide="ignore"):
         noise = float(outside(np.log(seen.noise), [np.log(other.noise) for other in known]))
     differing = []
     if np.abs(mean).max() > CHARGED:
         largest = float(mean[np.argmax(np.abs(mean))])
-        differing.append(f"the chambers' means by up to {largest:+.0%} of the strokes' pressure difference")
+        differing.append(f"the chambers' means by up to {largest:+.0%} of {seen.measure}")
     if abs(swing) > FRICTION:
         differing.append(f"the strokes' pressure difference by {math.expm1(swing):+.1%}, which friction sets")
     if abs(noise) > NOISY:
@@ -453,6 +486,10 @@ def _readings(seen: Signatures, onset: float | None, quiet: bool) -> OtherCause 
         for number, hertz in enumerate(() if quiet else seen.mains):
             size, surely = surest(seen.hum[:, chamber, number], onset)
             if abs(size) > HUMS and abs(surely) > sure:
+                # a leak that damps a ringing near the mains uncovers hum that was there
+                moved = surest(seen.line[:, chamber, number], onset)[0] * np.sign(size)
+                if moved < HUMS_OWN:
+                    continue
                 verb = "began" if size > 0 else "ended"
                 return OtherCause("sensor fault", f"hum of {hertz:g} Hz {verb} in {name}")
     lag, surely = lag_step(seen, onset) if onset is not None and not quiet else (0.0, 0.0)
@@ -462,8 +499,7 @@ def _readings(seen: Signatures, onset: float | None, quiet: bool) -> OtherCause 
 
 
 def _sensor(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
-    scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
-    size, surely = np.array([_step(seen, values / scale, onset) for values in seen.mean.T]).T
+    size, surely = np.array([_step(seen, values / seen.scale, onset) for values in seen.mean.T]).T
     largest = int(np.argmax(np.abs(size)))
     if abs(size[largest]) < strict * MEAN or abs(surely[largest]) < strict * SURE:
         return None
@@ -471,7 +507,7 @@ def _sensor(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
         return None
     return OtherCause(
         "sensor fault",
-        f"the mean of {CHAMBERS[largest]} alone steps by {size[largest]:+.1%} of the strokes' pressure difference, "
+        f"the mean of {CHAMBERS[largest]} alone steps by {size[largest]:+.1%} of {seen.measure}, "
         "which a piston that floats between both chambers does not allow",
     )
 
@@ -497,15 +533,14 @@ def _scale(seen: Signatures, evidence: Evidence) -> OtherCause | None:
 
 def _charge(seen: Signatures, onset: float) -> OtherCause | None:
     """Return whether both chambers' means step alike, which a leak between them does not bring about."""
-    scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
-    size, surely = np.array([_step(seen, values / scale, onset) for values in seen.mean.T]).T
+    size, surely = np.array([_step(seen, values / seen.scale, onset) for values in seen.mean.T]).T
     if np.abs(size).min() < max(CHARGED, ALIKE * np.abs(size).max()) or np.abs(surely).min() < SURE:
         return None
     if size[0] * size[1] < 0.0:
         return None
     return OtherCause(
         None,
-        f"both chambers' means step by {size.mean():+.0%} of the strokes' pressure difference, which a leak between "
+        f"both chambers' means step by {size.mean():+.0%} of {seen.measure}, which a leak between "
         "them does not bring about: another charge pressure, or another machine's readings",
     )
 
@@ -556,7 +591,6 @@ def _lost(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
 
     They need not step, since a make-up may hold them for a while.
     """
-    scale = max(float(np.exp(np.median(seen.swing))), np.finfo(float).tiny)
     t = seen.t - onset
     before = (t + seen.half <= -NEAR) & (t > -NEAR - REACH)
     after = (t - seen.half >= NEAR) & (t < NEAR + REACH)
@@ -566,7 +600,7 @@ def _lost(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
     inverse = np.linalg.inv(x[before].T @ x[before])
     at = x[after].mean(axis=0)
     fallen = []
-    for values in seen.mean.T / scale:
+    for values in seen.mean.T / seen.scale:
         line = inverse @ (x[before].T @ values[before])
         rest = values[before] - x[before] @ line
         variance = float(rest @ rest) / max(rest.size - 2, 1)
@@ -580,6 +614,5 @@ def _lost(seen: Signatures, onset: float, strict: float) -> OtherCause | None:
         return None
     return OtherCause(
         "external leak",
-        f"both chambers' means fall, by {np.mean(fallen):.1%} of the strokes' pressure difference: oil "
-        "leaves the circuit",
+        f"both chambers' means fall, by {np.mean(fallen):.1%} of {seen.measure}: oil leaves the circuit",
     )

@@ -13,11 +13,14 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.observer.evidence import MEANS
+from sealscope.diagnosis.observer.stream import Formulation
 from sealscope.errors import InputError
 from sealscope.fmu.description import description_2, description_3
 from sealscope.fmu.machine import FAILURES, Choice, code, object_code
@@ -118,20 +121,59 @@ def chosen_step(rig: Rig, error: float) -> tuple[float, float]:
     return min(run.step for run in runs), max(run.error for run in runs)
 
 
-def configuration(rig: Rig, token: str, step: float, present: Sequence[bool]) -> str:
-    """Return the header of a unit: its sizes, its token and the values it starts with."""
-    from operator import attrgetter
+@dataclass(frozen=True)
+class MockUp:
+    """A unit before it is built: its code, what it lists, and the sizes and starts that its layer in C needs.
 
-    sizes = {"STATES": len(STATES), "VALUES": len(VALUES), "INPUTS": len(INPUTS), "RESULTS": len(RESULTS)}
-    bases = {"INPUT_BASE": INPUT_BASE, "VALUE_BASE": VALUE_BASE, "RESULT_BASE": RESULT_BASE}
-    lines = [f"#define N_{name} {size}" for name, size in sizes.items()]
-    lines += [f"#define {name} {base}" for name, base in bases.items()]
-    lines += [f"#define START_POSITION {START_POSITION}", f"#define STEP {STEP}"]
-    lines += [f'#define TOKEN "{token}"', f"#define START_STEP {step!r}"]
-    lines += ["#define VALUES_AT_START {" + ", ".join(repr(float(attrgetter(name)(rig))) for name in VALUES) + "}"]
-    lines += ["#define VALUES_PRESENT {" + ", ".join("1" if there else "0" for there in present) + "}"]
-    lines += ["#define FAILURES {" + ", ".join(f'"{words}"' for words in FAILURES.values()) + "}"]
-    return "\n".join(lines) + "\n"
+    `modules`: LLVM code of its functions; `values`: parameters at the start, in the order of the code; `inputs`,
+    `results`, `states`: how many; `step` [s]: longest step of its solver; `failures`: words for the codes that its
+    functions return.
+    """
+
+    words: str
+    modules: Mapping[str, str]
+    listed: tuple[Variable, ...]
+    values: tuple[float, ...]
+    inputs: int
+    results: int
+    states: int
+    step: float
+    failures: Mapping[int, str]
+
+    @property
+    def token(self) -> str:
+        """The unit's identity, as the description and the library hold it."""
+        return hashlib.sha256("".join([self.words, str(self.listed), *self.modules.values()]).encode()).hexdigest()[:32]
+
+    def configuration(self) -> str:
+        """Return the header of the unit: its sizes, its token and the values it starts with."""
+        references = {variable.reference for variable in self.listed}
+        present = ["1" if VALUE_BASE + k in references else "0" for k in range(len(self.values))]
+        sizes = {"STATES": self.states, "VALUES": len(self.values), "INPUTS": self.inputs, "RESULTS": self.results}
+        bases = {"INPUT_BASE": INPUT_BASE, "VALUE_BASE": VALUE_BASE, "RESULT_BASE": RESULT_BASE}
+        lines = [f"#define N_{name} {size}" for name, size in sizes.items()]
+        lines += [f"#define {name} {base}" for name, base in bases.items()]
+        lines += [f"#define START_POSITION {START_POSITION}", f"#define STEP {STEP}"]
+        lines += [f'#define TOKEN "{self.token}"', f"#define START_STEP {self.step!r}"]
+        lines += ["#define VALUES_AT_START {" + ", ".join(map(repr, self.values)) + "}"]
+        lines += ["#define VALUES_PRESENT {" + ", ".join(present) + "}"]
+        lines += ["#define FAILURES {" + ", ".join(f'"{words}"' for words in self.failures.values()) + "}"]
+        return "\n".join(lines) + "\n"
+
+    def write(self, path: Path, version: Version, platforms: Sequence[str]) -> None:
+        """Write the unit's archive; raise InputError where the compiler refuses."""
+        identifier = identifier_of(path)
+        describe = description_2 if version == 2 else description_3
+        with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
+            place = Path(folder)
+            sources = _sources(place, self.modules, self.configuration(), version)
+            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr("modelDescription.xml", describe(identifier, self.token, self.words, self.listed))
+                for name in platforms:
+                    target = f"binaries/{PLATFORMS[name].folders[version]}/{identifier}{PLATFORMS[name].suffix}"
+                    archive.writestr(target, library(place, self.modules, name, version, identifier))
+                for source in sources:
+                    archive.write(source, f"sources/{source.relative_to(place).as_posix()}")
 
 
 def library(folder: Path, modules: Mapping[str, str], name: str, version: Version, identifier: str) -> bytes:
@@ -205,8 +247,119 @@ def write_fmu(
     >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['u', 'G', 'C', 'F', 'G_ext_A', 'G_ext_B']
     """
-    path = Path(path)
-    if path.suffix != ".fmu":
+    path, wanted = Path(path), _checked(path, fmi, platforms)
+    machine = _pump_controlled(rig)
+    if step is None:
+        step, reached = chosen_step(machine, error)
+        accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {reached:.2g} Pa rms"
+    elif step > 0:
+        accuracy = f"steps of at most {step:.3g} s"
+    else:
+        raise InputError(f"step must be > 0 s, got {step}")
+    unit = MockUp(
+        f"{machine.title}; {accuracy}",
+        code(Choice.of(machine)),
+        tuple(variables(machine, step)),
+        _values(machine),
+        len(INPUTS),
+        len(RESULTS),
+        len(STATES),
+        step,
+        FAILURES,
+    )
+    unit.write(path, fmi, wanted)
+    return unit.listed
+
+
+@checked_call
+def write_sensor_fmu(
+    path: str | os.PathLike[str],
+    *,
+    sensor: Formulation = "volume",
+    rig: Rig | str | os.PathLike[str] = "thesis",
+    rate: float = 500.0,
+    fmi: Version = 2,
+    platforms: Sequence[str] | None = None,
+) -> tuple[Variable, ...]:
+    """Write a soft sensor of leakage as a functional mock-up unit for co-simulation.
+
+    Readings go in, the leakage in m^3/s with its 95 % interval comes out, and its rise over the first minute. Its code
+    is that of the detector ``observer``, compiled; there is no Python in it.
+
+    Parameters
+    ----------
+    path : str or path-like
+        File to write (.fmu).
+    sensor : {"volume", "speed", "command"}, optional
+        What it reads beside the chamber pressures: the motor's angle and the piston's position, the motor's speed, or
+        the command.
+    rig : Rig, str or path-like, optional
+        The assumed machine: a rig, the name of a packaged one, or the path of a TOML file.
+    rate : float, optional
+        Sampling rate [Hz], whatever the communication steps are; 250 at least without a position, else 10.
+    fmi : {2, 3}, optional
+        Version of the Functional Mock-up Interface.
+    platforms : sequence of str, optional
+        Systems that it shall run on, as of `write_fmu`.
+
+    Returns
+    -------
+    tuple of Variable
+        What the unit lists: name, unit, causality, value at the start.
+
+    Raises
+    ------
+    InputError
+        An argument breaks a rule, or there is no compiler.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> variables = ss.write_sensor_fmu("leak.fmu", sensor="volume")  # doctest: +SKIP
+    >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
+    ['p_A', 'p_B', 'theta', 'x']
+    """
+    from sealscope.diagnosis.observer.detector import SLOWEST
+    from sealscope.fmu import sensor as own
+
+    path, wanted = Path(path), _checked(path, fmi, platforms)
+    if sensor not in own.INPUTS:
+        raise InputError(f"sensor must be one of {', '.join(own.INPUTS)}, got {sensor!r}")
+    if not rate >= SLOWEST[sensor]:
+        raise InputError(f"rate of the sensor {sensor} must be >= {SLOWEST[sensor]:g} Hz, got {rate:g}")
+    machine = _pump_controlled(rig)
+    listed = tuple(own.variables(machine, sensor, rate))
+    unit = MockUp(
+        f"soft sensor of leakage ({MEANS[sensor]}) for {machine.title}",
+        own.sensor_code(own.SensorChoice.of(machine, sensor)),
+        listed,
+        (*_values(machine), *(variable.start or 0.0 for variable in listed if variable.name in own.SAMPLING)),
+        len(own.INPUTS[sensor]),
+        len(own.RESULTS),
+        own.size(sensor),
+        1.0 / rate,
+        own.FAILURES,
+    )
+    unit.write(path, fmi, wanted)
+    return listed
+
+
+def _pump_controlled(rig: Rig | str | os.PathLike[str]) -> Rig:
+    """Return the rig of a unit; raise InputError for one with a servo valve."""
+    machine = load_rig(rig)
+    if machine.valve.spool == "present":
+        raise InputError(f"a unit must be of a pump-controlled rig (valve.spool = absent), got {machine.name}")
+    return machine
+
+
+def _values(rig: Rig) -> tuple[float, ...]:
+    """Return a rig's parameters in the order of a unit's code."""
+    return tuple(float(attrgetter(name)(rig)) for name in VALUES)
+
+
+def _checked(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the platforms of a unit to write; raise InputError for a wrong name, version or platform."""
+    if Path(path).suffix != ".fmu":
         raise InputError(f"a unit's file must end in .fmu, got {path}")
     if fmi not in (2, 3):
         raise InputError(f"fmi must be 2 or 3, got {fmi!r}")
@@ -217,32 +370,7 @@ def write_fmu(
             raise InputError(f"a platform of FMI {fmi} must be one of {known}, got {name!r}")
         if name != this_platform() and not compiler()[1]:
             raise InputError(f"a unit for {name} needs a compiler for it: pip install 'sealscope[fmu]'")
-    machine = load_rig(rig)
-    if step is None:
-        step, reached = chosen_step(machine, error)
-        accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {reached:.2g} Pa rms"
-    elif step > 0:
-        accuracy = f"steps of at most {step:.3g} s"
-    else:
-        raise InputError(f"step must be > 0 s, got {step}")
-    listed = tuple(variables(machine, step))
-    words = f"{machine.title}; {accuracy}"
-    modules, identifier = code(Choice.of(machine)), identifier_of(path)
-    token = hashlib.sha256("".join([words, str(listed), *modules.values()]).encode()).hexdigest()[:32]
-    references = {variable.reference for variable in listed}
-    present = [VALUE_BASE + k in references for k in range(len(VALUES))]
-    describe = description_2 if fmi == 2 else description_3
-    with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
-        place = Path(folder)
-        sources = _sources(place, modules, configuration(machine, token, step, present), fmi)
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("modelDescription.xml", describe(identifier, token, words, listed))
-            for name in wanted:
-                target = f"binaries/{PLATFORMS[name].folders[fmi]}/{identifier}{PLATFORMS[name].suffix}"
-                archive.writestr(target, library(place, modules, name, fmi, identifier))
-            for source in sources:
-                archive.write(source, f"sources/{source.relative_to(place).as_posix()}")
-    return listed
+    return wanted
 
 
 def _sources(place: Path, modules: Mapping[str, str], header: str, version: Version) -> list[Path]:

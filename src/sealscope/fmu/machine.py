@@ -106,6 +106,22 @@ class Choice(NamedTuple):
         return cls(laws, *throttle_readings(rig), choose_method(rig, "auto") == "imex", rig.motor.integrator == "euler")
 
 
+def numbers_of(choices: tuple[bool | tuple[bool, ...], ...], exponent: float, literal: bool) -> Callable[..., Any]:
+    """Return the law that makes `RigNumbers` of a unit's values, with leakage outwards beside the rig's."""
+
+    @law
+    def numbers(v: Any, outward_A: float, outward_B: float) -> Any:
+        V, V_rod, V_hose_A, V_hose_B = v[_FROM[5]], v[_FROM[6]], v[_FROM[7]], v[_FROM[8]]
+        C_d, d_line, closed_A, closed_B, rho = v[_FROM[0]], v[_FROM[1]], v[_FROM[2]], v[_FROM[3]], v[_FROM[4]]
+        derived = derived_numbers(C_d, d_line, closed_A, closed_B, rho, V, V_rod, V_hose_A, V_hose_B, exponent, literal)
+        taken = to_fixed_tuple(v, _N_PARAMETERS)
+        taken = tuple_setitem(taken, _OUTWARD_A, taken[_OUTWARD_A] + outward_A)
+        taken = tuple_setitem(taken, _OUTWARD_B, taken[_OUTWARD_B] + outward_B)
+        return RigNumbers(*(taken + derived + choices))
+
+    return numbers  # type: ignore[no-any-return]
+
+
 def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
     """Return the functions of a unit, to be compiled.
 
@@ -115,16 +131,11 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
     """
     choices, exponent, literal, implicit, euler = choice
     throttled, made_up = bool(choices[CHOICES.index("throttled")]), bool(choices[CHOICES.index("made_up")])
+    of_values = numbers_of(choices, exponent, literal)
 
     @law
     def numbers(v: Any, inputs: Any) -> Any:
-        V, V_rod, V_hose_A, V_hose_B = v[_FROM[5]], v[_FROM[6]], v[_FROM[7]], v[_FROM[8]]
-        C_d, d_line, closed_A, closed_B, rho = v[_FROM[0]], v[_FROM[1]], v[_FROM[2]], v[_FROM[3]], v[_FROM[4]]
-        derived = derived_numbers(C_d, d_line, closed_A, closed_B, rho, V, V_rod, V_hose_A, V_hose_B, exponent, literal)
-        taken = to_fixed_tuple(v, _N_PARAMETERS)
-        taken = tuple_setitem(taken, _OUTWARD_A, taken[_OUTWARD_A] + inputs[_MORE_A])
-        taken = tuple_setitem(taken, _OUTWARD_B, taken[_OUTWARD_B] + inputs[_MORE_B])
-        return RigNumbers(*(taken + derived + choices))
+        return of_values(v, inputs[_MORE_A], inputs[_MORE_B])
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
@@ -188,9 +199,14 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
 
 @lru_cache(maxsize=8)
 def code(choice: Choice) -> Mapping[str, str]:
+    """Return the LLVM code of a rig's unit (`unit_code`)."""
+    return unit_code(functions(choice))
+
+
+def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
     """Return the LLVM code of each function of a unit, by its name, with the symbol ``sealscope_NAME``."""
     modules = {}
-    for name, function in functions(choice).items():
+    for name, function in functions.items():
         text, symbol = plain_code(function, *ARGUMENTS[name])
         modules[name] = re.sub(r'"?' + re.escape(symbol) + r'"?(?=\()', f"sealscope_{name}", text)
     return MappingProxyType(modules)

@@ -36,6 +36,8 @@ _OF_STATES = {
     "v": ("m/s", "piston velocity"),
     "V_up": ("m^3", "oil that the make-up has fed"),
     "z": ("m", "deflection of the bristles of LuGre's friction"),
+    "x_s": ("m", "position of a servo valve's spool"),
+    "v_s": ("m/s", "speed of a servo valve's spool"),
     "Q_1": ("m^3/s", "flow of the pump into port 1"),
     "Q_A": ("m^3/s", "flow into chamber A"),
     "Q_B": ("m^3/s", "flow out of chamber B"),
@@ -45,6 +47,8 @@ _OF_STATES = {
 }
 #: Outputs in the order of the code: unit, words.
 RESULTS = {name: _OF_STATES.get(name) or (CHANNEL_UNITS[name], LONG_NAMES[name]) for name in OUTPUTS} | POWERS
+#: Outputs of laws that no unit has.
+_NONE = ("x_s", "v_s")
 #: Where the references of a kind of variable begin.
 INPUT_BASE, VALUE_BASE, RESULT_BASE, START_POSITION, STEP = 1, 1000, 2000, 3000, 3001
 
@@ -84,4 +88,6 @@ def variables(rig: Rig, step: float) -> Iterator[Variable]:
     )
     yield Variable(STEP, "step", "parameter", "fixed", "s", "longest step of the solver", step)
     for k, (name, (unit, words)) in enumerate(RESULTS.items()):
+        if name in _NONE:
+            continue
         yield Variable(RESULT_BASE + k, name, "output", "continuous", unit, words, None)

@@ -6,7 +6,8 @@ import logging
 import math
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -14,9 +15,10 @@ from sealscope.errors import InputError
 from sealscope.monitor.alarms.alarm import Alarm, status_word
 from sealscope.monitor.alarms.judging import AlarmJudge
 from sealscope.monitor.memory.sharing import Share
-from sealscope.monitor.memory.store import KEPT_IDENTITIES, PENDING_BLOCKS, PENDING_BYTES, MonitorStore
+from sealscope.monitor.memory.store import KEPT_IDENTITIES, PENDING_BLOCKS, PENDING_BYTES, MonitorStore, StoredRows
+from sealscope.monitor.outages import Outages
 from sealscope.monitor.settings import ActuatorSettings
-from sealscope.monitor.sources.source_block import SourceBlock, nothing
+from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.stream.baseline import plain_dataclass
 from sealscope.monitor.stream.watch import BlockEstimate, Watch, watch
 from sealscope.recordings.recording import Recording
@@ -40,13 +42,15 @@ class _Actuator:
     bytes: int = 0
     taken: int = 0
     last: BlockEstimate | None = None
+    shown: dict[str, Any] | None = None
+
+
+class _Repeated(Exception):  # noqa: N818 (says what happened)
+    """One of the blocks is stored already."""
 
 
 class WatchedActuators:
-    """The actuators of a monitor, restored from its database, which keeps estimates of `keep_days` of operation.
-
-    `counters`: blocks that were dropped since the start, by reason.
-    """
+    """The actuators of a monitor, restored from its database, which keeps estimates of `keep_days` of operation."""
 
     def __init__(
         self,
@@ -58,10 +62,12 @@ class WatchedActuators:
         self.store, self._share = store, share
         self._elsewhere: dict[str, deque[tuple[float, SourceBlock]]] = {each.name: deque() for each in settings}
         self._keep_s = keep_days * 86_400.0
-        self.counters: dict[str, int] = {}
+        self._counters: dict[str, int] = {}
+        self._counting = threading.Lock()
         self.changes = threading.Condition()
         self.changed = 0
         self.closed = False
+        self.outages = Outages(self._tell)
         self._lock = threading.RLock()
         self._settings = {each.name: each for each in settings}
         self._actuators: dict[str, _Actuator] = {}
@@ -79,7 +85,7 @@ class WatchedActuators:
         if saved is None:
             actuator = _Actuator(settings, fresh, AlarmJudge(settings.name))
             with self.store.writing() as connection:
-                self._checkpoint(connection, actuator)
+                self._checkpoint(connection, actuator, StoredRows())
             return actuator
         learned_with, state, pending = saved
         judge = AlarmJudge.from_state(state["judge"])
@@ -90,18 +96,26 @@ class WatchedActuators:
         for samples, follows in pending:
             self._judged(actuator, samples, follows)
             actuator.pending += 1
-            actuator.bytes += _size(samples)
+            actuator.bytes += bytes_of(samples)
         if learned_with != settings.learned_with:
             _log.warning("%s: learned with %s, begins anew with other settings", settings.name, learned_with)
             fresh.continue_from(actuator.watch)
             actuator.watch = fresh
             with self.store.writing() as connection:
-                self._checkpoint(connection, actuator)
+                self._checkpoint(connection, actuator, StoredRows())
         return actuator
 
-    def count(self, reason: str) -> None:
+    def count(self, reason: str, number: int = 1) -> None:
         """Count something that was dropped."""
-        self.counters[reason] = self.counters.get(reason, 0) + 1
+        if number:
+            with self._counting:
+                self._counters[reason] = self._counters.get(reason, 0) + number
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Messages and blocks that were dropped since the start, by reason."""
+        with self._counting:
+            return dict(self._counters)
 
     def renew(self) -> None:
         """Renew the share in the actuators; of one that is taken over the blocks since then are taken at once.
@@ -120,7 +134,7 @@ class WatchedActuators:
         """Take the blocks that came while another monitor watched an actuator; those it stored are passed over."""
         waiting = self._elsewhere[name]
         for _ in range(len(waiting)):
-            self._take(waiting[0][1])
+            self._take([waiting[0][1]])
             waiting.popleft()
 
     def _keep_elsewhere(self, block: SourceBlock) -> None:
@@ -132,44 +146,90 @@ class WatchedActuators:
         while waiting and waiting[0][0] < now - _KEPT_LEASES * self._share.lease_s:
             waiting.popleft()
 
-    def take(self, block: SourceBlock) -> list[BlockEstimate]:
-        """Take a block in one transaction: samples, estimates, alarms and the block's identity, or nothing of it.
+    def take(self, blocks: Sequence[SourceBlock]) -> list[BlockEstimate]:
+        """Take blocks in one transaction: samples, estimates, alarms and the blocks' identities, or nothing of it.
 
-        Raises what the database raises; the block can then be taken again.
+        Return the estimates in their order. Raises what the database raises; the blocks can then be taken again.
         """
-        if block.actuator not in self._settings:
-            self.count("blocks of an actuator that is not in the settings")
-            return []
         with self._lock:
+            mine, others, unknown = [], [], 0
+            for block in blocks:
+                if block.actuator not in self._settings:
+                    unknown += 1
+                elif self._share is not None and block.actuator not in self._share.held:
+                    others.append(block)
+                else:
+                    mine.append(block)
             if self._share is not None:
-                if block.actuator not in self._share.held:
-                    self._keep_elsewhere(block)
-                    return []
-                self._taken_over(block.actuator)
-            return self._take(block)
+                for name in {block.actuator for block in mine}:
+                    self._taken_over(name)
+            estimates = self._take(mine)
+            for block in others:
+                self._keep_elsewhere(block)
+            self.count("blocks of an actuator that is not in the settings", unknown)
+        return estimates
 
-    def _take(self, block: SourceBlock) -> list[BlockEstimate]:
-        """Take a block of an actuator that is this monitor's to watch."""
-        with self._lock:
-            actuator = self._actuator(block.actuator)
+    def _take(self, blocks: Sequence[SourceBlock]) -> list[BlockEstimate]:
+        """Take blocks of actuators that are this monitor's to watch.
+
+        None of them is likely to be stored: that is asked only where the database refuses to store one again.
+        """
+        if not blocks:
+            return []
+        names = {block.actuator for block in blocks}
+        new = {(block.actuator, block.identity): block for block in reversed(blocks)}  # of two the first
+        fresh = [block for block in blocks if new[block.actuator, block.identity] is block]
+        lost: set[str] = set()
+        try:
             try:
-                with self.store.writing() as connection:
-                    if self._share is not None and not self._share.holds(connection, block.actuator):
-                        self._actuators.pop(block.actuator)
-                        self._keep_elsewhere(block)
-                        return []
-                    if self.store.knows(connection, block.actuator, block.identity):
-                        self.count("blocks stored already")
-                        return []
-                    actuator.taken += 1
-                    self.store.keep_block(connection, block.actuator, block.identity, actuator.taken)
-                    estimates = [] if block.samples is None else self._taken(connection, actuator, block, block.samples)
-            except BaseException:
-                # what the detector took is not stored: the next block begins at the last transaction
+                lost, estimates = self._stored(fresh)
+            except _Repeated:
+                with self.store.engine.connect() as connection:
+                    known = self.store.known(connection, new)
+                fresh = [block for block in fresh if (block.actuator, block.identity) not in known]
+                lost, estimates = self._stored(fresh)
+        except BaseException:
+            # what the detectors took is not stored: the next blocks begin at the last transaction
+            for name in names:
+                self._actuators.pop(name, None)
+            raise
+        for block in fresh:
+            if block.actuator in lost:
                 self._actuators.pop(block.actuator, None)
-                raise
+                self._keep_elsewhere(block)
+        self.count("blocks stored already", len(blocks) - len(fresh))
         self._tell()
         return estimates
+
+    def _stored(self, blocks: Sequence[SourceBlock]) -> tuple[set[str], list[BlockEstimate]]:
+        """Take blocks in one transaction; return the actuators whose lease is another's, and the estimates.
+
+        Raises _Repeated, and no detector has taken anything, where one of the blocks is stored already.
+        """
+        from sqlalchemy.exc import IntegrityError
+
+        rows, estimates, lost = StoredRows(), list[BlockEstimate](), set[str]()
+        with self.store.writing() as connection:
+            if self._share is not None:
+                names = sorted({block.actuator for block in blocks})
+                lost = {name for name in names if not self._share.holds(connection, name)}
+            mine = [(block, self._actuator(block.actuator)) for block in blocks if block.actuator not in lost]
+            taken = Counter[str]()
+            numbered = []
+            for block, actuator in mine:
+                taken[block.actuator] += 1
+                numbered.append((block.actuator, block.identity, actuator.taken + taken[block.actuator]))
+            if numbered:
+                try:
+                    self.store.keep_blocks(connection, numbered)
+                except IntegrityError:
+                    raise _Repeated from None
+            for block, actuator in mine:
+                actuator.taken += 1
+                if block.samples is not None:
+                    estimates += self._taken(connection, rows, actuator, block, block.samples)
+            self.store.keep_rows(connection, rows)
+        return lost, estimates
 
     def _actuator(self, name: str) -> _Actuator:
         if name not in self._actuators:
@@ -177,23 +237,26 @@ class WatchedActuators:
         return self._actuators[name]
 
     def _taken(
-        self, connection: Any, actuator: _Actuator, block: SourceBlock, samples: Recording
+        self, connection: Any, rows: StoredRows, actuator: _Actuator, block: SourceBlock, samples: Recording
     ) -> list[BlockEstimate]:
         name = block.actuator
         estimates, happened = self._judged(actuator, samples, block.follows)
-        self.store.keep_estimates(connection, name, estimates)
+        rows.add_estimates(name, estimates)
         for alarm, kind, t in happened:
             if kind:
                 self.store.keep_event(connection, alarm, kind, t)
         for alarm in {alarm.id: alarm for alarm, _, _ in happened}.values():
             self.store.keep_alarm(connection, alarm)
         actuator.pending += 1
-        actuator.bytes += _size(samples)
+        actuator.bytes += bytes_of(samples)
         if actuator.pending >= PENDING_BLOCKS or actuator.bytes >= PENDING_BYTES:
-            self._checkpoint(connection, actuator)
+            rows.checkpoint(name)
+            self._checkpoint(connection, actuator, rows)
         else:
-            self.store.keep_pending(connection, name, actuator.pending, samples, block.follows)
-            self.store.keep_summary(connection, name, self._summary(actuator))
+            rows.add_pending(name, actuator.pending, samples, block.follows)
+            summary = self._summary(actuator)
+            if summary != actuator.shown:
+                rows.summaries[name] = actuator.shown = summary
         return estimates
 
     @staticmethod
@@ -212,15 +275,15 @@ class WatchedActuators:
             actuator.last = estimates[-1]
         return estimates, happened
 
-    def _checkpoint(self, connection: Any, actuator: _Actuator) -> None:
+    def _checkpoint(self, connection: Any, actuator: _Actuator, rows: StoredRows) -> None:
+        """Store the state; what is old then goes with the rows."""
         last = None if actuator.last is None else asdict(actuator.last)
         state = {"watch": actuator.watch.state(), "judge": actuator.judge.state(), "last": last}
         settings = actuator.settings
-        self.store.keep_checkpoint(connection, settings.name, settings.learned_with, state, self._summary(actuator))
+        actuator.shown = self._summary(actuator)
+        self.store.keep_checkpoint(connection, settings.name, settings.learned_with, state, actuator.shown)
         kept = self._keep_s / actuator.watch.block_seconds
-        self.store.forget(
-            connection, settings.name, actuator.taken - KEPT_IDENTITIES, math.floor(actuator.watch.blocks - kept)
-        )
+        rows.old[settings.name] = actuator.taken - KEPT_IDENTITIES, math.floor(actuator.watch.blocks - kept)
         actuator.pending = actuator.bytes = 0
 
     @staticmethod
@@ -252,6 +315,8 @@ class WatchedActuators:
             raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
         if len(text) > _LONGEST_TEXT or len(by_whom) > 80:
             raise InputError(f"a comment must have at most {_LONGEST_TEXT} characters, a name 80")
+        if not _storable(text + by_whom):
+            raise InputError("a comment must be text, got a NUL or half of a surrogate pair")
         if not 0.0 < hours <= 10_000.0:
             raise InputError(f"an alarm must be shelved for > 0 h, got {hours:g}")
         with self._lock:
@@ -275,11 +340,13 @@ class WatchedActuators:
                         actuator.watch.relearn()
                     self.store.keep_alarm(connection, alarm)
                     self.store.keep_event(connection, alarm, mark, at, by_whom, text)
-                    self._checkpoint(connection, actuator)
+                    rows = StoredRows()
+                    self._checkpoint(connection, actuator, rows)
+                    self.store.keep_rows(connection, rows)
             except InputError:
                 raise
             except BaseException:
-                del self._actuators[name]
+                self._actuators.pop(name, None)
                 raise
         self._tell()
         return alarm
@@ -295,6 +362,6 @@ class WatchedActuators:
             self.changes.notify_all()
 
 
-def _size(samples: Recording) -> int:
-    """Return about how many bytes samples take."""
-    return 8 * len(samples) * (1 + len(samples.channels))
+def _storable(text: str) -> bool:
+    """Return whether every database can hold a text."""
+    return "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)

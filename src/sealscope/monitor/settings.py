@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from sealscope.errors import InputError
 from sealscope.monitor.alarms.judging import Thresholds
+from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.storage.toml_file import read_toml
 
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
@@ -49,6 +50,10 @@ class ActuatorSettings(WatchSettings):
     pattern: str = "*"
     map: dict[str, str] = Field(default_factory=dict)
     topic: str | None = None
+    sparkplug: Annotated[str, Field(pattern=r"^[^/+#\x00]+/[^/+#\x00]+(/[^/+#\x00]+)?$", max_length=300)] | None = None
+    rate: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    nodes: dict[str, str] = Field(default_factory=dict)
+    units: dict[str, str] = Field(default_factory=dict)
 
 
 class PageSettings(_Part):
@@ -70,6 +75,26 @@ class BrokerSettings(_Part):
     tls: bool = False
     ca_file: Path | None = None
     alarms_topic: str | None = "sealscope"
+    host_id: Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)] | None = None
+
+
+class OpcUaSettings(_Part):
+    """The OPC UA server."""
+
+    url: Annotated[str, Field(pattern=r"^opc\.tcp://[^\s@]+$", max_length=2000)]
+    user: str | None = None
+    password_file: Path | None = None
+    security: str | None = None
+    block_s: float = Field(default=1.0, ge=0.1, le=60.0)
+    timeout_s: float = Field(default=10.0, gt=0, le=300)
+
+
+class SparkplugSettings(_Part):
+    """The edge node of Sparkplug B as which the alarms go out."""
+
+    group: Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)] = "Sealscope"
+    node: Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)] = "monitor"
+    every_s: float = Field(default=10.0, ge=0.1, le=86_400)
 
 
 class WebhookSettings(_Part):
@@ -97,6 +122,8 @@ class MonitorSettings(_Part):
     defaults: WatchSettings = Field(default_factory=WatchSettings)
     page: PageSettings | None = None
     mqtt: BrokerSettings | None = None
+    opcua: OpcUaSettings | None = None
+    sparkplug: SparkplugSettings | None = None
     webhook: WebhookSettings | None = None
     share: ShareSettings | None = None
     actuator: list[ActuatorSettings] = Field(min_length=1, max_length=10_000)
@@ -122,8 +149,26 @@ class MonitorSettings(_Part):
         for topic in topics:
             if topics.count(topic) > 1 or any(letter in topic for letter in "+#"):
                 raise ValueError(f"each actuator must have a topic of its own without wildcards, got {topic!r}")
-        if topics and self.mqtt is None:
-            raise ValueError("an actuator with a topic needs the table [mqtt]")
+        paths = [actuator.sparkplug for actuator in self.actuator if actuator.sparkplug is not None]
+        for path in paths:
+            if paths.count(path) > 1:
+                raise ValueError(f"each actuator must have a Sparkplug node or device of its own, got {path!r} twice")
+        if (topics or paths or self.sparkplug is not None) and self.mqtt is None:
+            raise ValueError("an actuator with a topic, or Sparkplug B, needs the table [mqtt]")
+        for actuator in self.actuator:
+            if not actuator.nodes:
+                continue
+            if self.opcua is None or actuator.rate is None:
+                raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {actuator.name!r}")
+            for channel in {**actuator.nodes, **actuator.units}:
+                if channel not in CHANNELS:
+                    raise ValueError(f"nodes must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
+        if self.sparkplug is not None:
+            devices = [topic_part(name) for name in names]
+            if len({*devices}) < len(devices):
+                raise ValueError("actuators must have names that differ in more than the letters + # / as devices")
+            if any(path.split("/")[:2] == [self.sparkplug.group, self.sparkplug.node] for path in paths):
+                raise ValueError("the node of the alarms must be none of the actuators' nodes")
         if self.share is not None and "://" not in self.database:
             raise ValueError(f"monitors that share actuators need a database by URL, got the file {self.database!r}")
         local = self.page is None or self.page.host in ("127.0.0.1", "localhost", "::1")
@@ -132,8 +177,18 @@ class MonitorSettings(_Part):
         return self
 
 
+def topic_part(name: str) -> str:
+    """Return a name as one level of a topic."""
+    return "".join("_" if letter in "+#/\0" else letter for letter in name)
+
+
 #: Files that the parts of the settings name.
-_FILES = {"page": ("token_file",), "mqtt": ("password_file", "ca_file"), "webhook": ("token_file",)}
+_FILES = {
+    "page": ("token_file",),
+    "mqtt": ("password_file", "ca_file"),
+    "opcua": ("password_file",),
+    "webhook": ("token_file",),
+}
 
 
 def read_settings(path: Path) -> MonitorSettings:
@@ -209,6 +264,19 @@ port = 8765
 # tls = false
 # ca_file = "ca.pem"
 # alarms_topic = "sealscope"     # alarms go to sealscope/ACTUATOR/alarm, retained
+# host_id = "sealscope"          # nodes of Sparkplug B that have this primary host hear when the monitor is away
+
+# [opcua]                        # OPC UA
+# url = "opc.tcp://localhost:4840"
+# user = "monitor"
+# password_file = "password.txt"
+# security = "Basic256Sha256,SignAndEncrypt,certificate.der,key.pem"
+# block_s = 1.0                  # values are gathered into blocks of so long [s]
+
+# [sparkplug]                    # alarms also go out as an edge node of Sparkplug B, a device for each actuator
+# group = "Sealscope"
+# node = "monitor"               # each monitor's own
+# every_s = 10.0                 # what has changed is sent so often; alarms at once
 
 # [share]                        # several monitors over one PostgreSQL, each with the same actuators
 # name = "monitor 1"             # its own
@@ -225,5 +293,9 @@ folder = "press 1"               # recordings that appear here are read, in any 
 pattern = "*"
 # map = { p_A = "PG_1[bar]" }    # channels from foreign columns
 # topic = "plant/press1/samples" # JSON or CBOR: {"t": 0.0, "rate": 500, "p_A": [...], "p_B": [...], "x": [...], ...}
+# sparkplug = "plant/node/press" # or an edge node of Sparkplug B, or its device: GROUP/NODE or GROUP/NODE/DEVICE
+# nodes = { p_A = "ns=2;s=press1.p_A", p_B = "ns=2;s=press1.p_B" } # or nodes of the OPC UA server, by channel
+# units = { p_A = "bar" }        # theirs, where they are not SI
+# rate = 500.0                   # its sampling rate [Hz], where no metric `rate` states it
 # error_lpm = 0.02               # what differs from the defaults
 """

@@ -8,7 +8,7 @@ from sealscope.parameters.fields import Part, choice, quantity
 
 
 class Cylinder(Part):
-    """Cylinder between two caps, eqs. (4.13)-(4.15), (4.18), (4.19), and its load; x = 0 at mid-stroke, |x| <= L/2.
+    """Cylinder between two caps, eqs. (4.13)-(4.15), (4.18), (4.19), and its load; x = 0 at mid-stroke.
 
     Double-rod where A_A = A_B, single-rod where not.
     """

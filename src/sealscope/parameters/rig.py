@@ -18,6 +18,7 @@ from sealscope.parameters.drive import Fluid, HydraulicLine, MakeUp, Motor, Pump
 from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, leaves, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
 from sealscope.parameters.names import resolve
+from sealscope.parameters.valve import ServoValve, Supply
 from sealscope.units import parse_quantity, to_si
 
 Value = float | int | str
@@ -54,7 +55,46 @@ class Rig(Part):
     """Parameters of one actuator; made by `load_rig`, changed only into another one by `with_overrides`.
 
     Numbers are SI doubles: `rig.motor.R_c` [ohm], `rig.sensors.p_A.noise` [Pa]. Two rigs are equal when all numbers and
-    choices are, whatever the units and sources they came with. Raises InputError where parts do not fit together.
+    choices are, whatever the units and sources they came with.
+
+    Parameters
+    ----------
+    motor : Motor
+        Servo motor with its speed loop.
+    pump : Pump
+        Bidirectional pump of fixed displacement.
+    line : HydraulicLine
+        Lines between pump and cylinder, and the throttles in them.
+    cylinder : Cylinder
+        Piston, chambers, end stops and load.
+    friction : Friction
+        Friction of the piston, by one of three laws.
+    fluid : Fluid
+        Oil, the air in it, and the charge pressure.
+    makeup : MakeUp
+        Accumulator with check and relief valves.
+    valve : ServoValve
+        Servo valve, or none.
+    supply : Supply
+        Supply of the servo valve.
+    sensors : Sensors
+        Every sensor, by the name of its channel.
+    daq : Daq
+        Data acquisition: rate, resolution, range.
+
+    Raises
+    ------
+    InputError
+        Where parts do not fit together.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> rig = ss.load_rig("thesis").with_overrides({"V_1": "50[cm^3]"}, source="hose 8 mm x 1 m, measured")
+    >>> rig.line.V_1, rig["V_1"], rig.entry("V_1").source
+    (5e-05, 5e-05, 'hose 8 mm x 1 m, measured')
+    >>> rig == ss.load_rig("thesis"), rig.entry("cylinder.L").source
+    (False, 'Table 4.1; section 2.4 d (60 cm)')
     """
 
     motor: Motor
@@ -64,6 +104,8 @@ class Rig(Part):
     friction: Friction
     fluid: Fluid
     makeup: MakeUp
+    valve: ServoValve
+    supply: Supply
     sensors: Sensors
     daq: Daq
     _name: str = PrivateAttr(default="")
@@ -88,6 +130,7 @@ class Rig(Part):
                 f"makeup.G_relief = {m.G_relief:g} m^3/(s Pa): relief valves must have an accumulator to open into "
                 "(makeup.check_valves = present or pilot-operated), got check_valves = absent"
             )
+        self._valve_fits()
         rod = abs(c.A_A - c.A_B) * c.L
         if m.check_valves == "pilot-operated" and m.V_gas <= rod:
             raise ValueError(
@@ -101,6 +144,29 @@ class Rig(Part):
                 f"got {f.coulomb_pressure} and {with_unit(f.F_pr, 'N')}"
             )
         return self
+
+    def _valve_fits(self) -> None:
+        """Raise ValueError for a valve without a supply, a supply without a valve, and what neither can have."""
+        valve, supply = self.valve, self.supply
+        if (valve.spool == "present") != (supply.drive != "absent"):
+            raise ValueError(
+                "a servo valve must have a supply, and a supply a valve (valve.spool = present and supply.drive = "
+                f"constant-speed), got valve.spool = {valve.spool} and supply.drive = {supply.drive}"
+            )
+        if valve.spool == "absent":
+            return
+        for name, value in (("line.orifices", self.line.orifices), ("makeup.check_valves", self.makeup.check_valves)):
+            if value != "absent":
+                raise ValueError(f"a servo valve (valve.spool = present) must have {name} = absent, got {value}")
+        if self.motor.K_i <= 0:
+            raise ValueError(
+                f"motor.K_i must be > 0 V/rad where the motor holds the speed of a supply, got {self.motor.K_i:g}"
+            )
+        if supply.V_acc > 0 and supply.p_pre >= supply.p_set + supply.p_return:
+            raise ValueError(
+                f"supply.p_pre must be < p_set + p_return = {with_unit(supply.p_set + supply.p_return, 'Pa')}, so that "
+                f"the accumulator takes oil, got {with_unit(supply.p_pre, 'Pa')}"
+            )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Rig):

@@ -6,6 +6,7 @@ import math
 
 from sealscope.compiled import contracted
 from sealscope.physics.fluid import P_ATM
+from sealscope.physics.lanes import select
 
 
 @contracted
@@ -35,6 +36,24 @@ def polytropic_pressure(V_up: float, p_charge: float, V_gas: float, n_gas: float
     exchange of heat (Merritt, Hydraulic Control Systems, 1967, accumulators).
     """
     return (p_charge + P_ATM) * math.pow(V_gas / (V_gas + V_up), n_gas) - P_ATM
+
+
+@contracted
+def gas_volume(p: float, p_pre: float, V_acc: float, n_acc: float) -> float:
+    """Return the gas [m^3] in an accumulator on a line at `p` [Pa gauge]: V_acc (p_pre_abs/p_abs)^(1/n).
+
+    The inverse of `polytropic_pressure`; V_acc at `p_pre` [Pa gauge] and below it, where the accumulator is empty.
+    """
+    return V_acc * math.pow((p_pre + P_ATM) / (max(p, p_pre) + P_ATM), 1.0 / n_acc)
+
+
+@contracted
+def accumulator_compliance(p: float, p_pre: float, V_gas: float, n_acc: float) -> float:
+    """Return the oil [m^3/Pa] that an accumulator takes in as its line's pressure `p` [Pa gauge] rises.
+
+    V_gas/(n p_abs), the slope of `gas_volume`, which is V_gas [m^3] at p; none below `p_pre`, where it is empty.
+    """
+    return select(p > p_pre, V_gas / (n_acc * (max(p, p_pre) + P_ATM)), 0.0)  # type: ignore[no-any-return]
 
 
 @contracted

@@ -10,8 +10,9 @@ from sealscope.compiled import kernel
 from sealscope.errors import InputError
 from sealscope.physics.cylinder import hard_stop_force, load_force
 from sealscope.physics.fluid import P_ATM
-from sealscope.physics.pump import pump_torque
-from sealscope.physics.state import CURRENT, INTEGRAL, P_1, P_2, P_A, P_B, POSITION, STATES
+from sealscope.physics.pump import pump_flow, pump_torque
+from sealscope.physics.rig import RigNumbers, rig_numbers, valve_rates
+from sealscope.physics.state import CURRENT, INTEGRAL, OMEGA, P_1, P_2, P_A, P_B, POSITION, STATES, state_of
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -53,6 +54,37 @@ def pressures_at_rest(
     return p_charge + moved / V_A, p_charge - moved / V_B
 
 
+@kernel
+def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2: float) -> tuple[float, float]:
+    """Return p_A, p_B [Pa] that carry `force` [N] against +x behind a servo valve with equal edges at null.
+
+    p_A + p_B = p_1 + p_2: as much is lost at the supply's edges as at those to the return (Merritt, Hydraulic Control
+    Systems, 1967, section 5.2). An overlapped valve may trap any mean; this one is taken.
+    """
+    p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
+    return p_A, p_1 + p_2 - p_A
+
+
+@kernel
+def supply_at_rest(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
+    """Return p_1, p_A, p_B [Pa] at which pump, relief valve and a servo valve at null let the supply's pressure stay.
+
+    By bisection: dp_1/dt falls as p_1 rises. `force` [N] against +x, `x` [m] of the piston.
+    """
+    y = np.zeros(len(STATES))
+    y[POSITION], y[P_2] = x, p.p_return
+    low = p.p_return
+    high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # the relief valve alone takes more
+    p_A, p_B = low, low
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
+        y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
+        rises = valve_rates(state_of(y), pump_flow(p.omega_P, middle - p.p_return, p.q_b, p.G_pump), p)[2] > 0.0
+        low, high = (middle, high) if rises else (low, middle)
+    return low, p_A, p_B
+
+
 def side_volumes(rig: Rig) -> tuple[float, float]:
     """Oil volumes [m^3] of both sides at mid-stroke: chamber, hose, and the line where there is one."""
     c, line = rig.cylinder, rig.line
@@ -82,11 +114,16 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
     speed controller's integral at R_c i/K_i, which gives that current. A machine that leaks creeps from there. Without
     a load and with equal areas all pressures are at the charge pressure and all else is zero.
 
-    Raises InputError where the pressures are below vacuum, or the drive cannot hold them.
+    Behind a servo valve at null the motor turns at the supply's speed, whose pressure stays (`supply_at_rest`). An
+    underlapped valve lets a loaded piston creep from there.
+
+    Raises InputError where the pressures are below vacuum or beyond the supply's, or the drive cannot hold them.
     """
     c, m = rig.cylinder, rig.motor
     y = np.zeros(len(STATES))
     y[POSITION] = x_0
+    if rig.valve.spool == "present":
+        return _at_valve(rig, y, push)
     force = carried_at_rest(x_0, c.F_l, c.k_load, c.L, c.k_stop, c.d_stop) + push
     p_A, p_B = rest_pressures(rig, force)
     y[[P_A, P_1]], y[[P_B, P_2]] = p_A, p_B
@@ -98,4 +135,29 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
             f"{most:.4g} A (motor.i_max, motor.V_max); take a smaller load or pump"
         )
     y[INTEGRAL] = holding_integral(y[CURRENT], m.R_c, m.K_i)
+    return y
+
+
+def _at_valve(rig: Rig, y: np.ndarray, push: float) -> np.ndarray:
+    """Return the state `y` at rest behind a servo valve, under `push` [N] beside the rig's own load."""
+    c, m, p = rig.cylinder, rig.motor, rig_numbers(rig)
+    force = carried_at_rest(y[POSITION], c.F_l, c.k_load, c.L, c.k_stop, c.d_stop) + push
+    p_1, p_A, p_B = supply_at_rest(force, y[POSITION], p)
+    if not rig.supply.p_return <= min(p_A, p_B) <= max(p_A, p_B) <= p_1:
+        raise InputError(
+            f"a load of {force:.4g} N must be carried at rest by pressures between the return's "
+            f"{rig.supply.p_return:.4g} Pa and the supply's {p_1:.4g} Pa, got p_A = {p_A:.4g} Pa and p_B = {p_B:.4g} "
+            "Pa; raise supply.p_set, or take a smaller load"
+        )
+    y[P_1], y[P_2], y[P_A], y[P_B] = p_1, rig.supply.p_return, p_A, p_B
+    y[OMEGA] = rig.supply.omega_P
+    y[CURRENT] = holding_current(p_1 - y[P_2], rig.pump.q_b, m.C_m) + m.B_M * y[OMEGA] / m.C_m
+    volts = m.R_c * y[CURRENT] + m.C_e * y[OMEGA]
+    y[INTEGRAL] = volts / m.K_i
+    if y[CURRENT] > m.i_max or volts > m.V_max:
+        raise InputError(
+            f"the drive must hold the supply at {p_1:.4g} Pa and {y[OMEGA]:.4g} rad/s, which takes {y[CURRENT]:.4g} A "
+            f"at {volts:.4g} V, got at most {m.i_max:g} A and {m.V_max:g} V (motor.i_max, motor.V_max); take a slower "
+            "or smaller pump, or a lower pressure (supply.omega_P, pump.q_b, supply.p_set)"
+        )
     return y

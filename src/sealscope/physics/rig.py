@@ -2,8 +2,10 @@
 
 State y, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega [rad/s] and
 angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa], oil V_up [m^3] that
-the make-up has fed, deflection z [m] of the bristles of LuGre's friction. Without throttles the pump is connected to
-the chambers directly: there are no line volumes, p_1 = p_A and p_2 = p_B. With throttles the stiffness of the equations
+the make-up has fed, deflection z [m] of the bristles of LuGre's friction, position x_s [m] and speed v_s [m/s] of a
+servo valve's spool. Without throttles the pump is connected to the chambers directly: there are no line volumes, p_1 =
+p_A and p_2 = p_B. With a servo valve the pump turns at a constant speed between the return (p_2) and the supply (p_1),
+and the valve's edges connect both with the chambers. With throttles the stiffness of the equations
 is in their two flows alone (microseconds, against milliseconds for all else), so the right-hand side comes in two
 parts: everything but the throttles, and the throttles.
 """
@@ -28,9 +30,11 @@ from sealscope.physics.cylinder import (
     pressure_rate,
 )
 from sealscope.physics.external import (
+    accumulator_compliance,
     accumulator_pressure,
     check_valve_flow,
     external_leakage,
+    gas_volume,
     pilot_valve_flow,
     polytropic_pressure,
 )
@@ -60,12 +64,21 @@ from sealscope.physics.state import (
     P_A,
     P_B,
     POSITION,
+    SPOOL,
+    SPOOL_SPEED,
     VELOCITY,
     Pressures,
     State,
     pressures_moved,
 )
 from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
+from sealscope.physics.valve import (
+    edge_flow,
+    spool_acceleration,
+    spool_speed,
+    spool_target,
+    spool_within_stroke,
+)
 
 #: Parameters that no law takes under its own symbol: informative ones, those within the throttles' coefficients or in
 #: the volumes of a side.
@@ -99,10 +112,10 @@ NUMBERS = (*PARAMETERS, *DERIVED)
 #: Laws that most rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out. Air
 #: in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has bristles, that differs
 #: between the directions; check valves with pilots, relief valves, an accumulator that exchanges little heat; a damper,
-#: a load that changes with time (of a run, not of a rig).
+#: a load that changes with time (of a run, not of a rig); a servo valve between a supply and the cylinder.
 LAWS = (
     *("aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
-    *("piloted", "relieved", "polytropic", "damped", "pushed"),
+    *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
 )
 #: The choices: truth values, and the laws.
 CHOICES = (*_CHOICES, "made_up", *LAWS)
@@ -129,6 +142,7 @@ if TYPE_CHECKING:
         polytropic: tuple[bool, ...]
         damped: tuple[bool, ...]
         pushed: tuple[bool, ...]
+        valved: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> float: ...
@@ -207,6 +221,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "polytropic": choices["made_up"] and rig.makeup.n_gas != 1.0,
         "damped": rig.cylinder.d_load > 0,
         "pushed": False,
+        "valved": rig.valve.spool == "present",
     }
     return RigNumbers(
         *(attrgetter(name)(rig) for name in PARAMETERS.values()),
@@ -220,19 +235,34 @@ def rig_numbers(rig: Rig) -> RigNumbers:
 def within_limits(y: State, p: RigNumbers) -> State:
     """Return the state after a step: the drive's current is held within its limits.
 
-    Without lines p_1 = p_A and p_2 = p_B; what no law of the rig moves is 0, so that the compiler leaves it out.
+    Without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is the return's, and the spool stays within its
+    stroke. What no law of the rig moves is 0, so that the compiler leaves it out.
     """
     fed = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     z = y[BRISTLE] if len(p.bristled) > 0 else 0.0
     current = min(max(y[CURRENT], -p.i_max), p.i_max)
     p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
-    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, fed, z
+    x_s, v_s = 0.0, 0.0
+    if len(p.valved) > 0:
+        p_1, p_2 = y[P_1], p.p_return
+        x_s, v_s = spool_within_stroke(y[SPOOL], y[SPOOL_SPEED], p.x_max, p.v_max)
+    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, fed, z, x_s, v_s
 
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Commanded less actual motor speed [rad/s]."""
+    """Commanded less actual motor speed [rad/s]; the pump of a servo valve's supply has one speed."""
+    if len(p.valved) > 0:
+        return p.omega_P - y[OMEGA]
     return p.omega_per_volt * u - y[OMEGA]
+
+
+@contracted
+def pump_difference(y: State, p: RigNumbers) -> float:
+    """Pressure difference [Pa] between the ports of the pump."""
+    if p.throttled or len(p.valved) > 0:
+        return y[P_1] - y[P_2]
+    return y[P_A] - y[P_B]
 
 
 @contracted
@@ -365,7 +395,55 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
         rate_2 = pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
         return (-pressure_rate(out_A, V_A, K_A), -pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
     rate_1, rate_2 = pressure_rate(up_1 - out_A, V_A, K_A), pressure_rate(up_2 - out_B, V_B, K_B)
+    if len(p.valved) > 0:  # a supply's line has no rod seal
+        return (rate_1, rate_2, 0.0 * rate_1, 0.0 * rate_2), fed
     return (rate_1, rate_2, rate_1, rate_2), fed
+
+
+@contracted
+def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
+    """Return the flows [m^3/s] of a servo valve's edges: P to A, A to T, P to B, B to T; x_s > 0 opens P-A and B-T."""
+    x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
+    p_P, p_T = y[P_1], y[P_2]
+    return (
+        edge_flow(p_P - y[P_A], x_s, p.o_PA, Q_N, dp_N, x_max, dp_lam),
+        edge_flow(y[P_A] - p_T, -x_s, p.o_AT, Q_N, dp_N, x_max, dp_lam),
+        edge_flow(p_P - y[P_B], -x_s, p.o_PB, Q_N, dp_N, x_max, dp_lam),
+        edge_flow(y[P_B] - p_T, x_s, p.o_BT, Q_N, dp_N, x_max, dp_lam),
+    )
+
+
+@contracted
+def supply_compliance(p_1: float, p: RigNumbers) -> float:
+    """Return the oil [m^3/Pa] that supply line and accumulator take in as p_1 [Pa] rises.
+
+    (V_1 + V_oil)/K + V_gas/(n p_abs), V_oil = V_acc - V_gas the oil in the accumulator.
+    """
+    V_gas = gas_volume(p_1, p.p_pre, p.V_acc, p.n_acc)
+    return (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p) + accumulator_compliance(p_1, p.p_pre, V_gas, p.n_acc)
+
+
+@contracted
+def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
+    """Return what a servo valve's edges and its supply add to the rates of p_A, p_B, p_1, p_2 [Pa/s].
+
+    `Q_1` [m^3/s]: flow of the pump into the supply. The return's pressure stays.
+    """
+    p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
+    Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
+    V_A, V_B = volumes_at(y[POSITION], p)
+    given_A, to_A = volumes_exchanged(Q_PA, p_P, p_A, p)
+    given_B, to_B = volumes_exchanged(Q_PB, p_P, p_B, p)
+    from_A, _ = volumes_exchanged(Q_AT, p_A, p_T, p)
+    from_B, _ = volumes_exchanged(Q_BT, p_B, p_T, p)
+    _, fed = volumes_exchanged(Q_1, p_T, p_P, p)
+    relief = check_valve_flow(p_P - p_T, p.p_set, p.G_set)
+    return (
+        pressure_rate(to_A - from_A, V_A, bulk_modulus(p_A, p)),  # eq. (4.18)
+        pressure_rate(to_B - from_B, V_B, bulk_modulus(p_B, p)),  # eq. (4.19)
+        (fed - relief - given_A - given_B) / supply_compliance(p_P, p),
+        0.0 * p_T,
+    )
 
 
 @contracted
@@ -374,7 +452,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     p_A, p_B, x, v = y[P_A], y[P_B], y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
         v = stuck_velocity(v, p.v_th)
-    dp_pump = (y[P_1] - y[P_2]) if p.throttled else (p_A - p_B)
+    dp_pump = pump_difference(y, p)
     error = speed_error(y, u, p)  # eq. (4.2) as a state
     voltage = controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
     current = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
@@ -398,17 +476,26 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_B = pressure_rate(p.A_B * v + to_B, V_B, K_B)
         rate_1 = pressure_rate(to_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = pressure_rate(-from_2, p.V_2, bulk_modulus(y[P_2], p))
+    elif len(p.valved) > 0:
+        by_valve = valve_rates(y, Q_1, p)
+        rate_A = by_valve[0] + pressure_rate(-p.A_A * v - from_A, V_A, K_A)
+        rate_B = by_valve[1] + pressure_rate(p.A_B * v + to_B, V_B, K_B)
+        rate_1, rate_2 = by_valve[2], by_valve[3]
     else:
         from_2, to_1 = volumes_exchanged(Q_1, p_B, p_A, p)
         rate_A = pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
         rate_B = pressure_rate(-from_2 + p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = rate_A, rate_B
-    dy = (error, current, spin, y[OMEGA], v, push, rate_A, rate_B, rate_1, rate_2, 0.0 * v, dz)  # eq. (4.13)
+    fed, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v
     if len(p.open_circuit) > 0:
         outer, fed = outer_rates(y, p)
-        dy = pressures_moved(dy, 1.0, outer)
-        return dy[0], dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], fed, dy[11]
-    return dy
+        rate_A, rate_B = rate_A + outer[0], rate_B + outer[1]
+        rate_1, rate_2 = rate_1 + outer[2], rate_2 + outer[3]
+    if len(p.valved) > 0:
+        d_x_s = spool_speed(y[SPOOL_SPEED], p.v_max)
+        x_d = spool_target(u, p.u_N, p.x_max)
+        d_v_s = spool_acceleration(y[SPOOL], y[SPOOL_SPEED], x_d, p.omega_s, p.zeta_s, p.v_max)
+    return error, current, spin, y[OMEGA], v, push, rate_A, rate_B, rate_1, rate_2, fed, dz, d_x_s, d_v_s  # eq. (4.13)
 
 
 @contracted
@@ -427,9 +514,11 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     for m in range(len(y)):
         row[m] = y[m]
     n = len(y)
-    dp_pump = (y[P_1] - y[P_2]) if p.throttled else (y[P_A] - y[P_B])
-    Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
+    Q_1 = pump_flow(y[OMEGA], pump_difference(y, p), p.q_b, p.G_pump)
     Q_A, Q_B = throttle_flows(y, p) if p.throttled else (Q_1, Q_1)
+    if len(p.valved) > 0:
+        Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
+        Q_A, Q_B = Q_PA - Q_AT, Q_BT - Q_PB
     row[n] = Q_1
     row[n + 1] = Q_A
     row[n + 2] = Q_B

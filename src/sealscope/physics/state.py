@@ -8,21 +8,23 @@ import numpy as np
 
 from sealscope.compiled import contracted, kernel
 
-STATES = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "V_up", "z")
-INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP, BRISTLE = range(len(STATES))
+STATES = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "V_up", "z", "x_s", "v_s")
+INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP, BRISTLE, SPOOL, SPOOL_SPEED = range(
+    len(STATES)
+)
 
 #: What a run reports at each output instant: the states and the quantities that follow from them.
 OUTPUTS = (*STATES, "Q_1", "Q_A", "Q_B", "q_leak", "V", "q_ext", "q_up")
 
 #: A state or its rate as the laws take it, in the order of `STATES`; p_A, p_B, p_1, p_2 or their rates.
-State = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+State = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float, float]
 Pressures = tuple[float, float, float, float]
 
 
 @contracted
 def state_of(y: np.ndarray) -> State:
-    """Return the state (12,) as the tuple of numbers that the laws take."""
-    return y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10], y[11]
+    """Return the state (14,) as the tuple of numbers that the laws take."""
+    return y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10], y[11], y[12], y[13]
 
 
 @contracted
@@ -41,6 +43,8 @@ def moved(y: State, h: float, dy: State) -> State:
         y[9] + h * dy[9],
         y[10] + h * dy[10],
         y[11] + h * dy[11],
+        y[12] + h * dy[12],
+        y[13] + h * dy[13],
     )
 
 
@@ -48,12 +52,12 @@ def moved(y: State, h: float, dy: State) -> State:
 def pressures_moved(y: State, h: float, s: Pressures) -> State:
     """Return the state with h s added to its pressures."""
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
-    return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11]
+    return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]
 
 
 @kernel
 def survey(rows: np.ndarray) -> tuple[bool, float, float]:
-    """Of rows of outputs (n, 19): whether all are finite, the largest |x| [m], and the lowest pressure [Pa]."""
+    """Of rows of outputs (n, 21): whether all are finite, the largest |x| [m], and the lowest pressure [Pa]."""
     reach, least, total = 0.0, math.inf, 0.0
     for k in range(rows.shape[0]):
         row = rows[k]

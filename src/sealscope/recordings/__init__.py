@@ -8,7 +8,7 @@ from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
-    from sealscope.recordings.files import read, write
+    from sealscope.recordings.files import read, read_parts, write
     from sealscope.recordings.formats.columns import split_map_option
     from sealscope.recordings.joining import join
     from sealscope.recordings.quality import Finding, inspect, uniform_segments
@@ -17,6 +17,7 @@ _HOMES = {
     "split_map_option": "formats.columns",
     "join": "joining",
     "read": "files",
+    "read_parts": "files",
     "write": "files",
     "Finding": "quality",
     "inspect": "quality",
@@ -31,6 +32,7 @@ __all__ = [
     "inspect",
     "join",
     "read",
+    "read_parts",
     "split_map_option",
     "uniform_segments",
     "write",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from math import isfinite
 from pathlib import Path
 from typing import cast
 
@@ -17,9 +18,12 @@ from sealscope.recordings.apart import apart
 from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
-from sealscope.recordings.formats.lvm import is_lvm
 from sealscope.recordings.formats.matlab import is_matlab_4
+from sealscope.recordings.formats.structured.json_log import is_json
+from sealscope.recordings.formats.structured.logs import is_one_table
+from sealscope.recordings.formats.structured.lvm import is_lvm
 from sealscope.recordings.formats.table import Choose, RawTable
+from sealscope.recordings.formats.text import read_text_parts
 from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
 from sealscope.recordings.recording import Recording
 from sealscope.storage.atomic import atomic_write
@@ -46,6 +50,9 @@ _READ_ONLY = {
     ".mdf": "mdf",
     ".mf4": "mdf",
     ".lvm": "lvm",
+    ".json": "json",
+    ".jsonl": "json",
+    ".ndjson": "json",
     ".xlsx": "spreadsheet",
     ".xlsm": "spreadsheet",
     ".xlsb": "spreadsheet",
@@ -61,8 +68,11 @@ _NAMES = {
     "tdms": "a TDMS",
     "mdf": "an MDF",
     "lvm": "a LabVIEW measurement",
+    "json": "a JSON",
     "spreadsheet": "a spreadsheet",
 }
+#: Format -> module that reads it, where it is none of its own name.
+_MODULES = {"text": "structured.logs", "lvm": "structured.lvm", "json": "structured.json_log"}
 #: First bytes -> format.
 _MAGIC = {
     b"PAR1": "parquet",
@@ -147,12 +157,14 @@ def _format_of(path: Path) -> str:
     if path.suffix.lower() in _PROPRIETARY and encoding_of(head) is None:
         name = _PROPRIETARY[path.suffix.lower()]
         raise UnreadableFile(f"a recording must be in a format that is read, got {name} ({path})")
-    return "lvm" if is_lvm(head) else "text"
+    return "lvm" if is_lvm(head) else "json" if is_json(head) else "text"
 
 
 def _reader(kind: str) -> Reader:
     """Return ``read_KIND`` of the format's module; its library is loaded now."""
-    return cast("Reader", getattr(import_module(f"sealscope.recordings.formats.{kind}"), f"read_{kind}"))
+    return cast(
+        "Reader", getattr(import_module(f"sealscope.recordings.formats.{_MODULES.get(kind, kind)}"), f"read_{kind}")
+    )
 
 
 def _table(kind: str, file: Path, choose: Choose) -> RawTable:
@@ -182,9 +194,9 @@ def read(
 ) -> Recording:
     r"""Read the recording in a file: the text of any logger, or the file of a measurement program.
 
-    Formats: text, NetCDF-4, HDF5, Parquet, TDMS, MATLAB (v4 to v7.3), MDF 3 and 4, LabVIEW's .lvm and spreadsheets
-    (.xlsx, .xlsb, .xls, .ods), each also inside .gz, .bz2, .xz, .zst, .zip or .tar. Channels of different rates are
-    brought to the clock of the chamber pressures; the history says how.
+    Formats: text, NetCDF-4, HDF5, Parquet, TDMS, MATLAB (v4 to v7.3), MDF 3 and 4, LabVIEW's .lvm, JSON (lines,
+    records, columns) and spreadsheets (.xlsx, .xlsb, .xls, .ods), each also inside .gz, .bz2, .xz, .zst, .zip or
+    .tar. Channels of different rates are brought to the clock of the chamber pressures; the history says how.
 
     Parameters
     ----------
@@ -196,7 +208,7 @@ def read(
         tell, in several languages; the history says what was taken.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
-    format : {"text", "netcdf", "parquet", "matlab", "tdms", "mdf", "lvm", "spreadsheet"}, optional
+    format : {"text", "netcdf", "parquet", "matlab", "tdms", "mdf", "lvm", "json", "spreadsheet"}, optional
         What the content must be.
 
     Returns
@@ -228,10 +240,87 @@ def read(
     check_call(channel_map, rate)
     if format is not None and format not in _NAMES:
         raise InputError(f"format must be one of {', '.join(sorted(_NAMES))}, got {format}")
+    with _inner(file) as inner:
+        return _read(inner, file.name, channel_map, rate, format)
+
+
+@checked_call
+def read_parts(
+    path: str | os.PathLike[str],
+    every: float,
+    *,
+    channel_map: ChannelMap | None = None,
+    rate: float | None = None,
+) -> Iterator[Recording]:
+    r"""Read a long recording part by part.
+
+    A text log is read in bounded memory, whatever its size; other formats are read whole and cut.
+
+    Parameters
+    ----------
+    path : str or path
+        The file, as for `read`.
+    every : float
+        Length of a part [s], by the sampling rate of the file's beginning; the last may be shorter. Gaps do not count.
+    channel_map : mapping of str to str or "auto", optional
+        As for `read`.
+    rate : float, optional
+        Sampling rate [Hz], in place of a time column.
+
+    Yields
+    ------
+    Recording
+        The next part. Its start is its own where the file has stamps; other times go on from part to part.
+
+    Raises
+    ------
+    UnreadableFile
+        If the file, or the next part of it, cannot be read as a recording.
+    InputError
+        If `every`, `channel_map` or `rate` is wrong.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> from pathlib import Path
+    >>> rows = "".join(f"{k / 500},{300 + k % 7}\n" for k in range(1000))
+    >>> _ = Path("long.csv").write_text("t [s],p_A [kPa]\n" + rows)
+    >>> [part.duration for part in ss.read_parts("long.csv", every=0.8)]
+    [0.8, 0.8, 0.4]
+    """
+    file, channel_map = Path(path), channel_map or {}
+    check_call(channel_map, rate)
+    if not (isfinite(every) and every > 0):
+        raise InputError(f"every must be > 0 s and finite, got {every:g}")
+    return _parts(file, every, channel_map, rate)
+
+
+def _parts(file: Path, every: float, channel_map: ChannelMap, rate: float | None) -> Iterator[Recording]:
+    with _inner(file) as inner:
+        choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(inner))
+
+        def recording_of(table: RawTable) -> Recording:
+            return Recording(*table.samples({"file": file.name}, rate=rate, infer_rate=bool(channel_map)))
+
+        if _format_of(inner) != "text" or not is_one_table(inner):
+            whole_file = _read(inner, file.name, channel_map, rate, None)
+            size = max(1, round(every * whole_file.rate))
+            for first in range(0, len(whole_file), size):
+                yield whole_file.samples(slice(first, first + size))
+            return
+        with whole("a text file", inner):
+            for table in read_text_parts(inner, choose, lambda table: max(1, round(every * recording_of(table).rate))):
+                yield recording_of(table)
+
+
+@contextmanager
+def _inner(file: Path) -> Iterator[Path]:
+    """Yield the file, or what is packed in it; what is wrong with either is an UnreadableFile."""
     try:
         archive = archive_of(file)
         if archive is None:
-            return _read(file, file.name, channel_map, rate, format)
+            yield file
+            return
     except UnreadableFile:
         raise
     except InputError as error:
@@ -247,7 +336,7 @@ def read(
             inner, depth = folders.enter_context(unpacked(inner, archive)), depth + 1
             archive = archive_of(inner)
         try:
-            return _read(inner, file.name, channel_map, rate, format)
+            yield inner
         except UnreadableFile as error:
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 

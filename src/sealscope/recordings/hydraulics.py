@@ -7,6 +7,7 @@ channel, a wrong unit or a wrong time unit lack one of these.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -31,6 +32,8 @@ LEAST_CORRELATION, _BY_CHANCE = 0.1, 5.0
 _SLOW, _DELAY, _FEWEST = 20.0, 5.0, 400
 #: Slow samples whose mean makes a step: noise hides the motion of a machine that is slow against its sampling.
 _SCALES = (1, 4, 16)
+#: Past values by which a slow pressure difference is foretold: a load that swings, even at two rates, takes four.
+_PAST = 4
 #: Angle and speed fit where the one's rate is so many times the other at most.
 _MISFIT, _BELONGS = 5.0, 0.5
 
@@ -91,12 +94,14 @@ def _aside(recording: Recording, names: list[str]) -> str | None:
     steps = ([np.diff(_slow(values, every, 1.0)) for values in (p_A, p_B)] for every in _SCALES)
     if not any(_follows(a, b, delay) for a, b in steps if a.size >= 0.25 * _FEWEST):
         return "p_A and p_B have nothing to do with each other: they are not of one machine"
-    moved = []
+    dp, moved = p_A - p_B, []
+    whitening = _whitening(dp)
     for name in ("u", "omega", "theta", "x"):
         if name not in recording or not np.isfinite(recording[name]).all() or constant(recording[name]):
             continue
         other = _slow(recording[name], recording.rate)
-        if _follows(p_A - p_B, np.gradient(other) if name in ("theta", "x") else other, delay):
+        motion = np.gradient(other) if name in ("theta", "x") else other
+        if _follows(dp, motion, delay) or _turns_with(dp, motion, whitening, delay):
             return None
         moved.append(name)
     if not moved:
@@ -104,11 +109,38 @@ def _aside(recording: Recording, names: list[str]) -> str | None:
     return f"the pressure difference p_A - p_B does not follow {', '.join(moved)}: they are not of one machine"
 
 
+def _whitening(values: Array) -> Array:
+    """Return the filter (`_PAST` + 1,) that leaves of a series (n,) what its past does not foretell (least squares)."""
+    series = values - values.mean()
+    past = np.lib.stride_tricks.sliding_window_view(series, _PAST)[:-1, ::-1]
+    weights, *_ = np.linalg.lstsq(past, series[_PAST:], rcond=None)
+    return np.concatenate([[1.0], -weights])
+
+
+def _turns_with(dp: Array, motion: Array, whitening: Array, delay: int) -> bool:
+    """Return whether what its past does not foretell of a pressure difference follows the sense of a motion, (n,) both.
+
+    A load that swings may be ten times the friction, and moves otherwise than the piston: then the pressure difference
+    does not follow the motion, but where the piston turns, friction turns with it. Both series go through the filter
+    that whitens the first (Box, Jenkins, Time Series Analysis, 1976, section 11.2.1); correlation in both halves.
+    """
+    pressure, sense = (np.convolve(values, whitening, "valid") for values in (dp - dp.mean(), np.sign(motion)))
+    return min(_by_halves(pressure, sense, delay)) >= _needed(dp.size)
+
+
 def _follows(a: Array, b: Array, delay: int) -> bool:
     """Return whether two series (n,) follow each other in either half, in whichever sense."""
+    return max(_by_halves(a, b, delay)) >= _needed(a.size)
+
+
+def _by_halves(a: Array, b: Array, delay: int) -> list[float]:
     half = a.size // 2
-    needed = max(LEAST_CORRELATION, _BY_CHANCE / half**0.5)
-    return any(_correlation(a[part], b[part], delay) >= needed for part in (slice(half), slice(half, None)))
+    return [_correlation(a[part], b[part], delay) for part in (slice(half), slice(half, None))]
+
+
+def _needed(size: int) -> float:
+    """Return the correlation that halves of series of so many samples need."""
+    return max(LEAST_CORRELATION, _BY_CHANCE / math.sqrt(size // 2))
 
 
 def _correlation(a: Array, b: Array, most: int) -> float:

@@ -229,7 +229,11 @@ def _unwrapped(t: Array, step: float) -> Array | None:
     return result
 
 
-def _from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, dict[str, Any], list[str]]:
+def from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, dict[str, Any], list[str]]:
+    """Return (seconds (n,), what is known of the moment 0, lines for the history) of the numbers of a time column.
+
+    Without a unit they are seconds, or since 1970 in the unit that their size tells, or days. Raises InputError.
+    """
     finite = values[np.isfinite(values)]
     if not finite.size:
         raise InputError("time must have a number in some row, got none")
@@ -303,7 +307,7 @@ def time_base(values: NDArray[Any], unit: str | None, name: str, stated_rate: fl
     if values.dtype.kind == "M":
         t, start, notes = _from_stamps(values, name)
     else:
-        t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name)
+        t, start, notes = from_numbers(np.asarray(values, dtype=np.float64), unit, name)
     with np.errstate(invalid="ignore", over="ignore"):  # infinite times are findings, not warnings
         if stated_rate is not None and t.size > 1 and 2 * np.count_nonzero(np.diff(t)) < t.size - 1:
             notes.append(f"column {name}: samples share their stamps, taken at {stated_rate:g} Hz, as the file says")

@@ -51,7 +51,7 @@ def write_page(
         Its diagnosis.
     rig : Rig, str or path-like, optional
         A Rig, the name of a packaged rig or the path of a TOML file; its values label the schematic.
-    marks : sequence of sealscope.reporting.Mark, optional
+    marks : sequence of Mark, optional
         Further moments on every chart.
     truth_onset_s, truth_leak_lpm : float, optional
         What is known to be true, shown beside the verdict [s], [L/min].

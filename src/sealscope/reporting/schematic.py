@@ -1,4 +1,4 @@
-"""The actuator as a labelled schematic after ISO 1219, drawn from the rig: its rods, throttles and make-up."""
+"""The actuator as a labelled schematic after ISO 1219, drawn from the rig: rods, throttles, make-up, or its valve."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class Circuit:
 
     `rods`: the sides that the rod leaves, "A", "B" or "AB"; `rod`: its height in the drawing, of a single rod in
     proportion to the bore: sqrt(1 - A_small / A_large); `throttles`, `make_up`, `bypass`: whether the lines have them;
-    `known`: whether a rig says so; `values`: symbol -> value with its unit, "" where it is not known.
+    `known`: whether a rig says so; `values`: symbol -> value with its unit, "" where it is not known; `valve`: whether
+    a servo valve drives it.
     """
 
     rods: str
@@ -42,6 +43,7 @@ class Circuit:
     bypass: bool
     known: bool
     values: dict[str, str]
+    valve: bool = False
 
     @property
     def cylinder(self) -> str:
@@ -51,6 +53,10 @@ class Circuit:
     @property
     def text(self) -> str:
         """The circuit in sentences, for who does not see the drawing."""
+        if self.valve:
+            drive = f"A servo valve joins the chambers A and B of a {self.cylinder} to a supply and a return."
+            rod = "" if self.rods == "AB" else f" The rod leaves chamber {self.rods}."
+            return f"{drive}{rod} A motor turns the supply's pump at a constant speed."
         parts = ["A servo motor turns a bidirectional pump of fixed displacement."]
         ends = f"Its ports 1 and 2 feed the chambers A and B of a {self.cylinder} through a line each"
         parts.append(f"{ends}, with a one-way throttle in each line." if self.throttles else f"{ends}.")
@@ -79,10 +85,11 @@ def circuit_of(rig: Rig | None, recording: Recording) -> Circuit:
     ratio = areas[side] / max(areas.values())
     throttles = rig.line.orifices == "present" or max(rig.line.closed_A, rig.line.closed_B) > 0
     make_up = rig.makeup.check_valves == "present"
+    valve = rig.valve.spool == "present"
     if ratio > _ALIKE:
-        return Circuit("AB", _ROD, throttles, make_up, bypass, True, values)
+        return Circuit("AB", _ROD, throttles, make_up, bypass, True, values, valve)
     rod = round(min(0.8, sqrt(1.0 - ratio)) * _BORE, 1)
-    return Circuit(side, rod, throttles, make_up, bypass, True, values)
+    return Circuit(side, rod, throttles, make_up, bypass, True, values, valve)
 
 
 def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> str:

@@ -83,6 +83,11 @@ def parse_position(text: str) -> Position | None:
     return Position(_course(words, _LENGTHS, "position"), words)
 
 
+def command_or_target(text: str) -> Command | Position:
+    """Read what a machine is asked for: a target for its piston, or else a command for its drive."""
+    return parse_position(text) or parse_command(text)
+
+
 def parse_force(text: str) -> Force:
     """Read a load such as ``2 kN``, ``500 N sin(2t) + 100 N``, ``step 2 kN at 3 s`` in the words of `parse_command`."""
     words = plain_text(text, "load")

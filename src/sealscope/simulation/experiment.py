@@ -16,8 +16,8 @@ from sealscope.calls import checked_call
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Effect, ParameterDrift, Readings
-from sealscope.simulation.commands import Command, Sine, check_command, parse_command
-from sealscope.simulation.courses import Force, Position, parse_force, parse_position
+from sealscope.simulation.commands import Command, Sine, check_command
+from sealscope.simulation.courses import Force, Position, command_or_target, parse_force
 from sealscope.simulation.faults import Fault, Leak, parse_fault, parse_leak
 from sealscope.units import parse_quantity
 
@@ -65,8 +65,10 @@ def check_target(target: Position, t: Array, half: float) -> None:
 
 
 def check_circuit(rig: Rig) -> None:
-    """Raise InputError for a single-rod cylinder in a circuit from which its rod cannot displace oil."""
+    """Raise InputError for a single-rod cylinder in a closed circuit from which its rod cannot displace oil."""
     c, m = rig.cylinder, rig.makeup
+    if rig.valve.spool == "present":
+        return
     if c.A_A != c.A_B and not (m.check_valves == "pilot-operated" or m.G_relief > 0):
         raise InputError(
             f"a single-rod cylinder (A_A = {1e6 * c.A_A:g} mm^2, A_B = {1e6 * c.A_B:g} mm^2) must have "
@@ -79,11 +81,53 @@ def check_circuit(rig: Rig) -> None:
 class Experiment:
     """Everything a run depends on; equal experiments give equal bytes.
 
-    `duration` [s]; `seed` of the instruments' noise; `x_0` [m] piston position at the start, from mid-stroke;
-    `method` of the solver, and either its `step` [s] or the rms `error` [Pa] that a pressure may have, by which the
-    step is chosen (`integrate`; None: 100 Pa); `allow_unresolved` lets an unstable or under-resolved run through,
-    marked in its provenance; `faults` beside the leaks across the piston, `drifts` within the run. The sampling rate
-    is the rig's `daq.sample_rate`.
+    `Experiment.of` makes one of texts with units. The sampling rate is the rig's `daq.sample_rate`.
+
+    Parameters
+    ----------
+    rig : Rig
+        Parameters of the machine and its instruments.
+    command : Command or Position
+        Voltage of the drive, or with a `controller` the position that it follows.
+    duration : float, default 180
+        Length of the run [s].
+    leaks : tuple of Leak
+        Leaks across the piston.
+    seed : int, default 0
+        Seed of the instruments' noise.
+    x_0 : float, default 0
+        Position of the piston at the start, from mid-stroke [m].
+    method : {"auto", "rk4", "imex"}
+        Solver; ``auto`` takes the one that suits the rig.
+    step : float, optional
+        Step of the solver [s], in place of one chosen by `error`.
+    allow_unresolved : bool, default False
+        Lets an unstable or under-resolved run through, marked in its provenance.
+    faults : tuple of Fault
+        Faults beside the leaks.
+    drifts : tuple of ParameterDrift
+        Parameters that change slowly within the run.
+    error : float, optional
+        Rms error that a pressure may have [Pa], by which the step is chosen; None: 100 Pa.
+    load : Force, optional
+        Force on the rod over time.
+    controller : Controller, optional
+        Closes the loop on the position.
+
+    Raises
+    ------
+    InputError
+        Where a number is out of its range, or parts do not fit together.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import sealscope as ss
+    >>> experiment = ss.Experiment.of(command="5 sin(2t)", leak="0.0042 L/min from 90 s", duration="2 min")
+    >>> experiment.onset(), len(experiment.sample_times())
+    (90.0, 60000)
+    >>> replace(experiment, seed=1).key() == experiment.key()
+    False
     """
 
     rig: Rig
@@ -187,7 +231,7 @@ class Experiment:
             overrides["daq.sample_rate"] = parse_quantity(rate, "Hz", name="rate")
         loaded = load_rig(rig)
         if isinstance(command, str):
-            command = parse_position(command) or parse_command(command)
+            command = command_or_target(command)
         if not (hasattr(command, "volts") or isinstance(command, Position)):
             raise InputError(f"command must be a text or a Command, got {command!r}")
         if not isinstance(load, str | Force | None):
@@ -223,7 +267,7 @@ class Experiment:
 
     @property
     def commanded(self) -> Command:
-        """The command that the rig gets: `command` as the faults of the duty leave it; InputError for a target."""
+        """The command that the rig gets, as the faults of the duty leave `command`; InputError for a target."""
         if isinstance(self.command, Position):
             raise InputError(f"what a controller sends is known after its run only, got {self.command}")
         return self._changed(self.command)
@@ -242,12 +286,12 @@ class Experiment:
 
     @property
     def controlled(self) -> Controller | None:
-        """The controller that follows the target: its own, or the one that knows the rig; None for a command."""
+        """The controller that follows the target, its own or the one that knows the rig; None for a command."""
         if not isinstance(self.command, Position):
             return None
-        from sealscope.control import PositionPI
+        from sealscope.control import position_controller
 
-        return self.controller or PositionPI.of(self.rig)
+        return self.controller or position_controller(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
         """Return what changes in the machine within the run."""
@@ -264,7 +308,7 @@ class Experiment:
 
     @property
     def error_allowed(self) -> float:
-        """Error [Pa] by which a step is chosen: the stated one, else the default."""
+        """Error by which a step is chosen [Pa], the stated one or else the default."""
         return PRESSURE_TOLERANCE if self.error is None else self.error
 
     @property

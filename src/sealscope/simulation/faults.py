@@ -135,7 +135,7 @@ class Leak:
 
     `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt|dp| with C [m^3/(s
     Pa^0.5)] (needle valve). The size at full opening is either `coefficient` (G or C), or `mean` [m^3/s]: the mean of
-    |Q_L| that the rig shall show at full opening; the coefficient is then found on the rig at its own operating point.
+    abs(Q_L) that the rig shall show at full opening; the coefficient is then found on the rig at its operating point.
     """
 
     law: Literal["laminar", "orifice"] = "laminar"

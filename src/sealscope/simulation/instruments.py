@@ -158,7 +158,8 @@ def record(
     command [V] at the recording's samples. Analog channels (pressures, flow meter) pass the anti-alias filter,
     encoders are read at the instant; the clock of all but the command may jitter. The noise of each channel comes
     from a stream of its own under `seed`, so that no channel's noise depends on another's settings. `readings`: what
-    changes at the instruments within the run.
+    changes at the instruments within the run. Of a valve-controlled rig neither angle nor speed of the motor, which
+    drives its supply, are recorded.
     """
     n = u.size
     rate = rig.daq.sample_rate
@@ -204,5 +205,7 @@ def record(
     read = true + of("q_leak")("noise", flow.noise) * random["q_leak"].standard_normal(n)
     read = np.clip(read, -flow.range_hi, flow.range_hi)
     channels["q_leak"] = read if flow.resolution == 0 else np.rint(read / flow.resolution) * flow.resolution
+    if rig.valve.spool == "present":  # the supply's motor has no encoder
+        del channels["omega"], channels["theta"]
     channels = {name: readings.held(name, values, t) for name, values in channels.items()}
     return Recording(t, channels, CHANNEL_UNITS, rate)

@@ -52,7 +52,7 @@ _OVERSAMPLING = 4
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Result of an integration: (n,) times [s] and (n, 19) outputs in the order of `sealscope.physics.state.OUTPUTS`.
+    """Result of an integration: (n,) times [s] and (n, 21) outputs in the order of `sealscope.physics.state.OUTPUTS`.
 
     `error`: the estimated rms error [Pa] of the pressures, NaN where it was not checked. `volts`: (n,) a controller's
     voltages [V], None where the command is known beforehand; `compensated`: (n,) the leakage flow [m^3/s] that it says
@@ -351,7 +351,8 @@ class _Run:
                 if first % feedback.apart == 0:
                     feedback.sample(first, y)
             steps = np.arange(first * every, last * every, dtype=np.float64)
-            u, G, C = self.inputs.at_nodes(steps * h, nodes * h)
+            # writable, so that a run with a leak takes the kernel that one without (zeros shared by all) has compiled
+            u, G, C = (np.require(a, requirements=("C", "W")) for a in self.inputs.at_nodes(steps * h, nodes * h))
             if feedback is not None:
                 u = np.full(u.shape, feedback.held(first))
             F = unloaded if self.load is None else np.ascontiguousarray(self.load.at(steps[:, None] * h + nodes * h))

@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 #: Called with what is being done and how far it is, 0..1.
 Progress = Callable[[str, float], None]
 #: What the truth of a run holds at each sample.
-TRUE_OUTPUTS = ("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak", "q_ext", "q_up")
+TRUE_OUTPUTS = (
+    *("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak", "q_ext", "q_up"),
+    *("x_s", "i", "V"),
+)
 #: States that a proof compares, and the unit of each.
 _STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 
@@ -321,10 +324,10 @@ def simulate(
         Voltage sent to the servo drive: ``"3 sin(4t)"``, ``"step 5 at 1 s"``, ``"ramp 5 from 1 s to 3 s"``, ``"chirp 3
         from 0.1 Hz to 5 Hz over 60 s"``, ``"prbs 2 every 0.5 s seed 1"``, or ``"file LOG"`` (channel u of a recording).
         Or a target for the piston, from mid-stroke, that a controller follows: ``"position 50 mm sin(2t)"``.
-    leak : str, Leak or several of them, optional
+    leak : str, Leak or sequence, optional
         Leakage across the piston: ``"0.0042 L/min from 90 s"`` (mean flow while open), ``"0.01[L/min] orifice growing
         from 1 min to 2 min"``, ``"G = 6.1e-13 from 90 s"``, ``"C = 2e-10"``, ``"table LEAK.csv"`` or ``"none"``.
-    fault : str, Fault or several of them, optional
+    fault : str, Fault or sequence, optional
         Other faults: ``"pump leak x3 from 90 s"``, ``"rod seal A 0.01 L/min"``, ``"friction +20 %"``, ``"air 1 %"``,
         ``"sensor p_A offset 2 psi"``, ``"sensor p_A gain -1 %"``, ``"sensor p_A stuck from 90 s to 100 s"``, ``"duty
         amplitude x1.5"``.

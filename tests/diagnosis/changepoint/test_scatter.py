@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis.changepoint.scatter import HealthyDrift, Scan, StepScan
+from sealscope.diagnosis.changepoint.scatter import WANDERS, HealthyDrift, Scan, StepScan
 from sealscope.diagnosis.changepoint.scatter import _orders as orders
 from sealscope.diagnosis.changepoint.shapes import least_blocks
 from sealscope.diagnosis.changepoint.tails import ONSET_CUT, near_best, seed_of, upper_quantile
@@ -115,6 +115,47 @@ def test_drift_of_the_stated_size_alarms_as_seldom_as_stated(strength: float) ->
             held, bare = held + (alarm and drift is not None), bare + (alarm and drift is None)
     assert held <= 11  # of 80 at 5 %: more has a probability of 0.1 %
     assert bare >= 20
+
+
+def test_a_series_says_how_much_it_wanders() -> None:
+    """Walks four times as large as stated are told, and alarm no more; a step beside those stated is none of them."""
+    random = np.random.default_rng(19)
+    stated = HealthyDrift(0.1 * np.eye(3), np.zeros((3, 0)))
+    bare, held, found = 0, 0, 0
+    for _ in range(40):
+        x = random.standard_normal((80, 3)) + 0.4 * np.cumsum(random.standard_normal((80, 3)), axis=0)
+        made = StepScan(x, [0, 1, 2], stated)
+        restless = made.likeliest()
+        bare += made.observed().joint.max() > upper_quantile(made.null(199)[0], 0.05)
+        held += restless.observed().joint.max() > upper_quantile(restless.null(199)[0], 0.05)
+        x = stepped(random, 80, 40, 3.0) + 0.1 * np.cumsum(random.standard_normal((80, 3)), axis=0)
+        made = StepScan(x, [0, 1, 2], stated).likeliest()
+        found += made.observed().joint.max() > upper_quantile(made.null(199)[0], 0.05)
+    assert bare >= 15
+    assert held <= 7  # of 40 at 5 %: more has a probability of 0.2 %
+    assert found >= 36
+
+
+def test_the_cost_is_the_likelihood_beside_the_best_step() -> None:
+    """Differences of the cost against dense covariance matrices, for series whose scatter is 1 by construction."""
+    random = np.random.default_rng(20)
+    n = 40
+    x = random.standard_normal((n, 1)) + 0.2 * np.cumsum(random.standard_normal((n, 1)), axis=0)
+    x /= np.sqrt(0.5 * np.mean(np.diff(x, axis=0) ** 2))
+    made = StepScan(x, [0], HealthyDrift(0.1 * np.eye(1), np.zeros((1, 0))))
+    costs, dense = [], []
+    for wander in WANDERS:
+        costs.append(StepScan(x, [0], made.drift, wander=wander).cost())
+        walk = np.tril(np.ones((n, n)))
+        contrast = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, : n - 1]]))[0][:, 1:]  # the mean is unknown
+        S = contrast.T @ (np.eye(n) + (0.1 * wander) ** 2 * walk @ walk.T) @ contrast
+        best = -np.inf
+        for k in range(made.least, n - made.least + 1):
+            step, y = contrast.T @ (np.arange(n) >= k), contrast.T @ x[:, 0]
+            solved = np.linalg.solve(S, step)
+            best = max(best, float(y @ solved) ** 2 / float(step @ solved))
+        dense.append(np.linalg.slogdet(S)[1] + y @ np.linalg.solve(S, y) - best)
+    np.testing.assert_allclose(np.diff(costs), np.diff(dense), rtol=1e-6)
 
 
 @pytest.mark.parametrize("n", [24, 60])

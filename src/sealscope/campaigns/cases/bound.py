@@ -19,7 +19,9 @@ from sealscope.errors import InputError, SimulationFailed
 from sealscope.evaluation.checks import share
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
+from sealscope.simulation.commands import Recorded
 from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.integrate import trajectory
 from sealscope.simulation.sensitivity import REFERENCE_DP, leak_sensitivity, parameter_sensitivity
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -151,18 +153,30 @@ def change_bound(experiment: Experiment, before: float, after: float, dp: float)
     The leak's change from `before` [s] without to `after` [s] with it, under a mean pressure difference `dp` [Pa], from
     pressures and command of a machine whose `UNKNOWN` parameters are found from either part alone:
     ``s sqrt(T/before + T/after)``, s the bound over a run of T = `BOUND_SECONDS` without leak, fault or drift. None
-    where that run has no bound. Drift, hum, skew and an unknown onset can only raise the true limit.
+    where that run has no bound. Drift, hum, skew, an unknown load and an unknown onset can only raise the true limit.
+
+    Of a closed loop it is that of the voltages which the controller gave, put in again: the bound of whoever takes the
+    command as an input. What it says of the position to one who knows target and controller is left out.
     """
     run = replace(
         experiment, leaks=(), faults=(), drifts=(), duration=min(BOUND_SECONDS, experiment.duration), step=None
     )
     try:
-        bound = leak_bound(run, unknown=UNKNOWN).unknown
+        bound = leak_bound(_opened(run), unknown=UNKNOWN).unknown
     except (InputError, SimulationFailed):
         return None
     if bound is None:
         return None
     return in_lpm(bound * math.sqrt(run.duration / before + run.duration / after), dp)
+
+
+def _opened(run: Experiment) -> Experiment:
+    """Return the run with the voltages that its controller gave as its command, the loop open."""
+    if run.controlled is None:
+        return run
+    path = trajectory(run, ())
+    assert path.volts is not None
+    return replace(run, command=Recorded(path.t, path.volts, str(run.command)), controller=None)
 
 
 def smallest_found(deviation: float, false_alarm: float, detection: float = 0.9) -> float:

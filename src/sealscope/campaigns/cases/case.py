@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sealscope.campaigns.plans.duty import CONTROLLER
 from sealscope.campaigns.plans.model import SimulatedPlan, Use
 
 #: The factor whose levels are families of the plan's profile.
@@ -83,11 +84,19 @@ def _families(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     return {str(name): {FAMILY: digest(repr(profile.family(str(name))))} for name in plan.factors[FAMILY]}
 
 
+def _own_controllers(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
+    """Return, for each controller of the user's own, the digest of its source: another law gives other cases."""
+    from sealscope.control.registry import source_of
+
+    sources = {str(name): source_of(str(name)) for name in plan.factors.get(CONTROLLER, ())}
+    return {name: {CONTROLLER: hashlib.sha256(path.read_bytes()).hexdigest()} for name, path in sources.items() if path}
+
+
 def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
     """Return all cases of a plan: records of each kind go round the cells one by one, the last round may be short."""
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = world(plan)
-    families = _families(plan)
+    families, controllers = _families(plan), _own_controllers(plan)
     cases = []
     for group in plan.records:
         for number in range(group.count):
@@ -100,7 +109,11 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
                 "levels": cells[k],
                 "replicate": replicate,
             }
-            name = digest({"world": shared, **content, **families.get(str(cells[k].get(FAMILY)), {})})
+            named = {
+                **families.get(str(cells[k].get(FAMILY)), {}),
+                **controllers.get(str(cells[k].get(CONTROLLER)), {}),
+            }
+            name = digest({"world": shared, **content, **named})
             machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
             cases.append(CampaignCase(name[:16], int(machine >> np.uint64(1)), int(noise >> np.uint64(1)), **content))
     return cases

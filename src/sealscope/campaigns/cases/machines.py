@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from sealscope.campaigns.cases.case import FAMILY, CampaignCase
-from sealscope.campaigns.plans.duty import closing_values, fault_of
+from sealscope.campaigns.plans.duty import COMMAND, CONTROLLER, LOAD, closing_values, fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
 
 if TYPE_CHECKING:
@@ -38,7 +38,8 @@ def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = N
     top. `profile`: the plan's bench, where it has been loaded.
     """
     from sealscope.simulation.bench.machines import BenchMachine, draw
-    from sealscope.simulation.commands import Sine, parse_command
+    from sealscope.simulation.commands import Sine
+    from sealscope.simulation.courses import command_or_target, parse_force
 
     if plan.profile:
         family = str(case.levels.get(FAMILY, ""))
@@ -49,8 +50,12 @@ def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = N
         machine = BenchMachine("none", case.machine_seed, plan.rig, plan.duration_s, {}, (), Sine(3.0, 4.0), 0.0)
     values = dict(machine.overrides)
     for name, level in case.levels.items():
-        if name == "command":
-            machine = replace(machine, command=parse_command(str(level)))
+        if name == COMMAND:
+            machine = replace(machine, command=command_or_target(str(level)))
+        elif name == CONTROLLER:
+            machine = replace(machine, controller=str(level))
+        elif name == LOAD:
+            machine = replace(machine, load=parse_force(str(level)))
         elif name == "closed":
             values |= {"line.orifices": str(plan.rig["line.orifices"])} | closing_values(level)
         elif name != FAMILY:

@@ -1,13 +1,49 @@
-"""What a plan's levels and faults mean on a rig: throttle closings and faults as text."""
+"""What a plan's levels and faults mean on a rig: closings, targets, controllers, loads and faults as text.
+
+The words are those of `sealscope simulate`: `command` as `--command` (a voltage or a target for the piston),
+`controller` as `--controller`, `load` as `--load`.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
+    from sealscope.parameters import Rig
     from sealscope.simulation.faults import Fault
+
+#: Factors whose levels are the duty of a machine, in the words of the command line.
+COMMAND, CONTROLLER, LOAD = "command", "controller", "load"
+#: Rate [Hz] at which a target is looked at before any run.
+_LOOKED = 50.0
+
+
+def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
+    """Raise InputError for a level of `command`, `controller` or `load` that no run of `duration` [s] can have."""
+    from sealscope.control import controller_named
+    from sealscope.simulation.courses import Position, command_or_target, parse_force
+    from sealscope.simulation.experiment import check_target
+
+    examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
+    if not isinstance(level, str):
+        raise InputError(f"a {name} must be a text such as {examples[name]}, got {level!r}")
+    if name == CONTROLLER:
+        controller_named(level, rig)
+    elif name == LOAD:
+        parse_force(level)
+    elif isinstance(command := command_or_target(level), Position):
+        check_target(command, np.arange(0.0, duration, 1.0 / _LOOKED), rig.cylinder.L / 2)
+
+
+def voltage_in(commands: tuple[str | float, ...]) -> str | None:
+    """Return the first of these commands that is no target for a piston, None where all are."""
+    from sealscope.simulation.courses import parse_position
+
+    return next((str(command) for command in commands if parse_position(str(command)) is None), None)
 
 
 def closing_values(level: str | float) -> dict[str, str | float]:

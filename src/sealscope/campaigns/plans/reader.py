@@ -11,7 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from sealscope.campaigns.plans.detectors import plan_detector
-from sealscope.campaigns.plans.duty import closing_values, fault_of
+from sealscope.campaigns.plans.duty import (
+    COMMAND,
+    CONTROLLER,
+    LOAD,
+    check_duty,
+    closing_values,
+    fault_of,
+    voltage_in,
+)
 from sealscope.campaigns.plans.model import (
     AnyPlan,
     ChosenClassifier,
@@ -124,7 +132,7 @@ def _simulated(tree: Mapping[str, Any], place: str) -> SimulatedPlan:
         onset_s=onset,
         seed=head.whole("seed", 0),
         keep_recordings=head.flag("keep_recordings"),
-        factors=_factors(tree.get("factors", {}), rig, profile, place),
+        factors=_factors(tree.get("factors", {}), rig, profile, duration, place),
         part=head.text("part", ""),
         bound=head.flag("bound"),
         records=_records(tree.get("records", ()), onset, place),
@@ -174,7 +182,7 @@ def _profile(head: PlanTable) -> str:
     return name
 
 
-def _factors(given: Any, rig: Rig, profile: str, place: str) -> dict[str, tuple[str | float, ...]]:
+def _factors(given: Any, rig: Rig, profile: str, duration: float, place: str) -> dict[str, tuple[str | float, ...]]:
     table = PlanTable(given, "factors", place)
     factors: dict[str, tuple[str | float, ...]] = {}
     for name, levels in table.left.items():
@@ -185,26 +193,36 @@ def _factors(given: Any, rig: Rig, profile: str, place: str) -> dict[str, tuple[
         for level in levels:
             if isinstance(level, bool) or not isinstance(level, (str, int, float)):
                 raise table.fail(f"{name} must be texts or numbers, got {level!r}")
-            _in(f"factors.{name}", place, partial(_check_level, name, level, rig, profile))
+            _in(f"factors.{name}", place, partial(_check_level, name, level, rig, profile, duration))
         factors[name] = tuple(levels)
         cells = math.prod(map(len, factors.values()))
         if cells > MOST_CELLS:
             raise table.fail(f"their levels must make at most {MOST_CELLS} cells, got {cells} or more")
+    if CONTROLLER in factors and (command := voltage_in(_commands(factors, profile))) is not None:
+        raise table.fail(f"{CONTROLLER} must have targets to follow ('position 50 mm sin(2t)'), got {command!r}")
     return factors
 
 
-def _check_level(name: str, level: str | float, rig: Rig, profile: str) -> None:
+def _commands(factors: Mapping[str, tuple[str | float, ...]], profile: str) -> tuple[str | float, ...]:
+    """Return the commands of a plan: its factor's, or else those of its profile, or of its families there."""
     from sealscope.simulation.bench.profile import load_profile
-    from sealscope.simulation.commands import parse_command
+
+    if COMMAND in factors or not profile:
+        return factors.get(COMMAND, ("3 sin(4t)",))
+    drawn = load_profile(profile)
+    kinds = [drawn.of_family(str(family)) for family in factors.get("family", ())] or [drawn]
+    return tuple(command for kind in kinds for command in kind.duty.commands)
+
+
+def _check_level(name: str, level: str | float, rig: Rig, profile: str, duration: float) -> None:
+    from sealscope.simulation.bench.profile import load_profile
 
     if name == "family":
         if not profile:
             raise InputError(f"a family must be of the plan's profile, got {level!r} and no profile")
         load_profile(profile).family(str(level))
-    elif name == "command":
-        if not isinstance(level, str):
-            raise InputError(f"a command must be a text such as '3 sin(4t)', got {level!r}")
-        parse_command(level)
+    elif name in (COMMAND, CONTROLLER, LOAD):
+        check_duty(name, level, rig, duration)
     else:
         rig.with_overrides(closing_values(level) if name == "closed" else {name: level})
 

@@ -40,7 +40,8 @@ from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.bench.machines import centred_start
-from sealscope.simulation.commands import Command, parse_command
+from sealscope.simulation.commands import Command
+from sealscope.simulation.courses import Position, command_or_target
 from sealscope.simulation.experiment import Experiment
 
 #: The commands of the thesis's tests that are compared, and the closings of both throttles (None: no throttles).
@@ -118,11 +119,15 @@ def bound_figures(bound: LeakBound, dp: float, target: DetectionTarget) -> Bound
 def experiment_for(rig: Rig, command: Command | str, duration: float, x_0: float | None = None) -> Experiment:
     """Return the leak-free experiment; `x_0` [m] by default such that the sweep's middle is at mid-stroke.
 
-    Raises InputError for a record too short for a prediction.
+    Raises InputError for a record too short for a prediction, a target for the piston, and a valve-controlled rig.
     """
+    if rig.valve.spool == "present":
+        raise InputError(f"a prediction must be of a pump-controlled rig (valve.spool = absent), got {rig.name}")
     if not duration >= SHORTEST:
         raise InputError(f"duration must be >= {SHORTEST:g} s for a prediction, got {duration:g} s")
-    parsed = parse_command(command) if isinstance(command, str) else command
+    parsed = command_or_target(command) if isinstance(command, str) else command
+    if isinstance(parsed, Position):
+        raise InputError(f"a prediction must be of a command in volts ('3 sin(4t)'), got a target ({parsed})")
     start = centred_start(rig, parsed, min(duration, LONGEST_LOOK)) if x_0 is None else x_0
     return Experiment(rig=rig, command=parsed, duration=duration, x_0=start)
 

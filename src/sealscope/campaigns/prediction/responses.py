@@ -35,7 +35,7 @@ from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import Details, details
 from sealscope.signals.filters import IntArray
-from sealscope.simulation.commands import parse_command
+from sealscope.simulation.courses import command_or_target
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import From, Leak
 from sealscope.simulation.instruments import decimate, record
@@ -283,7 +283,7 @@ def bench_responses(
 def _same_duty(row: CaseRow, command: str, rig: Rig) -> bool:
     """Return whether a row was run with this command and the rig's throttles; what did not vary counts as equal."""
     levels = row.levels
-    if "command" in levels and str(parse_command(str(levels["command"]))) != command:
+    if "command" in levels and str(command_or_target(str(levels["command"]))) != command:
         return False
     if "closed" not in levels:
         return True

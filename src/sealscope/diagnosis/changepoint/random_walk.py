@@ -10,7 +10,7 @@ The score is the largest t of the size over all onsets, where only a rise counts
 same maximum over series drawn from the walk estimated beside the step and, where the caller is `wary`, from the one
 estimated without a step too, whichever is higher. It depends on the number of blocks, the expected and the estimated
 walk and is interpolated in a table (`tails.null_threshold`). Unequal deviations, which the table does not know, made
-the probability 0.6 to 1.9 times the stated one where they were tried (docs/decisions/0013-observer.md).
+the probability 0.6 to 1.9 times the stated one where they were tried (docs/notes/null-tables.md).
 """
 
 from __future__ import annotations

@@ -19,11 +19,14 @@ The threshold is the quantile of max T2 over random orders of the same blocks wi
 abrupt change every order is as likely as the one observed. Pairs of neighbours are moved together, so that the short
 memory of the blocks (the filters reach from one into the next) stays in the null distribution; longer runs would carry
 the very step that is looked for.
+
+A machine may wander more than B says: a step is then the largest of many changes. Beside the best step, the series has
+the likelihood of its cosines; which of B, 2 B and 4 B makes it likeliest says how much it wanders (`likeliest`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +39,10 @@ from sealscope.recordings.recording import Array
 _RANK = 1e-8
 _BATCH = 250
 _RUN = 2
+#: How many times as much as a healthy one's a series' drift may be.
+WANDERS = (1.0, 2.0, 4.0)
+#: A larger drift must be likelier by so much of twice the log likelihood, which it is by chance once in seventy times.
+_LIKELIER = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +77,25 @@ class Scan:
 class StepScan:
     """The statistics of series of n blocks that scatter and drift as `x` (n, f) does.
 
-    `joint`: the columns that are judged together; `drift`: theirs without a step (default: none). Columns in which
-    `drift.other` has a share are read beside them. Steps nearer than `least` blocks to an end are left out.
+    `joint`: the columns that are judged together; `drift`: theirs without a step (default: none), `wander` times as
+    large. Columns in which `drift.other` has a share are read beside them. Steps nearer than `least` blocks to an end
+    are left out.
     """
 
     def __init__(
-        self, x: Array, joint: list[int], drift: HealthyDrift | None = None, *, least: int | None = None
+        self,
+        x: Array,
+        joint: list[int],
+        drift: HealthyDrift | None = None,
+        *,
+        least: int | None = None,
+        wander: float = 1.0,
     ) -> None:
         n, f = x.shape
-        self.n, self.f, self.x = n, f, x
+        self.n, self.f, self.x, self.joint, self.wander = n, f, x, joint, wander
         self.drift = HealthyDrift(np.zeros((f, 0)), np.zeros((f, 0))) if drift is None else drift
+        if wander != 1.0:
+            self.drift = replace(self.drift, walks=wander * self.drift.walks)
         self.least = least_blocks(n) if least is None else least
         self.used = sorted({*joint, *np.flatnonzero(np.any(self.drift.other != 0, axis=1)).tolist()})
         differences = np.diff(x, axis=0)
@@ -146,6 +162,21 @@ class StepScan:
         """Return the statistics of x itself."""
         t2, single, trend = self(self.x[None])
         return Scan(t2[0], single[0], float(trend[0]))
+
+    def cost(self) -> float:
+        """Return twice the negative log likelihood of x, beside its best step, but for a constant."""
+        squares = _cosines(_rescattered(self.x[None][..., self.used] @ self.to))[0, 1:] ** 2
+        passed = self.passed[1:]
+        return float(np.sum(squares * passed - np.log(passed)) - self.observed().joint.max())
+
+    def likeliest(self) -> StepScan:
+        """Return the scan with the drift, of `WANDERS` times this one's, under which x is likeliest.
+
+        This one's own where no other is likelier by a margin (`_LIKELIER`).
+        """
+        own = replace(self.drift, walks=self.drift.walks / self.wander)
+        scans = [StepScan(self.x, self.joint, own, least=self.least, wander=wander) for wander in WANDERS]
+        return min(scans, key=lambda scan: scan.cost() - _LIKELIER * (scan.wander == self.wander))
 
     def orders(self, count: int, random: np.random.Generator) -> Array:
         """Return `count` series (count, n, f) as x would be without a step: its blocks in a random order, and walks."""

@@ -18,7 +18,8 @@ import numpy as np
 from sealscope.compiled import law
 from sealscope.recordings.recording import Array
 
-_LEAD = 5
+#: Length of the sums, and of a row without the parameters.
+SUMS, LEAD = 11, 5
 
 
 class Estimates(NamedTuple):
@@ -39,11 +40,13 @@ class Estimates(NamedTuple):
     deviations: Array
 
 
-def new_sums(G: float, deviation: float) -> Array:
-    """Return the sums before a first sample, with the prior of G."""
-    sums = np.zeros(11)
-    sums[3], sums[4] = G, deviation**2
-    return sums
+@law
+def begin_sums(G: float, deviation: float, sums: np.ndarray) -> None:
+    """Write the sums before a first sample, with the prior of G."""
+    for i in range(SUMS):
+        sums[i] = 0.0
+    sums[3] = G
+    sums[4] = deviation**2
 
 
 @law
@@ -72,8 +75,8 @@ def close_block(
     row[3] = sums[8] / sums[2] if sums[2] > 0.0 else 0.0
     row[4] = sums[7] / sums[0]
     for j in range(m):
-        row[_LEAD + j] = q[j]
-        row[_LEAD + m + j] = math.sqrt(max(P[offset + j, offset + j], 0.0))
+        row[LEAD + j] = q[j]
+        row[LEAD + m + j] = math.sqrt(max(P[offset + j, offset + j], 0.0))
         P[offset + j, offset + j] += walk[j]
     for j in range(P.shape[0]):
         P[g, j] = 0.0
@@ -96,7 +99,7 @@ class BlockRows:
 
     def buffer(self, most: int) -> Array:
         """Return empty rows for at most `most` blocks."""
-        return np.empty((most, _LEAD + 2 * self._m))
+        return np.empty((most, LEAD + 2 * self._m))
 
     def add(self, rows: Array) -> None:
         """Append a copy of written rows."""
@@ -106,5 +109,5 @@ class BlockRows:
     def estimates(self) -> Estimates:
         """Return the estimates of all blocks so far."""
         rows = np.concatenate(self._rows) if self._rows else self.buffer(0)
-        G, sd, square, correlation, dp = rows[:, :_LEAD].T
-        return Estimates(G, sd, square, correlation, dp, rows[:, _LEAD : _LEAD + self._m], rows[:, _LEAD + self._m :])
+        G, sd, square, correlation, dp = rows[:, :LEAD].T
+        return Estimates(G, sd, square, correlation, dp, rows[:, LEAD : LEAD + self._m], rows[:, LEAD + self._m :])

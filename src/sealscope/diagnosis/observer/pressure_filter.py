@@ -13,11 +13,12 @@ at each step's middle. p_A and p_B are measured, one after the other.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.compiled import kernel, law
-from sealscope.diagnosis.observer.estimates import BlockRows, close_block, new_sums
+from sealscope.diagnosis.observer.estimates import SUMS, BlockRows, begin_sums, close_block
 from sealscope.diagnosis.observer.model import (
     FLOW_NOISE,
     FORCE_NOISE,
@@ -36,17 +37,18 @@ from sealscope.physics.pump import pump_flow, pump_torque
 from sealscope.physics.rig import RigNumbers
 from sealscope.recordings.recording import Array
 
-#: Order of the means: drive (integral, current, speed), then the four states that have a covariance.
-_MEANS = 7
+#: Means: drive (integral, current, speed), then the four states that have a covariance; rows of the covariance.
+MEANS = 7
 _STATES = 4
-_ALL = _STATES + len(PARAMETERS)
-_LONGEST_STEP = 1.0e-3
+COVARIANCE = _STATES + len(PARAMETERS)
+#: Longest step of the integration [s].
+LONGEST_STEP = 1.0e-3
 #: Uncertainty of velocity [m/s] and position [m] at the start.
 _VELOCITY, _POSITION = 0.01, 0.05
 #: The search of the stiffness: after these seconds this number of candidates goes on.
-_ROUNDS = ((6.3, 6), (12.6, 1))
+ROUNDS = ((6.3, 6), (12.6, 1))
 #: Length [s] of the beginning that `find_stiffness` reads.
-SEARCH_SECONDS = _ROUNDS[-1][0]
+SEARCH_SECONDS = ROUNDS[-1][0]
 _NEVER = 1 << 62
 
 
@@ -159,13 +161,146 @@ def _carry(J: np.ndarray, B: np.ndarray, h: float, E: np.ndarray, T: np.ndarray,
                 for j in range(_STATES):
                     T[i, j] = E[i, j]
     for i in range(_STATES):
-        for j in range(_ALL):
+        for j in range(COVARIANCE):
             N[i, j] = E[i, 0] * S[0, j] + E[i, 1] * S[1, j] + E[i, 2] * S[2, j] + E[i, 3] * S[3, j]
-        for j in range(_ALL - _STATES):
+        for j in range(COVARIANCE - _STATES):
             N[i, _STATES + j] += h * (T[i, 0] * B[0, j] + T[i, 1] * B[1, j] + T[i, 2] * B[2, j])
     for i in range(_STATES):
-        for j in range(_ALL):
+        for j in range(COVARIANCE):
             S[i, j] = N[i, j]
+
+
+class Room(NamedTuple):
+    """Arrays that `take_pressures` uses meanwhile."""
+
+    J: np.ndarray
+    E: np.ndarray
+    T: np.ndarray
+    B: np.ndarray
+    S: np.ndarray
+    W: np.ndarray
+    k1: np.ndarray
+    k2: np.ndarray
+    k3: np.ndarray
+    k4: np.ndarray
+    mid: np.ndarray
+    gain: np.ndarray
+
+
+#: Their shapes.
+ROOM = (
+    *((_STATES, _STATES),) * 3,
+    (_STATES, len(PARAMETERS)),
+    *((_STATES, COVARIANCE),) * 2,
+    *((MEANS,),) * 5,
+    (COVARIANCE,),
+)
+
+
+@law
+def take_pressures(
+    drive: float,
+    p_A: float,
+    p_B: float,
+    commanded: bool,
+    h: float,
+    steps: int,
+    a: RigNumbers,
+    z: np.ndarray,
+    q: np.ndarray,
+    P: np.ndarray,
+    sums: np.ndarray,
+    noise: np.ndarray,
+    walk: np.ndarray,
+    block: float,
+    row: np.ndarray,
+    room: Room,
+) -> bool:
+    """Take a sample, h [s] after the one before; return whether it closed a block, whose estimates are in `row`.
+
+    `drive`: command [V] if `commanded`, else the mean speed [rad/s] since the sample before. Means `z` (7,), parameters
+    `q` (8,), covariance `P` (12, 12) and `sums` (see `estimates`) are the filter's memory and are changed in place.
+    `noise` (2,): variances of the readings [Pa^2]; `walk` (8,): variances gained from block to block; `block`: length
+    of a block [samples].
+    """
+    J, E, T, B, S, W, k1, k2, k3, k4, mid, gain = room
+    step = h / steps
+    if sums[5] == 0.0:
+        sums[5] = 1.0
+        sums[6] = drive
+        z[3] = p_A
+        z[4] = p_B
+        return False
+    before, after = (sums[6], drive) if commanded else (drive, drive)
+    sums[6] = drive
+    for i in range(_STATES):
+        for j in range(COVARIANCE):
+            S[i, j] = 1.0 if i == j else 0.0
+    for part in range(steps):
+        left = before + (after - before) * part / steps
+        right = before + (after - before) * (part + 1) / steps
+        half = 0.5 * (left + right)
+        _rates(z, q, left, commanded, a, k1)
+        for i in range(MEANS):
+            mid[i] = z[i] + 0.5 * step * k1[i]
+        _rates(mid, q, half, commanded, a, k2)
+        for i in range(MEANS):
+            mid[i] = z[i] + 0.5 * step * k2[i]
+        _rates(mid, q, half, commanded, a, k3)
+        _slopes(mid, q, mid[2] if commanded else half, a, J, B)
+        for i in range(MEANS):
+            mid[i] = z[i] + step * k3[i]
+        _rates(mid, q, right, commanded, a, k4)
+        for i in range(MEANS):
+            z[i] += step / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+        _carry(J, B, step, E, T, W, S)
+    for i in range(_STATES):
+        for j in range(COVARIANCE):
+            W[i, j] = 0.0
+        for m in range(COVARIANCE):
+            for j in range(COVARIANCE):
+                W[i, j] += S[i, m] * P[m, j]
+    for i in range(_STATES):
+        for j in range(i, _STATES):
+            total = 0.0
+            for m in range(COVARIANCE):
+                total += W[i, m] * S[j, m]
+            P[i, j] = total
+            P[j, i] = total
+        for j in range(_STATES, COVARIANCE):
+            P[i, j] = W[i, j]
+            P[j, i] = W[i, j]
+    flow = (q[3] * a.K_oil / a.V * FLOW_NOISE) ** 2 * h
+    P[0, 0] += flow
+    P[1, 1] += flow
+    P[0, 1] -= flow
+    P[1, 0] -= flow
+    force = FORCE_NOISE + REVERSAL_NOISE * math.exp(-abs(z[5]) / REVERSAL_SPEED)
+    P[2, 2] += (force / a.M_eq) ** 2 * h
+    for c in range(2):
+        innovation = (p_A if c == 0 else p_B) - z[3 + c]
+        variance = P[c, c] + noise[c]
+        white = innovation / math.sqrt(variance)
+        sums[1] -= 0.5 * (white * white + math.log(variance))
+        sums[2] += 0.5 * white * white
+        sums[8] += 0.5 * white * sums[9 + c]
+        sums[9 + c] = white
+        for i in range(COVARIANCE):
+            gain[i] = P[i, c] / variance
+        for i in range(_STATES):
+            z[3 + i] += gain[i] * innovation
+        for j in range(len(PARAMETERS)):
+            q[j] += gain[_STATES + j] * innovation
+        for i in range(COVARIANCE):
+            share = gain[i] * variance
+            for j in range(COVARIANCE):
+                P[i, j] -= share * gain[j]
+    sums[7] += abs(p_A - p_B)
+    sums[0] += 1.0
+    if sums[0] < block:
+        return False
+    close_block(q, P, _STATES, 0, sums, walk, G_PRIOR, row)
+    return True
 
 
 @kernel
@@ -186,95 +321,56 @@ def advance(
     block: int,
     rows: np.ndarray,
 ) -> int:
-    """Advance the filter over samples `drive`, `p_A`, `p_B` (n,) of spacing h; return the number of `rows` written.
-
-    `drive`: command [V] if `commanded`, else the mean speed [rad/s] since the sample before. Means `z` (7,), parameters
-    `q` (8,), covariance `P` (12, 12) and `sums` (see `estimates`) are the filter's memory and are changed in place.
-    `noise` (2,): variances of the readings [Pa^2]; `walk` (8,): variances gained from block to block.
-    """
-    J, E, T = np.zeros((_STATES, _STATES)), np.zeros((_STATES, _STATES)), np.zeros((_STATES, _STATES))
-    B, S, W = np.zeros((_STATES, len(PARAMETERS))), np.zeros((_STATES, _ALL)), np.zeros((_STATES, _ALL))
-    k1, k2, k3, k4, mid = np.zeros(_MEANS), np.zeros(_MEANS), np.zeros(_MEANS), np.zeros(_MEANS), np.zeros(_MEANS)
-    gain = np.zeros(_ALL)
-    step = h / steps
-    written = 0
+    """Take samples, (n,) each, as `take_pressures` does; return the number of `rows` written."""
+    s, m = _STATES, len(PARAMETERS)
+    J, E, T, B = np.zeros((s, s)), np.zeros((s, s)), np.zeros((s, s)), np.zeros((s, m))
+    S, W, gain = np.zeros((s, COVARIANCE)), np.zeros((s, COVARIANCE)), np.zeros(COVARIANCE)
+    k1, k2, k3, k4, mid = np.zeros(MEANS), np.zeros(MEANS), np.zeros(MEANS), np.zeros(MEANS), np.zeros(MEANS)
+    room = Room(J, E, T, B, S, W, k1, k2, k3, k4, mid, gain)
+    row, written = np.zeros(rows.shape[1]), 0
     for n in range(drive.size):
-        if sums[5] == 0.0:
-            sums[5] = 1.0
-            sums[6] = drive[n]
-            z[3] = p_A[n]
-            z[4] = p_B[n]
-            continue
-        before, after = (sums[6], drive[n]) if commanded else (drive[n], drive[n])
-        sums[6] = drive[n]
-        for i in range(_STATES):
-            for j in range(_ALL):
-                S[i, j] = 1.0 if i == j else 0.0
-        for part in range(steps):
-            left = before + (after - before) * part / steps
-            right = before + (after - before) * (part + 1) / steps
-            half = 0.5 * (left + right)
-            _rates(z, q, left, commanded, a, k1)
-            for i in range(_MEANS):
-                mid[i] = z[i] + 0.5 * step * k1[i]
-            _rates(mid, q, half, commanded, a, k2)
-            for i in range(_MEANS):
-                mid[i] = z[i] + 0.5 * step * k2[i]
-            _rates(mid, q, half, commanded, a, k3)
-            _slopes(mid, q, mid[2] if commanded else half, a, J, B)
-            for i in range(_MEANS):
-                mid[i] = z[i] + step * k3[i]
-            _rates(mid, q, right, commanded, a, k4)
-            for i in range(_MEANS):
-                z[i] += step / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-            _carry(J, B, step, E, T, W, S)
-        for i in range(_STATES):
-            for j in range(_ALL):
-                W[i, j] = 0.0
-            for m in range(_ALL):
-                for j in range(_ALL):
-                    W[i, j] += S[i, m] * P[m, j]
-        for i in range(_STATES):
-            for j in range(i, _STATES):
-                total = 0.0
-                for m in range(_ALL):
-                    total += W[i, m] * S[j, m]
-                P[i, j] = total
-                P[j, i] = total
-            for j in range(_STATES, _ALL):
-                P[i, j] = W[i, j]
-                P[j, i] = W[i, j]
-        flow = (q[3] * a.K_oil / a.V * FLOW_NOISE) ** 2 * h
-        P[0, 0] += flow
-        P[1, 1] += flow
-        P[0, 1] -= flow
-        P[1, 0] -= flow
-        force = FORCE_NOISE + REVERSAL_NOISE * math.exp(-abs(z[5]) / REVERSAL_SPEED)
-        P[2, 2] += (force / a.M_eq) ** 2 * h
-        for c in range(2):
-            innovation = (p_A[n] if c == 0 else p_B[n]) - z[3 + c]
-            variance = P[c, c] + noise[c]
-            white = innovation / math.sqrt(variance)
-            sums[1] -= 0.5 * (white * white + math.log(variance))
-            sums[2] += 0.5 * white * white
-            sums[8] += 0.5 * white * sums[9 + c]
-            sums[9 + c] = white
-            for i in range(_ALL):
-                gain[i] = P[i, c] / variance
-            for i in range(_STATES):
-                z[3 + i] += gain[i] * innovation
-            for j in range(len(PARAMETERS)):
-                q[j] += gain[_STATES + j] * innovation
-            for i in range(_ALL):
-                share = gain[i] * variance
-                for j in range(_ALL):
-                    P[i, j] -= share * gain[j]
-        sums[7] += abs(p_A[n] - p_B[n])
-        sums[0] += 1.0
-        if sums[0] >= block:
-            close_block(q, P, _STATES, 0, sums, walk, G_PRIOR, rows[written])
+        if take_pressures(
+            drive[n], p_A[n], p_B[n], commanded, h, steps, a, z, q, P, sums, noise, walk, block, row, room
+        ):
+            rows[written] = row
             written += 1
     return written
+
+
+@law
+def start_pressures(
+    start: np.ndarray,
+    deviations: np.ndarray,
+    noise: np.ndarray,
+    z: np.ndarray,
+    q: np.ndarray,
+    P: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """Write the memory before a first sample: parameters `start` (8,), known to `deviations` (8,)."""
+    for i in range(MEANS):
+        z[i] = 0.0
+    for i in range(COVARIANCE):
+        for j in range(COVARIANCE):
+            P[i, j] = 0.0
+    for i in range(len(PARAMETERS)):
+        q[i] = start[i]
+        P[_STATES + i, _STATES + i] = deviations[i] ** 2
+    P[0, 0], P[1, 1], P[2, 2], P[3, 3] = noise[0], noise[1], _VELOCITY**2, _POSITION**2
+    begin_sums(start[0], deviations[0], sums)
+
+
+@kernel
+def _start(
+    start: np.ndarray,
+    deviations: np.ndarray,
+    noise: np.ndarray,
+    z: np.ndarray,
+    q: np.ndarray,
+    P: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    start_pressures(start, deviations, noise, z, q, P, sums)
 
 
 class PressureFilter:
@@ -292,17 +388,15 @@ class PressureFilter:
         block: int,
         start: tuple[Array, Array],
         noise: Array,
-        longest_step: float = _LONGEST_STEP,
+        longest_step: float = LONGEST_STEP,
     ) -> None:
         self.a, self.commanded, self.h, self.block, self.noise = a, commanded, 1.0 / rate, block, noise
         self.steps = max(1, math.ceil(self.h / longest_step - 1e-9))
         self.walk = walks(block * self.h)
         self.blocks = BlockRows(len(PARAMETERS))
-        q, deviations = start
-        self.q = q.copy()
-        self.z = np.zeros(_MEANS)
-        self.P = np.diag(np.concatenate([noise, [_VELOCITY**2, _POSITION**2], deviations**2]))
-        self.sums = new_sums(q[0], deviations[0])
+        self.z, self.q, self.P = np.empty(MEANS), np.empty(len(PARAMETERS)), np.empty((COVARIANCE, COVARIANCE))
+        self.sums = np.empty(SUMS)
+        _start(*start, noise, self.z, self.q, self.P, self.sums)
 
     def update(self, drive: Array, p_A: Array, p_B: Array) -> None:
         """Take more samples, (n,) each."""
@@ -335,9 +429,9 @@ def find_stiffness(
         begin, spread = q.copy(), deviations.copy()
         begin[number] = factor
         spread[number] = deviations[number] * factor
-        bank.append(PressureFilter(a, commanded, rate, _NEVER, (begin, spread), noise, 2.0 * _LONGEST_STEP))
+        bank.append(PressureFilter(a, commanded, rate, _NEVER, (begin, spread), noise, 2.0 * LONGEST_STEP))
     first = 0
-    for seconds, left in _ROUNDS:
+    for seconds, left in ROUNDS:
         stop = round(seconds * rate)
         for candidate in bank:
             candidate.update(*(channel[first:stop] for channel in samples))

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 #: and the angle or speed; `command` on the pressures and the command.
 Formulation = Literal["volume", "speed", "command"]
 #: Least noise of a reading: a tenth of a step of 14 bits over 3000 psi [Pa], and the square of it in volume [m^3].
-_LEAST_PRESSURE, _LEAST_VOLUME = 100.0, 1e-10
-_SLOW_SECONDS = 0.02
+LEAST_PRESSURE, LEAST_VOLUME = 100.0, 1e-10
+#: Interval of the samples by which the channels' senses are compared [s].
+SLOW_SECONDS = 0.02
 
 
 def whole(recording: Recording, name: str) -> bool:
@@ -109,7 +110,7 @@ class ObserverStream:
         """Estimate noise, senses and stiffness from the first seconds alone."""
         a = self._numbers
         first = {name: values[: round(SEARCH_SECONDS * self.rate)] for name, values in samples.items()}
-        stride = max(1, round(_SLOW_SECONDS * self.rate))
+        stride = max(1, round(SLOW_SECONDS * self.rate))
         slow = {name: values[::stride] for name, values in first.items()}
         dp = (slow["p_A"] - slow["p_B"])[1:]
         if "x" in self.channels:
@@ -119,11 +120,11 @@ class ObserverStream:
             self._origin = {name: float(first[name][0]) for name in ("theta", "x") if name in first}
             theta, x, drop = self._volumes(first, remember=False)
             volume = displacement(a) * theta - mean_area(a) * x - compliance(a) * drop
-            noise = max(_fine_rms(volume), _LEAST_VOLUME) ** 2
+            noise = max(_fine_rms(volume), LEAST_VOLUME) ** 2
             self._filter = VolumeFilter(a, self.rate, self.block, noise)
             return
         self._turn = _sense(slow["u"][1:] if "u" in slow else _speed(slow), dp)
-        variances = np.array([max(_fine_rms(first[name]), _LEAST_PRESSURE) ** 2 for name in CHAMBERS])
+        variances = np.array([max(_fine_rms(first[name]), LEAST_PRESSURE) ** 2 for name in CHAMBERS])
         start = start_parameters(self.rig)
         drive = self._drive(first, remember=False)
         commanded = "u" in self.channels

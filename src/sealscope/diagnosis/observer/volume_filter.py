@@ -15,8 +15,8 @@ import math
 
 import numpy as np
 
-from sealscope.compiled import kernel
-from sealscope.diagnosis.observer.estimates import BlockRows, close_block, new_sums
+from sealscope.compiled import kernel, law
+from sealscope.diagnosis.observer.estimates import SUMS, BlockRows, begin_sums, close_block
 from sealscope.diagnosis.observer.model import G_UNIT, compliance, displacement, mean_area
 from sealscope.physics.rig import RigNumbers
 from sealscope.recordings.recording import Array
@@ -36,6 +36,97 @@ _COMPLIANCE_WALK = 0.01
 _FLOW_NOISE = 1e-10
 #: Deviation of G at the start of every block, in units of `G_UNIT`.
 _G_PRIOR = 3.0
+#: Mean square of a block's normalised innovations from which on the model does not describe it.
+_LOST = 8.0
+
+
+@law
+def take_volume(
+    volume: float,
+    swept: float,
+    dp: float,
+    h: float,
+    area: float,
+    y: np.ndarray,
+    P: np.ndarray,
+    sums: np.ndarray,
+    noise: float,
+    walk: np.ndarray,
+    block: float,
+    row: np.ndarray,
+    held: np.ndarray,
+    room: np.ndarray,
+) -> bool:
+    """Take a sample, h [s] after the one before; return whether it closed a block, whose estimates are in `row`.
+
+    A block that the model does not describe, such as the one in which a large leak begins, teaches the slow states
+    nothing: they are again what they were before it.
+
+    `volume`: z [m^3]; `swept`: A x [m^3]; `dp`: p_A - p_B [Pa]; `y` (6,), `P` (6, 6) and `sums` are the filter's
+    memory, `held` (7, 6) the states and covariances before this block; `noise`: variance of z [m^6]; `block`: length of
+    a block [samples]; `room` (2, 6): used meanwhile.
+    """
+    if sums[5] == 0.0:
+        sums[5] = 1.0
+        sums[6] = dp
+        y[_S] = volume
+        return False
+    if sums[0] == 0.0:
+        for j in range(_M):
+            held[_M, j] = y[j]
+            for i in range(_M):
+                held[i, j] = P[i, j]
+    leaks = h * G_UNIT * 0.5 * (dp + sums[6])
+    sums[6] = dp
+    y[_S] += h * y[_BIAS] + leaks * y[_G]
+    for j in range(_M):
+        P[_S, j] += h * P[_BIAS, j] + leaks * P[_G, j]
+    for j in range(_M):
+        P[j, _S] += h * P[j, _BIAS] + leaks * P[j, _G]
+    P[_S, _S] += _FLOW_NOISE**2 * h
+    H, PH = room[0], room[1]
+    H[_S] = 1.0
+    H[_BIAS] = 0.0
+    H[_G] = 0.0
+    H[_SCALE] = swept
+    H[_COMPLIANCE] = dp
+    H[_SLOPE] = dp * swept / area
+    variance = noise
+    innovation = volume
+    for i in range(_M):
+        total = 0.0
+        for j in range(_M):
+            total += P[i, j] * H[j]
+        PH[i] = total
+        variance += H[i] * total
+        innovation -= H[i] * y[i]
+    white = innovation / math.sqrt(variance)
+    sums[1] -= 0.5 * (white * white + math.log(variance))
+    sums[2] += white * white
+    sums[8] += white * sums[9]
+    sums[9] = white
+    for i in range(_M):
+        y[i] += PH[i] / variance * innovation
+        for j in range(_M):
+            P[i, j] -= PH[i] * PH[j] / variance
+    sums[7] += abs(dp)
+    sums[0] += 1.0
+    if sums[0] < block:
+        return False
+    lost = sums[2] > _LOST * sums[0]
+    close_block(y, P, 0, _G, sums, walk, _G_PRIOR, row)
+    if lost:
+        for i in range(_M):
+            if i not in (_S, _G):
+                y[i] = held[_M, i]
+                for j in range(_M):
+                    P[i, j] = 0.0 if j in (_S, _G) else held[i, j]
+                    P[j, i] = P[i, j]
+                P[i, i] += walk[i]
+        P[_S, _G] = 0.0
+        P[_G, _S] = 0.0
+        P[_S, _S] = _START[_S] ** 2
+    return True
 
 
 @kernel
@@ -52,56 +143,63 @@ def advance_volume(
     walk: np.ndarray,
     block: int,
     rows: np.ndarray,
+    held: np.ndarray,
 ) -> int:
-    """Advance the filter over samples of spacing h, (n,) each; return the number of `rows` written.
-
-    `volume`: z [m^3]; `swept`: A x [m^3]; `dp`: p_A - p_B [Pa]; `y` (6,), `P` (6, 6) and `sums` are the filter's
-    memory; `noise`: variance of z [m^6].
-    """
-    H, PH = np.zeros(_M), np.zeros(_M)
+    """Take samples, (n,) each, as `take_volume` does; return the number of `rows` written."""
+    room = np.zeros((2, _M))
     written = 0
     for n in range(volume.size):
-        if sums[5] == 0.0:
-            sums[5] = 1.0
-            sums[6] = dp[n]
-            y[_S] = volume[n]
-            continue
-        leaks = h * G_UNIT * 0.5 * (dp[n] + sums[6])
-        sums[6] = dp[n]
-        y[_S] += h * y[_BIAS] + leaks * y[_G]
-        for j in range(_M):
-            P[_S, j] += h * P[_BIAS, j] + leaks * P[_G, j]
-        for j in range(_M):
-            P[j, _S] += h * P[j, _BIAS] + leaks * P[j, _G]
-        P[_S, _S] += _FLOW_NOISE**2 * h
-        H[_S] = 1.0
-        H[_SCALE] = swept[n]
-        H[_COMPLIANCE] = dp[n]
-        H[_SLOPE] = dp[n] * swept[n] / area
-        variance = noise
-        innovation = volume[n]
-        for i in range(_M):
-            total = 0.0
-            for j in range(_M):
-                total += P[i, j] * H[j]
-            PH[i] = total
-            variance += H[i] * total
-            innovation -= H[i] * y[i]
-        white = innovation / math.sqrt(variance)
-        sums[1] -= 0.5 * (white * white + math.log(variance))
-        sums[2] += white * white
-        sums[8] += white * sums[9]
-        sums[9] = white
-        for i in range(_M):
-            y[i] += PH[i] / variance * innovation
-            for j in range(_M):
-                P[i, j] -= PH[i] * PH[j] / variance
-        sums[7] += abs(dp[n])
-        sums[0] += 1.0
-        if sums[0] >= block:
-            close_block(y, P, 0, _G, sums, walk, _G_PRIOR, rows[written])
+        row = rows[written]
+        if take_volume(volume[n], swept[n], dp[n], h, area, y, P, sums, noise, walk, block, row, held, room):
             written += 1
     return written
+
+
+@law
+def start_volume(
+    area: float,
+    compliance: float,
+    K_oil: float,
+    block_s: float,
+    y: np.ndarray,
+    P: np.ndarray,
+    sums: np.ndarray,
+    walk: np.ndarray,
+) -> None:
+    """Write the memory before a first sample, and the variances that states gain from block to block of `block_s` [s].
+
+    `area` of the piston [m^2]; `compliance` [m^3/Pa].
+    """
+    for i in range(_M):
+        y[i] = 0.0
+        walk[i] = 0.0
+        for j in range(_M):
+            P[i, j] = 0.0
+    y[_G], y[_COMPLIANCE] = 0.5, compliance
+    for i in range(len(_START)):
+        P[i, i] = _START[i] ** 2
+    P[_COMPLIANCE, _COMPLIANCE] = (_COMPLIANCE_SHARE * compliance) ** 2
+    P[_SLOPE, _SLOPE] = (area / K_oil) ** 2
+    begin_sums(y[_G], _START[_G], sums)
+    share = block_s / 60.0
+    walk[_BIAS] = _BIAS_FLOW**2
+    walk[_SCALE] = 1e-14 * share
+    walk[_COMPLIANCE] = (_COMPLIANCE_WALK * compliance) ** 2 * share
+    walk[_SLOPE] = (_COMPLIANCE_WALK * area / K_oil) ** 2 * share
+
+
+@kernel
+def _start(
+    area: float,
+    compliance: float,
+    K_oil: float,
+    block_s: float,
+    y: np.ndarray,
+    P: np.ndarray,
+    sums: np.ndarray,
+    walk: np.ndarray,
+) -> None:
+    start_volume(area, compliance, K_oil, block_s, y, P, sums, walk)
 
 
 class VolumeFilter:
@@ -111,17 +209,9 @@ class VolumeFilter:
         self.displacement, self.area = displacement(a), mean_area(a)
         self.h, self.block, self.noise = 1.0 / rate, block, noise
         self.blocks = BlockRows(_M)
-        self.y = np.zeros(_M)
-        self.y[_G], self.y[_COMPLIANCE] = 0.5, compliance(a)
-        spread = np.array([*_START, _COMPLIANCE_SHARE * compliance(a), self.area / a.K_oil])
-        self.P = np.diag(spread**2)
-        self.sums = new_sums(self.y[_G], spread[_G])
-        share = block * self.h / 60.0
-        self.walk = np.zeros(_M)
-        self.walk[_BIAS] = _BIAS_FLOW**2
-        self.walk[_SCALE] = 1e-14 * share
-        self.walk[_COMPLIANCE] = (_COMPLIANCE_WALK * compliance(a)) ** 2 * share
-        self.walk[_SLOPE] = (_COMPLIANCE_WALK * self.area / a.K_oil) ** 2 * share
+        self.y, self.P, self.sums, self.walk = np.empty(_M), np.empty((_M, _M)), np.empty(SUMS), np.empty(_M)
+        self.held = np.zeros((_M + 1, _M))
+        _start(self.area, compliance(a), a.K_oil, block * self.h, self.y, self.P, self.sums, self.walk)
 
     def update(self, theta: Array, x: Array, dp: Array) -> None:
         """Take more samples, (n,) each: angle [rad] and position [m] since the start, p_A - p_B [Pa]."""
@@ -129,6 +219,6 @@ class VolumeFilter:
         rows = self.blocks.buffer(theta.size // self.block + 1)
         written = advance_volume(
             self.displacement * theta - swept, swept, dp, self.h, self.area,
-            self.y, self.P, self.sums, self.noise, self.walk, self.block, rows,
+            self.y, self.P, self.sums, self.noise, self.walk, self.block, rows, self.held,
         )  # fmt: skip
         self.blocks.add(rows[:written])

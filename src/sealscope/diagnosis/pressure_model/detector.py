@@ -36,8 +36,9 @@ STEADY, UNRULY = 1.2, 1.5
 #: A change of a parameter from the first to the last third that no healthy machine shows within a record, as a share.
 _OTHER_CAUSE = {"friction": 0.18, "stiffness": 0.15}
 #: What a machine that is fitted anew after the onset may have had, beside which a large leak is weighed. The command is
-#: the model's own, and how far a chamber's mean moves says nothing of what rings.
-_WEIGHED: frozenset[Cause] = frozenset({"friction change", "air in the oil", "changed duty"})
+#: the model's own, and how far a chamber's mean moves says nothing of what rings. Air makes the ringing slower and
+#: louder, which no leak does: it is asked for all the same.
+_WEIGHED: frozenset[Cause] = frozenset({"friction change", "changed duty"})
 #: From day to day the level of G moves by this much [m^3/(s Pa)], known as from five recordings: fits differ with the
 #: machine's friction.
 DAY_TO_DAY = DayToDay(2e-13, 4.0)
@@ -49,6 +50,8 @@ FLOW_SCALE = float(np.hypot(0.15, 2.0 * 0.04))
 #: Of two laws the dearer is excluded by this difference of cost (twice the log likelihood), which must also be this
 #: share of what the leak itself explains: a model that is off by some per cent misses more of a larger leak.
 _DECISIVE, _DECISIVE_SHARE = 6.0, 0.4
+#: Areas of a piston are alike within this share of their mean.
+UNEQUAL = 0.1
 #: Commands are alike within this ratio of their rms.
 _ALIKE = 1.1
 
@@ -136,6 +139,13 @@ class PressureModel:
         """Return the record as the model follows it, or the reason why it does not."""
         from sealscope.diagnosis.pressure_model.follow import follow
 
+        c = self.rig.cylinder
+        apart = abs(c.A_A - c.A_B) / (0.5 * (c.A_A + c.A_B))
+        if apart > UNEQUAL:
+            return (
+                "the model is of a piston whose two areas are alike, so that p_A and p_B move against each other; "
+                f"those of the rig {self.rig.name} differ by {apart:.0%}"
+            )
         cycle = find_cycle(recording)
         # parameters that are tried and make the model diverge are left again
         with np.errstate(over="ignore", invalid="ignore"):
@@ -239,11 +249,13 @@ def _within(followed: Followed, recording: Recording, probability: float) -> Evi
     estimate, low, high = (np.where(edges[:-1] < onset, 0.0, value) for value in (lpm, *limits))
     course = LeakCourse(0.5 * (edges[:-1] + edges[1:]), estimate, low, high)
     reason = f"the leakage conductance past piston or pump rose at {onset:.1f} s{law} ({figures})"
-    if cause is not None or followed.another:
+    if cause is not None or followed.another or lpm <= 0.0:
         why = {
             "friction change": "the friction changed more than it does in a healthy machine",
             "air in the oil": "the oil's stiffness changed more than it does in a healthy machine",
-            None: "another drive, friction and oil from then on explain the record better than a leak",
+            None: "another drive, friction and oil from then on explain the record better than a leak"
+            if followed.another
+            else "followed with a leak from then on, the record shows none",
         }[cause]
         return Evidence(
             "cannot tell",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.baseline.level import Level
+from sealscope.diagnosis.pressure_model.behind_valve import stalled
 from sealscope.diagnosis.pressure_model.fit import (
     LONG_WINDOW,
     PRIOR,
@@ -126,13 +127,20 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
     `cycle` [s]: length of the duty's cycle, None where it does not repeat.
     """
     u, p_A, p_B, rate = recording["u"], recording["p_A"], recording["p_B"], recording.rate
-    p_B = advanced(p_B, skew(p_A, p_B, rate), rate)
+    numbers = assumed_numbers(rig)
+    if not numbers.valved:  # behind a valve the chambers do not ring as each other's mirror
+        p_B = advanced(p_B, skew(p_A, p_B, rate), rate)
     dp = p_A - p_B
     dp = raw = dp * (1.0 if _same_sense(u, dp) else -1.0)
     centre = nominal(rig)
     centre[G] = max(centre[G], USUAL_G)
-    model = plain = DrivenModel.of(u, rate, assumed_numbers(rig), p_A + p_B)
+    model = plain = DrivenModel.of(u, rate, numbers, p_A + p_B)
     span = BLOCK if cycle is None else cycle
+    if model.numbers.valved and (at := stalled(dp, model.supply, rate)) is not None:
+        return (
+            f"p_A - p_B takes nearly all of the supply's pressure at {recording.t[at]:.1f} s: the piston is at an end "
+            "of its stroke there, or a load holds it"
+        )
     _, short = _windows(model, dp, centre, span)
     prior = prior_of(centre)
     guess = first_guess(short, prior)

@@ -4,9 +4,9 @@ Where both pistons' areas are alike, p_A and p_B move against each other, so the
 states: the difference dp, the piston's velocity v, the motor's speed omega, its current i and the integral I of its
 speed loop. Long strokes change the chambers' volumes, and with them the stiffness and the pressures' sum, on which
 friction depends: the sum is taken from the record, the piston's place from the model itself. Throttles and lines are
-left out: at the piston they act as more volume (a softer oil) and a little more damping, which the fit finds. The laws
-are those of `sealscope.physics`; the numbers are the detector's own, from a rig it may assume, and none of them is the
-recorded machine's.
+left out: at the piston they act as more volume (a softer oil) and a little more damping, which the fit finds. Behind a
+servo valve other laws of motion hold (`behind_valve`). The laws are those of `sealscope.physics`; the numbers are the
+detector's own, from a rig it may assume, and none of them is the recorded machine's.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import contracted, kernel
+from sealscope.diagnosis.pressure_model.behind_valve import flow_per_volt, rates_behind_a_valve, supply_of
 from sealscope.parameters import Rig
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
@@ -28,10 +29,11 @@ from sealscope.physics.rig import RigNumbers, rig_numbers
 from sealscope.recordings.recording import Array
 
 #: What is estimated: speed per volt of the command [rad/(s V)], lead of the command [s], what the speed has beyond it
-#: [rad/s], stiffness of the oil [Pa], conductance past the piston and the pump [m^3/(s Pa)], Coulomb friction [N],
-#: viscous friction [N s/m], breakaway over Coulomb friction [1], decay of the breakaway [s/m]; Coulomb friction per
-#: pressure [N/Pa]; share of the stiffness that follows the stroke [1], mid-stroke's offset as a share of V [1];
-#: coefficient of an orifice past the piston [m^3/(s Pa^0.5)], which a sound machine does not have.
+#: [rad/s] (behind a servo valve flows instead of speeds, [m^3/(s V)] and [m^3/s]), stiffness of the oil [Pa],
+#: conductance past the piston and the pump [m^3/(s Pa)], Coulomb friction [N], viscous friction [N s/m], breakaway over
+#: Coulomb friction [1], decay of the breakaway [s/m]; Coulomb friction per pressure [N/Pa]; share of the stiffness that
+#: follows the stroke [1], mid-stroke's offset as a share of V [1]; coefficient of an orifice past the piston
+#: [m^3/(s Pa^0.5)], which a sound machine does not have.
 PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c", "F_cfr", "stroke", "offset", "orifice")
 GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C, F_CFR, STROKE, OFFSET, ORIFICE = range(len(PARAMETERS))
 #: The parameters that a machine without an orifice past the piston has.
@@ -43,11 +45,15 @@ State = tuple[float, float, float, float, float]
 Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
 #: Largest share of V that a stroke takes away, squared.
 _LARGEST_SHARE = 0.75
+#: Largest share of V by which a chamber behind a valve is smaller or larger.
+_FARTHEST = 0.9
 #: Longest step of the solver [s]: a tenth of a radian at the ringing of the thesis's rig would be 2e-4 s; RK4 at 1e-3 s
 #: is within 100 Pa, far under the transducers' noise.
 LONGEST_STEP = 1.01e-3
 #: The slow part of a pressure: a Gaussian of this width [s] takes the ringing (60 to 80 Hz) out.
 SLOW_WIDTH = 0.008
+#: ... and of this one the supply's part of p_A + p_B, without what unlike edges do where the valve passes its middle.
+SUPPLY_WIDTH = 0.1
 
 
 def assumed_numbers(rig: Rig) -> RigNumbers:
@@ -72,7 +78,7 @@ def nominal(rig: Rig) -> Array:
     )
     return np.array(
         [
-            rig.motor.omega_per_volt,
+            rig.motor.omega_per_volt if rig.valve.spool == "absent" else flow_per_volt(rig),
             0.0,
             0.0,
             rig.fluid.K_oil,
@@ -103,15 +109,23 @@ def stiffening(travel: float, theta: Parameters) -> float:
 
 
 @contracted
-def reduced_rates(y: State, u: float, stiffness: float, coulomb: float, theta: Parameters, m: RigNumbers) -> State:
-    """Return dy/dt of y = (dp, v, omega, i, I) under the command u [V], `stiffness` [Pa] and `coulomb` friction [N]."""
+def reduced_rates(
+    y: State, u: float, stiffness: float, aside: float, coulomb: float, supply: float, theta: Parameters, m: RigNumbers
+) -> State:
+    """Return dy/dt of y = (dp, v, omega, i, I) under the command u [V], `stiffness` [Pa] and `coulomb` friction [N].
+
+    Behind a servo valve y is that of `rates_behind_a_valve`, whose arguments `aside` and `supply` are.
+    """
     dp, v, omega, i, integral = y
-    error = theta[GAIN] * u + theta[BIAS] - omega
-    voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
     friction = stribeck_friction(v, coulomb, theta[K_BRK], theta[C_C], theta[F_V], m.v_th, False)
-    flow = pump_flow(omega, dp, m.q_b, 0.0) - m.A_A * v - piston_leakage(dp, theta[G], theta[ORIFICE], m.dp_0)
+    past = m.A_A * v + piston_leakage(dp, theta[G], theta[ORIFICE], m.dp_0)
+    spin = theta[GAIN] * u + theta[BIAS]
+    if len(m.valved) > 0:
+        return rates_behind_a_valve(y, spin, theta[GAIN], friction, past, stiffness, aside, supply, m)  # type: ignore[no-any-return]
+    error = spin - omega
+    voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
     return (
-        2.0 * pressure_rate(flow, m.V, stiffness),
+        2.0 * pressure_rate(pump_flow(omega, dp, m.q_b, 0.0) - past, m.V, stiffness),
         piston_acceleration(0.5 * dp, -0.5 * dp, friction, 0.0, 0.0, m.A_A, m.A_A, m.M_eq),
         shaft_acceleration(i, omega, pump_torque(dp, m.q_b), m.C_m, m.B_M, m.J_M),
         winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
@@ -138,8 +152,9 @@ def pressure_differences(
 ) -> None:
     """Write dp [Pa], or v [m/s] if `speeds`, of RUNS runs at each sample into `out` (n, RUNS).
 
-    The method is RK4 in steps of h [s], `every` to a sample. `inputs`: (2 every n + 1, 4) at every half step: command
-    [V], its derivative [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa]; `theta`: (segments, 13,
+    The method is RK4 in steps of h [s], `every` to a sample. `inputs`: (2 every n + 1, 5) at every half step: command
+    [V], its derivative [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa], a servo valve's supply
+    [Pa]; `theta`: (segments, 13,
     RUNS) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, RUNS) at the first sample, in place.
     """
     y = (load(state, 0), load(state, 1), load(state, 2), load(state, 3), load(state, 4))
@@ -168,12 +183,14 @@ def pressure_differences(
             u_1 = inputs[at + 1, 0] + lead * inputs[at + 1, 1]
             u_2 = inputs[at + 2, 0] + lead * inputs[at + 2, 1]
             # place and pressures change little within a step: they hold as they are in its middle
-            stiff = now[K] * stiffening(inputs[at + 1, 2], now)
+            aside = min(max(now[STROKE] * (inputs[at + 1, 2] + now[OFFSET]), -_FARTHEST), _FARTHEST)
+            stiff = now[K] if len(m.valved) > 0 else now[K] * stiffening(inputs[at + 1, 2], now)
             coulomb = now[F_C] + now[F_CFR] * inputs[at + 1, 3]
-            k_1 = reduced_rates(y, u_0, stiff, coulomb, now, m)
-            k_2 = reduced_rates(_moved(y, 0.5 * h, k_1), u_1, stiff, coulomb, now, m)
-            k_3 = reduced_rates(_moved(y, 0.5 * h, k_2), u_1, stiff, coulomb, now, m)
-            k_4 = reduced_rates(_moved(y, h, k_3), u_2, stiff, coulomb, now, m)
+            supply = inputs[at + 1, 4]
+            k_1 = reduced_rates(y, u_0, stiff, aside, coulomb, supply, now, m)
+            k_2 = reduced_rates(_moved(y, 0.5 * h, k_1), u_1, stiff, aside, coulomb, supply, now, m)
+            k_3 = reduced_rates(_moved(y, 0.5 * h, k_2), u_1, stiff, aside, coulomb, supply, now, m)
+            k_4 = reduced_rates(_moved(y, h, k_3), u_2, stiff, aside, coulomb, supply, now, m)
             y = _moved(_moved(_moved(_moved(y, h / 6.0, k_1), h / 3.0, k_2), h / 3.0, k_3), h / 6.0, k_4)
     for state_row in range(5):
         store(state, state_row, y[state_row] + spread(0.0))
@@ -183,7 +200,7 @@ def pressure_differences(
 class DrivenModel:
     """The reduced rig under a recorded command, run for many sets of parameters.
 
-    `inputs` (m, 4) at every half step, as `pressure_differences` takes them; `every` steps of `h` [s] to a sample;
+    `inputs` (m, 5) at every half step, as `pressure_differences` takes them; `every` steps of `h` [s] to a sample;
     `numbers` of the assumed rig.
     """
 
@@ -204,20 +221,25 @@ class DrivenModel:
         fine = np.interp(at, np.arange(n), u)
         h = 1.0 / rate / every
         lift = np.zeros(at.size) if pressures is None else np.interp(at, np.arange(n), smoothed(pressures, rate))
-        inputs = np.column_stack([fine, np.gradient(fine, 0.5 * h), np.zeros(at.size), lift - lift.mean()])
+        supply = np.full(at.size, numbers.p_set)
+        if numbers.valved and pressures is not None:
+            supply = np.interp(at, np.arange(n), supply_of(smoothed(pressures, rate, SUPPLY_WIDTH), numbers))
+        inputs = np.column_stack([fine, np.gradient(fine, 0.5 * h), np.zeros(at.size), lift - lift.mean(), supply])
         return DrivenModel(inputs, h, every, numbers)
 
     def with_travel(self, theta: Array) -> DrivenModel:
         """Return the model with the piston's place that it shows itself for parameters `theta` (13,).
 
         Mean and trend of the place are removed: mid-stroke is not known, and a piston that stays in its cylinder has no
-        trend for long.
+        trend for long. Behind a valve the trend is kept: what the valve passes at no command moves the piston on.
         """
         n = self.samples
         place = np.cumsum(self.run(theta[None], speeds=True)[0]) * self.h * self.every
         place = place * self.numbers.A_A / self.numbers.V
         middle = np.arange(n) - 0.5 * (n - 1)
-        place -= place.mean() + middle * (middle @ place) / (middle @ middle)
+        place -= place.mean()
+        if not self.numbers.valved:
+            place -= middle * (middle @ place) / (middle @ middle)
         inputs = self.inputs.copy()
         inputs[:, 2] = np.interp(np.arange(len(inputs)) / (2.0 * self.every), np.arange(n), place)
         return replace(self, inputs=inputs)
@@ -242,6 +264,11 @@ class DrivenModel:
         """The piston's place (m,), A x / V."""
         return self.inputs[:, 2]
 
+    @property
+    def supply(self) -> Array:
+        """Pressure between a servo valve's supply and return (n,) [Pa], at the samples."""
+        return self.inputs[: -1 : 2 * self.every, 4]
+
     def speed_amplitude(self, theta: Array) -> float:
         """Return the amplitude of the motor's speed [rad/s], as of a sine of the command's rms."""
         return float(np.sqrt(2.0) * theta[GAIN] * np.std(self.u))
@@ -252,7 +279,8 @@ class DrivenModel:
 
     def piston_speed(self, omega: float | Array) -> float | Array:
         """Return the piston's speed [m/s] at a speed of the motor [rad/s], without leakage and stored oil."""
-        return omega * self.numbers.q_b / (2.0 * np.pi) / self.numbers.A_A
+        per_drive = 1.0 if self.numbers.valved else self.numbers.q_b / (2.0 * np.pi)
+        return omega * per_drive / self.numbers.A_A
 
     def run(
         self,
@@ -292,7 +320,7 @@ def gaussian(width: float) -> Array:
     return np.asarray(taps / taps.sum())
 
 
-def smoothed(values: Array, rate: float) -> Array:
-    """Return the slow part of a signal (n,): the ringing taken out, its ends held."""
-    taps = gaussian(SLOW_WIDTH * rate)
+def smoothed(values: Array, rate: float, width: float = SLOW_WIDTH) -> Array:
+    """Return the slow part of a signal (n,), what is faster than `width` [s] taken out, its ends held."""
+    taps = gaussian(width * rate)
     return np.convolve(np.pad(values, taps.size // 2, mode="edge"), taps, "valid")

@@ -94,6 +94,18 @@ class Trend:
         First recordings that were known to be healthy.
     dated : bool
         Whether the times are those of the recordings, as opposed to equal intervals.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import sealscope as ss
+    >>> days = [ss.simulate(duration="40 s", seed=day, leak="0.02 L/min" if day >= 4 else None) for day in range(6)]
+    >>> days = [replace(run, provenance={"start": f"2024-05-0{day + 1}T08:00"}) for day, run in enumerate(days)]
+    >>> trend = ss.trend(days, rig="thesis")
+    >>> trend.verdict, f"{trend.wear.now.value:.3f} {trend.unit}", trend.alarm.day
+    ('leak', '0.020 L/min', 5.0)
+    >>> trend.as_dict()["onset"]["value"]
+    '2024-05-05T08:00:00'
     """
 
     verdict: Verdict

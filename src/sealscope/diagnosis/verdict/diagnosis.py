@@ -99,6 +99,19 @@ class Diagnosis(Evidence):
         What the file says of its recording: operator, machine, oil temperature.
     start : str, optional
         When the recording began, as ISO 8601, where the file says so.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> diagnosis = ss.diagnose(ss.simulate(leak="0.05 L/min from 30 s", duration="60 s", seed=1))
+    >>> diagnosis
+    Diagnosis('leak', file='recording', onset_s=30, leak_lpm=0.05, score=250.1, threshold=6.695)
+    >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
+    ('piston or pump leak', '79 mm/min')
+    >>> [evidence.detector for evidence in diagnosis.parts if evidence.verdict == "cannot tell"]
+    ['pressure model', 'observer']
+    >>> [round(end, 1) for end in diagnosis.as_dict()["onset_interval_s"]]
+    [29.9, 30.1]
     """
 
     file: str = "recording"
@@ -167,7 +180,7 @@ class Diagnosis(Evidence):
 
     @property
     def known_healthy(self) -> bool:
-        """Whether the level is known to be that of a healthy machine: by leak-free recordings, or by the rig."""
+        """Whether leak-free recordings or the rig show that the level is that of a healthy machine."""
         by_rig = self.passage is not None and self.passage.healthy
         return self.verdict == "no leak" and (self.baselines > 0 or by_rig)
 

@@ -10,7 +10,8 @@ and a stream gives the same blocks as a file.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ from sealscope.recordings.recording import Array, Recording
 #: displaced volume counted by the pump's direction, and by the side of the higher pressure; and pressure difference at
 #: the pump's ports with its integral, these two only where the pump's ports are recorded.
 Y, THETA, FLOW, I_AB, I_ROOT, Y_PUMP, Y_SIDE, DP_12, I_12 = range(9)
+#: Columns that blocks of a piston with unequal sides have, too (those of the ports are 0 there, where not recorded):
+#: rise of p_B, and integrals of x dp_A and of x dp_B, each while that side carries the load.
+STORED_B, STORED_X_A, STORED_X_B = range(9, 12)
 #: Length a block should have [s], and the share of a short recording it may take.
 BLOCK_SECONDS = 3.0
 #: The size and the root of dp are taken of means over so long [s], which noise hardly moves and strokes do not notice.
@@ -35,6 +39,10 @@ _FEWEST_BLOCKS = 18
 #: Lengths tried where the duty has no cycle, and the share of the information of the longest that is enough.
 _WITHOUT_CYCLE = (1.0, 2.0, 4.0)
 _ENOUGH = 0.5
+#: Neither side carries the load while dp is under this share of its usual size; that is rare up to a share of a block.
+_UNLOADED, _RARE = 0.05, 0.05
+#: The oil stored in a side is looked at where it varies by so many times the variance of its noise.
+_MORE_THAN_NOISE = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +57,9 @@ class BalanceBlocks:
     variance of the conductance, over its square, that the noise of dp makes in the integral; `filled` (n,): by how much
     the sum of both pressures rises from the first tenth of a block to its last; `swinging` (n,): share of the way that
     the piston goes while dp has another sign than dp smoothed; `noise`, `noise_12` (n,):
-    variance of the noise of dp, of dp_12; `samples`: samples of a block; `seconds`: its length.
+    variance of the noise of dp, of dp_12; `steady` (n,): sum of squares of the time beyond offset and stored oil [s^2],
+    by which the slopes count where they are kept (`with_slopes`), and `along` (n,): the coefficient of dp in the time
+    [s/Pa]; `samples`: samples of a block; `seconds`: its length.
     """
 
     t: Array
@@ -66,6 +76,8 @@ class BalanceBlocks:
     swinging: Array
     noise: Array
     noise_12: Array
+    steady: Array
+    along: Array
     samples: int
     seconds: float
 
@@ -76,6 +88,25 @@ class BalanceBlocks:
         """Return the blocks of an index or mask."""
         arrays = {name: getattr(self, name)[which] for name in _ARRAYS}
         return BalanceBlocks(**arrays, samples=self.samples, seconds=self.seconds)
+
+    def with_slopes(self) -> BalanceBlocks:
+        """Return the blocks with sums of products of the columns beyond offset and stored oil alone, slopes kept.
+
+        What remains beyond offset and dp is what remains beyond the slope, too, and the slope times what is left of the
+        time. A random walk of noise is told from a steady flow less well than from a swinging one: of a steady dp the
+        integral is known to 1.2/samples of the variance of dp over dp^2.
+        """
+        gram = self.gram + self.steady[:, None, None] * self.slope[:, :, None] * self.slope[:, None, :]
+        own = np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny)
+        swing = self.gram[:, I_AB, I_AB] / own
+        steadily = 1.2 * self.noise / self.samples * (self.steady * self.slope[:, I_AB] / own) ** 2
+        return replace(
+            self,
+            gram=gram,
+            slope=np.zeros_like(self.slope),
+            stored=self.stored + self.slope * self.along[:, None],
+            walk=self.walk * swing**2 + steadily,
+        )
 
     @staticmethod
     def joined(parts: list[BalanceBlocks]) -> BalanceBlocks:
@@ -135,8 +166,7 @@ def _information(dp: Array, length: int) -> float:
     count = dp.size // length
     rows = np.nan_to_num(dp[: count * length]).reshape(count, length)
     columns = np.stack([rows, _integral(rows, 1.0)], axis=1)
-    rest, _, _ = _beyond(columns[:, 1:], columns[:, 0], 1.0)
-    return float(np.sum(rest**2))
+    return float(np.sum(_beyond(columns[:, 1:], columns[:, 0], 1.0).rest ** 2))
 
 
 def _integral(rows: Array, step: float) -> Array:
@@ -146,21 +176,35 @@ def _integral(rows: Array, step: float) -> Array:
     return integral
 
 
-def _beyond(columns: Array, dp: Array, step: float) -> tuple[Array, Array, Array]:
-    """Return what offset, slope and dp leave of columns (n, c, L), and coefficients (n, c) of slope [1/s] and dp."""
+class _Beyond(NamedTuple):
+    """What offset, slope and dp leave of columns (n, c, L), and coefficients (n, c) of slope [1/s] and dp.
+
+    `steady` (n,): sum of squares of the time beyond offset and dp [s^2]; `along` (n,): coefficient of dp in it [s/Pa].
+    """
+
+    rest: Array
+    slope: Array
+    stored: Array
+    steady: Array
+    along: Array
+
+
+def _beyond(columns: Array, dp: Array, step: float) -> _Beyond:
+    """Return what offset, slope and dp leave of columns (n, c, L)."""
     length = dp.shape[1]
     tau = (np.arange(length) - 0.5 * (length - 1)) * step
     tau2 = float(tau @ tau)
     tiny = np.finfo(float).tiny
     dp = dp - dp.mean(axis=1, keepdims=True)
     tilt = dp @ tau / tau2
+    along = tilt * tau2 / np.maximum(np.sum(dp**2, axis=1), tiny)
     dp = dp - tilt[:, None] * tau
     rest = columns - columns.mean(axis=2, keepdims=True)
     slope = rest @ tau / tau2
     rest -= slope[:, :, None] * tau
     stored = np.einsum("ncl,nl->nc", rest, dp) / np.maximum(np.sum(dp**2, axis=1), tiny)[:, None]
     rest -= stored[:, :, None] * dp[:, None, :]
-    return rest, slope - stored * tilt[:, None], stored
+    return _Beyond(rest, slope - stored * tilt[:, None], stored, tau2 * (1.0 - tilt * along), along)
 
 
 def _smooth(rows: Array, samples: int) -> Array:
@@ -235,7 +279,55 @@ def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple
     if "p_1" in rows:
         dp_12 = rows["p_1"] - rows["p_2"]
         columns += [dp_12, _integral(dp_12, step)]
+    if geometry.unequal:
+        columns += [] if "p_1" in rows else [np.zeros_like(dp)] * 2
+        columns += _stored(rows, smooth > 0.0)
+        return _under_load(np.stack(columns, axis=1), dp, smooth)
     return np.stack(columns, axis=1), dp, smooth
+
+
+def _under_load(columns: Array, dp: Array, smooth: Array) -> tuple[Array, Array, Array]:
+    """Return columns (n, c, L) and dp (n, L) that stand still while neither side carries the load; and dp smoothed.
+
+    Both sides are open to the supply then, and what the pump delivers goes round. Blocks in which that is rare are left
+    as they are: near a reversal dp is small, too, and the volumes balance.
+    """
+    size = np.abs(smooth)
+    carried = size > _UNLOADED * size.mean(axis=1, keepdims=True)
+    going_round = np.mean(~carried, axis=1) > _RARE
+    if not going_round.any():
+        return columns, dp, smooth
+    kept = (carried | ~going_round[:, None])[:, None, 1:]
+    both = np.concatenate([columns, dp[:, None]], axis=1)
+    steps = np.where(kept, np.diff(both, axis=2), 0.0)
+    both = both[:, :, :1] + np.concatenate([np.zeros_like(both[:, :, :1]), np.cumsum(steps, axis=2)], axis=2)
+    return both[:, :-1], both[:, -1], smooth
+
+
+def _stored(rows: Mapping[str, Array], on_A: NDArray[np.bool_]) -> list[Array]:
+    """Return what tells the oil stored in the side that carries the load from (V/2K) dp: three columns (n, L).
+
+    The side that does not carry is open to the supply. With side A carrying the oil stored is the integral of ``(V_A +
+    A_A x)/K dp_A``, with side B that of ``-(V_B - A_B x)/K dp_B``: beside dp, by which side A's constant part goes,
+    the rise of p_B while it carries, and x times either rise. `on_A` (n, L): side A carries.
+    """
+    x = rows["x"]
+    middle = 0.5 * (x + np.roll(x, 1, axis=1))
+    rise_A, rise_B = (np.diff(rows[name], axis=1, prepend=rows[name][:, :1]) for name in ("p_A", "p_B"))
+    on_B = ~on_A
+    return [np.cumsum(rise, axis=1) for rise in (on_B * rise_B, on_A * middle * rise_A, on_B * middle * rise_B)]
+
+
+def _shown(columns: Array, beyond: _Beyond) -> _Beyond:
+    """Return what offset, slope and dp leave, with 0 for the oil stored in a side where that is mostly noise.
+
+    Where one side carries throughout, the rise of its pressure is that of dp, and nothing but noise is beyond it.
+    """
+    rest, slope, stored = beyond.rest.copy(), beyond.slope.copy(), beyond.stored.copy()
+    for column in range(STORED_B, columns.shape[1]):
+        hidden = np.var(rest[:, column], axis=1) <= _MORE_THAN_NOISE * _noise(columns[:, column])
+        rest[hidden, column], slope[hidden, column], stored[hidden, column] = 0.0, 0.0, 0.0
+    return beyond._replace(rest=rest, slope=slope, stored=stored)
 
 
 def _swinging(x: Array, dp: Array, smooth: Array) -> Array:
@@ -278,6 +370,20 @@ def _over_rests(
     return np.asarray(over[:2] / np.maximum(over[2], 1.0))
 
 
+def mean_pressures(samples: Mapping[str, Array], chosen: NDArray[np.bool_], rate: float) -> tuple[float, float] | None:
+    """Return the means of abs(dp) [Pa] and of its root over the chosen samples (m,), end stops left out.
+
+    None where less than a tenth of a second is chosen, or dp is not known there.
+    """
+    motion = in_motion(samples, rate)
+    chosen = chosen if motion is None else chosen & ~motion[1]
+    dp = np.asarray(samples["p_A"] - samples["p_B"], dtype=np.float64)[chosen]
+    if dp.size < 0.1 * rate or not np.isfinite(dp).all():
+        return None
+    size = np.abs(_smooth(dp[None], 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)[0])
+    return float(size.mean()), float(np.sqrt(size).mean())
+
+
 def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float, geometry: Geometry) -> BalanceBlocks:
     """Cut samples into whole blocks of `length` samples from the first on.
 
@@ -303,7 +409,10 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
     usable &= np.all(np.isfinite(times), axis=1) & np.all((spacing > 0.5) & (spacing < 1.5), axis=1)
     cut = {name: values[usable] for name, values in cut.items()}
     columns, dp, smooth = volumes(cut, rate, geometry)
-    rest, slope, stored = _beyond(columns, dp, step)
+    beyond = _beyond(columns, dp, step)
+    if columns.shape[1] > STORED_B:
+        beyond = _shown(columns, beyond)
+    rest = beyond.rest
     noise, root = _noise(dp), np.sqrt(np.abs(smooth)).mean(axis=1)
     abs_dp, root_dp = np.abs(smooth).mean(axis=1), root
     abs_flow = np.abs(_smooth(columns[:, FLOW], 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)).mean(axis=1)
@@ -314,8 +423,8 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
     return BalanceBlocks(
         t=times[usable].mean(axis=1),
         gram=rest @ rest.transpose(0, 2, 1),
-        slope=slope,
-        stored=stored,
+        slope=beyond.slope,
+        stored=beyond.stored,
         abs_dp=abs_dp,
         root_dp=root_dp,
         abs_flow=abs_flow,
@@ -326,6 +435,8 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
         filled=both[:, -tenth:].mean(axis=1) - both[:, :tenth].mean(axis=1),
         noise=noise,
         noise_12=_noise(columns[:, DP_12]) if "p_1" in cut else np.zeros_like(noise),
+        steady=beyond.steady,
+        along=beyond.along,
         samples=length,
         seconds=length * step,
     )

@@ -25,6 +25,7 @@ from sealscope.diagnosis.volume_balance.blocks import (
     block_samples,
     channels_needed,
     cut_blocks,
+    mean_pressures,
 )
 from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trouble
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance
@@ -143,6 +144,13 @@ class _BehindTheFit:
     def dated(self, fit: BalanceFit, step: DriftStep) -> DriftStep:
         """Return the step with its onset from the samples about it."""
         return date_step(fit, step, self.recording, self.detector.geometry)
+
+    def pressed(self, onset: float) -> tuple[float, float] | None:
+        """Return the means of abs(p_A - p_B) [Pa] and of its root from `onset` on, end stops left out."""
+        names = balance_channels(self.recording)
+        return mean_pressures(
+            {name: self.recording[name] for name in names}, self.recording.t >= onset, self.recording.rate
+        )
 
     def levelled(self, zero: float) -> tuple[BalanceFit, _BehindTheFit] | None:
         """Return the fit of the recording with `zero` [Pa] added to p_A, and that recording."""

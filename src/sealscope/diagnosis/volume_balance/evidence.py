@@ -23,8 +23,8 @@ from sealscope.diagnosis.verdict.evidence import (
     RelativeLeak,
     Verdict,
 )
-from sealscope.diagnosis.volume_balance.blocks import FLOW, Y
-from sealscope.diagnosis.volume_balance.fit import BalanceFit, Law, discriminate, findable, search
+from sealscope.diagnosis.volume_balance.blocks import Y
+from sealscope.diagnosis.volume_balance.fit import GEOMETRY, BalanceFit, Law, discriminate, findable, search, swings
 from sealscope.diagnosis.volume_balance.growth import grown
 from sealscope.diagnosis.volume_balance.law import (
     OrificeShare,
@@ -38,17 +38,16 @@ from sealscope.diagnosis.volume_balance.law import (
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
-#: Displacement over area may differ by this share from that of a stated machine before L/min is not stated.
-GEOMETRY = 0.15
-#: ... and by this share, beside the error of the fit, from that of the default rig, before it is said to be another
-#: machine. Assumed: makers state displacements to some per cent.
+#: Displacement over area may differ by this share, beside the error of the fit, from that of the default rig, before it
+#: is said to be another machine (`GEOMETRY` where a machine is stated). Assumed: makers state displacements to some per
+#: cent.
 UNSTATED_GEOMETRY = 0.05
-#: Share of the way on which the higher pressure may change sides unseen: 0.001 on single rods whose load keeps it on a
-#: side, 0.23 to 0.34 where the circuit swings between its valves.
-_SWINGING = 0.05
 #: Relative deviation of what every L/min is multiplied by: scale of the position, mean pressure difference. The mean
 #: root of the difference is uncertain by the share that noise lifts it, too.
 _RELATIVE = 0.003
+#: ... and of what a single rod passes that neither side carries, where the load changes sides: 1 % on a press under 250
+#: N, whose neutral load is 305 N.
+_CHANGING_OVER = 0.01
 #: The motion must be this many times what the balance leaves unexplained.
 _CLEAR = 20.0
 #: ... and follow the angle's within this time [s]: more is no skew of channels and no filter.
@@ -111,6 +110,10 @@ class Samples(Protocol):
         """Return the step with its onset from the samples about it."""
         ...
 
+    def pressed(self, onset: float) -> tuple[float, float] | None:
+        """Return the means of abs(p_A - p_B) [Pa] and of its root from `onset` on; None where they are not known."""
+        ...
+
     def levelled(self, zero: float) -> tuple[BalanceFit, Samples] | None:
         """Return the fit, and its samples, with `zero` [Pa] added to p_A - p_B; None where there is none."""
         ...
@@ -136,7 +139,9 @@ def judge(
         if samples is not None:
             fit, risen, samples = _levelled(fit, risen, samples, probability)
             risen = samples.dated(fit, risen)
-        return _measured(replace(describe_leak(fit, risen, probability), passage=passage(fit, None, healthy)), fit)
+        pressed = samples.pressed(risen.onset) if samples is not None and risen.rise == 0.0 else None
+        leak = describe_leak(fit, risen, probability, pressed)
+        return _measured(replace(leak, passage=passage(fit, None, healthy)), fit)
     if window:
         return no_step(fit, step, None, 0.0)
     smallest = findable(fit, probability, step.noise)
@@ -248,7 +253,7 @@ def _geometry_fits(fit: BalanceFit) -> bool:
 
 def _swings(fit: BalanceFit) -> bool:
     """Return whether the areas differ and the higher pressure changes sides faster than the samples tell."""
-    return fit.unequal and float(np.median(fit.blocks.swinging)) > _SWINGING
+    return fit.unequal and swings(fit.blocks)
 
 
 def states_flow(fit: BalanceFit) -> bool:
@@ -282,7 +287,9 @@ def _refused(fit: BalanceFit) -> frozenset[Figure]:
 
 
 def _measured(evidence: Evidence, fit: BalanceFit) -> Evidence:
-    """Return the evidence with displacement over area as measured, over the assumed one."""
+    """Return the evidence with displacement over area as measured, over the assumed one, where it can be measured."""
+    if _swings(fit):
+        return evidence
     half = 1.96 * fit.carrying * math.hypot(fit.scale_sd, _RELATIVE * fit.scale)
     ratio = fit.misfit
     return replace(evidence, ratio=ratio, ratio_interval=(ratio - half, ratio + half)) if fit.metres else evidence
@@ -415,16 +422,13 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
     """
     own = level(fit)
     high = own.value + 1.96 * own.error
-    # in volumes of the piston, which need no unit of the position
-    pump = abs(fit.scale) * float(np.sqrt(np.median(fit.blocks.gram[:, FLOW, FLOW]) / fit.blocks.samples))
-    dp = float(fit.blocks.abs_dp.mean())
     rise = float(step.level[-1] - step.level[0])
     verdict: Verdict = "no leak"
     reason = (
         "no change within this recording: the leakage conductance does not rise beyond its smooth drift "
         f"({_figures(step)})"
     )
-    if high * dp < -LEAK_WORTH_FINDING * pump:
+    if _pump_share(high, fit) < -LEAK_WORTH_FINDING:
         verdict = "cannot tell"
         reason = "the balance gives a leak against the pressure: areas, displacement or the pressures' signs do not fit"
     elif rise > _LARGE_DRIFT * max(high - 0.5 * rise, 0.0) and rise > 6.0 * float(np.median(fit.sd)):
@@ -433,7 +437,7 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
             f"the conductance rises smoothly by {_flow_text(rise, fit)} over the recording, more than oil that "
             f"warms up explains: a growing leak would look alike ({_figures(step)})"
         )
-    elif smallest * dp > LEAK_WORTH_FINDING * pump:
+    elif _pump_share(smallest, fit) > LEAK_WORTH_FINDING:
         verdict = "cannot tell"
         reason += (
             f"; but a leak of {LEAK_WORTH_FINDING:.0%} of the pump's flow, the smallest worth finding, would not have "
@@ -460,8 +464,14 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
     )
 
 
-def describe_leak(fit: BalanceFit, step: DriftStep, probability: float) -> Evidence:
-    """Return the evidence where the conductance rises: where the oil goes, since when, how much."""
+def describe_leak(
+    fit: BalanceFit, step: DriftStep, probability: float, pressed: tuple[float, float] | None = None
+) -> Evidence:
+    """Return the evidence where the conductance rises: where the oil goes, since when, how much.
+
+    `pressed`: means of abs(p_A - p_B) and of its root while the leak is open; None: those of the blocks, which begin
+    after the onset and end with the last whole cycle.
+    """
     shape = shape_of(fit, step)
     near = discriminate(fit, step.onset, step.rise, within=reach(fit))
     cause, place = _place(fit, step, shape, near)
@@ -475,9 +485,13 @@ def describe_leak(fit: BalanceFit, step: DriftStep, probability: float) -> Evide
     if open_.any():
         laminar, orifice = (float(np.mean((fit.unit_flow(name) * shape)[open_])) / LITRE_PER_MINUTE for name in _LAWS)
         flow = float(np.mean((unit_flow * shape)[open_])) / LITRE_PER_MINUTE
+        while_open = _while_open(fit, open_, pressed)
+        laminar, orifice = laminar * while_open[0], orifice * while_open[1]
+        flow *= (1.0 - law.mean) * while_open[0] + law.mean * while_open[1]
         more = abs(orifice - laminar) * size
+        over = _CHANGING_OVER if fit.changes_over else 0.0
         lift = law.mean * float(np.mean(np.abs(fit.blocks.lift[open_])))
-        half = _t_quantile(step.freedom) * math.hypot(size_sd, _RELATIVE * size, lift * size) * flow
+        half = _t_quantile(step.freedom) * math.hypot(size_sd, _RELATIVE * size, over * size, lift * size) * flow
         less, most = (law.mean - law.low, law.high - law.mean)[:: 1 if orifice > laminar else -1]
         lpm = size * flow
         interval = max(0.0, lpm - half - less * more), lpm + half + most * more
@@ -514,6 +528,14 @@ def describe_leak(fit: BalanceFit, step: DriftStep, probability: float) -> Evide
     if evidence.verdict == "leak":
         return evidence
     return replace(evidence, leak_lpm=None, leak_interval_lpm=None, course=None, relative=None)
+
+
+def _while_open(fit: BalanceFit, open_: NDArray[np.bool_], pressed: tuple[float, float] | None) -> tuple[float, float]:
+    """Return means of the size of the pressure difference and of its root over those of the open blocks."""
+    usual = float(np.mean(fit.blocks.abs_dp[open_])), float(np.mean(fit.blocks.root_dp[open_]))
+    if pressed is None or not (min(usual) > 0.0 and np.isfinite(pressed).all()):
+        return 1.0, 1.0
+    return pressed[0] / usual[0], pressed[1] / usual[1]
 
 
 def _law_text(law: OrificeShare, near: dict[str, float]) -> str:

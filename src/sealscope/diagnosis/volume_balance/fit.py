@@ -25,6 +25,9 @@ from sealscope.diagnosis.volume_balance.blocks import (
     I_12,
     I_AB,
     I_ROOT,
+    STORED_B,
+    STORED_X_A,
+    STORED_X_B,
     THETA,
     Y_PUMP,
     Y_SIDE,
@@ -66,6 +69,15 @@ _SEPARATE = 10.0
 _SURE = 5.0
 #: More blocks than this are merged for the search; around the rise they are searched one by one.
 MOST_BLOCKS = 96
+#: Share of the way on which the higher pressure may change sides unseen: 0.001 on single rods whose load keeps it on a
+#: side, 0.23 to 0.34 where the circuit swings between its valves.
+_SWINGING = 0.05
+#: Slopes are not kept where conductances scatter by over so many times what they do without; blocks that show it.
+_SCATTERS, _FEW = 2.0, 3
+#: Median of the size of a standard normal number.
+_QUARTILE = 0.6745
+#: Displacement over area may differ by this share from that of a stated machine before it is another one.
+GEOMETRY = 0.15
 #: Errors that the blocks share count where they differ between blocks by more than this share of a block's own error.
 _DIFFERENT = 0.1
 
@@ -81,7 +93,8 @@ class BalanceFit:
     the noise of dp; `shared` (n, m): deviations common to the blocks, from the shared coefficients; `residual` [m^3]:
     rms; `signal` [m^3]: rms of the volume delivered; `slip` (n,): flow that nothing explains [m^3/s]; `metres`: the
     position has a unit; `unequal`: the sides' areas differ; `scale_sd`: deviation of `scale`; `geometry`: as assumed;
-    `side`: 1 where p_A is the higher one along most of the way, -1 where p_B is.
+    `side`: 1 where p_A is the higher one along most of the way, -1 where p_B is; `by_side`: the volume displaced is
+    counted by the assumed area of the side that carries the load, sample by sample.
     """
 
     blocks: BalanceBlocks
@@ -102,6 +115,20 @@ class BalanceFit:
     scale_sd: float
     geometry: Geometry
     side: int
+    by_side: bool
+
+    @property
+    def weights(self) -> Array:
+        """Weights (c,) of the columns of a block as it was cut, in what the balance leaves beside the leak."""
+        weights = np.zeros(self.blocks.gram.shape[1])
+        weights[Y] = 1.0
+        weights[list(self.columns)] -= self.beta
+        return np.asarray(weights @ _turn(weights.size, self.side, self._counted))
+
+    @property
+    def _counted(self) -> float:
+        """Difference of the sides' areas over their sum by which the volume displaced is counted."""
+        return self.geometry.asymmetry if self.by_side else 0.0
 
     @property
     def scale(self) -> float:
@@ -112,14 +139,19 @@ class BalanceFit:
     def carrying(self) -> float:
         """Area of the side that carries the load most of the way, over the mean of both, of the assumed machine.
 
-        1 where the sides are counted by the pump's direction: then `scale` is by the mean.
+        1 where the sides are counted by the pump's direction, then `scale` is by the mean, or each by its own area.
         """
-        return 1.0 if Y_PUMP in self.columns else 1.0 + self.side * self.sense * self.geometry.asymmetry
+        return 1.0 if self.by_side or Y_PUMP in self.columns else 1.0 + self.side * self.sense * self.geometry.asymmetry
 
     @property
     def misfit(self) -> float:
         """Displacement over area, over that of the assumed machine: 1 where it is this one."""
         return abs(self.scale) * self.carrying
+
+    @property
+    def changes_over(self) -> bool:
+        """Whether either side carries the load in turn."""
+        return STORED_X_A in self.columns and STORED_X_B in self.columns
 
     @property
     def lag(self) -> float:
@@ -161,17 +193,26 @@ def _beyond(gram: Array, column: int) -> Array:
     return np.asarray(gram - gram[:, :, column, None] * gram[:, None, column, :] / own[:, None, None])
 
 
+def swings(blocks: BalanceBlocks) -> bool:
+    """Return whether the higher pressure changes sides faster than the samples tell."""
+    return float(np.median(blocks.swinging)) > _SWINGING
+
+
 def _shared_columns(blocks: BalanceBlocks) -> list[int]:
     """Return the columns whose coefficients all blocks share.
 
-    They are the angle, its lag (the flow), the pump's ports where they are recorded, and the pump's leakage where
-    throttles set the ports so far apart from the chambers that it can be told from the piston's.
+    They are the angle, its lag (the flow), the pump's ports where they are recorded, the oil stored in unequal sides,
+    and the pump's leakage where throttles set the ports so far apart from the chambers that it can be told from the
+    piston's.
     """
-    if blocks.gram.shape[1] <= I_12:
-        return [THETA, FLOW]
+    diagonal = np.einsum("ncc->c", blocks.gram)
+    known = range(STORED_B, STORED_B if swings(blocks) else diagonal.size)
+    stored = [column for column in known if diagonal[column] > 0.0]
+    if not np.any(blocks.noise_12):
+        return [THETA, FLOW, *stored]
     own = float(np.median(_beyond(blocks.gram, I_AB)[:, I_12, I_12]))
     own_pump = own > _SEPARATE * _noise_of_integrals(blocks)
-    return [THETA, FLOW, DP_12, I_12] if own_pump else [THETA, FLOW, DP_12]
+    return [THETA, FLOW, DP_12, *stored, I_12] if own_pump else [THETA, FLOW, DP_12, *stored]
 
 
 def _noise_of_integral(blocks: BalanceBlocks, variance: Array) -> Array:
@@ -281,15 +322,22 @@ def _filling(blocks: BalanceBlocks) -> NDArray[np.bool_]:
     return np.asarray(filling & (np.mean(filling) <= _SELDOM))
 
 
-def _by_lesser_side(blocks: BalanceBlocks, side: int) -> BalanceBlocks:
-    """Return the blocks with the volume displaced under pressure from the side that has it less, in place of `Y_SIDE`.
+def _turn(columns: int, side: int, asymmetry: float) -> Array:
+    """Return what makes the columns of the fit from those of a block as it was cut (c, c).
 
-    `side`: 1 where that is B, -1 where it is A. It is nothing where one side carries the load throughout; twice it and
-    the volume displaced differ by a sign only.
+    In place of `Y_SIDE` there is the volume displaced under pressure from the side that has it less (`side`: 1 where
+    that is B, -1 where it is A), which is nothing where one side carries the load throughout: twice it and the volume
+    displaced differ by a sign only. The volume displaced is counted by areas that differ by `asymmetry` of their sum.
     """
-    turn = np.eye(blocks.gram.shape[1])
+    turn = np.eye(columns)
     turn[Y_SIDE, Y_SIDE] = -0.5 * side
     turn[Y_SIDE, Y] = 0.5
+    turn[Y, Y_SIDE] = asymmetry
+    return turn
+
+
+def _turned(blocks: BalanceBlocks, turn: Array) -> BalanceBlocks:
+    """Return the blocks with other columns, `turn` (c, c) of those that they have."""
     return replace(blocks, gram=turn @ blocks.gram @ turn.T, slope=blocks.slope @ turn.T, stored=blocks.stored @ turn.T)
 
 
@@ -297,22 +345,67 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
     """Fit the balance; blocks in which the machine stands or is filled, or that do not balance at all, are left out.
 
     `geometry`: what made volumes of the samples. Needs one block or more; `residual` and `signal` show a fit that means
-    nothing (no motion, encoders that do not belong together).
+    nothing (no motion, encoders that do not belong together). Where the sides' areas differ, and one of them carries
+    the load, a leak is a steady flow: the slopes are kept then, unless the conductances scatter for it.
     """
+    fit = _fitted(blocks, metres, geometry)
+    if not geometry.unequal or swings(blocks):
+        return fit
+    steady = _slipping(_fitted(blocks.with_slopes(), metres, geometry), blocks)
+    return fit if _scatter(steady) > _SCATTERS * _scatter(fit) else steady
+
+
+def _scatter(fit: BalanceFit) -> float:
+    """Return by how much the conductances of neighbouring blocks differ; infinite where too few balance."""
+    if len(fit.blocks) < _FEW or len(fit.left_out) > len(fit.blocks):
+        return float("inf")
+    return float(np.median(np.abs(np.diff(fit.g))))
+
+
+def _slipping(fit: BalanceFit, cut: BalanceBlocks) -> BalanceFit:
+    """Return a fit with slopes kept, with the flow that neither motion nor leak explains in the deviations.
+
+    Valves that change over as the load changes sides, and zeros of the transducers, make a flow of the deviation q that
+    is another in each block. It moves a block's conductance by ``q <I_AB, t>/<I_AB, I_AB>``, and q is what the
+    differences of neighbouring blocks show. `cut`: the blocks as they were cut.
+    """
+    if len(fit.blocks) < _FEW:
+        return fit
+    used = cut.chosen(np.searchsorted(cut.t, fit.blocks.t))
+    own = np.maximum(fit.blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
+    moved = used.steady * np.abs(used.slope[:, I_AB]) / own
+    spread = np.maximum(moved[1:] ** 2 + moved[:-1] ** 2, np.finfo(float).tiny)
+    slip = float(np.median(np.abs(np.diff(fit.g)) / np.sqrt(spread))) / _QUARTILE
+    return replace(fit, sd=np.hypot(fit.sd, slip * moved))
+
+
+def _share_off(beta: Array) -> float:
+    """Return by which share displacement over area differs from the assumed one."""
+    return abs(abs(float(beta[0])) - 1.0)
+
+
+def _fitted(blocks: BalanceBlocks, metres: bool, geometry: Geometry) -> BalanceFit:
     side = 1 if float(np.sum(blocks.gram[:, Y, Y_SIDE])) >= 0 else -1
-    blocks = _by_lesser_side(blocks, side)
+    cut = blocks
+    by_side = geometry.asymmetry != 0.0 and geometry.area_stated and not swings(cut)
+    blocks = _turned(cut, _turn(cut.gram.shape[1], side, geometry.asymmetry if by_side else 0.0))
     keep = _moving(blocks) & ~_filling(blocks)
     if not keep.any():
         keep = np.ones(len(blocks), dtype=bool)
     freedom = max(1, blocks.samples - 4)
     shared = _shared_columns(blocks.chosen(keep))
     beta, inverse = _geometry(blocks.gram[keep], shared)
-    plain = _UNEQUAL * _least(blocks.gram[keep], shared, beta)
+    least = _UNEQUAL * _least(blocks.gram[keep], shared, beta)
+    known = by_side and geometry.displacement_stated
+    plainly = _turned(cut, _turn(cut.gram.shape[1], side, 0.0)) if by_side else blocks
     for column in (Y_PUMP, Y_SIDE):
         apart = [*shared[:2], column, *[other for other in shared[2:] if other not in (Y_PUMP, Y_SIDE)]]
-        counted = _geometry(blocks.gram[keep], apart)
-        if (least := _least(blocks.gram[keep], apart, counted[0])) < plain:
-            plain, shared, (beta, inverse) = least, apart, counted
+        counted = _geometry(plainly.gram[keep], apart)
+        left_over = _least(plainly.gram[keep], apart, counted[0])
+        if left_over < least and not (known and _share_off(counted[0]) > GEOMETRY >= _share_off(beta)):
+            least, shared, (beta, inverse) = left_over, apart, counted
+    if by_side and {Y_PUMP, Y_SIDE} & set(shared):
+        blocks, by_side = plainly, False
     own = np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
     leaning = blocks.gram[:, I_AB][:, shared] / own[:, None]
     slope = blocks.gram[:, I_AB, Y] / own - leaning @ beta
@@ -323,7 +416,7 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
     keep &= ~spoilt | bent | (left <= _UNBALANCED**2 * beta[0] ** 2 * blocks.gram[:, THETA, THETA])
     used, own, leaning, slope = blocks.chosen(keep), own[keep], leaning[keep], slope[keep]
     left, astray = left[keep], (spoilt & ~bent)[keep]
-    sense = _sense(used, slope, beta)
+    sense = _sense(used, slope, beta, shared)
     # a residual beyond noise may be all in the direction of the leak
     variance = np.where(left > 2.0 * usual * freedom, np.where(astray, left, left / freedom), usual)
     # numerically exact data have no residual; a relative rounding error keeps deviations above zero
@@ -351,16 +444,20 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
         scale_sd=float(np.sqrt(max(inverse[0, 0], 0.0) * usual)),
         geometry=geometry,
         side=side,
+        by_side=by_side,
     )
 
 
-def _sense(blocks: BalanceBlocks, slope: Array, beta: Array) -> int:
+def _sense(blocks: BalanceBlocks, slope: Array, beta: Array, shared: list[int]) -> int:
     """Return 1 where p_A - p_B rises as the piston is pushed towards positive A x, -1 where channels count otherwise.
 
     Stored oil takes volume from the motion whatever the signs of the encoders are; where its share is not clear, the
     pressure works along the motion on the whole (friction).
     """
     stored = blocks.stored[:, Y] - beta[0] * blocks.stored[:, THETA] - slope * blocks.stored[:, I_AB]
+    apart = {Y_PUMP, Y_SIDE, STORED_B, STORED_X_A, STORED_X_B}
+    unequal = [j for j, column in enumerate(shared) if column in apart]
+    stored -= blocks.stored[:, shared][:, unequal] @ beta[unequal]
     deviation = float(np.std(stored)) / np.sqrt(max(1, stored.size - 1))
     mean = float(np.mean(stored))
     if abs(mean) > _SURE * deviation:
@@ -415,7 +512,8 @@ def moved_share(fit: BalanceFit, column: int, onset: float, rise: float, *, with
     near = np.abs(t - onset - 0.5 * rise) < within + 0.5 * rise
     before, after = near & (t + half <= onset), near & (t - half >= onset + rise)
     gram, shared, beta = fit.blocks.gram, list(fit.columns), fit.beta
-    if min(before.sum(), after.sum()) < 3 or column >= gram.shape[1]:
+    recorded = column not in (DP_12, I_12) or bool(np.any(fit.blocks.noise_12))
+    if min(before.sum(), after.sum()) < 3 or not recorded:
         return None
     rest = _beyond(gram, I_AB)
     if column == I_12:

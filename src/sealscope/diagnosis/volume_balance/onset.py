@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import DriftStep
-from sealscope.diagnosis.volume_balance.blocks import I_AB, Geometry, Y, balance_channels, volumes
+from sealscope.diagnosis.volume_balance.blocks import I_AB, Geometry, balance_channels, volumes
 from sealscope.diagnosis.volume_balance.fit import BalanceFit
 from sealscope.recordings.recording import Array, Recording
 
@@ -55,7 +55,7 @@ def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: 
     t, columns, dp = part.t[sparse], columns[0][:, sparse], dp[0, sparse]
     level = float(before.mean())
     opened = fit.sense * (float(after.mean()) - level) * columns[I_AB]
-    left = columns[Y] - fit.beta @ columns[list(fit.columns)] + fit.sense * level * columns[I_AB]
+    left = fit.weights @ columns + fit.sense * level * columns[I_AB]
     free, _ = np.linalg.qr(np.column_stack([np.ones(t.size), t - t.mean(), dp - dp.mean()]))
 
     def noise(at: NDArray[np.signedinteger[Any]]) -> Array:

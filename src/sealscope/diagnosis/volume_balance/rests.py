@@ -38,9 +38,16 @@ def in_motion(samples: Mapping[str, Array], rate: float) -> tuple[NDArray[np.boo
     at_end = (x < x.min() + near) | (x > x.max() - near)
     usual = float(np.median(dp[~piston_rests])) if not piston_rests.all() else np.inf
     stopped = piston_rests & ~pump_rests & at_end & (dp > _PRESSED * usual)
+    stopped = _about(stopped, 2 * width) & at_end & (dp > _PRESSED * usual) | stopped
     stopped &= known
     passed = ((piston_rests & pump_rests) | stopped) & known
     return (~passed, stopped) if np.mean(passed) > _WORTH else None
+
+
+def _about(chosen: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
+    """Return the samples within `width` of a chosen one."""
+    sums = np.cumsum(np.pad(chosen.astype(np.int64), (width + 1, width)))
+    return np.asarray(sums[2 * width + 1 :] > sums[: -2 * width - 1])
 
 
 def _rests(speed: Array, width: int) -> NDArray[np.bool_]:

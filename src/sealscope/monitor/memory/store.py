@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sealscope.errors import InputError, MissingExtra
 from sealscope.monitor.alarms.alarm import Alarm
 from sealscope.monitor.memory.packing import packed, unpacked_samples
+from sealscope.monitor.memory.postgresql import engine_options, limit_answers
 from sealscope.monitor.stream.watch import BlockEstimate
 from sealscope.recordings.recording import Recording
 
@@ -37,6 +39,40 @@ _ESTIMATES = (
 )
 
 
+@dataclass
+class StoredRows:
+    """Rows that blocks add to the tables beside themselves, gathered to be stored at once.
+
+    By actuator: `summaries`, and `old`, the numbers up to which blocks and estimates are deleted.
+    """
+
+    estimates: list[dict[str, Any]] = field(default_factory=list)
+    pending: list[dict[str, Any]] = field(default_factory=list)
+    summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
+    old: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate]) -> None:
+        """Add the estimates of a block."""
+        for estimate in estimates:
+            values = (
+                estimate.total_lpm,
+                *(estimate.total_interval_lpm or (None, None)),
+                estimate.leak_lpm,
+                *(estimate.leak_interval_lpm or (None, None)),
+            )
+            place = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": estimate.status[:160]}
+            self.estimates.append({**place, **dict(zip(_ESTIMATES, values, strict=True))})
+
+    def add_pending(self, actuator: str, number: int, samples: Recording, follows: bool) -> None:
+        """Add samples that a restart goes through once more after the checkpoint."""
+        self.pending.append({"actuator": actuator, "number": number, "samples": packed(samples, follows)})
+
+    def checkpoint(self, actuator: str) -> None:
+        """Leave out what a checkpoint of an actuator makes needless."""
+        self.pending = [row for row in self.pending if row["actuator"] != actuator]
+        self.summaries.pop(actuator, None)
+
+
 class MonitorStore:
     """The database of a monitor, `database` a file of SQLite or a URL; raises InputError where it cannot be opened."""
 
@@ -52,7 +88,8 @@ class MonitorStore:
         self._is_file = "://" not in database
         url = f"sqlite:///{Path(database)}" if self._is_file else database
         try:
-            self.engine: Engine = sqlalchemy.create_engine(url)
+            self.engine: Engine = sqlalchemy.create_engine(url, **engine_options(sqlalchemy.make_url(url)))
+            limit_answers(self.engine)
             if self.engine.dialect.name == "sqlite":
                 sqlalchemy.event.listen(self.engine, "connect", _prepare_sqlite)
             for attempt in range(_ATTEMPTS):
@@ -87,22 +124,51 @@ class MonitorStore:
         with self.engine.begin() as connection:
             yield connection
 
-    def knows(self, connection: Connection, actuator: str, identity: str) -> bool:
-        """Return whether a block is stored."""
-        from sqlalchemy import select
+    def known(self, connection: Connection, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
+        """Return which of some blocks are stored; a block is an actuator and an identity."""
+        from sqlalchemy import bindparam, select
 
-        blocks = self.tables.blocks
-        query = select(blocks.c.identity).where(blocks.c.actuator == actuator, blocks.c.identity == identity)
-        return connection.execute(query).first() is not None
+        # a query for each: SQLite goes through the whole table for a list of pairs
+        table = self.tables.blocks
+        query = select(table.c.number).where(
+            table.c.actuator == bindparam("of"), table.c.identity == bindparam("identity")
+        )
+        return {
+            block
+            for block in blocks
+            if connection.execute(query, {"of": block[0], "identity": block[1]}).first() is not None
+        }
 
     def is_known(self, actuator: str, identity: str) -> bool:
         """Return whether a block is stored, by a connection of its own."""
         with self.engine.connect() as connection:
-            return self.knows(connection, actuator, identity)
+            return bool(self.known(connection, [(actuator, identity)]))
 
-    def keep_block(self, connection: Connection, actuator: str, identity: str, number: int) -> None:
-        """Store the identity of a block and its number among those of its actuator."""
-        connection.execute(self.tables.blocks.insert().values(actuator=actuator, identity=identity, number=number))
+    def keep_blocks(self, connection: Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
+        """Store blocks: actuator, identity, and number among those of the actuator.
+
+        Raises IntegrityError, and the transaction is over, where one of them is stored already.
+        """
+        names = ("actuator", "identity", "number")
+        connection.execute(self.tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
+
+    def keep_rows(self, connection: Connection, rows: StoredRows) -> None:
+        """Store the rows of blocks, each table's at once."""
+        from sqlalchemy import bindparam
+
+        tables = self.tables
+        for table, values in (
+            (tables.estimates, rows.estimates),
+            (tables.pending, rows.pending),
+        ):
+            if values:
+                connection.execute(table.insert(), values)
+        if rows.summaries:
+            statement = tables.actuators.update().where(tables.actuators.c.actuator == bindparam("of"))
+            shown = [{"of": name, "summary": json.dumps(summary)} for name, summary in rows.summaries.items()]
+            connection.execute(statement.values(summary=bindparam("summary")), shown)
+        for name, (block, estimate) in rows.old.items():
+            self._forget(connection, name, block, estimate)
 
     def blocks_kept(self, actuator: str) -> int:
         """Return the number of the last block of an actuator."""
@@ -113,7 +179,7 @@ class MonitorStore:
             query = select(func.max(blocks.c.number)).where(blocks.c.actuator == actuator)
             return int(connection.execute(query).scalar() or 0)
 
-    def forget(self, connection: Connection, actuator: str, block: int, estimate: int) -> None:
+    def _forget(self, connection: Connection, actuator: str, block: int, estimate: int) -> None:
         """Delete the identities up to the number `block`, and the estimates up to the number `estimate`."""
         blocks, estimates = self.tables.blocks, self.tables.estimates
         if block > 0:
@@ -121,32 +187,6 @@ class MonitorStore:
         if estimate > 0:
             old = (estimates.c.actuator == actuator) & (estimates.c.number <= estimate)
             connection.execute(estimates.delete().where(old))
-
-    def keep_estimates(self, connection: Connection, actuator: str, estimates: list[BlockEstimate]) -> None:
-        """Store the estimates of blocks."""
-        rows = [
-            {
-                "actuator": actuator,
-                "number": estimate.number,
-                "t": estimate.t,
-                "status": estimate.status[:160],
-                **dict(
-                    zip(
-                        _ESTIMATES,
-                        (
-                            estimate.total_lpm,
-                            *(estimate.total_interval_lpm or (None, None)),
-                            estimate.leak_lpm,
-                            *(estimate.leak_interval_lpm or (None, None)),
-                        ),
-                        strict=True,
-                    )
-                ),
-            }
-            for estimate in estimates
-        ]
-        if rows:
-            connection.execute(self.tables.estimates.insert(), rows)
 
     def keep_alarm(self, connection: Connection, alarm: Alarm) -> None:
         """Store an alarm as it is now."""
@@ -168,13 +208,6 @@ class MonitorStore:
         }
         connection.execute(self.tables.events.insert().values(**values))
 
-    def keep_pending(
-        self, connection: Connection, actuator: str, number: int, samples: Recording, follows: bool
-    ) -> None:
-        """Store samples that a restart goes through once more after the checkpoint."""
-        values = {"actuator": actuator, "number": number, "samples": packed(samples, follows)}
-        connection.execute(self.tables.pending.insert().values(**values))
-
     def keep_checkpoint(
         self, connection: Connection, actuator: str, settings: str, checkpoint: dict[str, Any], summary: dict[str, Any]
     ) -> None:
@@ -187,12 +220,6 @@ class MonitorStore:
             "summary": json.dumps(summary),
         }
         self.put(connection, self.tables.actuators, {"actuator": actuator}, values)
-
-    def keep_summary(self, connection: Connection, actuator: str, summary: dict[str, Any]) -> None:
-        """Store what an actuator shows now."""
-        actuators = self.tables.actuators
-        statement = actuators.update().where(actuators.c.actuator == actuator)
-        connection.execute(statement.values(summary=json.dumps(summary)))
 
     def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
         """Return settings and state as of the checkpoint, and the samples since then; None where there is none."""
@@ -299,6 +326,21 @@ class MonitorStore:
             statement = statement.where(table.c[name] == value)
         if connection.execute(statement.values(**values)).rowcount == 0:
             connection.execute(table.insert().values(**key, **values))
+
+
+def away(error: BaseException) -> str | None:
+    """Return in one line why the database does not answer or does not write, None for an error of another kind.
+
+    Values that it cannot hold are another kind: they would be refused again.
+    """
+    from sqlalchemy.exc import DataError, DBAPIError
+    from sqlalchemy.exc import TimeoutError as PoolTimeout
+
+    if isinstance(error, PoolTimeout):
+        return "every connection to the database is in use"
+    if not isinstance(error, DBAPIError) or isinstance(error, DataError):
+        return None
+    return " ".join(str(error.orig).split())[:200]
 
 
 def _event(row: Any) -> dict[str, Any]:

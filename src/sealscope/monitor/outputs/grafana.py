@@ -16,6 +16,8 @@ _PANELS = (
         *("rate(sealscope_passed_over_total{%s}[5m])", "{{actuator}}: {{reason}}", "", 12, 7),
     ),
     ("Messages dropped", "timeseries", "rate(sealscope_dropped_blocks_total[5m])", "{{reason}}", "", 12, 7),
+    ("Database, broker, webhook: 1 reached", "timeseries", "sealscope_reached", "{{part}}", "", 12, 6),
+    ("Blocks that wait to be stored", "timeseries", "sealscope_waiting_blocks", "", "", 12, 6),
 )
 _CHOSEN = 'actuator=~"$actuator"'
 

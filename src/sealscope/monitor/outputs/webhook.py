@@ -11,6 +11,7 @@ import urllib.request
 from typing import Any
 
 from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.outages import WEBHOOK, Outages
 from sealscope.monitor.outputs.lines import announced
 
 _log = logging.getLogger(__name__)
@@ -41,10 +42,19 @@ class Webhook:
         Sent as `Authorization: Bearer`; it stands in no log.
     timeout : float
         Longest time an answer may take [s].
+    outages : Outages, optional
+        Is told when the address does not take an event, and when it does again.
     """
 
-    def __init__(self, store: MonitorStore, url: str, token: str | None = None, timeout: float = 10.0) -> None:
-        self._store, self._url, self._token, self._timeout = store, url, token, timeout
+    def __init__(
+        self,
+        store: MonitorStore,
+        url: str,
+        token: str | None = None,
+        timeout: float = 10.0,
+        outages: Outages | None = None,
+    ) -> None:
+        self._store, self._url, self._token, self._timeout, self._outages = store, url, token, timeout, outages
         self._pause, self._next = 0.0, 0.0
         self._opener = urllib.request.build_opener(_NoRedirect)
 
@@ -65,11 +75,15 @@ class Webhook:
             for number, event in self._store.events_since(self._store.position(_NAME)):
                 if announced(event):
                     self._post(number, event)
+                    if self._outages is not None:
+                        self._outages.back(WEBHOOK)
                 self._store.keep_position(_NAME, number)
                 self._pause = 0.0
         except (urllib.error.URLError, OSError, ValueError, DBAPIError) as error:
             self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), LONGEST_PAUSE_S)
             self._next = time.monotonic() + self._pause
+            if self._outages is not None and not isinstance(error, DBAPIError):
+                self._outages.lost(WEBHOOK, _reason(error))
             _log.warning("the webhook does not take an event, tried again in %.0f s: %s", self._pause, _reason(error))
 
     def _post(self, number: int, event: dict[str, Any]) -> None:

@@ -34,7 +34,24 @@ function clock(t) {
 async function asked(address, options) {
   const answer = await fetch(address, options);
   if (answer.status === 401) location.href = "/login";
-  return answer.json();
+  const values = await answer.json();
+  if (answer.status === 503) {
+    showOutages(values);
+    throw new Error(values.error || "the monitor is busy");
+  }
+  return values;
+}
+
+// what the monitor does not reach, and what waits for it
+function showOutages(values) {
+  const lines = (values.outages || []).map(
+    (outage) => `The ${outage.part} is not reached since ${clock(outage.since)}: ${outage.reason}`,
+  );
+  if (lines.length && values.waiting) lines.push(`${values.waiting} blocks wait to be stored`);
+  const place = byId("outages");
+  const text = lines.join(". ");
+  if (place.textContent !== text) place.textContent = text;
+  place.hidden = !lines.length;
 }
 
 function stateOf(row) {
@@ -187,6 +204,7 @@ function showLife(life) {
 
 async function refresh() {
   const fleet = await asked("/api/fleet");
+  showOutages(fleet);
   if (chosen === null && fleet.actuators.length) chosen = fleet.actuators[0].name;
   showFleet(fleet);
   if (chosen === null) return;
@@ -198,9 +216,12 @@ function choose(name) {
   chosen = name;
   history.replaceState(null, "", `#${encodeURIComponent(name)}`);
   byId("mark-answer").textContent = "";
-  refresh().then(() => {
-    if (matchMedia("(max-width: 60rem)").matches) byId("life").scrollIntoView();
-  });
+  refresh().then(
+    () => {
+      if (matchMedia("(max-width: 60rem)").matches) byId("life").scrollIntoView();
+    },
+    soon,
+  );
 }
 
 byId("marks").addEventListener("submit", async (event) => {
@@ -210,10 +231,10 @@ byId("marks").addEventListener("submit", async (event) => {
     method: "POST",
     headers: { "Content-Type": "application/json", "X-Sealscope": "mark" },
     body: JSON.stringify({ mark, text: byId("comment").value }),
-  });
+  }).catch((error) => ({ error: `not kept: ${error.message}` }));
   byId("mark-answer").textContent = answer.error || `${answer.id}: ${mark}`;
   if (!answer.error) byId("comment").value = "";
-  refresh();
+  soon();
 });
 
 for (const button of document.querySelectorAll(".spans button")) {
@@ -222,7 +243,7 @@ for (const button of document.querySelectorAll(".spans button")) {
     for (const other of document.querySelectorAll(".spans button")) {
       other.setAttribute("aria-pressed", String(other === button));
     }
-    refresh();
+    soon();
   });
 }
 
@@ -238,7 +259,9 @@ async function soon() {
     await refresh();
     byId("overall").classList.remove("lost");
   } catch (error) {
-    byId("overall").textContent = "the monitor does not answer";
+    byId("overall").textContent = error instanceof TypeError ? "the monitor does not answer" : error.message;
+    again = !(error instanceof TypeError);
+    await new Promise((later) => setTimeout(later, 1500));
   }
   setTimeout(() => {
     busy = false;

@@ -10,13 +10,15 @@ import hashlib
 import hmac
 import socket
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from sealscope.errors import InputError, MissingExtra
 from sealscope.monitor.actuators import WatchedActuators
+from sealscope.monitor.memory.store import away
+from sealscope.monitor.outages import DATABASE
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
 from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.settings import PageSettings, secret_of
@@ -39,6 +41,8 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+#: When to ask again [s].
+_LATER = {"Retry-After": "5"}
 _COOKIE = "sealscope"
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 #: Address -> file and kind of what the page is made of.
@@ -54,8 +58,17 @@ _VENDORED = {
 }
 
 
-def site(actuators: WatchedActuators, settings: PageSettings, token: str | None) -> Starlette:
-    """Return the application of a monitor; with a token, nothing but the form for it is open without."""
+def site(
+    actuators: WatchedActuators,
+    settings: PageSettings,
+    token: str | None,
+    waits: Callable[[], tuple[int, int, int]] = lambda: (0, 0, 0),
+) -> Starlette:
+    """Return the application of a monitor; with a token, nothing but the form for it is open without.
+
+    `waits`: returns how many blocks wait to be stored, their bytes, and how often a source had to wait for them.
+    """
+    from sqlalchemy.exc import SQLAlchemyError
     from starlette.applications import Starlette
     from starlette.middleware import Middleware
     from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -75,7 +88,8 @@ def site(actuators: WatchedActuators, settings: PageSettings, token: str | None)
 
     def fleet(request: Request) -> Response:
         rows = ranked(actuators.plain(), store.alarms(open_only=True))
-        return JSONResponse({"actuators": rows, "counters": actuators.counters})
+        shown = {"actuators": rows, "counters": actuators.counters, "waiting": waits()[0]}
+        return JSONResponse({**shown, "outages": actuators.outages.plain()})
 
     def actuator(request: Request) -> Response:
         name = request.path_params["name"]
@@ -133,7 +147,22 @@ def site(actuators: WatchedActuators, settings: PageSettings, token: str | None)
         return StreamingResponse(lines(), media_type="text/event-stream")
 
     def metrics(request: Request) -> Response:
-        return Response(metrics_text(actuators.plain(), actuators.counters), headers={"Content-Type": CONTENT_TYPE})
+        return Response(measured(actuators.plain()), headers={"Content-Type": CONTENT_TYPE})
+
+    def measured(summaries: Mapping[str, Mapping[str, Any]]) -> str:
+        return metrics_text(summaries, actuators.counters, actuators.outages.totals(), waits())
+
+    async def not_answering(request: Request, error: Exception) -> Response:
+        """Say in the form that was asked for that the database is away, and what is known without it."""
+        reason = away(error)
+        if reason is None:
+            raise error
+        actuators.outages.lost(DATABASE, reason)
+        text = f"the database does not answer: {reason}"
+        if request.url.path == "/metrics":
+            return Response(f"# {text}\n{measured({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
+        known = {"counters": actuators.counters, "waiting": waits()[0], "outages": actuators.outages.plain()}
+        return JSONResponse({"error": text, **known}, 503, _LATER)
 
     async def login(request: Request) -> Response:
         if request.method == "POST" and token is not None:
@@ -161,7 +190,7 @@ def site(actuators: WatchedActuators, settings: PageSettings, token: str | None)
     middleware = []
     if settings.host in _LOCAL:  # a name of another site that leads to this machine is refused
         middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*_LOCAL, "[::1]", "testserver"]))
-    application = Starlette(routes=routes, middleware=middleware)
+    application = Starlette(routes=routes, middleware=middleware, exception_handlers={SQLAlchemyError: not_answering})
 
     async def guard(request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
         answer: Response
@@ -210,7 +239,12 @@ class PageServer:
     Raises MissingExtra without starlette and uvicorn, InputError where the port is taken or the token cannot be read.
     """
 
-    def __init__(self, actuators: WatchedActuators, settings: PageSettings) -> None:
+    def __init__(
+        self,
+        actuators: WatchedActuators,
+        settings: PageSettings,
+        waits: Callable[[], tuple[int, int, int]] = lambda: (0, 0, 0),
+    ) -> None:
         try:
             import starlette  # noqa: F401 (asked for before the port is taken)
             import uvicorn
@@ -227,7 +261,7 @@ class PageServer:
         self.port = int(self._socket.getsockname()[1])
         self.address = f"http://{settings.host}:{self.port}/"
         config = uvicorn.Config(
-            site(actuators, settings, token), log_level="warning", access_log=False, timeout_graceful_shutdown=2
+            site(actuators, settings, token, waits), log_level="warning", access_log=False, timeout_graceful_shutdown=2
         )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [self._socket]}, daemon=True)

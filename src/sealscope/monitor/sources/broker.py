@@ -3,32 +3,50 @@
 The session outlives the connection (QoS 1, no clean start), so the broker keeps what comes while the monitor is away.
 A message is acknowledged after its block is in the database: what was in flight at a crash comes again, and is known by
 its identity.
+
+The thread of the connection only takes messages in; another one decodes them and hands them over, and waits where the
+service does. So the connection stays alive while the database is away. Of QoS 0 those messages are dropped and counted
+for which there is no room. Of QoS 1 the broker sends no more than agreed and keeps the rest; where it sends more (as
+mosquitto 2.0.11 does after an acknowledgement) and there is no room, that one and all after it are left to the broker,
+which sends them again, in their order, over a new connection.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import socket
+import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
-from sealscope.errors import InputError, MissingExtra
-from sealscope.monitor.settings import BrokerSettings, secret_of
-from sealscope.monitor.sources.source_block import BlockReceiver, decoded
+from sealscope.monitor.memory.store import away
+from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, client_of
+from sealscope.monitor.outages import BROKER, DATABASE
+from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
+from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, decoded
+from sealscope.monitor.sources.sparkplug_host import SparkplugHost
+from sealscope.monitor.sparkplug import NAMESPACE
+from sealscope.monitor.waiting import Waiting
 
 _log = logging.getLogger(__name__)
 #: How long the broker keeps the session [s], messages in flight at most, and the largest one [bytes].
 _SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 64, 16_000_000
+#: Messages that wait to be decoded and their bytes, at most, as one more of QoS 0 is taken in, and as one of QoS 1 is.
+_ROOM, _ROOM_BYTES = 256, 64_000_000
+_ASSURED_ROOM, _ASSURED_BYTES = 2048, 192_000_000
 _NAME = "mqtt"
+#: What messages are counted under that find no room.
+_NO_ROOM = "messages of QoS 0 that found no room"
+_ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
 
 
 def broker_of(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
     """Return the source of a broker's messages; raises InputError for a secret that cannot be read."""
     password = secret_of(settings.password_file, "mqtt.password_file")
-    try:
-        import paho.mqtt.client  # noqa: F401 (asked for before the service starts)
-    except ImportError:
-        raise MissingExtra("MQTT needs paho-mqtt: pip install 'sealscope[mqtt]'") from None
+    check_mqtt()
     return lambda service: _Connection(settings, password, service).run()
 
 
@@ -36,23 +54,23 @@ class _Connection:
     """The connection of a service to its broker."""
 
     def __init__(self, settings: BrokerSettings, password: str | None, service: BlockReceiver) -> None:
-        from paho.mqtt.client import Client
-        from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
-
         self._settings, self._service = settings, service
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
-        self._client = Client(
-            CallbackAPIVersion.VERSION2, settings.client_id, protocol=MQTTProtocolVersion.MQTTv5, manual_ack=True
-        )
-        if settings.user is not None:
-            self._client.username_pw_set(settings.user, password)
-        if settings.tls:
-            self._client.tls_set(ca_certs=None if settings.ca_file is None else str(settings.ca_file))
+        self._client = client_of(settings.client_id, settings.user, password, settings.tls, settings.ca_file)
+        self._host: SparkplugHost | None = None
+        if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
+            self._host = SparkplugHost(service.settings.actuator, self._send, service.count)
+        self._online = 0
         self._connection = 0
+        self._refusing = -1  # the connection whose further messages are left to the broker
+        self._to_close: Any = None  # the line of that connection
+        self._arrived: Waiting[Any] = Waiting(_ROOM, _ROOM_BYTES)
+        self._client.on_connect_fail = self._unreached
         self._client.on_connect = self._connected
         self._client.on_message = self._message
         self._client.on_disconnect = self._lost
-        self._client.reconnect_delay_set(1, 30)
+        if settings.host_id is not None:
+            self._client.on_pre_connect = self._before_connection
 
     def run(self) -> None:
         """Hand messages over and pass alarms on until the service stops."""
@@ -63,57 +81,131 @@ class _Connection:
         properties.SessionExpiryInterval = _SESSION_S
         properties.ReceiveMaximum = _IN_FLIGHT
         properties.MaximumPacketSize = _LARGEST
-        self._client.connect_async(self._settings.host, self._settings.port, clean_start=False, properties=properties)
+        self._service.outages.expect(BROKER)
+        self._client.connect_async(
+            self._settings.host, self._settings.port, KEEP_ALIVE_S, clean_start=False, properties=properties
+        )
+        decoding = threading.Thread(target=self._decode, daemon=True)
+        decoding.start()
         self._client.loop_start()
         try:
             while not self._service.stopping.wait(0.2):
                 self._pass_on()
             self._pass_on()
         finally:
+            decoding.join()
+            if self._settings.host_id is not None and self._client.is_connected():
+                self._say_state(online=False)
             self._client.disconnect()
             self._client.loop_stop()
 
     def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         self._connection += 1
         if reason.is_failure:
-            _log.error("the broker %s refuses the connection: %s", self._settings.host, reason)
+            self._service.outages.lost(BROKER, f"{self._settings.host} refuses the connection: {reason}")
             return
+        self._service.outages.back(BROKER)
         for topic in self._names:
             client.subscribe(topic, qos=1)
+        if self._settings.host_id is not None:
+            self._say_state(online=True)
+        if self._host is not None:
+            for topic in self._host.topics:
+                client.subscribe(topic, qos=1)
+            self._arrived.put((self._connection, None), 0, always=True)
+
+    def _before_connection(self, client: Any, userdata: Any) -> None:
+        """Set the will of a primary host of Sparkplug; it has the time of the connection to come."""
+        self._online = round(1000.0 * time.time())
+        client.will_set(*self._state(online=False), qos=1, retain=True)
+
+    def _state(self, *, online: bool) -> tuple[str, str]:
+        """Return topic and payload of the state of a primary host."""
+        state = json.dumps({"online": online, "timestamp": self._online})
+        return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
+
+    def _say_state(self, *, online: bool) -> None:
+        self._client.publish(*self._state(online=online), qos=1, retain=True)
+
+    def _send(self, topic: str, payload: bytes) -> None:
+        self._client.publish(topic, payload, qos=0)
 
     def _lost(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        if not self._service.stopping.is_set():
-            _log.warning("the connection to the broker %s is lost: %s", self._settings.host, reason)
+        if not self._service.stopping.is_set() and self._refusing != self._connection:
+            self._service.outages.lost(BROKER, f"the connection to {self._settings.host} is lost: {reason}")
+
+    def _unreached(self, client: Any, userdata: Any) -> None:
+        self._service.outages.lost(BROKER, f"no connection to {self._settings.host}:{self._settings.port}")
 
     def _message(self, client: Any, userdata: Any, message: Any) -> None:
-        number, qos, connection = message.mid, message.qos, self._connection
+        """Take a message in; must not wait, for the connection would be lost meanwhile."""
+        arrived, size = (self._connection, message), len(message.payload)
+        if message.qos == 0:
+            if not self._arrived.put(arrived, size):
+                self._service.count(_NO_ROOM)
+            return
+        full = len(self._arrived) >= _ASSURED_ROOM or self._arrived.bytes + size > _ASSURED_BYTES
+        if full and self._refusing != self._connection:
+            self._refusing, self._to_close = self._connection, self._client.socket()
+        if self._refusing == self._connection:
+            self._service.count(_ASKED_AGAIN)
+        else:
+            self._arrived.put(arrived, size, always=True)
+
+    def _decode(self) -> None:
+        """Hand the messages over that were taken in, in their order."""
+        while not self._service.stopping.is_set():
+            arrived = self._arrived.take(1, 0.5)
+            for connection, message in arrived:
+                if message is not None:
+                    self._hand(connection, message)
+                elif self._host is not None:  # a connection was made
+                    self._host.ask_all()
+            if not arrived and (line := self._to_close) is not None:
+                self._to_close = None
+                with suppress(OSError):
+                    line.shutdown(socket.SHUT_RDWR)  # paho connects again, and the broker sends what it was left
+
+    def _hand(self, connection: int, message: Any) -> None:
+        number, qos = message.mid, message.qos
 
         def done() -> None:
             # after a lost connection the number may be another message's, and the broker sends this one again
-            if connection == self._connection:
-                client.ack(number, qos)
+            if qos and connection == self._connection:
+                self._client.ack(number, qos)
 
         try:
-            self._service.hand(decoded(message.payload, self._names.get(message.topic), done))
-        except InputError as error:
-            self._service.hand(InputError(f"{message.topic[:100]}: {error}"))
+            topic = message.topic
+        except UnicodeDecodeError:
+            topic = ""
+        try:
+            if self._host is None or not self._host.owns(topic):
+                self._service.hand(decoded(message.payload, self._names.get(topic), done))
+            elif (block := self._host.taken(topic, message.payload, done)) is not None:
+                self._service.hand(block)
+            else:
+                done()
+        except RefusedMessage as error:
+            self._service.hand(RefusedMessage(error.reason, f"{topic[:100]}: {error}"))
             done()  # it would be no better a second time
 
     def _pass_on(self) -> None:
         """Publish the alarms of new events, each retained."""
-        from sqlalchemy.exc import DBAPIError
-
         topic, store = self._settings.alarms_topic, self._service.store
         if topic is None or not store.sends or not self._client.is_connected():
             return
         try:
             for number, event in store.events_since(store.position(_NAME)):
                 alarm = event["alarm"]
-                name = "".join("_" if letter in "+#/\0" else letter for letter in alarm["actuator"])
+                name = topic_part(alarm["actuator"])
                 sent = self._client.publish(f"{topic}/{name}/alarm", json.dumps(alarm), qos=1, retain=True)
                 sent.wait_for_publish(timeout=5.0)
                 if not sent.is_published():
                     return
                 store.keep_position(_NAME, number)
-        except (DBAPIError, RuntimeError, ValueError) as error:
-            _log.warning("alarms wait for the broker or the database: %s", str(error).splitlines()[0])
+        except (RuntimeError, ValueError) as error:
+            _log.warning("alarms wait for the broker: %s", str(error).splitlines()[0])
+        except Exception as error:
+            if (lost := away(error)) is None:
+                raise
+            self._service.outages.lost(DATABASE, lost)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import BinaryIO
 
-from sealscope.errors import InputError
-from sealscope.monitor.sources.source_block import LARGEST, SourceBlock, decoded
+from sealscope.monitor.sources.source_block import LARGEST, OVERSIZED, RefusedMessage, SourceBlock, decoded
 
 
-def blocks_of_lines(stream: BinaryIO) -> Iterator[SourceBlock | InputError]:
+def blocks_of_lines(stream: BinaryIO) -> Iterator[SourceBlock | RefusedMessage]:
     """Yield the block of every line, or the error where a line holds none; empty lines are passed over."""
     while True:
         line = stream.readline(LARGEST + 1)
@@ -18,11 +17,11 @@ def blocks_of_lines(stream: BinaryIO) -> Iterator[SourceBlock | InputError]:
         if len(line) > LARGEST:
             while line and not line.endswith(b"\n"):
                 line = stream.readline(LARGEST)
-            yield InputError(f"a line must have at most {LARGEST} bytes, got more")
+            yield RefusedMessage(OVERSIZED, f"a line must have at most {LARGEST} bytes, got more")
             continue
         if not line.strip():
             continue
         try:
             yield decoded(line.strip())
-        except InputError as error:
+        except RefusedMessage as error:
             yield error

@@ -1,7 +1,11 @@
-"""A block of samples of one actuator with its identity, and its form as a message of JSON or CBOR."""
+"""A block of samples of one actuator with its identity, and its form as a message of JSON or CBOR.
+
+A message that holds no block is a RefusedMessage, whose reason is one of few: messages from outside are counted by it.
+"""
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,15 +17,17 @@ import numpy as np
 from sealscope.errors import InputError
 from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
-from sealscope.storage.plain_values import parse_json
 from sealscope.units import to_si
 
 if TYPE_CHECKING:
     from sealscope.monitor.memory.store import MonitorStore
+    from sealscope.monitor.outages import Outages
     from sealscope.monitor.settings import MonitorSettings
 
 #: Largest message [bytes], and most samples of a channel in it.
 LARGEST, MOST_SAMPLES = 16_000_000, 1_000_000
+#: Tags of CBOR for arrays of numbers (RFC 8746) -> how their bytes are to be read.
+_TYPED = {81: ">f4", 82: ">f8", 85: "<f4", 86: "<f8"}
 _KNOWN = {"actuator", "t", "rate", "units", "id", *CHANNELS}
 
 
@@ -31,9 +37,36 @@ class BlockReceiver(Protocol):
     stopping: threading.Event
     store: MonitorStore
     settings: MonitorSettings
+    outages: Outages
 
-    def hand(self, block: SourceBlock | InputError) -> None:
-        """Take a block, or the error of a message that holds none."""
+    def hand(self, block: SourceBlock | RefusedMessage) -> None:
+        """Take a block, or the error of a message that holds none; may wait."""
+
+    def count(self, reason: str) -> None:
+        """Count something that was dropped."""
+
+
+class RefusedMessage(InputError):  # noqa: N818 (says what happened)
+    """A message holds no block; `reason` is one of `REASONS`."""
+
+    def __init__(self, reason: str, message: object) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+#: Why a message holds no block: what it is counted under.
+REASONS = (
+    OVERSIZED := "oversized messages",
+    UNREADABLE := "messages that are no JSON or CBOR",
+    NO_MAPPING := "messages that are no mapping of known names",
+    NO_CLOCK := "messages without a clock, a rate or a sound identity",
+    NO_SAMPLES := "messages whose channels are no lists of numbers of one length",
+    WRONG_UNITS := "messages with units of another dimension",
+    WRONG_ACTUATOR := "messages without an actuator, or with another one than their topic",
+    UNBORN := "Sparkplug messages without a birth",
+    OUT_OF_SEQUENCE := "Sparkplug messages out of sequence",
+    STALE_DEATH := "Sparkplug deaths of an earlier connection",
+)
 
 
 def nothing() -> None:
@@ -59,66 +92,110 @@ class SourceBlock:
 def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None] = nothing) -> SourceBlock:
     """Return the block of a message, JSON where it begins with ``{``, else CBOR.
 
-    Its mapping has ``t``, the clock of the first sample [s], ``rate`` [Hz], and a list of numbers for each channel,
-    null where one is missing; ``units`` names those that are not SI; ``actuator`` where the source does not say; ``id``
-    where the contents are not the identity. Raises InputError for anything else.
+    Its mapping has ``t``, the clock of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers,
+    null where one is missing, or in CBOR a typed array of floats (RFC 8746), NaN where one is missing; ``units`` names
+    those that are not SI; ``actuator`` where the source does not say; ``id`` where the contents are not the identity.
+    Raises RefusedMessage for anything else.
     """
     if len(payload) > LARGEST:
-        raise InputError(f"a message must have at most {LARGEST} bytes, got {len(payload)}")
+        raise RefusedMessage(OVERSIZED, f"a message must have at most {LARGEST} bytes, got {len(payload)}")
     values = _mapping(payload)
     unknown = sorted(str(name)[:40] for name in values if name not in _KNOWN)
     if unknown:
-        raise InputError(f"a message must hold {', '.join(sorted(_KNOWN))}, got {unknown[0]!r}")
+        raise RefusedMessage(NO_MAPPING, f"a message must hold {', '.join(sorted(_KNOWN))}, got {unknown[0]!r}")
     name = values.get("actuator", actuator)
     if not isinstance(name, str) or (actuator is not None and name != actuator):
-        raise InputError(f"a message must name its actuator, got {str(name)[:40]!r}")
+        raise RefusedMessage(WRONG_ACTUATOR, f"a message must name its actuator, got {str(name)[:40]!r}")
     units = values.get("units", {})
     if not isinstance(units, Mapping):
-        raise InputError("a message's units must be a mapping")
+        raise RefusedMessage(WRONG_UNITS, "a message's units must be a mapping")
     t, rate = _number(values, "t"), _number(values, "rate")
+    if not rate > 0.0:
+        raise RefusedMessage(NO_CLOCK, f"rate must be > 0 Hz, got {rate:g}")
     channels = {channel: _channel(values[channel], channel, units) for channel in CHANNELS if channel in values}
     sizes = {values.size for values in channels.values()}
-    if len(sizes) != 1 or not 0 < min(sizes) <= MOST_SAMPLES or not rate > 0:
-        raise InputError(f"channels must have equally many samples, 1 to {MOST_SAMPLES}, and a rate > 0 Hz")
-    samples = Recording(
-        t + np.arange(sizes.pop()) / rate, channels, {channel: CHANNEL_UNITS[channel] for channel in channels}, rate
-    )
-    identity = values.get("id") or blake2b(payload, digest_size=16).hexdigest()
-    return SourceBlock(name, str(identity)[:100], samples, done=done)
+    if sizes and max(sizes) > MOST_SAMPLES:
+        raise RefusedMessage(OVERSIZED, f"a channel must have at most {MOST_SAMPLES} samples, got {max(sizes)}")
+    if len(sizes) != 1 or not min(sizes):
+        raise RefusedMessage(NO_SAMPLES, f"channels must have equally many samples, 1 to {MOST_SAMPLES}")
+    with np.errstate(over="ignore"):  # times beyond floating point are dropped by the stream
+        clock = t + np.arange(sizes.pop()) / rate
+    samples = Recording(clock, channels, {channel: CHANNEL_UNITS[channel] for channel in channels}, rate)
+    return SourceBlock(name, _identity(values.get("id")) or digest_of(payload), samples, done=done)
+
+
+def bytes_of(samples: Recording | None) -> int:
+    """Return about how many bytes samples take."""
+    return 0 if samples is None else 8 * len(samples) * (1 + len(samples.channels))
+
+
+def digest_of(payload: bytes) -> str:
+    """Return what tells contents from others: their digest."""
+    return blake2b(payload, digest_size=16).hexdigest()
+
+
+def _identity(given: Any) -> str:
+    """Return the identity that a message states, "" where it states none; a database must be able to hold it."""
+    if given is None or given == "":
+        return ""
+    if isinstance(given, bool) or not isinstance(given, (str, int)):
+        raise RefusedMessage(NO_CLOCK, f"id must be a text or a whole number, got {type(given).__name__}")
+    identity = str(given)
+    if len(identity) > 100 or not identity.isprintable():
+        raise RefusedMessage(NO_CLOCK, f"id must have at most 100 letters that can be printed, got {identity[:40]!r}")
+    return identity
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"a number must be finite, got {text}")
 
 
 def _mapping(payload: bytes) -> Mapping[str, Any]:
     try:
         if payload.lstrip()[:1] == b"{":
-            values = parse_json(payload)
+            values = json.loads(payload, parse_constant=_no_number)
         else:
             import cbor2
 
             values = cbor2.loads(payload)
     except ImportError:
-        raise InputError("a message must be JSON, or cbor2 installed: pip install 'sealscope[mqtt]'") from None
+        raise RefusedMessage(
+            UNREADABLE, "a message must be JSON, or cbor2 installed: pip install 'sealscope[mqtt]'"
+        ) from None
     except Exception as error:  # a damaged message makes the libraries raise whatever they like
-        raise InputError(f"a message must be JSON or CBOR: {' '.join(str(error).split())[:80]}") from None
+        raise RefusedMessage(
+            UNREADABLE, f"a message must be JSON or CBOR: {' '.join(str(error).split())[:80]}"
+        ) from None
     if not isinstance(values, Mapping):
-        raise InputError(f"a message must be a mapping, got {type(values).__name__}")
+        raise RefusedMessage(NO_MAPPING, f"a message must be a mapping, got {type(values).__name__}")
     return values
 
 
 def _number(values: Mapping[str, Any], name: str) -> float:
     value = values.get(name)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise InputError(f"{name} must be a number, got {str(value)[:40]!r}")
+        raise RefusedMessage(NO_CLOCK, f"{name} must be a number, got {str(value)[:40]!r}")
     return float(value)
 
 
 def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
-    if not isinstance(values, (list, tuple)):
-        raise InputError(f"channel {name} must be a list of numbers, got {type(values).__name__}")
+    kind = _TYPED.get(getattr(values, "tag", None) or 0)
+    if kind is not None:
+        if not isinstance(values.value, bytes) or len(values.value) % np.dtype(kind).itemsize:
+            raise RefusedMessage(NO_SAMPLES, f"channel {name} must be an array of whole numbers of its type")
+        values = np.frombuffer(values.value, dtype=kind)
+    elif not isinstance(values, (list, tuple)):
+        raise RefusedMessage(NO_SAMPLES, f"channel {name} must be a list of numbers, got {type(values).__name__}")
     try:
-        array = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+        array = np.array(values, dtype=np.float64)  # None becomes NaN
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"channel {name} must be a list of numbers") from None
+        raise RefusedMessage(NO_SAMPLES, f"channel {name} must be a list of numbers") from None
     if array.ndim != 1:
-        raise InputError(f"channel {name} must be a list of numbers, got a list of lists")
+        raise RefusedMessage(NO_SAMPLES, f"channel {name} must be a list of numbers, got a list of lists")
+    if np.isinf(array).any():
+        raise RefusedMessage(NO_SAMPLES, f"channel {name} must have finite numbers, got infinity")
     unit = units.get(name)
-    return array if unit is None else np.asarray(to_si(array, str(unit)[:40], CHANNEL_UNITS[name], name=name))
+    try:
+        return array if unit is None else np.asarray(to_si(array, str(unit)[:40], CHANNEL_UNITS[name], name=name))
+    except InputError as error:
+        raise RefusedMessage(WRONG_UNITS, error) from None

@@ -3,7 +3,7 @@
 Three tests look at the conductance of pump and piston, each at another pace:
 
 - *step*: the last blocks are searched for a rise that no smooth drift explains (`volume_balance.evidence.judge`, as
-  `SequentialBalance` does), when a cheap contrast has shown one worth searching for;
+  `SequentialBalance` does), when two cheap contrasts and the score of the frozen balance have shown one worth it;
 - *rise*: the same search over means of `GROUP` blocks, some fifty minutes;
 - *level*: a mean of `GROUP` blocks over `WARMEST` times the least one of the baseline: more than oil that warms by 30 K
   makes of it.
@@ -20,7 +20,7 @@ from functools import cache
 
 import numpy as np
 
-from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, find_step
+from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, find_step, share_of_threshold
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import BalanceBlocks, Geometry
 from sealscope.diagnosis.volume_balance.evidence import judge, trouble
@@ -46,6 +46,12 @@ _WORTH_A_SEARCH = 4.5
 _FEW = 40
 #: ... and so many beside the means of so many values before it, where the conductance wanders.
 _BESIDE_NEIGHBOURS, _NEIGHBOURS, _LAG = 3.5, (1, 2, 4, 8, 16, 24), 8
+#: A balance is fitted anew and searched where the score of the frozen one is over this share of the threshold (of 184
+#: searches the two scores differed by 0.6 at most, thresholds are 27 and more), or where the last tenth of the blocks
+#: is this many times the first one, by so many deviations of a mean.
+_NEAR_THE_THRESHOLD, _GROWN, _SURELY_GROWN = 0.6, 0.75 * WARMEST, 3.0
+#: Blocks are even where they differ by less than this share of their spacing.
+_EVEN = 0.02
 #: Logarithm by which the duty changes where a rise of the conductance is not compared across it.
 _OTHER_DUTY = 0.15
 #: A rise that comes from these is an alarm, whichever of them it is.
@@ -119,24 +125,41 @@ def worth_a_search(g: Array) -> bool:
     return False
 
 
+def near_an_alarm(t: Array, g: Array, probability: float) -> bool:
+    """Return whether a search of blocks, middles `t` (n,) and conductances `g` (n,), could come near an alarm.
+
+    Where blocks are missing that is not known without the search.
+    """
+    steps = np.diff(t)
+    if np.ptp(steps) > _EVEN * float(np.median(steps)):
+        return True
+    ends = max(3, g.size // 10)
+    noise = float(np.median(np.abs(np.diff(g, 2)))) / (0.6745 * math.sqrt(6.0 * ends))
+    if float(g[-ends:].mean()) > _GROWN * max(float(g[:ends].mean()), 0.0) + _SURELY_GROWN * noise:
+        return True
+    return share_of_threshold(g, probability) > _NEAR_THE_THRESHOLD
+
+
 def step_of(
     blocks: BalanceBlocks, g: Array, probability: float, geometry: Geometry, *, again: bool = False
 ) -> tuple[ConductanceRise | None, str | None]:
-    """Return the rise that the last blocks show, and what else was seen that forbids to compare them, in one line.
+    """Return the rise that the last blocks show, and what else was seen that forbids to compare them, in a few words.
 
-    `g` (n,): their conductances; `again`: an alarm stands, and is to be stated anew.
+    `g` (n,): their conductances; `again`: an alarm stands, and is to be stated anew. The words are one of few, without
+    figures: blocks are counted by them.
     """
-    if len(blocks) < FEWEST or not (again or worth_a_search(g)):
+    if len(blocks) < FEWEST:
+        return None, None
+    if not (again or (worth_a_search(g) and near_an_alarm(blocks.t, g, probability))):
         return None, None
     fit = fit_balance(blocks, metres=True, geometry=geometry)
-    problem = trouble(fit)
-    if problem is not None:
-        return None, problem
+    if trouble(fit) is not None:
+        return None, "no balance can be fitted"
     evidence = judge(fit, probability, window=True)
     if not evidence.alarmed or evidence.onset_s is None:
         return None, None
     if evidence.cause not in _CAUSES:
-        return None, evidence.cause or evidence.reason
+        return None, evidence.cause or "another cause"
     if (duty := _other_duty(blocks, evidence.onset_s)) is not None:
         return None, duty
     return _rise(evidence, blocks, g), None
@@ -168,7 +191,7 @@ def _rise(evidence: Evidence, blocks: BalanceBlocks, g: Array) -> ConductanceRis
 
 
 def _other_duty(blocks: BalanceBlocks, onset: float) -> str | None:
-    """Return that the duty changed with the rise, in one line, or None."""
+    """Return that the duty changed with the rise, or None."""
     duty, after = duty_of(blocks), blocks.t >= onset
     if min(after.sum(), (~after).sum()) < 3:
         return None
@@ -178,7 +201,7 @@ def _other_duty(blocks: BalanceBlocks, onset: float) -> str | None:
 
 def slow_rise_of(t: Array, g: Array, sd: Array, probability: float) -> ConductanceRise | None:
     """Return the rise that means of blocks show: middles `t` (n,), conductances `g` (n,), deviations `sd` (n,)."""
-    if g.size < FEWEST or not worth_a_search(g):
+    if g.size < FEWEST or not worth_a_search(g) or not near_an_alarm(t, g, probability):
         return None
     step = find_step(t, g, sd, probability)
     if not step.alarm:
@@ -215,6 +238,9 @@ def level_rise_of(
         f"oil that warms by 30 K makes of it (score {score:.1f}, threshold {threshold:.1f})"
     )
     size = g - max(baseline.level, 0.0)
+    # what is healthy may be anywhere from the least of the baseline to the ceiling
+    healthy = baseline.level - baseline.low, ceiling - baseline.level
+    size_sd = math.hypot(sd, max(*healthy, 0.0) / 1.96)
     return ConductanceRise(
-        "level", at, (baseline.learned_s, at), size, sd, "piston or pump leak", reason, score, threshold
+        "level", at, (baseline.learned_s, at), size, size_sd, "piston or pump leak", reason, score, threshold
     )

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.volume_balance.blocks import FLOW, I_AB, THETA, Y_SIDE, BalanceBlocks, Y
+from sealscope.diagnosis.volume_balance.blocks import FLOW, I_AB, THETA, BalanceBlocks
 from sealscope.diagnosis.volume_balance.evidence import states_flow
 from sealscope.diagnosis.volume_balance.fit import BalanceFit
 from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
@@ -52,20 +52,11 @@ class FrozenBalance:
     litres: bool
 
     @classmethod
-    def of(cls, fit: BalanceFit, blocks: BalanceBlocks) -> FrozenBalance:
-        """Return the coefficients of a fit to `blocks`."""
-        weights = np.zeros(blocks.gram.shape[1])
-        weights[Y] = 1.0
-        for column, beta in zip(fit.columns, fit.beta, strict=True):
-            if column == Y_SIDE:  # the fit counts the volume displaced under pressure from the lesser side
-                sign = -0.5 if float(np.sum(blocks.gram[:, Y, Y_SIDE])) >= 0 else 0.5
-                weights[Y_SIDE] -= sign * beta
-                weights[Y] -= 0.5 * beta
-            else:
-                weights[column] -= beta
+    def of(cls, fit: BalanceFit) -> FrozenBalance:
+        """Return the coefficients of a fit."""
         offset = float(np.sqrt(np.mean(np.sum(fit.shared**2, axis=1))))
         volume = 1.0 / abs(fit.scale) if fit.by_pump else 1.0
-        return cls(weights, fit.sense, fit.residual, volume, offset, states_flow(fit))
+        return cls(fit.weights, fit.sense, fit.residual, volume, offset, states_flow(fit))
 
     def conductances(self, blocks: BalanceBlocks) -> tuple[Array, Array]:
         """Return conductances (n,) of blocks and their deviations (n,) [m^3/(s Pa)]."""

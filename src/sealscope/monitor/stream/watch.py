@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 2
+STATE_VERSION = 3
 #: The duty's cycle is looked for in so long a run without a hole [s].
 _LEARN_SECONDS = 60.0
 #: Blocks that the frozen balance is fitted to, at most.
@@ -121,6 +121,15 @@ class WatchedLeak:
 
 class Watch:
     """The volume balance of one running actuator, whose state can be saved; `watch` makes one.
+
+    Parameters
+    ----------
+    rig : Rig
+        Gives the piston's area and the pump's displacement.
+    false_alarms_per_1000_h : float
+        False alarms of a healthy machine per 1000 operating hours, at most.
+    learn_hours : float
+        Operating hours of healthy running that the baseline is learned from.
 
     Attributes
     ----------
@@ -278,7 +287,7 @@ class Watch:
             self._samples.count("blocks: no balance can be fitted", len(window) // 2)
             self._window = window.chosen(np.arange(len(window) // 2, len(window)))
             return BlockEstimate(self.blocks, end, problem)
-        self._balance, self._window = FrozenBalance.of(fit, window), None
+        self._balance, self._window = FrozenBalance.of(fit), None
         for k in range(len(window)):
             estimate = self._judge(window.chosen(np.array([k])), end)
         return estimate

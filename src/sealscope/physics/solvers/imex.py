@@ -140,9 +140,9 @@ def advance_imex(
     every: int,
     rows: np.ndarray,
 ) -> None:
-    """Advance `y` (12,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
+    """Advance `y` (14,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
-    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 19).
+    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 21).
     `F`: (n, 6) load [N] beside the rig's own, (0, 0) without one.
     """
     z = state_of(y)

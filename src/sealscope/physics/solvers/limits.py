@@ -62,13 +62,31 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     stuck = _longest_for_pair((max(1.0, p.backward) * breakaway + p.d_load) / p.M_eq, column)
     if len(p.bristled) > 0:
         stuck = _longest_for_pair((p.sigma_1 + p.F_v + p.d_load) / p.M_eq, column + p.sigma_0 / p.M_eq)
+    ports = 0.0 if len(p.valved) > 0 else ports  # the pump works on the supply: see there
     pump = _longest_for_pair(ports * p.G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
     leak = _longest_for_pair(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
     # Q = G dp (dp - p_crack)/p_open of a pilot-operated valve is steepest where it is fully open
     steepest = 2.0 + p.p_crack / p.p_open if len(p.piloted) > 0 else 1.0
     valves = max(p.G_check * steepest * p.made_up, p.G_relief * (len(p.relieved) > 0))
     outward = _longest_for_pair(chambers * max(p.G_ext_A, p.G_ext_B) + ports * valves, 0.0)
-    return float(min(loop, running, stuck, pump, leak, outward))
+    fastest = min(loop, running, stuck, pump, leak, outward)
+    if len(p.valved) > 0:
+        fastest = min(fastest, _longest_of_valve(p, ends))
+    return float(fastest)
+
+
+def _longest_of_valve(p: RigNumbers, ends: tuple[tuple[float, float], ...]) -> float:
+    """Longest step [s] for a servo valve: its spool, a chamber behind its laminar edges, the supply behind all."""
+    overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
+    steepest = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of an edge at full stroke
+    most = steepest * (1.0 + 2.0 * max(0.0, *(-o for o in overlaps)) / p.x_max)  # both edges of a chamber
+    chamber = p.K_oil * max(1.0 / volume for volumes in ends for volume in volumes)
+    supply = p.K_oil / p.V_1  # the accumulator may be empty
+    spool = _longest_for_pair(2.0 * p.zeta_s * p.omega_s, p.omega_s**2)
+    edges = _longest_for_pair(most * chamber, 0.0)
+    pump = supply * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M
+    line = _longest_for_pair(supply * (p.G_pump + p.G_set + 2.0 * most), pump)
+    return min(spool, edges, line)
 
 
 def longest_step_on_stop(p: RigNumbers) -> float:

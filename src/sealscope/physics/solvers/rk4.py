@@ -20,7 +20,7 @@ Nodes = tuple[float, float, float]
 def held_integral(dy: State, euler_integral: bool) -> State:
     """Return the rates with the controller's integral standing still where eq. (4.2) is taken literally."""
     still = 0.0 * dy[0] if euler_integral else dy[0]
-    return still, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10], dy[11]
+    return still, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10], dy[11], dy[12], dy[13]
 
 
 @contracted
@@ -34,7 +34,7 @@ def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigN
     total = moved(moved(moved(k1, 2.0, k2), 2.0, k3), 1.0, k4)
     z = within_limits(moved(y, h / 6.0, total), p)
     integral = y[0] + h * first[0] if euler_integral else z[0]  # eq. (4.2)
-    return integral, z[1], z[2], z[3], z[4], z[5], z[6], z[7], z[8], z[9], z[10], z[11]
+    return integral, z[1], z[2], z[3], z[4], z[5], z[6], z[7], z[8], z[9], z[10], z[11], z[12], z[13]
 
 
 @kernel
@@ -50,10 +50,10 @@ def advance_rk4(
     every: int,
     rows: np.ndarray,
 ) -> None:
-    """Advance `y` (12,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
+    """Advance `y` (14,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
     `u`, `G`, `C`: (n, 3) command [V] and leakage coefficients at t, t + h/2 and t + h of each step; `F`: (n, 3) load
-    [N] beside the rig's own, (0, 0) without one; `rows`: (n // every, 19). `euler_integral` takes eq. (4.2) literally:
+    [N] beside the rig's own, (0, 0) without one; `rows`: (n // every, 21). `euler_integral` takes eq. (4.2) literally:
     I is held within the step and grows by h (omega_d - omega) once after it.
     """
     n = u.shape[0]

@@ -52,7 +52,7 @@ lane_numbers = _lane_numbers()
 
 @contracted
 def lane_state(y: np.ndarray, at: int) -> State:
-    """Return the state of a group from rows at .. at + 11."""
+    """Return the state of a group from rows at .. at + 13."""
     return (
         load(y, at),
         load(y, at + 1),
@@ -66,6 +66,8 @@ def lane_state(y: np.ndarray, at: int) -> State:
         load(y, at + 9),
         load(y, at + 10),
         load(y, at + 11),
+        load(y, at + 12),
+        load(y, at + 13),
     )
 
 
@@ -120,7 +122,7 @@ def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> A
     if q.throttled:
         least = min(least, z[P_1])
         least = min(least, z[P_2])
-    total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11]
+    total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]
     return flow, opened + share, max(abs(z[POSITION]), reach), least, diverged + 0.0 * total
 
 
@@ -147,7 +149,7 @@ def advance(
 
     By the implicit-explicit method where `implicit`, else by RK4; for lanes, or on a GPU for a thread's one number.
 
-    `y`: (groups, 12, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
+    `y`: (groups, 14, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
     WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields, WIDTH) with
     `bounds` (cells + 1,) the step at which each cell begins; `pressures`: (groups, outputs, CHANNELS, WIDTH), written
     from output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).

@@ -13,6 +13,7 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
 from sealscope.recordings.formats.headings.labels import Label, square_brackets
 from sealscope.recordings.formats.headings.proposal import TURNS, is_time, map_options, proposed_map, unit_of_time
+from sealscope.recordings.formats.headings.split_time import below_seconds, parts_of_time
 from sealscope.units import same_dimension, to_si
 
 #: Names of a time column, most telling first, and the unit that the name itself tells.
@@ -38,7 +39,7 @@ _TIME_NAMES = {
     "t_ms": "ms",
     "milliseconds": "ms",
 }
-_PARTS = re.compile(r"[./\\\\:]")
+_PARTS = re.compile(r"[./\\\\:<>]")
 #: Names of a column of dates beside the time of the day.
 _DATE_NAMES = ("date", "datum", "day", "tag", "fecha", "data")
 
@@ -51,9 +52,11 @@ ChannelMap = Mapping[str, str] | Literal["auto"]
 class ColumnMap:
     """What to load of a table: the number of the time column and its label, name -> (column, unit) of each channel.
 
-    `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day;
-    `names`: channel -> label of its column, where the file calls it otherwise; `rate`: of the samples [Hz], as the
-    caller or the file says, or None.
+    `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day, or
+    the time column itself where a date is taken for it; `names`: channel -> label of its column, where the file calls
+    it otherwise; `rate`: of the samples [Hz], as the caller or the file says, or None;
+    `parts`: part of the time -> its column, where several columns hold the time;
+    `missing`: mapped channels whose column is not there, where some may be.
     """
 
     time: int | None
@@ -63,11 +66,17 @@ class ColumnMap:
     date: int | None = None
     names: Mapping[str, str] = field(default_factory=dict)
     rate: float | None = None
+    parts: Mapping[str, int] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
 
     @property
     def columns(self) -> list[tuple[int, bool]]:
-        """(column, whether it is read as time): those of the channels in the table's order, and at the end the time."""
-        channels = [(column, False) for column in sorted({column for column, _ in self.channels.values()})]
+        """(column, whether it is read as time): those of channels and parts of the time in the table's order, the time.
+
+        A column of hours is the time and a part of it.
+        """
+        read = {column for column, _ in self.channels.values()} | (set(self.parts.values()) - {self.time})
+        channels = [(column, False) for column in sorted(read)]
         return channels if self.time is None else [*channels, (self.time, True)]
 
 
@@ -120,6 +129,7 @@ def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | No
     for matches in (
         [i for i, label in enumerate(labels) if label.whole == name],
         [i for i, label in enumerate(labels) if label.name == name],
+        [i for i, label in enumerate(labels) if label.called and label.called == name],
         [i for i, label in enumerate(labels) if folded in (label.whole.casefold(), label.name.casefold())],
     ):
         if len(matches) > 1:
@@ -136,7 +146,7 @@ def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | No
 
 
 def _inside(labels: Sequence[Label], channel: str) -> int | None:
-    """Return the only column that bears a channel's name between points or strokes: `Rig.Cyl.p_A`."""
+    """Return the only column that bears a channel's name between points, strokes or brackets: `Rig.Cyl.p_A`."""
     unit = CHANNEL_UNITS[channel]
     matches = [
         i
@@ -199,14 +209,17 @@ def choose_columns(
     channel_map: ChannelMap,
     rate: float | None,
     place: str,
+    some: bool = False,
 ) -> ColumnMap:
     """Decide which columns are read, and as what.
 
     Without a time column the samples have the `rate` given, else the `stated_rate` of the file itself [Hz]. A map
     `auto` is what `proposed_map` makes of the labels. A mapped channel comes before a column that bears the
     channel's own name. Raises UnreadableFile where a mapped column is missing, where no column is a channel, and where
-    there is neither time nor rate; InputError for a unit of another dimension.
+    there is neither time nor rate; InputError for a unit of another dimension. With `some`, mapped columns may be
+    missing, which another sheet may have.
     """
+    missing: list[str] = []
     notes: list[str] = []
     channels: dict[str, tuple[int, str]] = {}
     if isinstance(channel_map, str):
@@ -214,7 +227,13 @@ def choose_columns(
     time: int | None = None
     time_label: Label | None = None
     for channel, foreign in channel_map.items():
-        column, unit = _mapped(labels, channel, foreign, place)
+        try:
+            column, unit = _mapped(labels, channel, foreign, place)
+        except UnreadableFile:
+            if not some:
+                raise
+            missing.append(channel)
+            continue
         whole = labels[column].whole
         if channel == "t":
             time, time_label = column, Label(whole, whole, unit)
@@ -222,7 +241,7 @@ def choose_columns(
         unit, note = _checked_unit(channel, unit, f"column {whole}, read as {channel},", place)
         channels[channel] = column, unit
         notes.append(note or f"column {whole} read as {channel} in {unit}")
-    for channel in CHANNEL_UNITS:
+    for channel in (channel for channel in CHANNEL_UNITS if channel not in missing):
         own = None if channel in channels else _find(labels, channel, f"channel {channel}", place)
         own = _inside(labels, channel) if own is None and channel not in channels else own
         if own is not None and own != time and own not in {column for column, _ in channels.values()}:
@@ -235,6 +254,10 @@ def choose_columns(
             label = labels[time]
             unit = label.unit or _TIME_NAMES.get(label.name.casefold()) or unit_of_time(label)
             time_label = Label(label.whole, label.name, unit)
+    parts: dict[str, int] = {}
+    if rate is None:
+        taken = [column for column, _ in channels.values()]
+        time, time_label, parts = _split(labels, time, time_label, taken, stated_rate is not None)
     have = listed(label.whole for label in labels)
     if not channels:
         guess = map_options(proposed_map(labels))
@@ -248,7 +271,7 @@ def choose_columns(
                 f"a recording must have a time column such as t [s] or be given a rate, got columns {have} ({place})"
             )
         notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
-    used = {column for column, _ in channels.values()} | {time}
+    used = {column for column, _ in channels.values()} | {time} | set(parts.values())
     dates = [i for i, label in enumerate(labels) if label.name.casefold() in _DATE_NAMES and i not in used]
     date = dates[0] if dates and time is not None else None
     if rate is not None and time_label is not None:
@@ -262,4 +285,37 @@ def choose_columns(
     order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel][0])}
     names = {channel: labels[column].whole for channel, (column, _) in order.items() if labels[column].name != channel}
     own_rate = stated_rate if rate is None else rate
-    return ColumnMap(time, time_label, order, tuple(notes), None if time is None else date, names, own_rate)
+    if time is None:
+        date = None
+    elif "t" not in channel_map and not parts and labels[time].name.casefold() in _DATE_NAMES:
+        date = time
+    return ColumnMap(time, time_label, order, tuple(notes), date, names, own_rate, parts, tuple(missing))
+
+
+def _split(
+    labels: Sequence[Label], time: int | None, label: Label | None, used: Sequence[int], rated: bool
+) -> tuple[int | None, Label | None, dict[str, int]]:
+    """Return the time column, its label and the parts of the time, where several columns hold the time together.
+
+    Hours, minutes and seconds stand beside a date or alone; then the column of seconds or of hours is the time. Where
+    nothing else tells it, a date is the time, or the only column in a unit of time; `rated`: the file states a rate.
+    """
+    parts = parts_of_time(labels, used)
+    if parts and time is not None and time not in parts.values():
+        parts = {}
+    dates = [
+        column
+        for column, own in enumerate(labels)
+        if own.name.casefold() in _DATE_NAMES and column not in (*used, *parts.values())
+    ]
+    if parts:
+        column = dates[0] if dates and "year" not in parts else parts["hour"] if time is None else time
+        whole = ", ".join(labels[i].whole for i in dict.fromkeys((column, *parts.values())))
+        return column, Label(whole, whole, "s" if time is not None else None), parts
+    if time is None and not rated:
+        timed = [i for i, own in enumerate(labels) if i not in used and own.unit and same_dimension(own.unit, "s")]
+        if dates:
+            time, label = dates[0], labels[dates[0]]
+        elif len(timed) == 1:  # `x-axis` over `second`, as oscilloscopes write
+            time, label = timed[0], labels[timed[0]]
+    return time, label, {} if time is None else below_seconds(labels, [*used, time])

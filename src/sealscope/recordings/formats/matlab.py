@@ -1,48 +1,23 @@
 """MATLAB files of any version, with mat-io: vectors, matrices, structs, tables, timetables, timeseries, Simulink logs.
 
-A file is walked as a tree. A vector of either direction is a series, a matrix one a column of it; a struct, a table or
-an object is a group. What has the fields of a time series (``time`` and ``signals``, or ``Time`` and ``Data``) gives
-its series a clock.
+A file is walked as a tree of structs and objects (`structured.tree`).
 """
 
 from __future__ import annotations
 
 import struct
 import warnings
-from collections.abc import Iterator, Mapping
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.errors import UnreadableFile
-from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
-from sealscope.recordings.formats.series import Clock, Series, table_of, uniform
+from sealscope.recordings.formats.series import table_of
+from sealscope.recordings.formats.structured.tree import number_of, series_in
 from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable
-
-#: Deepest nesting that is walked, and most columns of a matrix that are taken for series.
-_DEEPEST = 8
-_MOST_COLUMNS = 256
-#: Fields of a struct that name a signal, its unit and the columns of a matrix.
-_NAME_FIELDS = ("name", "signalname", "label", "title")
-_UNIT_FIELDS = ("unit", "units", "einheit", "einheiten")
-_HEADS = (
-    "colheaders",
-    "names",
-    "name",
-    "header",
-    "headers",
-    "labels",
-    "channels",
-    "channelnames",
-    "columns",
-    "varnames",
-)
 
 
 def is_matlab_4(head: bytes) -> bool:
@@ -76,8 +51,8 @@ def read_matlab(path: Path, choose: Choose) -> RawTable:
         _refuse_elsewhere(path, place)
         held = matio.load_from_mat(path, add_table_attrs=True)
     values = {name: value for name, value in held.items() if not name.startswith("__")}
-    series = list(_group("", "", values, None, -1))
-    scalars = {name: repr(number) for name, value in values.items() if (number := _number(value)) is not None}
+    series = list(series_in(values))
+    scalars = {name: repr(number) for name, value in values.items() if (number := number_of(value)) is not None}
     return table_of(series, choose, "MATLAB", place, rate=stated_rate(scalars))
 
 
@@ -100,192 +75,3 @@ def _refuse_elsewhere(path: Path, place: str) -> None:
                         folders.append(item)
                     elif isinstance(item, h5py.Dataset):
                         refuse_elsewhere(name, item, place)
-
-
-def _walk(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
-    """Yield the series in a value called `name`, of the group `group`."""
-    inner = f"{group}/{name}" if group else name
-    if depth > _DEEPEST:
-        return
-    if (fields := _fields(value)) is not None:
-        yield from _group(group, name, fields, clock, depth)
-    elif hasattr(value, "columns") and hasattr(value, "index"):
-        yield from _frame(inner, value)
-    elif isinstance(value, np.ndarray) and value.dtype == object:
-        for number, member in enumerate(value.reshape(-1), start=1):
-            yield from _walk(group, name if value.size == 1 else f"{name}({number})", member, clock, depth + 1)
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiubmMU":
-        yield from _columns(group, name, value, None, clock)
-
-
-def _fields(value: Any) -> Mapping[str, Any] | None:
-    """Return the fields of a struct or the properties of an object; None for anything else."""
-    properties = getattr(value, "properties", None)
-    if isinstance(properties, Mapping):
-        return properties
-    if isinstance(value, Mapping):
-        return value
-    if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
-        only = value.reshape(-1)[0]
-        return {name: only[name] for name in value.dtype.names}
-    if isinstance(value, np.ndarray) and value.dtype.names and 1 < value.size <= _MOST_COLUMNS:
-        members = value.reshape(-1)
-        return {f"({number})": members[number - 1 : number] for number in range(1, value.size + 1)}
-    return None
-
-
-def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
-    time = _times(by_name)
-    if time is not None:
-        clock = Clock((group, name, depth), partial(np.asarray, time))
-        if "signals" in by_name:  # a structure with time, as Simulink's scopes write
-            for number, signal in enumerate(_members(by_name["signals"]), start=1):
-                label = _text(signal.get("label")) or f"{name}({number})"
-                yield from _columns("", label, np.asarray(signal.get("values")), None, clock)
-            return
-        if "data" in by_name:
-            label = _text(by_name.get("name")) or name
-            unit = _text((_fields(by_name.get("datainfo")) or {}).get("Units")) or _first_text(by_name, _UNIT_FIELDS)
-            unit = unit or None
-            yield from _columns(group, label, np.asarray(by_name["data"]), unit, clock)
-            return
-        clock = None  # a struct of vectors beside a vector called time: that is a column like the others
-    elif (held := _vector_of(by_name)) is not None and _first_text(by_name, _UNIT_FIELDS) is not None:
-        # a signal with its name and unit beside its samples
-        own = by_name.get("time", by_name.get("t"))
-        if isinstance(own, np.ndarray) and own.dtype.kind in "fiu" and own.size == held.size:
-            clock = Clock((group, name, depth), partial(np.asarray, own.reshape(-1).astype(np.float64)))
-        yield from _columns(
-            group, _first_text(by_name, _NAME_FIELDS) or name, held, _first_text(by_name, _UNIT_FIELDS) or None, clock
-        )
-        return
-    elif "values" in by_name and _text(by_name.get("name")):  # a signal of a Simulink log, named by the log
-        yield from _walk(group, _text(by_name["name"]), by_name["values"], clock, depth + 1)
-        return
-    inner = f"{group}/{name}" if group else name
-    units = _texts_of(fields, _UNIT_FIELDS)
-    names = _column_names(fields)
-    for key, value in fields.items():
-        if _catman(key, fields) is not None:
-            yield from _catman_channel(inner, key, fields)
-        elif names and isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == len(names):
-            for number, label in enumerate(names):
-                yield from _columns(inner, label, np.asarray(value[:, number]), None, clock)
-        elif key in units and isinstance(value, np.ndarray):
-            yield from _columns(inner, key, value, units[key], clock)
-        else:
-            yield from _walk(inner, key, value, clock, depth + 1)
-
-
-def _vector_of(by_name: Mapping[str, Any]) -> NDArray[Any] | None:
-    """Return the samples that a signal's fields hold under one of the usual names."""
-    for name in ("data", "value", "values", "samples", "y"):
-        value = by_name.get(name)
-        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
-            return value
-    return None
-
-
-def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
-    """Return the text of the first of these fields, empty where it holds none; None where no field has the name."""
-    return next((_text(by_name[name]) for name in names if name in by_name), None)
-
-
-def _texts_of(fields: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, str]:
-    """Return the texts of a struct called `units` beside the vectors: name of each -> unit."""
-    for key, value in fields.items():
-        held = _fields(value) if key.casefold() in names else None
-        if held is not None:
-            return {name: text for name, member in held.items() if (text := _text(member))}
-    return {}
-
-
-def _column_names(fields: Mapping[str, Any]) -> list[str]:
-    """Return the names of a matrix's columns, which a cell array of texts beside it holds."""
-    for key, value in fields.items():
-        if key.casefold() in _HEADS and isinstance(value, np.ndarray) and value.dtype.kind in "OU" and value.size > 1:
-            texts = [_text(cell) or str(cell) for cell in value.reshape(-1)]
-            if all(texts):
-                return texts
-    return []
-
-
-def _catman(key: str, fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the header of `Channel_3_Data`, as catman exports it; None for any other name."""
-    head, _, last = key.rpartition("_")
-    return _fields(fields.get(f"{head}_Header")) if last == "Data" else None
-
-
-def _catman_channel(group: str, key: str, fields: Mapping[str, Any]) -> Iterator[Series]:
-    header = _catman(key, fields) or {}
-    value = np.asarray(fields[key])
-    step = _number(header.get("dt"))
-    clock = None if not step or step <= 0.0 else uniform("catman", value.size, step)
-    label = _text(header.get("SignalName")) or key
-    yield from _columns(group, label, value, _text(header.get("Unit")) or None, clock)
-
-
-def _times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Return the times (n,) [s] that fields hold, as numbers or as start, increment and length; None without."""
-    if "signals" not in by_name and "data" not in by_name:
-        return None
-    time = by_name.get("time")
-    if isinstance(time, np.ndarray) and time.dtype.kind in "fiu" and time.size > 1:
-        return np.asarray(time, dtype=np.float64).reshape(-1)
-    info = _fields(by_name.get("timeinfo")) or {}
-    numbers = {key.rstrip("_"): _number(value) for key, value in info.items()}
-    step, length = numbers.get("Increment"), numbers.get("Length")
-    if step is None or length is None or not 1 < length <= MAX_VALUES:
-        return None
-    return (numbers.get("Start") or 0.0) + step * np.arange(int(length), dtype=np.float64)
-
-
-def _members(value: Any) -> list[Mapping[str, Any]]:
-    fields = _fields(value) or {}
-    members = [_fields(member) for member in fields.values()]
-    whole = [member for member in members if member is not None]
-    return whole if whole and all(key.startswith("(") for key in fields) else [fields]
-
-
-def _columns(group: str, name: str, value: NDArray[Any], unit: str | None, clock: Clock | None) -> Iterator[Series]:
-    """Yield a series for a vector, and one a column for a matrix, called `name(:,1)` and so on."""
-    if value.dtype.kind not in "fiubmMU":
-        return
-    flat = np.squeeze(value)
-    if flat.ndim == 1 and flat.size > 1:
-        yield Series(group, Label.parse(name, unit), flat.size, partial(np.asarray, flat), clock)
-    elif flat.ndim == 2 and min(flat.shape) <= _MOST_COLUMNS:
-        upright = flat if flat.shape[0] >= flat.shape[1] else flat.T
-        for number in range(upright.shape[1]):
-            label = Label(f"{name}(:,{number + 1})", f"{name}(:,{number + 1})", unit)
-            yield Series(group, label, upright.shape[0], partial(np.asarray, upright[:, number]), clock)
-
-
-def _frame(group: str, frame: Any) -> Iterator[Series]:
-    """Yield the columns of a table; the row times of a timetable are their clock."""
-    units = [str(unit) for unit in frame.attrs.get("VariableUnits", frame.attrs.get("varUnits", ()))]
-    clock = None
-    index = np.asarray(frame.index)
-    if index.dtype.kind == "m":
-        clock = Clock((group, "row times"), lambda: index.astype("timedelta64[ns]").astype(np.float64) / 1e9)
-    elif index.dtype.kind == "M":
-        start = index[0].astype("datetime64[ns]")
-        clock = Clock((group, "row times"), lambda: (index - index[0]) / np.timedelta64(1, "ns") / 1e9, start)
-    for number, name in enumerate(frame.columns):
-        unit = units[number] if number < len(units) and units[number] else None
-        values = np.asarray(frame[name])
-        yield Series(group, Label.parse(str(name), unit), len(values), partial(np.asarray, values), clock)
-
-
-def _text(value: Any) -> str:
-    """Return the text of a value of MATLAB's, empty where it is none."""
-    flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
-    return str(flat[0]).strip() if flat.size == 1 and isinstance(flat[0], str) else ""
-
-
-def _number(value: Any) -> float | None:
-    flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
-    if flat.size != 1 or flat.dtype.kind not in "fiu" or not np.isfinite(flat[0]):
-        return None
-    return float(flat[0])

@@ -27,7 +27,7 @@ from sealscope.recordings.timebase import nominal_rate
 from sealscope.units import to_si
 
 #: The clock of a file among the columns: what stands for it where no column is mapped to `t`.
-_CLOCK_LABEL = Label("t [s]", "t", "s")
+CLOCK_LABEL = Label("t [s]", "t", "s")
 #: Channels whose clock is the base, most telling first.
 _BASE = ("p_A", "p_B", "p_1", "p_2")
 #: A slower series is not interpolated between samples that are this many of its usual intervals apart.
@@ -108,7 +108,7 @@ def table_of(
     series, notes = _distinct(_timed(series))
     labels = [member.label for member in series]
     clocked = any(member.clock is not None for member in series) and not any(label.name == "t" for label in labels)
-    choice = choose([*labels, _CLOCK_LABEL] if clocked else labels, rate)
+    choice = choose([*labels, CLOCK_LABEL] if clocked else labels, rate)
     chosen = {column: series[column] for column, time in choice.columns if not time}
     check_size(max(member.count for member in chosen.values()), len(choice.columns), place)
     if choice.time == len(series):

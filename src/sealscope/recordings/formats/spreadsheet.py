@@ -8,21 +8,28 @@ from __future__ import annotations
 
 import datetime as dt
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.formats.libraries import library
+from sealscope.recordings.formats.structured.logs import read_text
+from sealscope.recordings.formats.structured.sheets import joined_sheets
 from sealscope.recordings.formats.table import Choose, RawTable, check_size
-from sealscope.recordings.formats.text import read_text
+
+#: Most sheets that are looked at for more of a run.
+_MOST_SHEETS = 32
 
 
 def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
     """Read the chosen columns of the first sheet that holds them: hidden sheets last, those with most rows first.
 
-    Raises MissingExtra where python-calamine is absent, and what the largest sheet lacks where no sheet holds a log.
+    Visible sheets that belong to its run are joined. Raises MissingExtra where python-calamine is absent, and what the
+    largest sheet lacks where no sheet holds a log.
     """
     place = str(path)
     workbook = library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(str(path))
@@ -33,18 +40,51 @@ def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
     if not sheets:
         raise UnreadableFile(f"a workbook must have a sheet with rows, got none ({place})")
     reason: UnreadableFile | None = None
+    tables: list[tuple[str, RawTable]] = []
     for sheet in sheets:
+        if tables and (sheet.name in hidden or len(tables) == _MOST_SHEETS):
+            break
         check_size(sheet.total_height, sheet.total_width, place)
         try:
-            table = _read_sheet(sheet, choose, place)
+            tables.append((sheet.name, _read_sheet(sheet, choose, place)))
         except UnreadableFile as error:
             reason = reason or error
+    if tables:
+        table, used = joined_sheets(tables, place)
+    else:
+        assert reason is not None
+        table, used = _shared_map([sheet for sheet in sheets if sheet.name not in hidden], choose, place, reason)
+    others = [name for name in workbook.sheet_names if name not in used]
+    notes = (
+        (f"{'sheet' if len(used) == 1 else 'sheets'} {listed(used, 8)} read, not {listed(others, 4)}",)
+        if others
+        else ()
+    )
+    return replace(table, kind="spreadsheet", notes=(*notes, *table.notes))
+
+
+def _shared_map(
+    sheets: Sequence[Any], choose: Choose, place: str, reason: UnreadableFile
+) -> tuple[RawTable, tuple[str, ...]]:
+    """Return the table of sheets that hold the columns of a map together, and their names.
+
+    Raises `reason` where no sheet holds any, and UnreadableFile where a column is in none of one time.
+    """
+    tables = []
+    for sheet in sheets[:_MOST_SHEETS] if len(sheets) > 1 else ():
+        try:
+            tables.append((sheet.name, _read_sheet(sheet, partial(choose, some=True), place)))
+        except UnreadableFile:
             continue
-        others = [name for name in workbook.sheet_names if name != sheet.name]
-        notes = (f"sheet {sheet.name} read, not {listed(others, 4)}",) if others else ()
-        return replace(table, kind="spreadsheet", notes=(*notes, *table.notes))
-    assert reason is not None
-    raise reason
+    if not tables:
+        raise reason
+    table, used = joined_sheets(tables, place)
+    lost = [name for name in tables[0][1].choice.missing if name not in (*table.choice.channels, "t")]
+    if lost:
+        raise UnreadableFile(
+            f"mapped columns must be in sheets of one time, got none for {', '.join(lost)} in {listed(used)} ({place})"
+        )
+    return table, used
 
 
 def _read_sheet(sheet: Any, choose: Choose, place: str) -> RawTable:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
 from sealscope.recordings.formats.columns import ColumnMap
+from sealscope.recordings.formats.headings.split_time import joined_time
 from sealscope.recordings.timebase import falling, stamps, time_base
 from sealscope.units import to_si
 
@@ -67,6 +68,11 @@ class RawTable:
             raise InputError("a recording must have samples, got a header and no rows")
         notes = (*self.notes, *choice.notes)
         read = self.columns
+        if choice.parts:
+            read, more = self._joined()
+            notes += more
+        if choice.time is not None and choice.time == choice.date:
+            self._check_clock(read[-1])
         if choice.time_label is not None and own is None and falling(read[-1]):
             read = [cells[::-1] for cells in read]
             notes += ("rows begin with the last sample: taken in the order of time",)
@@ -94,6 +100,32 @@ class RawTable:
         if choice.names:
             about["columns"] = dict(choice.names)
         return RecordingFields(t, channels, units, rate, {**source, "format": self.kind, **start, **about}, notes)
+
+    def _check_clock(self, time: NDArray[Any]) -> None:
+        """Raise InputError where a column of dates, taken for the time, holds none with a time of the day."""
+        stamps = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
+        if (stamps == stamps.astype("datetime64[D]").astype(stamps.dtype)).all():
+            whole = "" if self.choice.time_label is None else self.choice.time_label.whole
+            raise InputError(
+                "a recording must have a time column such as t [s] or be given a rate, "
+                f"got dates alone in column {whole}"
+            )
+
+    def _joined(self) -> tuple[Sequence[NDArray[Any]], tuple[str, ...]]:
+        """Return the columns with the time that several of them hold, and a line for the history."""
+        choice = self.choice
+        assert choice.time is not None and choice.time_label is not None
+        read = dict(zip((column for column, _ in choice.columns), self.columns, strict=True))
+        parts = {part: np.asarray(read[column], dtype=np.float64) for part, column in choice.parts.items()}
+        time = joined_time(self.columns[-1], parts, choice.time_label.unit)
+        whole = choice.time_label.whole
+        if time is not None:
+            return [*self.columns[:-1], time], (f"time joined from {whole} and its parts: {', '.join(parts)}",)
+        if choice.time == choice.parts.get("hour"):
+            raise InputError(
+                f"time must be whole hours below 24, whole minutes and seconds below 60, got others in columns {whole}"
+            )
+        return self.columns, (f"{', '.join(parts)} beside column {whole} not used: no parts of its seconds",)
 
 
 def check_size(rows: int, columns: int, place: str) -> None:

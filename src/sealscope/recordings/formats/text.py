@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.columns import ColumnMap, counted
+from sealscope.recordings.formats.headings.quantities import plain_cells
 from sealscope.recordings.formats.table import MOST_WORDS, Choose, RawTable, check_size, parse_description
 from sealscope.recordings.formats.text_layout import (
     COMMENTS,
@@ -41,8 +43,55 @@ _LONGEST_REMARK = 400
 _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 
 
-def read_text(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen columns of a text log."""
+def read_text(path: Path, choose: Choose, layout: Layout | None = None) -> RawTable:
+    """Read the chosen columns of a text log, whose `layout` may be known already."""
+    place = str(path)
+    layout = look_at(path) if layout is None else layout
+    choice = choose(layout.labels, layout.rate)
+    taken, loose = _Columns(layout, choice, place), _Loose()
+    with path.open("rb") as file:
+        for rows, numbers, cut in _row_blocks(file, layout, choice, place, loose):
+            taken.take(rows, numbers, cut)
+    return _table(layout, taken, loose.notes(taken.total))
+
+
+def read_text_parts(path: Path, choose: Choose, rows_of: Callable[[RawTable], int]) -> Iterator[RawTable]:
+    """Yield the chosen columns of a text log part by part, in bounded memory.
+
+    `rows_of`: returns how many rows a part shall have, from the beginning of the log.
+    """
+    place = str(path)
+    layout = look_at(path)
+    choice = choose(layout.labels, layout.rate)
+    taken, loose, size, total = _Columns(layout, choice, place), _Loose(), 0, 0
+    with path.open("rb") as file:
+        for block, numbers, cut in _row_blocks(file, layout, choice, place, loose):
+            if not size:
+                beginning = _Columns(layout, choice, place)
+                beginning.take(block, numbers, cut)
+                size = rows_of(_table(layout, beginning, []))
+            first = 0
+            while first < len(block):
+                last = min(len(block), first + size - taken.total)
+                taken.take(block[first:last], numbers[first:last], cut and last == len(block))
+                total, first = total + last - first, last
+                if taken.total == size:
+                    yield _table(layout, taken, [])
+                    taken = _Columns(layout, choice, place)
+    notes = loose.notes(total)
+    if taken.total or not total:
+        yield _table(layout, taken, notes)
+
+
+def _table(layout: Layout, taken: _Columns, notes: Sequence[str]) -> RawTable:
+    """Return the table of the columns taken; `notes`: more lines for the history."""
+    columns, own = taken.finish()
+    description = None if layout.own is None else parse_description(layout.own, taken.place)
+    return RawTable(layout.kind, taken.choice, columns, description, (*layout.notes, *own, *notes), layout.about)
+
+
+def look_at(path: Path) -> Layout:
+    """Return the layout of a text log, by its beginning; raise UnreadableFile where it is none."""
     place = str(path)
     with path.open("rb") as file:
         head = file.read(SNIFF)
@@ -53,12 +102,7 @@ def read_text(path: Path, choose: Choose) -> RawTable:
             raise UnreadableFile(f"a recording must be text, NetCDF, HDF5 or Parquet, got other binary data ({place})")
         if head.startswith(OWN_MARK.encode()):
             head += _own_line(file, head)
-        layout = layout_of(head, encoding, len(file.read(1)) == 0, place)
-        choice = choose(layout.labels, layout.rate)
-        file.seek(0)
-        columns, notes = _columns(file, layout, choice, place)
-    description = None if layout.own is None else parse_description(layout.own, place)
-    return RawTable(layout.kind, choice, columns, description, (*layout.notes, *notes), layout.about)
+        return layout_of(head, encoding, len(file.read(1)) == 0, place)
 
 
 def _own_line(file: BinaryIO, head: bytes) -> bytes:
@@ -128,18 +172,26 @@ def _rows(lines: list[str], numbers: Sequence[int], layout: Layout, cut: bool, p
     return rows[:-1]
 
 
-def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> tuple[list[NDArray[Any]], list[str]]:
-    """Read the chosen columns, and lines for the history; the time may hold stamps, with the date in another column."""
-    columns = choice.columns
-    parts: list[list[NDArray[Any]]] = [[] for _ in columns]
-    words = [_Words(layout.labels[column].whole) for column, _ in columns]
-    total = 0
-    dated = False
-    stamped: bool | None = None
-    least = max(column for column, _ in columns) + 1
-    usual = 0
-    repeated = 0
-    remarks = _Words("")
+@dataclass
+class _Loose:
+    """What stands among the rows of a log and is none: remarks, repeated headings."""
+
+    remarks: _Words = field(default_factory=lambda: _Words(""))
+    repeated: int = 0
+
+    def notes(self, rows: int) -> list[str]:
+        """Return lines for the history; raise UnreadableFile where remarks are more than a few among `rows`."""
+        notes = self.remarks.notes(rows)
+        if self.repeated:
+            notes.append(f"{counted(self.repeated, 'line')} of the heading repeated among the samples left out")
+        return notes
+
+
+def _row_blocks(
+    file: BinaryIO, layout: Layout, choice: ColumnMap, place: str, loose: _Loose
+) -> Iterator[tuple[list[list[str]], Sequence[int], bool]]:
+    """Yield blocks of rows with a cell in each chosen column, their lines' numbers, whether the last is cut short."""
+    least, usual = max(column for column, _ in choice.columns) + 1, 0
     for number, lines, cut in _blocks(file, layout.encoding, place):
         skip = max(0, layout.first_row + 1 - number)
         blank = " " if layout.delimiter == "\t" else None  # tabs alone are a row of missing samples
@@ -149,7 +201,7 @@ def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> t
         if layout.above:
             count = len(kept)
             kept = [i for i in kept if lines[i].strip() not in layout.above]
-            repeated += count - len(kept)
+            loose.repeated += count - len(kept)
         if not kept:
             continue
         numbers: Sequence[int] = [number + i for i in kept]
@@ -159,44 +211,64 @@ def _columns(file: BinaryIO, layout: Layout, choice: ColumnMap, place: str) -> t
             # a last line without an end was not written whole: half a number and what follows it are missing
             rows[-1] = [*rows[-1][:-1], *[""] * (least - len(rows[-1]) + 1)]
         usual = len(rows[-1])
-        rows, numbers = _without_remarks(rows, numbers, least, layout, place, remarks)
-        if not rows:
-            continue
-        _check_widths(rows, numbers, least, layout, place)
-        total += len(rows)
-        check_size(total, len(columns), place)
-        for part, odd, (column, time) in zip(parts, words, columns, strict=True):
+        rows, numbers = _without_remarks(rows, numbers, least, layout, place, loose.remarks)
+        if rows:
+            _check_widths(rows, numbers, least, layout, place)
+            yield rows, numbers, cut
+
+
+class _Columns:
+    """The chosen columns of the rows taken so far; the time may hold stamps, with the date in another column."""
+
+    def __init__(self, layout: Layout, choice: ColumnMap, place: str) -> None:
+        self._layout, self.choice, self.place = layout, choice, place
+        self._parts: list[list[NDArray[Any]]] = [[] for _ in choice.columns]
+        self._words = [_Words(layout.labels[column].whole) for column, _ in choice.columns]
+        self._stamped: bool | None = None
+        self._dated = False
+        self.total = 0
+
+    def take(self, rows: list[list[str]], numbers: Sequence[int], cut: bool) -> None:
+        """Read more rows; `cut`: whether the last one was not written whole."""
+        layout, choice, place = self._layout, self.choice, self.place
+        self.total += len(rows)
+        check_size(self.total, len(choice.columns), place)
+        for part, odd, (column, time) in zip(self._parts, self._words, choice.columns, strict=True):
             cells = [row[column] for row in rows]
-            if time and stamped is None:
+            if unit := layout.cell_units.get(column):
+                where = partial(_place_of, numbers=numbers, column=column, layout=layout, place=place)
+                cells = plain_cells(cells, unit, cut, where)
+            if time and self._stamped is None:
                 index = next((i for i, cell in enumerate(cells) if cell.strip().lower() not in MISSING), 0)
-                stamped = not is_number(cells[index], layout.decimal) and is_stamp(cells[index])
+                self._stamped = not is_number(cells[index], layout.decimal) and is_stamp(cells[index])
                 # a time of the day beside a date
                 day = rows[index][choice.date] if choice.date is not None and choice.date < len(rows[index]) else ""
-                dated = stamped and ":" in cells[index][:3] and is_stamp(day) and ":" not in day
-            if not (time and stamped):
+                self._dated = self._stamped and ":" in cells[index][:3] and is_stamp(day) and ":" not in day
+            if not (time and self._stamped):
                 part.append(_numbers(cells, numbers, column, layout, place, odd))
                 continue
-            if dated and choice.date is not None:
+            if self._dated and choice.date is not None:
                 cells = [
                     f"{row[choice.date].strip()} {cell.strip()}" if cell.strip() else ""
                     for row, cell in zip(rows, cells, strict=True)
                 ]
             part.append(_dates(cells, numbers, column, layout, place, odd))
-    no_time = words[-1].at if choice.time is not None else []
-    joined: list[NDArray[Any]] = []
-    for part in parts:  # each column's blocks are let go before the next is joined
-        joined.append(np.concatenate(part) if part else np.empty(0))
-        part.clear()
-        if no_time:  # the rows of a summary, where a word stands in place of the time
-            joined[-1] = np.delete(joined[-1], no_time)
-    notes = [note for odd in words for note in odd.notes(total)]
-    notes += remarks.notes(total)
-    if repeated:
-        notes.append(f"{counted(repeated, 'line')} of the heading repeated among the samples left out")
-    if dated and choice.date is not None:
-        before, after = layout.labels[choice.date], layout.labels[columns[-1][0]]
-        notes.append(f"date and time joined from columns {before.whole} and {after.whole}")
-    return joined, notes
+
+    def finish(self) -> tuple[list[NDArray[Any]], list[str]]:
+        """Return the columns, and lines for the history."""
+        choice, labels = self.choice, self._layout.labels
+        no_time = self._words[-1].at if choice.time is not None else []
+        joined: list[NDArray[Any]] = []
+        for part in self._parts:  # each column's blocks are let go before the next is joined
+            joined.append(np.concatenate(part) if part else np.empty(0))
+            part.clear()
+            if no_time:  # the rows of a summary, where a word stands in place of the time
+                joined[-1] = np.delete(joined[-1], no_time)
+        notes = [note for odd in self._words for note in odd.notes(self.total)]
+        if self._dated and choice.date is not None:
+            before, after = labels[choice.date], labels[choice.columns[-1][0]]
+            notes.append(f"date and time joined from columns {before.whole} and {after.whole}")
+        return joined, notes
 
 
 def _without_remarks(

@@ -11,9 +11,12 @@ from dataclasses import dataclass, field
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.formats.headings.described import LABEL_ROWS, described
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import of_lines, stated_rate
 from sealscope.recordings.formats.headings.proposal import knows, measures
+from sealscope.recordings.formats.headings.quantities import units_in, with_units, without_units
+from sealscope.recordings.formats.headings.scope import scope_heading
 from sealscope.recordings.timebase import is_stamp
 from sealscope.units import parse_unit
 
@@ -59,7 +62,8 @@ _NAMES = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " ": "blank"}
 class Layout:
     """`delimiter`: a blank is any white space; `first_row`: index of the first data line; `own`: our JSON line.
 
-    `above`: the lines above the first row, which some loggers repeat further down; `rate`: what they say of it [Hz].
+    `above`: the lines above the first row, which some loggers repeat further down; `rate`: what they say of it [Hz];
+    `cell_units`: column -> the unit that stands behind each of its numbers.
     """
 
     encoding: str
@@ -72,6 +76,7 @@ class Layout:
     about: Mapping[str, str] = field(default_factory=dict)
     above: frozenset[str] = frozenset()
     rate: float | None = None
+    cell_units: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
@@ -219,6 +224,8 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
     above = [i for i in range(first - 1, -1, -1) if lines[i].strip()]
     if not above:
         return [], 0
+    if (scope := scope_heading(lines[:first], delimiter)) is not None:
+        return scope
     rows: list[list[str]] = []
     for index in above[:_DEEPEST_HEADING]:
         row = names(index)
@@ -226,7 +233,9 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
             break
         rows.append(row)
     if rows:
-        return _keyed(rows) or _stacked(rows)
+        labels, taken = _keyed(rows) or _stacked(rows)
+        own = [index for index, row in zip(above, rows, strict=False) if row[0].strip().casefold() in LABEL_ROWS]
+        return described(labels, [cells_of(lines[index], delimiter) for index in sorted([*above[taken:], *own])]), taken
     commented = names(above[0], commented=True) if not lines[above[0]].startswith(OWN_MARK) else None
     return ([Label.parse(name) for name in commented], 1) if commented else ([], 0)
 
@@ -261,7 +270,7 @@ def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
         skipped += 1
     row, *over = rows[skipped:]
     texts, taken = list(row), skipped + 1
-    units = _unit_cells(row) if over else None
+    units = (_numbered_units(row) or _unit_cells(row)) if over else None
     if units is not None:
         texts, over, taken = list(over[0]), over[1:], taken + 1
     elif over and (units := _unit_cells(over[0])) is not None and None not in units and len(units) == len(row) > 1:
@@ -277,6 +286,14 @@ def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
         texts, taken = joined, taken + 1
     units += [None] * (len(texts) - len(units))
     return [Label.parse(name, unit) for name, unit in zip(texts, units, strict=False)], taken
+
+
+def _numbered_units(row: Sequence[str]) -> list[str | None] | None:
+    """Return the units of Graphtec's row `NO.,Time,ms,V,...`, whose other cells are none; None for any other row."""
+    cells = [cell.strip() for cell in row]
+    if [cell.casefold() for cell in cells[:3]] != ["no.", "time", "ms"]:
+        return None
+    return [cell if column > 1 and _unit_cells([cell]) else None for column, cell in enumerate(cells)]
 
 
 def _tells_nothing(row: Sequence[str]) -> bool:
@@ -310,6 +327,10 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
     if not content:
         raise UnreadableFile(f"a recording must have samples, got an empty file ({place})")
     body = content[max(1, min(len(content) // 2, len(content) - 20)) :][-_SAMPLE_ROWS:] or content
+    written, cell_units = lines, _units_in_cells(body)
+    if cell_units:
+        spelt = list(cell_units.values())
+        lines, body = ([without_units(line, spelt) for line in part] for part in (lines, body))
     delimiter, decimal, width = _look(body)
     rows = [row for row in (cells_of(line, delimiter) for line in body) if len(row) == width]
     values = [sum(_is_value(cell, decimal) for cell in row) for row in rows]
@@ -345,7 +366,9 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
     if not labels:
         labels = [Label(str(i + 1), str(i + 1)) for i in range(width)]
         notes.append("no header: columns are called by their number, from 1")
-    above = [line for line in lines[:first] if line.strip()]
+    if cell_units:
+        labels = with_units(labels, cell_units, place)
+    above = [line for line in written[:first] if line.strip()]
     remarks = above[: len(above) - taken]
     about = of_lines(remarks, delimiter)
     plain = [line for line in remarks if not line.startswith(COMMENTS)]
@@ -354,7 +377,20 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         notes.append(f"{counted(unused, 'line')} before the header not used")
     lines_above = frozenset(line.strip() for line in above)
     rate = stated_rate(of_lines(above, delimiter))
-    return Layout(encoding, delimiter, decimal, tuple(labels), first, None, tuple(notes), about, lines_above, rate)
+    return Layout(
+        encoding, delimiter, decimal, tuple(labels), first, None, tuple(notes), about, lines_above, rate, cell_units
+    )
+
+
+def _units_in_cells(body: Sequence[str]) -> dict[int, str]:
+    """Return column -> unit of the columns whose cells hold it beside their number, by the delimiter with most such."""
+    tried = [
+        units_in(
+            [cells_of(line, delimiter) for line in body], lambda cell: _is_value(cell, ".") or _is_value(cell, ",")
+        )
+        for delimiter in ("\t", ";", "|", ",")
+    ]
+    return max(tried, key=len)
 
 
 def _refuse_markup(line: str, place: str) -> None:

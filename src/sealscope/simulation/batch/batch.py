@@ -45,7 +45,7 @@ class Batch:
     """Result of `simulate_batch`: RMS of the details in segments, and the leaks as they were.
 
     `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`DETAILS`: d1, d2, d3, d4
-    [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) [s]; `mean_leak_lpm`: (runs,) mean |Q| while open [L/min];
+    [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) [s]; `mean_leak_lpm`: (runs,) mean abs(Q) while open [L/min];
     `coefficients`: (runs,) leaks' G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]; `steps`: (runs,) [s].
     """
 

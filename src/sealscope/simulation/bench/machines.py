@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sealscope.control import controller_named, drive_of
 from sealscope.errors import InputError
 from sealscope.simulation.bench.profile import DriftRange, Nuisance, NuisanceChoice, Profile, load_profile
 from sealscope.simulation.changes import ParameterDrift, Wander
 from sealscope.simulation.commands import Command, parse_command
+from sealscope.simulation.courses import Force, Position, command_or_target, parse_force
 from sealscope.simulation.experiment import Experiment
 
 if TYPE_CHECKING:
@@ -28,7 +30,8 @@ class BenchMachine:
     """One machine on one day: a rig as designed, what differs from it, what drifts, and what the machine is asked for.
 
     `overrides`: values of parameters by dotted name, in SI, throttles among them (`closed`; open ones leave
-    `line.orifices` as the rig has it); `duration` [s] of the record over which the drifts have their sizes.
+    `line.orifices` as the rig has it); `duration` [s] of the record over which the drifts have their sizes. A target is
+    followed by the `controller` of that name, which assumes the rig as designed and not the machine.
     """
 
     profile: str
@@ -37,8 +40,10 @@ class BenchMachine:
     duration: float
     overrides: Mapping[str, float | str]
     drifts: tuple[ParameterDrift, ...]
-    command: Command
+    command: Command | Position
     closed: float
+    load: Force | None = None
+    controller: str = "pi"
 
     def experiment(self, **arguments: Any) -> Experiment:
         """Make the experiment of this machine on its duty, from a start that centres its strokes.
@@ -48,20 +53,33 @@ class BenchMachine:
         """
         built = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         own = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
-        given = {**own, **arguments}
+        given = {"load": self.load, **own, **arguments}
+        if isinstance(given["command"], str):
+            given["command"] = command_or_target(given["command"])
+        if isinstance(given["command"], Position):
+            given.setdefault("controller", controller_named(self.controller, self.rig))
         given.setdefault("x_0", centred_start(built, given["command"], given["duration"]))
         return Experiment.of(rig=built, **given)
 
 
-def centred_start(rig: Rig, command: Command | str, duration: float) -> float:
+def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
     """Start [m] from which the strokes of a command lie evenly about mid-stroke, as far as that is possible.
 
+    That of a target is where the target begins.
+
     The piston goes with the pump's flow, A v = q_b omega/(2 pi), and an unloaded motor without inertia follows its PI
-    loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5).
+    loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a servo valve it goes
+    with the valve's flow without a load.
     """
     command = parse_command(command) if isinstance(command, str) else command
     motor, cylinder = rig.motor, rig.cylinder
-    dt = 0.05
+    dt, half = 0.05, 0.5 * cylinder.L
+    if isinstance(command, Position):
+        return float(np.clip(command.at(np.zeros(())), -half, half))
+    area = 0.5 * (cylinder.A_A + cylinder.A_B)
+    if rig.valve.spool == "present":
+        moved = dt * np.cumsum(command.volts(np.arange(0.0, duration + dt, dt))) * drive_of(rig).largest(1.0) / area
+        return float(np.clip(-0.5 * (min(moved.min(), 0.0) + max(moved.max(), 0.0)), -half, half))
     demand = motor.omega_per_volt * command.volts(np.arange(0.0, duration + dt, dt))
     gain = motor.k_p + motor.C_e
     integral = angle = lowest = highest = 0.0
@@ -70,8 +88,7 @@ def centred_start(rig: Rig, command: Command | str, duration: float) -> float:
         integral += dt * (omega_d - omega)
         angle += dt * omega
         lowest, highest = min(lowest, angle), max(highest, angle)
-    stroke = rig.pump.q_b / (2.0 * np.pi) / (0.5 * (cylinder.A_A + cylinder.A_B))
-    half = 0.5 * cylinder.L
+    stroke = rig.pump.q_b / (2.0 * np.pi) / area
     return float(np.clip(-0.5 * stroke * (lowest + highest), -half, half))
 
 
@@ -150,12 +167,17 @@ def draw(
         overrides |= {name: float(base[name]) * value for name, value in values.items()} if nuisance.scales else values
         drifts += drifting
     random = _random(seed, "duty")
-    command = parse_command(given.duty.commands[int(random.integers(len(given.duty.commands)))])
+    command = command_or_target(given.duty.commands[int(random.integers(len(given.duty.commands)))])
     closed = given.duty.closed[int(random.integers(len(given.duty.closed)))]
     overrides |= {"line.closed_A": closed, "line.closed_B": closed}
     if closed > 0:
         overrides["line.orifices"] = "present"
     amplitude = float(random.uniform(*given.duty.amplitude))
     if amplitude != 1.0:
-        command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, attr-defined]
-    return BenchMachine(given.name, seed, base, duration, overrides, tuple(drifts), command, closed)
+        command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, union-attr]
+    load, controller = None, "pi"
+    if given.duty.loads:
+        load = parse_force(given.duty.loads[int(random.integers(len(given.duty.loads)))])
+    if given.duty.controllers:
+        controller = given.duty.controllers[int(random.integers(len(given.duty.controllers)))]
+    return BenchMachine(given.name, seed, base, duration, overrides, tuple(drifts), command, closed, load, controller)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from sealscope.errors import InputError
 from sealscope.simulation.changes import Linear, ParameterDrift, drifts_absolutely
-from sealscope.simulation.commands import parse_command
+from sealscope.simulation.courses import Position, command_or_target, parse_force
 from sealscope.storage.toml_file import read_toml
 
 _PACKAGED = Path(__file__).parent / "profiles"
@@ -58,17 +58,24 @@ class NuisanceChoice:
     why: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Duty:
     """What the machines are asked for.
 
-    One of `commands`, times a factor within `amplitude`, both throttles `closed` by one of these shares.
+    One of `commands`, times a factor within `amplitude`, both throttles `closed` by one of these shares. Where commands
+    are targets for the piston, one of `controllers` follows them (none: PI); one of `loads` acts on the rod.
     """
 
     commands: tuple[str, ...]
     closed: tuple[float, ...]
     amplitude: tuple[float, float]
     why: str
+    loads: tuple[str, ...] = ()
+    controllers: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:  # seeds of cases derive from it: what a profile does not state is left out
+        stated = [part for part in fields(self) if part.default is MISSING or getattr(self, part.name) != part.default]
+        return f"Duty({', '.join(f'{part.name}={getattr(self, part.name)!r}' for part in stated)})"
 
 
 AnyNuisance = Nuisance | NuisanceChoice
@@ -111,12 +118,18 @@ class Profile:
     def of_family(self, name: str) -> Profile:
         """Return the profile of one family's machines: its nuisances, and the others of this one."""
         family = self.family(name)
-        own = {parameter for nuisance in family.nuisances for parameter in nuisance.parameters}
-        kept = []
-        for nuisance in self.nuisances:
-            left = tuple(parameter for parameter in nuisance.parameters if parameter not in own)
-            kept += [replace(nuisance, parameters=left)] if left else []
-        return replace(self, duty=family.duty or self.duty, nuisances=(*kept, *family.nuisances), families=())
+        nuisances = _in_place(self.nuisances, family.nuisances)
+        return replace(self, duty=family.duty or self.duty, nuisances=nuisances, families=())
+
+
+def _in_place(nuisances: tuple[AnyNuisance, ...], own: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
+    """Return the nuisances with `own` in place of those for the same parameters."""
+    taken = {parameter for nuisance in own for parameter in nuisance.parameters}
+    kept: list[AnyNuisance] = []
+    for nuisance in nuisances:
+        left = tuple(parameter for parameter in nuisance.parameters if parameter not in taken)
+        kept += [replace(nuisance, parameters=left)] if left else []
+    return (*kept, *own)
 
 
 def profile_names() -> tuple[str, ...]:
@@ -144,13 +157,13 @@ def _profile(path: Path, place: str) -> Profile:
     _known(head, ("name", "title", "extends"), "[profile]", place)
     base = None
     if "extends" in head:
-        if head["extends"] not in profile_names() or tree.get("nuisance"):
-            rule = f"extends must be a packaged profile ({', '.join(profile_names())}), in one without nuisances"
-            raise InputError(f"{rule}, got {head['extends']!r} ({place})")
+        if head["extends"] not in profile_names():
+            known = ", ".join(profile_names())
+            raise InputError(f"extends must be a packaged profile ({known}), got {head['extends']!r} ({place})")
         base = load_profile(head["extends"])
     name, title = (_text(head, key, "[profile]", place) for key in ("name", "title"))
     duty = base.duty if base is not None and "duty" not in tree else _duty(tree.get("duty"), place)
-    nuisances = _nuisances(tree, place) if base is None else base.nuisances
+    nuisances = _in_place(() if base is None else base.nuisances, _nuisances(tree, place))
     entries = tree.get("family", [])
     if not isinstance(entries, list):
         raise InputError(f"families must be [[family]] tables, got {entries!r} ({place})")
@@ -317,23 +330,37 @@ def _drift(table: Any, name: str, parameters: tuple[str, ...], place: str) -> Dr
 def _duty(table: Any, place: str) -> Duty:
     if table is None:
         raise InputError(f"a profile must have [duty], got none ({place})")
-    _known(table, ("commands", "closed", "amplitude", "why"), "[duty]", place)
-    commands = table.get("commands")
-    if not isinstance(commands, list) or not commands or not all(isinstance(item, str) for item in commands):
-        raise InputError(f"commands of [duty] must be a list of texts, got {commands!r} ({place})")
+    _known(table, ("commands", "closed", "amplitude", "loads", "controllers", "why"), "[duty]", place)
+    commands = _texts(table, "commands", place)
     amplitude = _pair(table.get("amplitude", [1.0, 1.0]), "amplitude of [duty]", place)
     for text in commands:
         try:
-            command = parse_command(text)
+            command = command_or_target(text)
         except InputError as error:
             raise InputError(f"{error} ({place})") from None
+        if "controllers" in table and not isinstance(command, Position):
+            raise InputError(f"a controller must have a target to follow, got {text!r} ({place})")
         if amplitude != (1.0, 1.0) and not hasattr(command, "amplitude"):
             raise InputError(f"{text!r} has no amplitude to be drawn ({place})")
     closed = table.get("closed", [0])
     if not isinstance(closed, list) or not closed or not all(_percent(share) for share in closed):
         raise InputError(f"closed of [duty] must be a list of per cent, 0 to 99, got {closed!r} ({place})")
     shares = tuple(share / 100.0 for share in closed)
-    return Duty(tuple(commands), shares, amplitude, _text(table, "why", "[duty]", place))
+    why = _text(table, "why", "[duty]", place)
+    loads, controllers = (_texts(table, key, place) if key in table else () for key in ("loads", "controllers"))
+    for text in loads:
+        try:
+            parse_force(text)
+        except InputError as error:
+            raise InputError(f"{error} ({place})") from None
+    return Duty(commands, shares, amplitude, why, loads, controllers)
+
+
+def _texts(table: dict[str, Any], key: str, place: str) -> tuple[str, ...]:
+    given = table.get(key)
+    if not isinstance(given, list) or not given or not all(isinstance(item, str) for item in given):
+        raise InputError(f"{key} of [duty] must be a list of texts, got {given!r} ({place})")
+    return tuple(given)
 
 
 def _percent(value: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Section 6.2, the thesis's future work: the loop closed over the piston, a leak in it, and a load on it."""
+"""Section 6.2, the thesis's future work: the loop closed over the piston, a leak in it, a load on it, valve or pump."""
 
 from __future__ import annotations
 
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from sealscope.simulation.integrate import Trajectory
 
 RIG = "thesis-closed-loop"
+#: The valve-controlled rig with the same cylinder, and what it is compared by.
+VALVE_RIG, VALVE_CONTROLLERS = "servo-valve", ("pi", "flatness")
+#: Damper [N s/m] that takes the work by which efficiency is reckoned: 1.3 kN at the duty's largest speed.
+DAMPER = 20e3
 #: What no controller knows: friction up and stiffness down by 20 %.
 OFF: Mapping[str, float | str] = {"F_pr": 30.0, "F_cfr": 1.2e-6, "F_v": 360.0, "K_oil": 551e6}
 #: Load [N], under which a leak has its size; leaks [L/min].
@@ -46,6 +50,18 @@ COLUMNS = (
     "stiffness at 0.5 Hz [N/mm]",
     "made good [L/min]",
 )
+VALVE_COLUMNS = (
+    "source",
+    "controller",
+    "leak [L/min]",
+    "rms error [mm]",
+    "bandwidth [Hz]",
+    "stiffness at 0.5 Hz [N/mm]",
+    "electrical energy a cycle [J]",
+    "hydraulic energy a cycle [J]",
+    "efficiency against a damper [%]",
+    "efficiency from what the cylinder takes [%]",
+)
 
 
 def conductance(lpm: float, rig: Rig) -> float:
@@ -62,16 +78,23 @@ def controller_of(name: str, rig: Rig, lpm: float) -> Controller:
     return controller_named(name, rig)
 
 
-def followed(command: str, duration: float, controller: Controller | None, lpm: float, load: str) -> Trajectory:
-    """Run the rig whose friction and stiffness are off, under a load in words beside `LOAD`."""
+def followed(
+    command: str,
+    duration: float,
+    controller: Controller | None,
+    lpm: float,
+    load: str,
+    rig: str = RIG,
+    values: Mapping[str, float | str] | None = None,
+) -> Trajectory:
+    """Run a rig whose friction and stiffness are off, under a load in words beside `LOAD`."""
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import trajectory
 
-    rig = _rig()
-    leak = f"G = {conductance(lpm, rig)!r}" if lpm else None
+    leak = f"G = {conductance(lpm, _rig(rig))!r}" if lpm else None
     experiment = Experiment.of(
-        rig=rig,
-        set={**OFF, "F_l": LOAD},
+        rig=_rig(rig),
+        set={**OFF, "F_l": LOAD, **(values or {})},
         command=command,
         duration=duration,
         controller=controller,
@@ -82,10 +105,10 @@ def followed(command: str, duration: float, controller: Controller | None, lpm: 
 
 
 @cache
-def _rig() -> Rig:
+def _rig(name: str = RIG) -> Rig:
     from sealscope.parameters import load_rig
 
-    return load_rig(RIG)
+    return load_rig(name)
 
 
 def amplitude_at(t: Array, values: Array, f: float) -> complex:
@@ -95,31 +118,61 @@ def amplitude_at(t: Array, values: Array, f: float) -> complex:
     return complex(a[0], -a[1])
 
 
-def tracking(name: str, lpm: float, load: str = "0 N") -> tuple[float, float, float]:
+def on_duty(
+    name: str, lpm: float, load: str = "0 N", rig: str = RIG, values: Mapping[str, float | str] | None = None
+) -> tuple[Trajectory, Array]:
+    """Return a run of five cycles of the duty, and which of its samples are of the last two."""
+    cycle = 2.0 * math.pi / OMEGA
+    command = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
+    run = followed(command, 5.0 * cycle, controller_of(name, _rig(rig), lpm), lpm, load, rig, values)
+    return run, np.asarray((run.t >= 3.0 * cycle) & (run.t < 5.0 * cycle))
+
+
+def tracking(name: str, lpm: float, load: str = "0 N", rig: str = RIG) -> tuple[float, float, float]:
     """Return the rms error [mm], the electrical energy of a cycle [J] and the flow made good [L/min] on the duty."""
     cycle = 2.0 * math.pi / OMEGA
-    run = followed(
-        f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)", 5.0 * cycle, controller_of(name, _rig(), lpm), lpm, load
-    )
-    late = (run.t >= 3.0 * cycle) & (run.t < 5.0 * cycle)
+    run, late = on_duty(name, lpm, load, rig)
     error = AMPLITUDE * np.sin(OMEGA * run.t[late]) - run["x"][late]
     power = run["V"][late] * run["i"][late]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[late])) * 6e4
     return 1e3 * float(np.sqrt(np.mean(error**2))), float(np.mean(power)) * cycle, flow
 
 
-def stiffness(name: str, lpm: float) -> float:
+def drawn(run: Trajectory) -> Array:
+    """Return the flow [m^3/s] that a servo valve without overlap draws from its supply: that of its open edge."""
+    return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
+
+
+def energies(name: str, lpm: float, rig: str) -> tuple[float, float, float]:
+    """Return the hydraulic energy of a cycle [J] on the duty, and two efficiencies against a damper alone.
+
+    Hydraulic energy: what the pump gives, Q_1 (p_1 - p_2). Efficiency: the damper's work over the electrical energy,
+    and over the hydraulic energy that the cylinder takes: what a supply without losses would give to the valve at its
+    pressure, or the pump to its ports.
+    """
+    cycle = 2.0 * math.pi / OMEGA
+    run, late = on_duty(name, lpm, rig=rig)
+    given = float(np.mean((run["Q_1"] * (run["p_1"] - run["p_2"]))[late])) * cycle
+    damped, late = on_duty(name, lpm, rig=rig, values={"F_l": 0.0, "d_load": DAMPER})
+    dp = damped["p_1"] - damped["p_2"]
+    taken = (drawn(damped) if _rig(rig).valve.spool == "present" else damped["Q_1"]) * dp
+    work = DAMPER * float(np.mean(damped["v"][late] ** 2))
+    electrical = float(np.mean((damped["V"] * damped["i"])[late]))
+    return given, work / electrical, work / float(np.mean(taken[late]))
+
+
+def stiffness(name: str, lpm: float, rig: str = RIG) -> float:
     """Return |F/x| [N/mm] in hold at `STIFF_AT`."""
     load = f"{STIFF_FORCE} N sin({2 * math.pi * STIFF_AT!r}t)"
-    run = followed("position 0 mm sin(t)", 16.0, controller_of(name, _rig(), lpm), lpm, load)
+    run = followed("position 0 mm sin(t)", 16.0, controller_of(name, _rig(rig), lpm), lpm, load, rig)
     late = run.t >= 8.0
     return STIFF_FORCE / (1e3 * abs(amplitude_at(run.t[late], run["x"][late], STIFF_AT)))
 
 
-def bandwidth(name: str, lpm: float) -> float:
+def bandwidth(name: str, lpm: float, rig: str = RIG) -> float:
     """Return the frequency [Hz] from which on small targets are missed by -3 dB of themselves or more."""
     terms = [f"{1e3 * SMALL_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in SMALL_AT]
-    run = followed(f"position {' + '.join(terms)}", 14.0, controller_of(name, _rig(), lpm), lpm, "0 N")
+    run = followed(f"position {' + '.join(terms)}", 14.0, controller_of(name, _rig(rig), lpm), lpm, "0 N", rig)
     late = run.t >= 8.0
     X = [np.ones(int(late.sum()))]
     for f in SMALL_AT:
@@ -218,8 +271,46 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=notes),)
 
 
+def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
+    """Tabulate and draw tracking, stiffness and energy of the pump-controlled and the valve-controlled rig."""
+    leaks = (0.0, 0.5) if context.quick else LEAKS
+    rows: list[tuple[Cell, ...]] = []
+    for source, rig in (("pump", RIG), ("valve", VALVE_RIG)):
+        for name in VALVE_CONTROLLERS:
+            for lpm in leaks:
+                error, energy, _ = tracking(name, lpm, rig=rig)
+                given, efficiency, taken = energies(name, lpm, rig)
+                loop = bandwidth(name, lpm, rig), stiffness(name, lpm, rig)
+                rows.append((source, name, lpm, error, *loop, energy, given, 100 * efficiency, 100 * taken))
+    notes = (
+        f"{RIG} and {VALVE_RIG}: one cylinder, oil, motor and pump, one controller with the same gains, friction and "
+        f"stiffness off by 20 %; {1e3 * AMPLITUDE:g} mm at {OMEGA / (2 * math.pi):g} Hz under {LOAD:g} N, efficiencies "
+        f"against a damper of {DAMPER:g} N s/m instead. The valve's supply turns at a constant speed; the last column "
+        "leaves its losses, motor and pump out. A pump takes energy back on the way down where the load drives it."
+    )
+    roles: dict[tuple[str, str], Role] = {
+        ("pump", "pi"): "simulated",
+        ("pump", "flatness"): "25 %",
+        ("valve", "pi"): "leak",
+        ("valve", "flatness"): "75 %",
+    }
+    panels = []
+    for column in (6, 5):
+        curves = []
+        for (source, name), role in roles.items():
+            own = [row for row in rows if row[:2] == (source, name)]
+            x, y = (np.array([float(row[k] or 0.0) for row in own]) for k in (2, column))
+            curves.append(FigureCurve(np.maximum(x, 0.001), y, f"{source}, {name}", role))
+        panels.append(
+            Panel("leak [L/min], none drawn at 0.001", VALVE_COLUMNS[column], tuple(curves), log_x=True, log_y=True)
+        )
+    table = ThesisTable(item.id, item.title, VALVE_COLUMNS, tuple(rows), notes=notes)
+    return table, Figure(f"{item.id}-figure", "Energy and stiffness, pump and valve", tuple(panels), notes=notes)
+
+
 ITEMS: tuple[Item, ...] = (
     Item("sec-6.2-open-loop", 6, "table", "The piston's drift with a leak: open loop and closed loop", open_loop_table),
     Item("sec-6.2-controllers", 6, "table", "Controllers against the size of the leak", controllers_table),
     Item("sec-6.2-load", 6, "table", "Tracking and energy against the load on the cylinder", load_table),
+    Item("sec-6.2-valve", 6, "table", "Pump-controlled against valve-controlled", valve_table),
 )

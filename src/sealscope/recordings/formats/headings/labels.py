@@ -17,11 +17,15 @@ _BEHIND = re.compile(r"(?P<name>.{1,80}?)(?:\s+in\s+|\s*/|\s*,\s+)(?P<unit>\S{1,
 
 @dataclass(frozen=True)
 class Label:
-    """A column's heading: `whole` as written, `name` without the unit, `unit` where one is given."""
+    """A column's heading: `whole` as written, `name` without the unit, `unit` where one is given.
+
+    `called`: the column's own name, where `name` is what a user has typed for its channel.
+    """
 
     whole: str
     name: str
     unit: str | None = None
+    called: str = ""
 
     @classmethod
     def parse(cls, text: str, unit: str | None = None) -> Label:

@@ -1,0 +1,36 @@
+"""A client of an MQTT broker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealscope.errors import MissingExtra
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client
+
+#: Silence after which the broker is asked for a sign of life [s]; half of it later the connection counts as lost.
+KEEP_ALIVE_S = 20
+
+
+def check_mqtt() -> None:
+    """Raise MissingExtra where the library for MQTT is not installed."""
+    try:
+        import paho.mqtt.client  # noqa: F401 (asked for before the service starts)
+    except ImportError:
+        raise MissingExtra("MQTT needs paho-mqtt: pip install 'sealscope[mqtt]'") from None
+
+
+def client_of(client_id: str, user: str | None, password: str | None, tls: bool, ca_file: Path | None) -> Client:
+    """Return a client of MQTT 5 that is not connected yet; messages are acknowledged by hand."""
+    from paho.mqtt.client import Client
+    from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+
+    client = Client(CallbackAPIVersion.VERSION2, client_id, protocol=MQTTProtocolVersion.MQTTv5, manual_ack=True)
+    if user is not None:
+        client.username_pw_set(user, password)
+    if tls:
+        client.tls_set(ca_certs=None if ca_file is None else str(ca_file))
+    client.reconnect_delay_set(1, 30)
+    return client

@@ -1,0 +1,288 @@
+"""Alarms as an edge node of Sparkplug B: a device for each actuator, with births, data, a death as the will.
+
+Births state everything as it is; data state each event of an alarm at once, in order, and of the rest what has changed
+every few seconds. Sequence numbers begin at 0 with each birth of the node; its bdSeq is one more with each connection,
+also after a restart. A host that asks for a rebirth gets it. Messages have QoS 0, as Sparkplug has it: what a host
+misses it learns from the next birth, which it asks for when a number is missing.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from sealscope.monitor.memory.store import MonitorStore, away
+from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, client_of
+from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, topic_part
+from sealscope.monitor.sparkplug import (
+    BIRTH_SEQUENCE,
+    BOOLEAN,
+    DOUBLE,
+    INT64,
+    REBIRTH,
+    STRING,
+    UINT32,
+    UINT64,
+    SparkplugMetric,
+    SparkplugPayload,
+    after,
+    check_sparkplug,
+    decoded_payload,
+    encoded,
+    named,
+    topic_of,
+)
+
+_log = logging.getLogger(__name__)
+_NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
+_LOOK_S, _SENT_S = 0.2, 5.0
+_Table = dict[str, tuple[int, str | None, tuple[str, ...]]]
+#: Metric of a device -> type, unit, and where it is in the summary of an actuator.
+_STATE: _Table = {
+    "Status": (STRING, None, ("status",)),
+    "Status Word": (UINT32, None, ("status_word",)),
+    "Leak": (DOUBLE, "L/min", ("leak_lpm",)),
+    "Leak Low": (DOUBLE, "L/min", ("leak_interval_lpm", "0")),
+    "Leak High": (DOUBLE, "L/min", ("leak_interval_lpm", "1")),
+    "Total": (DOUBLE, "L/min", ("total_lpm",)),
+    "Blocks": (UINT64, None, ("blocks",)),
+    "Block Time": (DOUBLE, "s", ("t",)),
+    "Baseline Version": (UINT32, None, ("baseline", "version")),
+}
+#: ... in its alarm.
+_ALARM: _Table = {
+    "Alarm/Id": (STRING, None, ("id",)),
+    "Alarm/Level": (STRING, None, ("level",)),
+    "Alarm/State": (STRING, None, ("state",)),
+    "Alarm/Diagnostic Number": (UINT32, None, ("diagnostic_number",)),
+    "Alarm/Leak": (DOUBLE, "L/min", ("leak_lpm",)),
+    "Alarm/Leak Low": (DOUBLE, "L/min", ("leak_interval_lpm", "0")),
+    "Alarm/Leak High": (DOUBLE, "L/min", ("leak_interval_lpm", "1")),
+    "Alarm/Onset": (DOUBLE, "s", ("onset_s",)),
+    "Alarm/Raised": (DOUBLE, "s", ("raised_s",)),
+    "Alarm/Cause": (STRING, None, ("cause",)),
+    "Alarm/Evidence": (STRING, None, ("evidence",)),
+    "Alarm/Next Check": (STRING, None, ("next_check",)),
+    "Alarm/Mark": (STRING, None, ("mark",)),
+    "Alarm/Shelved": (BOOLEAN, None, ("shelved",)),
+}
+#: ... in an event.
+_EVENT: _Table = {
+    "Alarm/Event": (STRING, None, ("event",)),
+    "Alarm/Event Number": (UINT64, None, ("number",)),
+}
+
+
+class SparkplugNode:
+    """The edge node of a monitor.
+
+    Parameters
+    ----------
+    store : MonitorStore
+    summaries : callable
+        Returns what each actuator shows now.
+    count : callable
+        Counts what was dropped, by a reason.
+    broker : BrokerSettings
+    settings : SparkplugSettings
+    password : str, optional
+        Of the broker.
+    """
+
+    def __init__(
+        self,
+        store: MonitorStore,
+        summaries: Callable[[], dict[str, dict[str, Any]]],
+        count: Callable[[str], None],
+        broker: BrokerSettings,
+        settings: SparkplugSettings,
+        password: str | None = None,
+    ) -> None:
+        check_mqtt()
+        check_sparkplug()
+        self._store, self._summaries, self._count = store, summaries, count
+        self._settings, self._broker = settings, broker
+        name = f"{broker.client_id}-{settings.group}-{settings.node}"
+        self._client = client_of(name, broker.user, password, broker.tls, broker.ca_file)
+        self._client.on_pre_connect = self._before_connection
+        self._client.on_connect = self._connected
+        self._client.on_message = self._message
+        self._born = self._birth_number = 0  # bdSeq of the last birth, and of this connection
+        self._seq = 255
+        self._due = threading.Event()
+        self._shown: dict[str, dict[str, Any]] = {}
+        self._next = 0.0
+
+    def run(self, stopping: threading.Event) -> None:
+        """Send what happens until `stopping` is set; a monitor that does not send for all others is not connected."""
+        online = False
+        try:
+            while True:
+                last = stopping.wait(_LOOK_S)
+                try:
+                    if self._store.sends and not online:
+                        self._born = self._store.position(_BIRTHS)
+                        self._client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, clean_start=True)
+                        self._client.loop_start()
+                        online = True
+                    elif online and not self._store.sends:
+                        self._offline()
+                        online = False
+                    if online and self._client.is_connected():
+                        self._pass_on()
+                except Exception as error:
+                    if away(error) is None:
+                        raise
+                if last:
+                    return
+        finally:
+            if online:
+                self._offline()
+
+    def _offline(self) -> None:
+        """Say that the node ends, which the will does where it ends otherwise."""
+        if self._client.is_connected():
+            self._client.publish(self._topic("NDEATH"), self._death(), qos=1).wait_for_publish(_SENT_S)
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _topic(self, kind: str, device: str | None = None) -> str:
+        return topic_of(self._settings.group, kind, self._settings.node, device)
+
+    def _death(self) -> bytes:
+        number = SparkplugMetric(BIRTH_SEQUENCE, self._birth_number, INT64)
+        return encoded(SparkplugPayload(_now(), (number,), None))
+
+    def _before_connection(self, client: Any, userdata: Any) -> None:
+        """Set the will of the connection to come; its number is the one after that of the last birth."""
+        self._birth_number = (self._born + 1) % 256
+        client.will_set(self._topic("NDEATH"), self._death(), qos=1, retain=False)
+
+    def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+        if reason.is_failure:
+            _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)
+            return
+        client.subscribe(f"{self._topic('NCMD')}/#", qos=1)
+        self._due.set()
+
+    def _message(self, client: Any, userdata: Any, message: Any) -> None:
+        if message.qos:
+            client.ack(message.mid, message.qos)
+        try:
+            asked = named(decoded_payload(message.payload).metrics, REBIRTH)
+        except ValueError as error:
+            self._count("Sparkplug commands that are none")
+            _log.info("a command that is none: %s", error)
+            return
+        if asked is not None and asked.value is True:
+            self._due.set()
+
+    def _pass_on(self) -> None:
+        """Send the births that are due, the events, and what has changed."""
+        if self._due.is_set():
+            self._due.clear()
+            try:
+                self._bear()
+            except BaseException:
+                self._due.set()
+                raise
+        for number, event in self._store.events_since(self._store.position(_NAME)):
+            alarm = event["alarm"]
+            if alarm["actuator"] not in self._shown:  # it is no longer in the settings
+                self._store.keep_position(_NAME, number)
+                continue
+            metrics = [*_metrics(_ALARM, alarm, _clock(event["t"])), *_metrics(_EVENT, event, _clock(event["t"]))]
+            if not self._send("DDATA", metrics, alarm["actuator"]):
+                return
+            self._store.keep_position(_NAME, number)
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + self._settings.every_s
+            for actuator, summary in self._summaries().items():
+                self._show(actuator, summary)
+
+    def _show(self, actuator: str, summary: dict[str, Any]) -> None:
+        """Send what has changed of an actuator, or the birth of one that was not there."""
+        shown = self._shown.get(actuator)
+        if shown is None:
+            self._bear_device(actuator, summary, {})
+            return
+        changed = {name: value for name, value in _values(_STATE, summary).items() if value != shown[name]}
+        if changed and self._send("DDATA", _of_values(_STATE, changed, _clock(summary["t"])), actuator):
+            shown.update(changed)
+
+    def _bear(self) -> None:
+        """Send the births of the node and of all devices, with everything as it is."""
+        self._store.keep_position(_BIRTHS, self._birth_number)
+        self._born = self._birth_number
+        summaries, latest = self._summaries(), _latest_alarms(self._store)
+        self._seq, self._shown = 255, {}
+        number = SparkplugMetric(BIRTH_SEQUENCE, self._birth_number, INT64)
+        self._send("NBIRTH", [number, SparkplugMetric(REBIRTH, False, BOOLEAN)])
+        for actuator, summary in summaries.items():
+            self._bear_device(actuator, summary, latest.get(actuator, {}))
+
+    def _bear_device(self, actuator: str, summary: dict[str, Any], alarm: dict[str, Any]) -> None:
+        metrics = [
+            *_metrics(_STATE, summary, _clock(summary["t"])),
+            *_metrics(_ALARM, alarm, _clock(alarm.get("updated_s"))),
+            *_metrics(_EVENT, {}, _now()),
+        ]
+        self._send("DBIRTH", metrics, actuator)
+        self._shown[actuator] = _values(_STATE, summary)
+
+    def _send(self, kind: str, metrics: list[SparkplugMetric], actuator: str | None = None) -> bool:
+        """Send a message with the next sequence number; return whether it went out."""
+        self._seq = after(self._seq)
+        topic = self._topic(kind, None if actuator is None else topic_part(actuator))
+        sent = self._client.publish(topic, encoded(SparkplugPayload(_now(), tuple(metrics), self._seq)), qos=0)
+        try:
+            sent.wait_for_publish(_SENT_S)
+        except (RuntimeError, ValueError):  # the connection is lost: births come with the next one
+            return False
+        return bool(sent.is_published())
+
+
+def _now() -> int:
+    return round(1000.0 * time.time())
+
+
+def _clock(t: float | None) -> int:
+    """Return a clock of samples [s] in [ms]; where it does not count from 1970, the present."""
+    return round(1000.0 * t) if t is not None and 1e8 < t < 1e11 else _now()
+
+
+def _values(table: _Table, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a table's metrics, None where there is none."""
+    known: dict[str, Any] = {}
+    for name, (_, _, path) in table.items():
+        value: Any = values
+        for part in path:
+            if isinstance(value, Mapping):
+                value = value.get(part)
+            elif isinstance(value, (list, tuple)):
+                value = value[int(part)]
+        known[name] = value
+    return known
+
+
+def _of_values(table: _Table, values: Mapping[str, Any], at: int) -> list[SparkplugMetric]:
+    return [
+        SparkplugMetric(name, value, table[name][0], timestamp=at, unit=table[name][1])
+        for name, value in values.items()
+    ]
+
+
+def _metrics(table: _Table, values: Mapping[str, Any], at: int) -> list[SparkplugMetric]:
+    """Return the metrics of a table, of the time `at` [ms]."""
+    return _of_values(table, _values(table, values), at)
+
+
+def _latest_alarms(store: MonitorStore) -> dict[str, dict[str, Any]]:
+    """Return of each actuator the alarm that was raised last."""
+    latest: dict[str, dict[str, Any]] = {}
+    for alarm in store.alarms():
+        latest.setdefault(alarm["actuator"], alarm)
+    return latest

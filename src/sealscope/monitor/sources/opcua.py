@@ -1,0 +1,156 @@
+"""Blocks from an OPC UA server: values by subscription, gathered into blocks.
+
+Each channel of an actuator is a variable of the server, whose value is a number, or an array of samples from its source
+timestamp on. The server keeps what changes between two publications in a queue of each item; what it sends while
+nobody is connected is lost, for OPC UA subscriptions end with their session.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from sealscope.errors import MissingExtra
+from sealscope.monitor.outages import OPCUA
+from sealscope.monitor.settings import OpcUaSettings, secret_of
+from sealscope.monitor.sources.gathering import ValueGatherer
+from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock, digest_of
+from sealscope.recordings.recording import CHANNEL_UNITS, Recording
+from sealscope.units import to_si
+
+_log = logging.getLogger(__name__)
+#: Publications in a block, and blocks that wait for the service; more are dropped and counted.
+_PUBLICATIONS, _ROOM = 4, 256
+#: Pauses between two tries to connect [s], and how often the connection is looked at [s].
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S, _LOOK_S = 0.5, 30.0, 0.5
+_NO_ROOM = "blocks of OPC UA that found no room"
+_NO_NUMBER = "OPC UA values that are no number"
+
+
+def opcua_of(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
+    """Return the source of a server's values; raises InputError for a secret that cannot be read."""
+    try:
+        import asyncua  # noqa: F401 (asked for before the service starts)
+    except ImportError:
+        raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'") from None
+    password = secret_of(settings.password_file, "opcua.password_file")
+    return lambda service: asyncio.run(_OpcUaSession(settings, password, service).run())
+
+
+class _OpcUaSession:
+    """The subscriptions of a service at its server; asyncua calls `datachange_notification`."""
+
+    def __init__(self, settings: OpcUaSettings, password: str | None, service: BlockReceiver) -> None:
+        self._settings, self._password, self._service = settings, password, service
+        service.outages.expect(OPCUA)
+        self._pause = _FIRST_PAUSE_S
+        self._gatherers: dict[str, ValueGatherer] = {}
+        self._scales: dict[tuple[str, str], Callable[[Any], Any]] = {}
+        self._actuators = [actuator for actuator in service.settings.actuator if actuator.nodes]
+        for actuator in self._actuators:
+            assert actuator.rate is not None  # the settings are checked
+            self._gatherers[actuator.name] = ValueGatherer(
+                tuple(actuator.nodes), actuator.rate, settings.block_s, service.count
+            )
+            for channel in actuator.nodes:
+                unit = actuator.units.get(channel, CHANNEL_UNITS[channel])
+                scale = partial(to_si, unit=unit, si_unit=CHANNEL_UNITS[channel], name=channel)
+                scale(np.zeros(1))
+                self._scales[actuator.name, channel] = scale
+        self._channels: dict[Any, tuple[str, str]] = {}
+        self._waiting: asyncio.Queue[SourceBlock] = asyncio.Queue(_ROOM)
+
+    async def run(self) -> None:
+        """Hand blocks over until the service stops; after a lost connection a new one is made."""
+        handing = asyncio.create_task(self._hand())
+        try:
+            while not self._service.stopping.is_set():
+                try:
+                    await self._connected()
+                except Exception as error:  # whatever the library and the server make of a lost connection
+                    reason = " ".join(str(error).split()) or type(error).__name__
+                    self._service.outages.lost(OPCUA, f"{self._settings.url}: {reason}")
+                for gatherer in self._gatherers.values():
+                    gatherer.interrupted()
+                await self._rest(self._pause)
+                self._pause = min(2.0 * self._pause, _LONGEST_PAUSE_S)
+        finally:
+            handing.cancel()
+            with suppress(asyncio.CancelledError):
+                await handing
+
+    async def _rest(self, seconds: float) -> None:
+        """Wait, but not beyond the service's end."""
+        for _ in range(max(1, math.ceil(seconds / _LOOK_S))):
+            if self._service.stopping.is_set():
+                return
+            await asyncio.sleep(_LOOK_S)
+
+    async def _connected(self) -> None:
+        """Connect, subscribe, and stay until the connection is lost (which raises) or the service stops."""
+        from asyncua import Client
+
+        client = Client(self._settings.url, timeout=self._settings.timeout_s)
+        if self._settings.security is not None:
+            await client.set_security_string(self._settings.security)
+        if self._settings.user is not None:
+            client.set_user(self._settings.user)
+            client.set_password(self._password or "")
+        async with client:
+            period = 1000.0 * self._settings.block_s / _PUBLICATIONS
+            subscription = await client.create_subscription(period, self)
+            for actuator in self._actuators:
+                nodes = {client.get_node(node): channel for channel, node in actuator.nodes.items()}
+                self._channels.update({node.nodeid: (actuator.name, channel) for node, channel in nodes.items()})
+                rate = float(actuator.rate or 1.0)
+                answers = await subscription.subscribe_data_change(
+                    list(nodes), queuesize=math.ceil(2.0 * rate * self._settings.block_s), sampling_interval=1e3 / rate
+                )
+                for (node, channel), answer in zip(nodes.items(), answers, strict=True):
+                    if not isinstance(answer, int):
+                        raise ConnectionError(f"{actuator.name}: {channel} is no node, got {node.nodeid} ({answer})")
+            self._service.outages.back(OPCUA)
+            self._pause = _FIRST_PAUSE_S
+            while not self._service.stopping.is_set():
+                await client.check_connection()
+                await asyncio.sleep(_LOOK_S)
+
+    def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
+        """Take a value of a subscription."""
+        name, channel = self._channels[node.nodeid]
+        stamped = data.monitored_item.Value
+        at = stamped.SourceTimestamp or stamped.ServerTimestamp or datetime.now(UTC)
+        t = (at if at.tzinfo is not None else at.replace(tzinfo=UTC)).timestamp()
+        known = stamped.StatusCode is None or stamped.StatusCode.is_good()
+        try:
+            samples = np.atleast_1d(np.asarray(value if known else math.nan, dtype=np.float64))
+            samples = np.where(np.isfinite(samples), samples, math.nan)
+        except (TypeError, ValueError):
+            samples = np.empty((0, 0))
+        if samples.ndim != 1 or not samples.size:
+            self._service.count(_NO_NUMBER)
+            return
+        for block in self._gatherers[name].take(channel, t, self._scales[name, channel](samples).tolist()):
+            try:
+                self._waiting.put_nowait(SourceBlock(name, _identity(block), block))
+            except asyncio.QueueFull:
+                self._service.count(_NO_ROOM)
+
+    async def _hand(self) -> None:
+        """Hand blocks to the service, which may wait, while the connection lives on."""
+        while True:
+            block = await self._waiting.get()
+            await asyncio.to_thread(self._service.hand, block)
+
+
+def _identity(block: Recording) -> str:
+    """Return the digest of a block: what comes twice is known."""
+    return digest_of(np.concatenate([block.t, *block.channels.values()]).tobytes())

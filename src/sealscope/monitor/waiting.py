@@ -1,0 +1,74 @@
+"""Things that wait for another thread: at most so many, and so many bytes."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Generic, TypeVar
+
+_Item = TypeVar("_Item")
+
+
+class Waiting(Generic[_Item]):
+    """A queue between threads that is bounded in number and in bytes; something larger than all bytes fits alone.
+
+    Parameters
+    ----------
+    most : int
+        Things at a time.
+    most_bytes : int
+        Their bytes, as `put` states them.
+    """
+
+    def __init__(self, most: int, most_bytes: int) -> None:
+        self._most, self._most_bytes = most, most_bytes
+        self._items: deque[tuple[_Item, int]] = deque()
+        self._bytes = 0
+        self._at_hand = self._at_hand_bytes = 0
+        self._changed = threading.Condition()
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of what waits."""
+        return self._bytes
+
+    def unsettled(self) -> tuple[int, int]:
+        """Return the number of things that wait or were taken since the last `settle`, and their bytes."""
+        with self._changed:
+            return len(self._items) + self._at_hand, self._bytes + self._at_hand_bytes
+
+    def settle(self) -> None:
+        """State that all that was taken is dealt with."""
+        with self._changed:
+            self._at_hand = self._at_hand_bytes = 0
+
+    def _room(self, size: int) -> bool:
+        return not self._items or (len(self._items) < self._most and self._bytes + size <= self._most_bytes)
+
+    def put(self, item: _Item, size: int, timeout: float = 0.0, *, always: bool = False) -> bool:
+        """Append something of `size` bytes; return False where there was no room for `timeout` [s].
+
+        `always`: beyond the bounds, for what somebody else bounds.
+        """
+        with self._changed:
+            if not always and not self._changed.wait_for(lambda: self._room(size), timeout):
+                return False
+            self._items.append((item, size))
+            self._bytes += size
+            self._changed.notify_all()
+            return True
+
+    def take(self, most: int, timeout: float) -> list[_Item]:
+        """Return the next things, at most so many: what is there, or what comes first within `timeout` [s]."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._items), timeout)
+            taken = [self._items.popleft() for _ in range(min(most, len(self._items)))]
+            size = sum(size for _, size in taken)
+            self._bytes -= size
+            self._at_hand += len(taken)
+            self._at_hand_bytes += size
+            self._changed.notify_all()
+            return [item for item, _ in taken]

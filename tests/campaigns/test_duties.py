@@ -1,0 +1,159 @@
+"""Targets, controllers and loads of a plan: the words of the command line, and what becomes of them on a machine."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from sealscope.campaigns.cases.bound import _opened, change_bound
+from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.machines import experiment_of
+from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.plans.reader import load_plan
+from sealscope.control import Flatness
+from sealscope.errors import InputError
+from sealscope.simulation.bench.machines import draw
+from sealscope.simulation.bench.profile import load_profile
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.integrate import trajectory
+
+PLAN = """
+[campaign]
+name = "loops"
+rig = "thesis-closed-loop"
+profile = "closed-loop"
+duration = "6 s"
+onset = "3 s"
+seed = 3
+detectors = ["volume balance"]
+
+[factors]
+command = ["position 20 mm sin(2t)"]
+controller = ["pi", "flatness"]
+load = ["300 N sin(0.5t)"]
+
+[[records]]
+count = 2
+"""
+PROFILES = ("closed-loop", "load", "single-rod")
+
+
+def plan_of(folder, text):
+    path = folder / "plan.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_plan(path)
+
+
+def test_a_machine_follows_its_target_under_its_load(tmp_path):
+    plan = plan_of(tmp_path, PLAN)
+    pi, flat = (experiment_of(plan, case) for case in cases_of(plan))
+    assert str(pi.target) == "position 20 mm sin(2t)"
+    assert [type(one.controlled).__name__ for one in (pi, flat)] == ["PositionPI", "Flatness"]
+    assert str(pi.load) == "load 300 N sin(0.5t)"
+    assert pi.x_0 == 0.0
+    row = work(plan, cases_of(plan)[0])
+    assert row.error is None
+    assert row.statements["volume balance"].verdict == "cannot tell"  # 6 s are too short
+
+
+def test_the_controller_assumes_the_rig_as_designed_and_not_the_machine(tmp_path):
+    plan = plan_of(tmp_path, PLAN)
+    experiment = experiment_of(plan, cases_of(plan)[1])
+    assert experiment.controlled == Flatness.of(plan.rig) != Flatness.of(experiment.rig)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ('"position 20 mm sin(2t)"', '"position 900 mm sin(2t)"', "factors.command: position must stay within"),
+        ('"position 20 mm sin(2t)"', '"position 20 sin(2t)"', "factors.command: position must have its unit"),
+        ('"position 20 mm sin(2t)"', "5", "a command must be a text such as '3 sin(4t)' or 'position 50 mm sin(2t)'"),
+        ('"position 20 mm sin(2t)"', '"3 sin(4t)"', "factors.controller must have targets to follow"),
+        ('"pi", "flatness"', '"pid"', "factors.controller: controller must be one of pi, flatness"),
+        ('"pi", "flatness"', "2", "a controller must be a text such as 'pi', got 2"),
+        ("300 N", "300", "factors.load: load must have its unit (N, kN)"),
+        ('rig = "thesis-closed-loop"', 'rig = "servo-valve"', ""),
+    ],
+)  # fmt: skip
+def test_a_duty_that_no_run_can_have_is_refused_in_one_line(tmp_path, before, after, told):
+    text = PLAN.replace(before, after)
+    if not told:  # a controller that reads the pump's angle, on a rig without one
+        text, told = text.replace('"flatness"', '"fault-tolerant"'), "factors.controller: "
+    with pytest.raises(InputError, match=re.escape(told)) as error:
+        plan_of(tmp_path, text)
+    assert "plan.toml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_controller_of_ones_own_is_part_of_the_case(tmp_path):
+    law = "class Law:\n    rate = 500.0\n    delay = 1\n    def __init__(self, rig): pass\n"
+    law += "    def start(self):\n        return lambda measured: {gain} * (measured.target - measured.x)\n"
+    own, cases = tmp_path / "own.py", []
+    for gain in (50.0, 60.0):
+        own.write_text(law.format(gain=gain), encoding="utf-8")
+        plan = plan_of(tmp_path, PLAN.replace('"pi", "flatness"', f'"{own}:Law"'))
+        cases.append({case.id for case in cases_of(plan)})
+        assert experiment_of(plan, cases_of(plan)[0]).controlled.rate == 500.0
+    assert not cases[0] & cases[1]
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_each_family_is_either_for_development_or_held_back(name):
+    halves = [load_plan(f"bench-{name}{half}") for half in ("-development", "")]
+    families = [plan.factors["family"] for plan in halves]
+    assert not set(families[0]) & set(families[1])
+    assert {*families[0], *families[1]} == {family.name for family in load_profile(name).families}
+    assert not {case.machine_seed for case in cases_of(halves[0])} & {case.machine_seed for case in cases_of(halves[1])}
+    for plan in halves:
+        assert sum(group.count for group in plan.records if not (group.leak_lpm or group.fault)) >= 400
+        for case in cases_of(plan)[:6]:
+            experiment_of(plan, case)
+
+
+def test_a_profile_says_what_differs_from_the_one_that_it_extends():
+    bench, rod = draw("bench", 5).overrides, draw("single-rod", 5, rig="single-rod-eha")
+    assert rod.controller == "pi"
+    changed = {name for name, value in rod.overrides.items() if bench.get(name) != value}
+    own = {"fluid.K_oil", "pump.G_pump", "fluid.p_charge", "makeup.p_crack"}
+    scaled = {"friction.F_pr", "friction.F_cfr", "friction.F_v"}  # factors on another rig's values
+    assert own <= changed <= own | scaled | {"line.closed_A", "line.closed_B", "line.orifices"}
+    assert 0.8e9 <= rod.overrides["fluid.K_oil"] <= 1.15e9
+
+
+def test_a_family_draws_its_loads_and_controllers():
+    machines = [draw("load", seed, rig="thesis-closed-loop", family="steady, loop closed") for seed in range(20)]
+    assert {machine.controller for machine in machines} == {"pi", "fault-tolerant"}
+    assert {str(machine.load) for machine in machines} == {"load 2 kN", "load -1 kN"}
+    with pytest.raises(InputError, match="a controller must have a target to follow"):
+        draw("load", 1, rig="thesis-closed-loop").experiment(controller="pi")
+
+
+@pytest.mark.parametrize(
+    ("duty", "told"),
+    [
+        ('commands = ["3 sin(t)"]\ncontrollers = ["pi"]\nwhy = "x"\n', "a controller must have a target to follow"),
+        ('commands = ["3 sin(t)"]\nloads = ["2"]\nwhy = "x"\n', "load must have its unit"),
+        ('commands = ["3 sin(t)"]\nloads = "2 kN"\nwhy = "x"\n', "loads of [duty] must be a list of texts"),
+        ('commands = ["position 5 mm sin(t)"]\namplitude = [0.9, 1.1]\nwhy = "x"\n', "has no amplitude to be drawn"),
+    ],
+)
+def test_a_profiles_duty_is_refused_in_one_line(tmp_path, duty, told):
+    path = tmp_path / "own.toml"
+    path.write_text(f'[profile]\nname = "own"\ntitle = "own"\nextends = "bench"\n[duty]\n{duty}', encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape(told)) as error:
+        load_profile(path)
+    assert "own.toml" in str(error.value)
+
+
+def test_the_bound_of_a_closed_loop_is_that_of_its_voltages():
+    """Put in again with the loop open, they move the piston as the controller did, and a leak shows as it would."""
+    closed = Experiment.of(rig="thesis-closed-loop", command="position 20 mm sin(2t)", duration=4.0)
+    opened = _opened(closed)
+    assert opened.controlled is None
+    a, b = (trajectory(one, ()) for one in (closed, opened))
+    assert np.max(np.abs(a["x"] - b["x"])) < 1e-4
+    sizes = [change_bound(one, 60.0, 60.0, 0.1e6) for one in (closed, opened)]
+    assert sizes[0] == sizes[1]
+    assert 1e-5 < sizes[0] < 0.1

@@ -1,0 +1,309 @@
+"""Exports of data bases, controllers and instruments are read to the channels that they hold."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sealscope.errors import UnreadableFile
+from sealscope.recordings import read
+
+from .dialects import RATE, N, T, deviations
+from .exports import EXPORTS, NAMED, POSITION, RECORDS, A, twincat
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_exports_are_read_to_their_last_digit(name: str, tmp_path: Path) -> None:
+    dialect = EXPORTS[name]
+    recording = read(dialect.write(tmp_path), **dialect.options)
+    assert recording.rate == pytest.approx(RATE, rel=1e-6)
+    assert len(recording) == N
+    assert recording.t - recording.t[0] == pytest.approx(T, abs=1e-6)
+    for channel, off in deviations(recording).items():
+        assert off <= 0.5 * dialect.digit + 1e-11, channel
+        assert np.isfinite(recording[channel]).all()
+
+
+def refused(path: Path, **options: object) -> str:
+    start = time.process_time()
+    with pytest.raises(UnreadableFile) as caught:
+        read(path, **options)  # type: ignore[arg-type]
+    assert time.process_time() - start < 5.0
+    assert "\n" not in str(caught.value)
+    return str(caught.value).replace(str(path), "FILE")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"t": 0, "p_A": 1}\n{"t": 1, "p_A": }\n{"t": 2, "p_A": 3}\n',
+         "JSON must be whole, got: Expecting value (line 2, FILE)"),
+        ('{"t": 0, "p_A [Pa]": 1e999}\n', "a sample must be a finite number, got p_A [Pa] = inf (FILE)"),
+        ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 400), "a sample must be a finite number, got p_A [Pa] = 1000"),
+        ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 9000), "JSON must be plain, got: Exceeds the limit"),
+        ('{"t": 0, "p": ' + "[" * 100_000, "JSON must be plain, got: maximum recursion depth"),
+        ('[{"t": 0, "p_A": {"value": 1, "unit": "bar"}}, {"t": 1, "p_A": {"value": 1, "unit": "psi"}}]',
+         "p_A must have one unit, got bar and psi (row 2, FILE)"),
+        ('{"t": 0}\n3\n', "JSON must hold objects or arrays, got '3' (row 2, FILE)"),
+        ('[["t", "p_A"], [0, 1, 2]]', "a row must have 2 values, got 3 (row 1, FILE)"),
+        ("[]", "a recording must have samples, got empty JSON (FILE)"),
+        ('{"a": {}}', "JSON must hold records or columns of samples, got none (FILE)"),
+        ('{"t": [0, 1], "p_A [Pa]": [1, 2, 3]}', "p_A [Pa] must have as many samples as t (2), got 3 (FILE)"),
+        ("\n".join(f'{{"n{k}": 1}}' for k in range(2000)), "records must have at most 1024 names, got more (FILE)"),
+        ("[" + "[]," * 50_000, "JSON must hold records or columns of samples, got none (FILE)"),
+        ('{"a": "' + "x" * 3_000_000, "JSON must be whole, got: Unterminated string starting at (line 1, FILE)"),
+        ('{"a":[' + "{}," * 4_300_000 + "0]}", "JSON must have at most 4194304 parts in one value (FILE)"),
+    ],
+)  # fmt: skip
+def test_json_that_is_no_log(content: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.json"
+    path.write_text(content)
+    assert refused(path).startswith(message)
+
+
+def test_what_has_brackets_and_is_no_json_is_a_text(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = "t [s],p_A [bar]\n" + "".join(f"{k / 500},3\n" for k in range(9))
+    for above in (
+        "[Header]\n",
+        "[2024-05-31 12:00:00] started\n",
+        '["rig 3"] and [bar]\n',
+        "{rig 3}\n",
+        "[1] remark\n",
+    ):
+        path.write_text(above + rows)
+        assert read(path)["p_A"].tolist() == [3e5] * 9
+
+
+def test_a_record_that_the_end_of_the_file_cuts_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    for whole in ("".join(json.dumps(row) + "\n" for row in RECORDS), json.dumps(RECORDS)):
+        path.write_text(whole[:-9])
+        recording = read(path)
+        assert len(recording) == N - 1
+        assert "the last value is cut short and left out, after 199 rows" in recording.history
+
+
+def test_words_and_missing_values_among_the_numbers(tmp_path: Path) -> None:
+    records = [dict(row) for row in RECORDS]
+    del records[3]["p_A [bar]"]
+    records[4]["p_A [bar]"] = None
+    records[5]["p_A [bar]"] = "OVERLOAD"
+    path = tmp_path / "log.jsonl"
+    path.write_text("".join(json.dumps(row) + "\n" for row in records).replace(repr(A[6]), "NaN", 1))
+    assert np.flatnonzero(np.isnan(read(path)["p_A"])).tolist() == [3, 4, 5, 6]
+
+
+def test_a_value_is_as_long_as_may_be_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sealscope.recordings.formats.structured.json_log.LARGEST_DOCUMENT", 300_000)
+    monkeypatch.setattr("sealscope.recordings.formats.structured.json_log._CHUNK", 10_000)
+    path = tmp_path / "log.json"
+    path.write_text('{"p_A [Pa]": [' + "0," * 140_000 + "0]}")
+    assert len(read(path, rate=RATE)) == 140_001
+    path.write_text('{"p_A [Pa]": [' + "0," * 160_000 + "0]}")
+    assert refused(path) == ("JSON must be whole, got: over 300000 signs in one, write a record a line (line 1, FILE)")
+
+
+def test_a_large_document_is_read_in_blocks(tmp_path: Path) -> None:
+    path, many = tmp_path / "log.json", 100
+    path.write_text(json.dumps({name: cells * many for name, cells in NAMED.items() if name != "t [s]"}, indent=1))
+    assert path.stat().st_size > 2**20
+    recording = read(path, rate=RATE)
+    assert np.array_equal(recording["p_A"], np.tile(np.array(A) * 1e5, many))
+
+
+def test_whole_seconds_of_a_controller_s_log_are_shared_among_its_samples(tmp_path: Path) -> None:
+    """A data log of the S7-1200: a record's number, date and time in two columns, and an end that says so."""
+    begin = np.datetime64("2024-05-31T23:59:50")
+    rows = []
+    for k in range(400):
+        day, clock = str(begin + np.timedelta64(k // 10, "s")).split("T")
+        rows.append(f"{k + 1},{day[5:7]}/{day[8:]}/{day[:4]},{clock},{3 + k % 5}\n")
+    (tmp_path / "log.csv").write_text("Record,Date,UTC Time,p_A [bar]\n" + "".join(rows) + "//END\n")
+    recording = read(tmp_path / "log.csv")
+    assert recording.rate == 10.0
+    assert recording.t == pytest.approx(np.arange(400) / 10, abs=0.1)
+    assert recording.provenance["start"].startswith("2024-05-31T23:59:50")
+
+
+def saved(folder: Path, head: str, rows: list[str]) -> Path:
+    (folder / "log.csv").write_text(
+        f"{head},p_A [bar]\n" + "".join(f"{row},{3 + k % 5}\n" for k, row in enumerate(rows))
+    )
+    return folder / "log.csv"
+
+
+def test_milliseconds_that_are_no_part_of_the_seconds_are_left_out(tmp_path: Path) -> None:
+    """A count since the start stands beside stamps, too: it does not begin again with the next second."""
+    for many in (50, 500):
+        rows = [f"12:00:{1 + int(k / 50 + 0.5):02d},{20 * k}" for k in range(many)]
+        recording = read(saved(tmp_path, "Time,ms", rows))
+        assert "ms beside column Time not used: no parts of its seconds" in recording.history
+        assert np.all(np.diff(recording.t) < 1.5)
+    assert recording.rate == pytest.approx(50.0, rel=0.02)
+    within = [f"{k / 50:.2f},{(k * 7) % 90}" for k in range(100)]
+    recording = read(saved(tmp_path, "t [s],ms", within))
+    assert recording.t == pytest.approx(np.arange(100) / 50, abs=1e-9)
+    assert "ms beside column t [s] not used: no parts of its seconds" in recording.history
+
+
+def test_hours_minutes_and_seconds_must_be_those_of_a_clock(tmp_path: Path) -> None:
+    assert refused(saved(tmp_path, "h,m,s", [f"0,{k},0" for k in range(80)])) == (
+        "time must be whole hours below 24, whole minutes and seconds below 60, got others in columns h, m, s (FILE)"
+    )
+    # the time since the start in three units: that in seconds is read, as without the others
+    recording = read(saved(tmp_path, "hours,minutes,seconds", [f"{k / 1.8e6},{k / 3e4},{k / 500}" for k in range(80)]))
+    assert recording.t == pytest.approx(np.arange(80) / 500, abs=1e-9)
+    assert recording.rate == 500.0
+
+
+def test_a_column_called_date_is_the_time_where_it_holds_times_of_the_day(tmp_path: Path) -> None:
+    for cells in (["1", "2", "3"], ["2024-05-31", "2024-06-01", "2024-06-02"]):
+        assert "got dates alone in column data (FILE)" in refused(saved(tmp_path, "data", cells))
+    assert read(saved(tmp_path, "data", ["1", "2", "3"]), channel_map={"t": "data[s]"}).rate == 1.0
+
+
+def test_a_column_called_s_that_a_map_takes_is_no_part_of_the_time(tmp_path: Path) -> None:
+    path = saved(tmp_path, "h,m,s", [f"1,2,{k}" for k in range(80)])
+    recording = read(path, channel_map={"x": "s[mm]"}, rate=500)
+    assert recording["x"] == pytest.approx(np.arange(80) * 1e-3)
+    assert "a recording must have a time column" in refused(path, channel_map={"x": "s[mm]"})
+
+
+def test_parts_of_the_time_in_other_tables(tmp_path: Path) -> None:
+    import pandas as pd
+
+    openpyxl = pytest.importorskip("openpyxl")
+    moments = pd.date_range("2024-05-31 23:59:59.9", periods=N, freq="2ms")
+    frame = pd.DataFrame({"Date": moments.floor("s"), "ms": moments.microsecond // 1000, "p_A [bar]": A})
+    frame.to_parquet(tmp_path / "log.parquet")
+    book = openpyxl.Workbook()
+    book.active.append(["Date", "Time", "ms", "p_A [bar]"])
+    for moment, value in zip(moments, A, strict=True):
+        whole = moment.floor("s").to_pydatetime()
+        book.active.append([whole.date(), whole.time(), moment.microsecond // 1000, value])
+    book.save(tmp_path / "log.xlsx")
+    for name in ("log.parquet", "log.xlsx"):
+        recording = read(tmp_path / name)
+        assert recording.t == pytest.approx(T, abs=1e-9)
+        assert recording.provenance["start"].startswith("2024-05-31T23:59:59.9")
+
+
+def test_a_slower_channel_of_a_twincat_export_is_interpolated(tmp_path: Path) -> None:
+    recording = read(twincat(every=2)(tmp_path))
+    known = T[-2] >= T
+    assert recording["x"][known] == pytest.approx(1e-3 * np.interp(T, T[::2], POSITION[::2])[known], abs=1e-9)
+    assert np.isnan(recording["x"][~known]).all()
+    assert "x at 250 Hz: interpolated linearly to 500 Hz" in recording.history
+    assert recording.provenance["start"].startswith("2022-05-02T13:56:24.376")
+
+
+def test_channels_of_one_length_whose_clocks_differ_are_not_put_beside_each_other(tmp_path: Path) -> None:
+    """Columns called t, the second half an interval late: the same rows are not the same moments."""
+    rows = "".join(f"{k / 100:.4f},{k},{k / 100 + 0.005:.4f},{k}\n" for k in range(100))
+    (tmp_path / "log.csv").write_text("t,p_A [bar],t,p_B [bar]\n" + rows)
+    recording = read(tmp_path / "log.csv")
+    assert recording["p_A"] == pytest.approx(1e5 * np.arange(100))
+    assert recording["p_B"][1:] == pytest.approx(1e5 * (np.arange(1, 100) - 0.5))
+    # a map that names the time takes the rows as they are
+    assert read(tmp_path / "log.csv", channel_map={"t": "#1[s]"})["p_B"] == pytest.approx(1e5 * np.arange(100))
+
+
+def test_what_a_long_table_says_of_its_samples(tmp_path: Path) -> None:
+    rows = [
+        f"p_A [bar];{k / 50:.2f};{k};{k != 3:d}\np_B [bar];{k / 50:.2f};{'text' if k == 7 else k};1" for k in range(200)
+    ]
+    (tmp_path / "log.csv").write_text("Name;Time [s];Value;Validity\n" + "\n".join(rows) + "\n$RT_OFF$;4.0;0;2\n")
+    recording = read(tmp_path / "log.csv")
+    assert np.flatnonzero(np.isnan(recording["p_A"])).tolist() == [3]
+    assert np.flatnonzero(np.isnan(recording["p_B"])).tolist() == [7]
+    assert "1 value that the file calls invalid read as missing" in recording.history
+    assert "long table: 401 rows of 3 names" in recording.history
+    assert "must be a column, got columns p_A [bar], p_B [bar], $RT_OFF$" in refused(
+        tmp_path / "log.csv", channel_map={"x": "Weg"}
+    )
+
+
+def test_a_table_with_a_column_of_names_is_read_as_it_was_where_a_map_names_its_columns(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("Name,Time [s],Value\n" + "".join(f"rig 3,{k / 50},{k}\n" for k in range(99)))
+    assert read(tmp_path / "log.csv", channel_map={"p_A": "Value[bar]"})["p_A"][7] == 7e5
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("Name,Time,Value\n" + "p_A,yesterday,1\n" * 3, "time must be a stamp such as"),
+        ("Name,Time,Value\n" + "".join(f"n{k},{k},1\n" for k in range(5000)), "a long table must have at most 4096"),
+        ("Name,Time,Value\np_A,0,1\n" + "p_A,1," + "x" * 2**21, "a text log must have lines, got 1048576 signs"),
+        ("Name,Time,Value\n" + "p_A [Pa],3,1\n" * 9, "time must increase between some samples (FILE)"),
+        ("Name,Time,Value\n" + "".join(f"p_A [Pa],{k},word\np_B [Pa],{k},1\n" for k in range(99)),
+         "p_A [Pa] must hold numbers, got text (FILE)"),
+        ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,,2\n1,1,,2\n", "time must have a number in some row, got none in column t"),
+        ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,0,2\n1,1,1,2\n2,1,1,3\n", "the times of p_B [Pa] must increase"),
+    ],
+)  # fmt: skip
+def test_long_tables_and_clocks_that_are_none(content: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(content)
+    assert refused(tmp_path / "log.csv").startswith(message)
+
+
+def with_cells(folder: Path, **cells: str) -> Path:
+    """Write a log of cells with units, some of them others."""
+    rows = [f"{k / 500:.3f} s;{cells.get(f'p{k}', f'{20 + k % 3},5 bar')};{k % 7} mm" for k in range(400)]
+    (folder / "log.csv").write_text("t;p_A;x\n" + "\n".join(rows).replace(".", ","))
+    return folder / "log.csv"
+
+
+def test_a_unit_in_the_cells_is_the_same_in_the_whole_column(tmp_path: Path) -> None:
+    for cell in ("300 psi", "200 kPa", "17"):
+        assert refused(with_cells(tmp_path, p9=cell)) == (
+            f"a cell must be in bar, as others of its column, got '{cell}' (line 11, column p_A, FILE)"
+        )
+    recording = read(with_cells(tmp_path, p9="OVERLOAD", p10="", p11="0", p12="-3 bar"))
+    assert recording["p_A"][8:13] == pytest.approx([22.5e5, np.nan, np.nan, 0.0, -3e5], nan_ok=True)
+    assert any("1 cell without a number read as missing, first 'OVERLOAD' (line 11" in h for h in recording.history)
+    path = with_cells(tmp_path)
+    path.write_text(path.read_text().replace("p_A", "p_A [psi]"))
+    message = "a column must have one unit, got psi in its heading and bar in its cells (column p_A [psi], FILE)"
+    assert refused(path) == message
+
+
+def test_a_last_cell_that_is_cut_within_its_unit_is_missing(tmp_path: Path) -> None:
+    path = with_cells(tmp_path)
+    path.write_text(path.read_text()[:-1])
+    recording = read(path)
+    assert np.flatnonzero(np.isnan(recording["x"])).tolist() == [399]
+
+
+def test_units_in_the_cells_of_a_workbook(tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["Time", "p_A"])
+    for t, value in zip(T.tolist(), A, strict=True):
+        book.active.append([t, f"{value:.6f} bar"])
+    book.save(tmp_path / "log.xlsx")
+    assert read(tmp_path / "log.xlsx")["p_A"] == pytest.approx(1e5 * np.array(A), abs=0.05)
+
+
+def test_cells_that_only_look_like_quantities_are_left_alone(tmp_path: Path) -> None:
+    """A column that nothing reads may hold what looks like units: stage 1a, 2 h, 5 V and 3 A."""
+    rows = "".join(f"{k / 500},{3 + k % 5},{k}a,{k} {'VAh'[k % 3]}\n" for k in range(99))
+    (tmp_path / "log.csv").write_text("t [s],p_A [bar],stage,remark\n" + rows)
+    recording = read(tmp_path / "log.csv")
+    assert recording["p_A"].tolist() == [(3 + k % 5) * 1e5 for k in range(99)]
+    assert "columns not used: stage, remark" in recording.history
+
+
+@pytest.mark.parametrize("cell", ["1" * 60 + " bar", "1 " + "q" * 16, "1,2" * 20, "1 b r" * 12, "-" * 70 + "1"])
+def test_no_cell_keeps_the_search_for_units_busy(cell: str, tmp_path: Path) -> None:
+    start = time.process_time()
+    (tmp_path / "log.csv").write_text("t [s];p_A [Pa]\n" + f"{cell};{cell}\n" * 900)
+    refused(tmp_path / "log.csv")
+    odd = ";".join(f"{k} q{chr(97 + k % 26)}{chr(97 + k // 26 % 26)}" for k in range(65, 3000))
+    (tmp_path / "log.csv").write_text("t [s];p_A [Pa]\n" + f"{odd}\n" * 3)
+    refused(tmp_path / "log.csv")
+    assert time.process_time() - start < 5.0

@@ -1,0 +1,94 @@
+"""A long recording read part by part: the same samples as read whole, in memory that does not grow with the file."""
+
+from __future__ import annotations
+
+import gzip
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import sealscope as ss
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.formats import text
+
+RATE = 500.0
+
+
+def rows(count: int, *, stamps: bool) -> str:
+    t = np.arange(count) / RATE
+    clock = np.datetime64("2026-05-31T23:59:50", "ms") + np.round(1e3 * t).astype("timedelta64[ms]")
+    p_A, p_B = 300 + 60 * np.sin(4 * t), 300 - 60 * np.sin(4 * t)
+    times = clock.astype(str) if stamps else [f"{value:.3f}" for value in t]
+    return "".join(f"{a},{b:.4f},{c:.4f}\n" for a, b, c in zip(times, p_A, p_B, strict=True))
+
+
+def log(folder: Path, count: int, *, stamps: bool = False) -> Path:
+    path = folder / "long.csv"
+    path.write_text(f"{'Timestamp' if stamps else 't [s]'},p_A [kPa],p_B [kPa]\n" + rows(count, stamps=stamps))
+    return path
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(every=st.floats(0.004, 20.0), stamps=st.booleans(), chunk=st.integers(200, 40_000))
+def test_parts_are_the_whole(every: float, stamps: bool, chunk: int, tmp_path: Path) -> None:
+    path = log(tmp_path, 3000, stamps=stamps)
+    whole = ss.read(path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(text, "_CHUNK", chunk)
+        parts = list(ss.read_parts(path, every))
+    size = max(1, round(every * RATE))
+    assert [len(part) for part in parts[:-1]] == [size] * (len(parts) - 1)
+    for name in ("p_A", "p_B"):
+        assert np.array_equal(np.concatenate([part[name] for part in parts]), whole[name])
+    assert all(part.rate == RATE or len(part) < 3 for part in parts)
+    if not stamps:
+        assert np.array_equal(np.concatenate([part.t for part in parts]), whole.t)
+    else:
+        begins = [np.datetime64(part.provenance["start"]) - np.datetime64(whole.provenance["start"]) for part in parts]
+        assert [begin / np.timedelta64(1, "ms") for begin in begins] == [2.0 * size * k for k in range(len(parts))]
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".parquet", ".csv.gz"])
+def test_other_formats_are_cut_the_same(suffix: str, tmp_path: Path) -> None:
+    plain = log(tmp_path, 1000)
+    path = tmp_path / f"other{suffix}"
+    if suffix == ".csv.gz":
+        path.write_bytes(gzip.compress(plain.read_bytes()))
+    else:
+        ss.write(ss.read(plain), path)
+    ours, theirs = list(ss.read_parts(plain, 0.7)), list(ss.read_parts(path, 0.7))
+    assert [len(part) for part in theirs] == [350, 350, 300]
+    for a, b in zip(ours, theirs, strict=True):
+        assert np.array_equal(a["p_B"], b["p_B"])
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(text, "_CHUNK", 40_000)
+    peaks = []
+    for count in (20_000, 80_000):
+        path = log(tmp_path, count)
+        next(ss.read_parts(path, 4.0))  # what is imported meanwhile does not count
+        tracemalloc.start()
+        assert sum(len(part) for part in ss.read_parts(path, 4.0)) == count
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0], peaks
+
+
+def test_a_bad_row_names_its_line_after_the_parts_before_it(tmp_path: Path) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text("t [s],p_A [kPa],p_B [kPa]\n" + rows(700, stamps=False) + "1.4,inf,300\n")
+    parts = []
+    with pytest.raises(UnreadableFile, match=r"must be a finite number, got 'inf' \(line 702"):
+        parts.extend(ss.read_parts(path, 1.0))
+    empty = tmp_path / "empty.csv"
+    empty.write_text("t [s],p_A [kPa],p_B [kPa]\n")
+    with pytest.raises(UnreadableFile, match="must have samples"):
+        list(ss.read_parts(empty, 1.0))
+    for every in (0.0, float("inf"), float("nan")):
+        with pytest.raises(InputError, match="every must be > 0 s and finite"):
+            ss.read_parts(path, every)
