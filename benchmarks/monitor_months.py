@@ -173,7 +173,8 @@ class Life:
                 lpm = self.lpm(clock - onset)
                 g = cold * WARMEST**warm * (1.0 + slow.after(passed)) + lpm / flow
                 block = changed(blocks[random.integers(len(blocks))], 1000.0 + clock, g, scaled)
-                estimate = watch.judged(block, 1000.0 + clock + 0.5 * self.seconds)
+                shown = watch.estimator.readings(block, watch.to_learn)
+                estimate = watch.judged(shown, 1000.0 + clock + 0.5 * self.seconds)
                 leaked = ran if clock <= onset else leaked
                 ran += self.seconds
                 if watch.leak is None:

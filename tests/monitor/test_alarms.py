@@ -14,7 +14,7 @@ from sealscope.monitor.alarms.alarm import status_word
 from sealscope.monitor.alarms.judging import AlarmJudge, Thresholds
 from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.outputs.lines import EventLines
-from sealscope.monitor.stream.watch import BlockEstimate, WatchedLeak
+from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 
 THRESHOLDS = Thresholds(warning_lpm=0.002, error_lpm=0.01, debounce=2, return_share=0.5)
 LEAK = WatchedLeak(

@@ -15,7 +15,8 @@ from sealscope.diagnosis.changepoint.smooth_drift import find_step, share_of_thr
 from sealscope.errors import InputError
 from sealscope.monitor.stream.baseline import WatchBaseline
 from sealscope.monitor.stream.decisions import level_rise_of, near_an_alarm, worth_a_search
-from sealscope.monitor.stream.watch import BlockEstimate, Watch
+from sealscope.monitor.stream.estimates import BlockEstimate
+from sealscope.monitor.stream.watch import Watch
 from sealscope.recordings.recording import Recording
 
 from ..diagnosis.balance_machine import machine, step
@@ -204,7 +205,7 @@ def test_a_dismissed_leak_is_compared_with_nothing_before():
     "damage",
     [
         {"version": 99},
-        {"window": {"t": 1}},
+        {"estimator": {"area": 1}},
         {"samples": None},
         {"leak": {"raised_s": "x"}},
         {"means": {"shape": [1e12, 4], "f8": ""}},

@@ -20,7 +20,8 @@ from sealscope.monitor.outages import Outages
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.stream.baseline import plain_dataclass
-from sealscope.monitor.stream.watch import BlockEstimate, Watch, watch
+from sealscope.monitor.stream.estimates import BlockEstimate
+from sealscope.monitor.stream.watch import Watch, watch
 from sealscope.recordings.recording import Recording
 
 _log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from typing import Any
 from sealscope.errors import InputError
 from sealscope.monitor.alarms.alarm import NEXT_CHECKS, Alarm, AlarmState, Level
 from sealscope.monitor.stream.baseline import plain_dataclass
-from sealscope.monitor.stream.watch import BlockEstimate, WatchedLeak
+from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from sealscope.errors import InputError, MissingExtra
 from sealscope.monitor.alarms.alarm import Alarm
 from sealscope.monitor.memory.packing import packed, unpacked_samples
 from sealscope.monitor.memory.postgresql import engine_options, limit_answers
-from sealscope.monitor.stream.watch import BlockEstimate
+from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
