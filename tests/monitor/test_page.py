@@ -7,22 +7,35 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
 from sealscope.errors import InputError
+from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, PageSettings
 
-from .plant import lines_of
+from .plant import lines_of, until
 from .test_service import SOUND, WORN
 
 HOSTILE = '<img src=x onerror="document.title=1">\\ \n&amp;'
-PAGES = ("/", "/page.js", "/page.css", "/uPlot.js", "/uPlot.css", "/metrics", "/api/fleet", "/login")
+PAGES = (
+    "/",
+    "/page.js",
+    "/live.js",
+    "/twin.js",
+    "/page.css",
+    "/uPlot.js",
+    "/uPlot.css",
+    "/metrics",
+    "/api/fleet",
+    "/login",
+)
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +71,9 @@ def test_everything_is_served_and_nothing_comes_from_elsewhere(page: TestClient)
         answer = page.get(address)
         assert answer.status_code == 200
         assert answer.headers["content-security-policy"].startswith("default-src 'none'; script-src 'self'")
-        if address in ("/", "/page.js", "/page.css"):
+        if address in ("/", "/page.js", "/live.js", "/twin.js", "/page.css"):
             assert "http://" not in answer.text and "https://" not in answer.text
-    assert "innerHTML" not in page.get("/page.js").text
+            assert "innerHTML" not in answer.text and "style=" not in answer.text
 
 
 def test_the_leaking_one_comes_first_with_its_life(page: TestClient):
@@ -149,6 +162,31 @@ def test_a_port_in_use_is_one_line(service: Service):
     service.actuators.closed = False
 
 
+def look_at_the_live_part(view: Any, live: LiveSamples) -> None:
+    """Pressures, details and the drawing show what comes, say what does not, and stop while nobody looks."""
+    until(lambda: live._windows)
+    live.take(HOSTILE, WORN.between(0.0, 60.0))
+    view.locator("#live-says", has_text="As of 00:00:59, 50 Hz").wait_for()
+    view.locator("#pressures canvas").wait_for()
+    view.locator("#details canvas").wait_for()
+    assert (view.text_content("#twin-leak-text") or "").startswith("leak 0.00")
+    assert view.locator("#twin-leak").is_visible() and not view.locator("#twin-valve").is_visible()
+    view.locator("#twin-x", has_text=" mm").wait_for()
+    away = "() => document.querySelector('#twin-moving').getAttribute('transform') != 'translate(200.00 0)'"
+    view.wait_for_function(away)
+    view.locator("[data-drawn=details]").focus()
+    view.keyboard.press("Enter")
+    view.locator("#details-title", has_text="Details d1 to d4").wait_for()
+    pressures = WORN.between(70.0, 74.0).only(("p_A", "p_B"))
+    live.take(HOSTILE, pressures)
+    view.locator("#twin-missing", has_text="No position is recorded").wait_for()
+    assert view.get_attribute("#twin-moving", "transform") == "translate(200.00 0)"
+    view.locator("#pause").click()
+    until(lambda: not live._windows)  # nothing is sent any more
+    view.locator("#pause").click()
+    until(lambda: live._windows)
+
+
 @pytest.mark.slow
 def test_the_page_in_a_browser(service: Service):
     """The alarm appears, the hostile name stays text, the alarm is acknowledged by keyboard, at both widths."""
@@ -156,7 +194,8 @@ def test_the_page_in_a_browser(service: Service):
     browser_path = shutil.which("chromium")
     if browser_path is None:
         pytest.skip("chromium is not installed")
-    server = PageServer(service.actuators, PageSettings(port=0))
+    live = LiveSamples(service.store.last_samples)
+    server = PageServer(service.actuators, PageSettings(port=0), live=live)
     try:
         with playwright.sync_playwright() as player:
             browser = player.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
@@ -180,6 +219,7 @@ def test_the_page_in_a_browser(service: Service):
                     view.locator("#mark-answer", has_text="acknowledged").wait_for()
                     view.locator("#alarm-title", has_text="acknowledged").wait_for()
                 assert "acknowledged" in (view.text_content("#alarm-title") or "")
+                look_at_the_live_part(view, live)
                 assert errors == []
                 service.outages.lost("broker", "<b>gone</b>")
                 view.locator("#outages", has_text="The broker is not reached").wait_for()

@@ -352,6 +352,11 @@ class WatchedActuators:
         self._tell()
         return alarm
 
+    @property
+    def rigs(self) -> dict[str, str]:
+        """The rig of each actuator, by name or path."""
+        return {name: settings.rig for name, settings in self._settings.items()}
+
     def plain(self) -> dict[str, dict[str, Any]]:
         """Return what each actuator of the settings shows now, as its last transaction left it."""
         known = self.store.summaries()

@@ -21,6 +21,7 @@ from sealscope.monitor.memory.store import MonitorStore, away
 from sealscope.monitor.outages import DATABASE, WEBHOOK
 from sealscope.monitor.outputs.lines import EventLines
 from sealscope.monitor.outputs.webhook import Webhook
+from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import MonitorSettings, secret_of
 from sealscope.monitor.sources.folder import WatchedFolder
@@ -97,11 +98,12 @@ class Service:
         except BaseException:
             self._hold.close()
             raise
+        self._live = LiveSamples(self.store.last_samples)
         self._lines = EventLines(self.store, self._stdout)
         self.page: PageServer | None = None
         if settings.page is not None and not once:
             try:
-                self.page = PageServer(self.actuators, settings.page, self.waits)
+                self.page = PageServer(self.actuators, settings.page, self.waits, self._live)
             except BaseException:
                 self._hold.close()
                 raise
@@ -114,6 +116,7 @@ class Service:
             if _worth_a_line(self._refused):
                 _log.warning("%s (message %d without a block)", block, self._refused)
             return
+        self._live.take(block.actuator, block.samples)
         size = bytes_of(block.samples)
         if self._queue.put(block, size):
             return

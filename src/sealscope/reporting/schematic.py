@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from math import sqrt
 from typing import Any
@@ -69,12 +70,12 @@ class Circuit:
         return " ".join(parts)
 
 
-def circuit_of(rig: Rig | None, recording: Recording) -> Circuit:
+def circuit_of(rig: Rig | None, recorded: Container[str]) -> Circuit:
     """Return what to draw of a machine: of an unknown one only what every pump-controlled actuator has.
 
     A bypass is drawn where its flow meter was recorded: no rig states it.
     """
-    bypass = "q_leak" in recording
+    bypass = "q_leak" in recorded
     if rig is None:
         return Circuit("AB", _ROD, False, False, bypass, False, dict.fromkeys((v[0] for v in _VALUES.values()), ""))
     values = {

@@ -225,12 +225,23 @@ class MonitorStore:
         """Return settings and state as of the checkpoint, and the samples since then; None where there is none."""
         from sqlalchemy import select
 
-        actuators, pending = self.tables.actuators, self.tables.pending
+        actuators = self.tables.actuators
         with self.engine.connect() as connection:
             row = connection.execute(select(actuators).where(actuators.c.actuator == actuator)).first()
-            query = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
-            samples = [unpacked_samples(data) for (data,) in connection.execute(query)]
+            samples = self._pending(connection, actuator)
         return None if row is None else (row.settings, json.loads(row.checkpoint), samples)
+
+    def _pending(self, connection: Connection, actuator: str) -> list[tuple[Recording, bool]]:
+        from sqlalchemy import select
+
+        pending = self.tables.pending
+        query = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
+        return [unpacked_samples(data) for (data,) in connection.execute(query)]
+
+    def last_samples(self, actuator: str) -> list[Recording]:
+        """Return the samples of an actuator since its last checkpoint."""
+        with self.engine.connect() as connection:
+            return [samples for samples, _ in self._pending(connection, actuator)]
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Return what each actuator showed last."""

@@ -200,6 +200,7 @@ function showLife(life) {
   const passed = Object.entries(now.counters).map(([reason, number]) => `${number} ${reason}`);
   byId("counters").textContent = passed.length ? passed.join("; ") : "none";
   draw(life.course, life.events);
+  showMachine(life.machine, now, alarm);
 }
 
 async function refresh() {
@@ -207,6 +208,7 @@ async function refresh() {
   showOutages(fleet);
   if (chosen === null && fleet.actuators.length) chosen = fleet.actuators[0].name;
   showFleet(fleet);
+  listen();
   if (chosen === null) return;
   const query = hours ? `?hours=${hours}` : "";
   showLife(await asked(`/api/actuator/${encodeURIComponent(chosen)}${query}`));
@@ -272,11 +274,6 @@ async function soon() {
   }, 500);
 }
 
-const news = new EventSource("/api/changes");
-news.onmessage = soon;
-news.onerror = () => {
-  byId("overall").textContent = "the monitor does not answer";
-};
 addEventListener("resize", soon);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", soon);
 soon();

@@ -8,9 +8,11 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import hmac
+import json
 import socket
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import ExitStack
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
@@ -20,6 +22,7 @@ from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.store import away
 from sealscope.monitor.outages import DATABASE
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
+from sealscope.monitor.page.live import DRAWN, PRESSURES, LiveSamples, machine_of
 from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.settings import PageSettings, secret_of
 from sealscope.reporting.template import packaged
@@ -32,7 +35,8 @@ if TYPE_CHECKING:
 
 #: Largest body of a request [bytes], and most listeners at a time.
 _LARGEST_BODY, _MOST_LISTENERS = 10_000, 200
-#: How often listeners are served [s], and how often they get a sign of life without news.
+#: How often listeners are served [s], those who look at an actuator with its last samples too, and how often they get a
+#: sign of life without news.
 _LOOK_S, _ALIVE_S = 0.3, 15.0
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -49,6 +53,8 @@ _LOCAL = ("127.0.0.1", "localhost", "::1")
 _FILES = {
     "/": ("page.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),
+    "/live.js": ("live.js", "text/javascript"),
+    "/twin.js": ("twin.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
     "/login.css": ("page.css", "text/css"),
 }
@@ -63,10 +69,12 @@ def site(
     settings: PageSettings,
     token: str | None,
     waits: Callable[[], tuple[int, int, int]] = lambda: (0, 0, 0),
+    live: LiveSamples | None = None,
 ) -> Starlette:
     """Return the application of a monitor; with a token, nothing but the form for it is open without.
 
-    `waits`: returns how many blocks wait to be stored, their bytes, and how often a source had to wait for them.
+    `waits`: returns how many blocks wait to be stored, their bytes, and how often a source had to wait for them;
+    `live`: the samples that the service takes, those that are stored alone where there is none.
     """
     from sqlalchemy.exc import SQLAlchemyError
     from starlette.applications import Starlette
@@ -76,6 +84,8 @@ def site(
     from starlette.routing import Route
 
     store = actuators.store
+    live = live or LiveSamples(store.last_samples)
+    machines = {name: machine_of(rig) for name, rig in actuators.rigs.items()}
     listeners = 0
 
     def file(request: Request) -> Response:
@@ -101,6 +111,7 @@ def site(
             {
                 "name": name,
                 "summary": actuators.plain()[name],
+                "machine": machines[name],
                 "course": store.course(name, seconds=seconds),
                 "alarms": store.alarms(actuator=name)[:50],
                 "events": store.last_events(name),
@@ -129,20 +140,34 @@ def site(
         nonlocal listeners
         if listeners >= _MOST_LISTENERS:
             return JSONResponse({"error": "too many listeners"}, 503)
+        asked = request.query_params
+        name, pressure, drawn = asked.get("actuator", ""), asked.get("pressure", "p_A"), asked.get("drawn", "rms")
+        if name and name not in machines:
+            return JSONResponse({"error": "no such actuator"}, 404)
+        if pressure not in PRESSURES or drawn not in DRAWN:
+            return JSONResponse({"error": f"pressure must be one of {PRESSURES}, drawn one of {DRAWN}"}, 400)
 
         async def lines() -> AsyncIterator[str]:
             nonlocal listeners
             listeners += 1
+            looking = ExitStack()
             try:
-                seen, silent = -1, 0.0
+                room = bool(name) and await asyncio.to_thread(looking.enter_context, live.looked_at(name))
+                if name and not room:
+                    yield _event("live", {"name": name, "t": None, "error": "too many others are looked at"})
+                seen, pictured, silent = -1, -1, 0.0
                 while not await request.is_disconnected() and not actuators.closed:
                     if actuators.changed != seen or silent >= _ALIVE_S:
                         seen, silent = actuators.changed, 0.0
                         yield f"data: {seen}\n\n"
+                    if room and live.version(name) != pictured:
+                        pictured = live.version(name)
+                        yield _event("live", await asyncio.to_thread(live.picture, name, pressure, drawn))
                     await asyncio.sleep(_LOOK_S)
                     silent += _LOOK_S
             finally:
                 listeners -= 1
+                looking.close()
 
         return StreamingResponse(lines(), media_type="text/event-stream")
 
@@ -210,6 +235,11 @@ def site(
     return application
 
 
+def _event(kind: str, values: Mapping[str, Any]) -> str:
+    """Return an event of a stream of server-sent events; JSON keeps it on one line."""
+    return f"event: {kind}\ndata: {json.dumps(values, allow_nan=False)}\n\n"
+
+
 def _same(given: str, token: str) -> bool:
     return hmac.compare_digest(given.encode(), token.encode())
 
@@ -244,6 +274,7 @@ class PageServer:
         actuators: WatchedActuators,
         settings: PageSettings,
         waits: Callable[[], tuple[int, int, int]] = lambda: (0, 0, 0),
+        live: LiveSamples | None = None,
     ) -> None:
         try:
             import starlette  # noqa: F401 (asked for before the port is taken)
@@ -261,7 +292,10 @@ class PageServer:
         self.port = int(self._socket.getsockname()[1])
         self.address = f"http://{settings.host}:{self.port}/"
         config = uvicorn.Config(
-            site(actuators, settings, token, waits), log_level="warning", access_log=False, timeout_graceful_shutdown=2
+            site(actuators, settings, token, waits, live),
+            log_level="warning",
+            access_log=False,
+            timeout_graceful_shutdown=2,
         )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [self._socket]}, daemon=True)

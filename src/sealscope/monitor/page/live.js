@@ -1,0 +1,138 @@
+// The last seconds of the chosen actuator: its pressures, and their details, as the stream of events brings them.
+"use strict";
+
+let news = null;
+let heard = "";
+let paused = false;
+let latest = null;
+const drawing = { pressure: "p_A", drawn: "rms" };
+const plots = {};
+
+// one stream for what has changed and for the samples of who is looked at; none while nobody looks
+function listen() {
+  const query = new URLSearchParams();
+  if (chosen !== null && !paused) {
+    query.set("actuator", chosen);
+    query.set("pressure", drawing.pressure);
+    query.set("drawn", drawing.drawn);
+  }
+  const address = document.hidden ? "" : `/api/changes?${query}`;
+  if (address === heard && news && news.readyState !== EventSource.CLOSED) return;
+  if (news) news.close();
+  heard = address;
+  news = null;
+  if (!address) return;
+  news = new EventSource(address);
+  news.onmessage = soon;
+  news.addEventListener("live", (event) => showLive(JSON.parse(event.data)));
+  news.onerror = () => {
+    byId("overall").textContent = "the monitor does not answer";
+    // a refused stream is closed for good: ask again
+    if (news && news.readyState === EventSource.CLOSED) setTimeout(listen, 3000);
+  };
+}
+
+const bar = (value) => (value === null || value === undefined ? "–" : value.toFixed(value < 99.95 ? 1 : 0));
+const seconds = (value) => `${Number(value.toFixed(1))} s`;
+
+function plotOf(id, names, unit, colours, values) {
+  const place = byId(id);
+  const key = [place.clientWidth, names.join(), unit, colour("--ink")].join("|");
+  const data = [values.t, ...names.map((name) => values[name])];
+  if (plots[id] && plots[id].key === key) {
+    plots[id].plot.setData(data);
+    return;
+  }
+  if (plots[id]) plots[id].plot.destroy();
+  place.replaceChildren();
+  const grid = { stroke: colour("--line"), width: 1 };
+  const plot = new uPlot(
+    {
+      width: Math.max(240, place.clientWidth),
+      height: 190,
+      legend: { live: false },
+      scales: { x: { time: false } },
+      axes: [
+        { stroke: colour("--quiet"), grid, space: 60, values: (made, at) => at.map(seconds) },
+        { stroke: colour("--quiet"), grid, size: 58, label: unit, labelSize: 18, values: (made, at) => at.map(litres) },
+      ],
+      series: [
+        {},
+        ...names.map((name, k) => ({
+          label: name,
+          stroke: colour(colours[k]),
+          width: 1.5,
+          points: { show: false },
+        })),
+      ],
+    },
+    data,
+    place,
+  );
+  plots[id] = { key, plot };
+}
+
+function emptied(id, why) {
+  if (plots[id]) plots[id].plot.destroy();
+  delete plots[id];
+  byId(id).replaceChildren(element("p", "quiet", why));
+}
+
+function showLive(live) {
+  if (live.name !== chosen) return;
+  latest = live;
+  const says = byId("live-says");
+  if (live.t === null) {
+    says.textContent = live.error || "Waits for samples.";
+    emptied("pressures", "");
+    emptied("details", "");
+    showTwin(live);
+    return;
+  }
+  says.textContent = `As of ${clock(live.t)}, ${Number(live.rate.toPrecision(4))} Hz: ${live.channels.join(", ")}`;
+  const names = ["p_A", "p_B"].filter((name) => live.pressures[name]);
+  if (names.length) {
+    const tones = { p_A: "--side-a", p_B: "--side-b" };
+    plotOf("pressures", names, "bar", names.map((name) => tones[name]), live.pressures);
+  } else emptied("pressures", "No chamber pressure is recorded.");
+  const details = live.details;
+  if (details.t.length) {
+    const levels = ["d1", "d2", "d3", "d4"];
+    plotOf("details", levels, "kPa", levels.map((level) => `--${level}`), details);
+  } else emptied("details", `The details need ${details.needs} successive samples, ${details.has} are known.`);
+  showTwin(live);
+}
+
+function drawn() {
+  for (const button of document.querySelectorAll("[data-pressure], [data-drawn]")) {
+    const on = button.dataset.pressure === drawing.pressure || button.dataset.drawn === drawing.drawn;
+    button.setAttribute("aria-pressed", String(on));
+  }
+  byId("pause").setAttribute("aria-pressed", String(paused));
+  const what = drawing.drawn === "rms" ? "RMS over 1000 samples of the details" : "Details";
+  byId("details-title").textContent = `${what} d1 to d4 (db8) of ${drawing.pressure}`;
+}
+
+for (const button of document.querySelectorAll("[data-pressure], [data-drawn]")) {
+  button.addEventListener("click", () => {
+    Object.assign(drawing, { ...button.dataset });
+    drawn();
+    listen();
+  });
+}
+byId("pause").addEventListener("click", () => {
+  paused = !paused;
+  drawn();
+  listen();
+});
+document.addEventListener("visibilitychange", () => {
+  listen();
+  if (!document.hidden) soon();
+});
+const redrawn = () => {
+  if (latest) showLive(latest);
+};
+addEventListener("resize", redrawn);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redrawn);
+drawn();
+listen();
