@@ -196,3 +196,9 @@ def test_every_cause_has_its_check(cause: Cause) -> None:
     assert len(texts) == len(get_args(Cause))
     assert "\n" not in next_check("leak", cause)
     assert len({next_check(verdict, None) for verdict in get_args(Verdict)}) == 3
+
+
+def test_no_leak_by_the_least_specific_method_says_what_it_misses() -> None:
+    coarse, fine = ("misses most small leaks" in next_check("no leak", None, coarse=own) for own in (True, False))
+    assert (coarse, fine) == (True, False)
+    assert "misses" not in next_check("no leak", None, healthy=True, coarse=True)  # a baseline has shown its level

@@ -55,7 +55,10 @@ from sealscope.recordings.formats.headings.proposal import proposed_map
                 "p_B": "Pressure B (psi)",
             },
         ),
-        ("t [s];p_A [bar];p_B [bar];Kolbenweg [mm]", {"x": "Kolbenweg [mm]", "t": "t [s]"}),
+        (
+            "t [s];p_A [bar];p_B [bar];Kolbenweg [mm];Stellsignal [V]",
+            {"x": "Kolbenweg [mm]", "t": "t [s]", "u": "Stellsignal [V]"},
+        ),
     ],
 )
 def test_names_of_loggers(heads: str, expected: dict[str, str]) -> None:

@@ -90,7 +90,7 @@ MapOption = Annotated[
         "--map",
         metavar="CHANNEL=COLUMN",
         help="Take a channel from a foreign column, with its unit if the file has none: p_A=PG_1[psi], x=#4[mm]; "
-        "repeat. `auto`: what the columns' names tell.",
+        "repeat. `auto`: what the columns' names tell, also beside others.",
     ),
 ]
 RateOption = Annotated[float | None, typer.Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
@@ -181,20 +181,20 @@ def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
 
 
 def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
-    """Channel -> column of the `--map` options, or `auto`; raises InputError where a channel is given twice."""
+    """Channel -> column of the `--map` options, the rest by names with `auto`; InputError for a channel given twice."""
     from sealscope.recordings import split_map_option
+    from sealscope.recordings.formats.columns import REST
 
-    if options and "auto" in options:
-        if len(options) > 1:
-            raise InputError(f"--map auto must stand without other maps, got {options[options[0] == 'auto']}")
-        return "auto"
     columns: dict[str, str] = {}
     for option in options or ():
+        if option == "auto":
+            columns[REST] = option
+            continue
         channel, column = split_map_option(option)
         if channel in columns:
             raise InputError(f"--map {channel} must be given once, got {columns[channel]} and {column}")
         columns[channel] = column
-    return columns
+    return "auto" if set(columns) == {REST} else columns
 
 
 def printable(text: str, kept: str = "") -> str:

@@ -427,7 +427,7 @@ def inspect(
     """Show what a file holds and what is wrong with it; columns without a map are taken by their names."""
     from sealscope.parameters.load import save_channel_map
     from sealscope.recordings import inspect as inspected
-    from sealscope.recordings.formats.columns import map_taken
+    from sealscope.recordings.formats.columns import by_names, map_taken, stated_columns
     from sealscope.reporting import overview_text
 
     complete = True
@@ -443,16 +443,17 @@ def inspect(
             complete = False
         else:
             say(overview_text(str(file), recording, inspected(recording)))
-            if isinstance(kept, str):  # a recording of our own keeps the columns of the file that it was made from
-                kept = map_taken(recording.provenance) if recording.provenance.get("file") == file.name else {}
+            if by_names(kept):  # a recording of our own keeps the columns of the file that it was made from
+                own = recording.provenance.get("file") == file.name
+                kept = {**map_taken(recording.provenance), **stated_columns(kept)} if own else {}
     if not complete:
         raise typer.Exit(1)
-    if save_map and rig is not None and not isinstance(kept, str):
+    if save_map and rig is not None and not by_names(kept):
         if not kept:
             raise InputError(
                 f"--save-map must have a map to keep, got columns with the channels' own names ({files[0]})"
             )
-        save_channel_map(rig, kept)
+        save_channel_map(rig, stated_columns(kept))
         say(f"map kept in {rig}: later calls with --rig {rig} find it")
 
 

@@ -205,7 +205,8 @@ def read(
     channel_map : mapping of str to str or "auto", optional
         Channel (or ``t``) -> name of the file's column, or name and unit, as in ``{"p_A": "PG_1[psi]"}``, or number,
         as in ``{"p_A": "#2"}``. A column without any unit is raw counts. ``"auto"``: what the columns' names and units
-        tell, in several languages; the history says what was taken.
+        tell, in several languages; the history says what was taken. ``{"*": "auto", ...}``: so for the channels that
+        the mapping does not name.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
     format : {"text", "netcdf", "parquet", "matlab", "tdms", "mdf", "lvm", "json", "spreadsheet"}, optional

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any
 
-from sealscope.diagnosis.verdict.evidence import RAREST, Cause, Evidence, Passage, Verdict
+from sealscope.diagnosis.verdict.evidence import LEAST_SPECIFIC, RAREST, Cause, Evidence, Passage, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
 from sealscope.recordings.formats.headings.preamble import remarks_of
@@ -53,10 +53,11 @@ _CHECKS: Mapping[Cause, str] = {
 }
 
 
-def next_check(verdict: Verdict, cause: Cause | None, *, healthy: bool = False) -> str:
+def next_check(verdict: Verdict, cause: Cause | None, *, healthy: bool = False, coarse: bool = False) -> str:
     """Return what to check next on the machine, in one or two sentences.
 
-    `healthy`: with `no leak`, whether the level of the leakage is known to be that of a healthy machine.
+    With `no leak`, `healthy`: whether the level of the leakage is known to be that of a healthy machine; `coarse`:
+    whether only the least specific method, which states no size, could judge.
     """
     if cause is not None:
         return _CHECKS[cause]
@@ -67,6 +68,11 @@ def next_check(verdict: Verdict, cause: Cause | None, *, healthy: bool = False) 
         )
     if verdict == "no leak" and healthy:
         return "Nothing needs a check; keep this recording as a baseline for later ones with the same command."
+    if verdict == "no leak" and coarse:
+        return (
+            "Nothing changed in the RMS of the pressures' details, the only method that could judge here, which misses "
+            "most small leaks: see what the others need (-v), and compare with leak-free recordings."
+        )
     if verdict == "no leak":
         return (
             "Nothing changed within this recording, which does not show that the machine is healthy: compare it with "
@@ -176,7 +182,7 @@ class Diagnosis(Evidence):
     @property
     def next_check(self) -> str:
         """What to check next on the machine, in one or two sentences."""
-        return next_check(self.verdict, self.cause, healthy=self.known_healthy)
+        return next_check(self.verdict, self.cause, healthy=self.known_healthy, coarse=self.detector == LEAST_SPECIFIC)
 
     @property
     def known_healthy(self) -> bool:

@@ -51,6 +51,8 @@ class LeakCourse:
 #: The smallest leak worth finding, as a share of the pump's mean flow. Assumed: makers state volumetric efficiencies of
 #: 95 to 98 %; what is below the least loss of these is no reason to act.
 LEAK_WORTH_FINDING = 0.02
+#: The detector that judges where no other can: it sees that something changed, and states no size.
+LEAST_SPECIFIC = "rms change"
 
 
 @dataclass(frozen=True)

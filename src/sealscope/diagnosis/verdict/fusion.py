@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sealscope.diagnosis.verdict.evidence import LEAK_WORTH_FINDING, LEAKS, Evidence, Figure
+from sealscope.diagnosis.verdict.evidence import LEAK_WORTH_FINDING, LEAKS, LEAST_SPECIFIC, Evidence, Figure
 
 #: The most specific first: what accounts for every litre, what models the pressures, what estimates a state, what sees
 #: that something changed. A user's own detectors follow in the order of their names.
-ORDER = ("volume balance", "pressure model", "observer", "rms change")
+ORDER = ("volume balance", "pressure model", "observer", LEAST_SPECIFIC)
 
 
 def fuse(evidences: Sequence[Evidence]) -> Evidence:
@@ -42,7 +42,7 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     else:
         fused = replace(judge, onset_s=None, onset_interval_s=None)
         blind = next((own for own in others if _blind(own)), None)
-        if judge.verdict == "no leak" and judge.detector == ORDER[-1] and blind is not None:
+        if judge.verdict == "no leak" and judge.detector == LEAST_SPECIFIC and blind is not None:
             fused = replace(fused, verdict="cannot tell", cause=judge.cause)
             reasons.append(f"{blind.detector}: {blind.reason}")
         naming = next((own for own in others if _other_cause(own)), None)

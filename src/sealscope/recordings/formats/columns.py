@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import isfinite
 from typing import Literal
@@ -44,8 +45,10 @@ _PARTS = re.compile(r"[./\\\\:<>]")
 _DATE_NAMES = ("date", "datum", "day", "tag", "fecha", "data")
 
 
-#: Channel (or `t`) -> column, as a caller gives it; or the word for what the columns' names tell.
+#: Channel (or `t`) -> column, as a caller gives it; or the word for what the columns' names tell. In a mapping the
+#: key `REST` with that word asks for the channels that it does not name.
 ChannelMap = Mapping[str, str] | Literal["auto"]
+REST = "*"
 
 
 @dataclass(frozen=True)
@@ -104,10 +107,23 @@ def check_call(channel_map: ChannelMap, rate: float | None) -> None:
         if channel_map != "auto":
             raise InputError(f"channel_map must be a mapping or the word auto, got {channel_map!r}")
     else:
-        for channel in channel_map:
-            check_channel(channel)
+        for channel, column in channel_map.items():
+            if channel != REST:
+                check_channel(channel)
+            elif column != "auto":
+                raise InputError(f"channel_map must map {REST} to the word auto, got {column!r}")
     if rate is not None and not (isfinite(rate) and rate > 0):
         raise InputError(f"rate must be > 0 Hz, got {rate}")
+
+
+def by_names(channel_map: ChannelMap) -> bool:
+    """Whether a map takes channels by what the columns' names tell."""
+    return isinstance(channel_map, str) or REST in channel_map
+
+
+def stated_columns(channel_map: ChannelMap) -> dict[str, str]:
+    """Return the part of a map that names channels and their columns."""
+    return {} if isinstance(channel_map, str) else {name: own for name, own in channel_map.items() if name != REST}
 
 
 def counted(count: int, noun: str) -> str:
@@ -214,19 +230,19 @@ def choose_columns(
     """Decide which columns are read, and as what.
 
     Without a time column the samples have the `rate` given, else the `stated_rate` of the file itself [Hz]. A map
-    `auto` is what `proposed_map` makes of the labels. A mapped channel comes before a column that bears the
-    channel's own name. Raises UnreadableFile where a mapped column is missing, where no column is a channel, and where
-    there is neither time nor rate; InputError for a unit of another dimension. With `some`, mapped columns may be
-    missing, which another sheet may have.
+    `auto` is what `proposed_map` makes of the labels, for the channels and columns that the map does not name. A mapped
+    channel comes before a column that bears the channel's own name. Raises UnreadableFile where a mapped column is
+    missing, where no column is a channel, and where there is neither time nor rate; InputError for a unit of another
+    dimension. With `some`, mapped columns may be missing, which another sheet may have.
     """
     missing: list[str] = []
     notes: list[str] = []
     channels: dict[str, tuple[int, str]] = {}
-    if isinstance(channel_map, str):
-        channel_map = proposed_map(labels)
+    stated = stated_columns(channel_map)
+    columns = _completed(labels, stated, place) if by_names(channel_map) else stated
     time: int | None = None
     time_label: Label | None = None
-    for channel, foreign in channel_map.items():
+    for channel, foreign in columns.items():
         try:
             column, unit = _mapped(labels, channel, foreign, place)
         except UnreadableFile:
@@ -287,9 +303,19 @@ def choose_columns(
     own_rate = stated_rate if rate is None else rate
     if time is None:
         date = None
-    elif "t" not in channel_map and not parts and labels[time].name.casefold() in _DATE_NAMES:
+    elif "t" not in columns and not parts and labels[time].name.casefold() in _DATE_NAMES:
         date = time
     return ColumnMap(time, time_label, order, tuple(notes), date, names, own_rate, parts, tuple(missing))
+
+
+def _completed(labels: Sequence[Label], stated: Mapping[str, str], place: str) -> dict[str, str]:
+    """Return a map with the channels that it does not name, by the names of the columns that it does not take."""
+    taken = set()
+    for channel, foreign in stated.items():
+        with suppress(UnreadableFile):  # said where the map is gone through
+            taken.add(_mapped(labels, channel, foreign, place)[0])
+    free = [Label("", "") if column in taken else label for column, label in enumerate(labels)]
+    return {**proposed_map(free), **stated}
 
 
 def _split(

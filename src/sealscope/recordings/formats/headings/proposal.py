@@ -31,8 +31,9 @@ _WORDS: Mapping[str, frozenset[str]] = {
         "poloha lage laege konum положение ход 位移 行程 位置 変位 ストローク 변위 위치"
     ),
     "command": _words(
-        "u cmd command soll sollwert setpoint ref reference demand spannung voltage stellgroesse ansteuerung consigne "
-        "tension comando mando tensione 指令 电压 電圧"
+        "u cmd command soll sollwert setpoint ref reference demand spannung voltage stellgroesse "
+        "stellsignal stellwert steuersignal steuerspannung ansteuerung ansteuersignal ventilsignal ventilspannung "
+        "consigne tension comando mando tensione 指令 电压 電圧"
     ),
     "speed": _words(
         "omega n speed rpm drehzahl motordrehzahl vitesse velocidad velocidade velocita giri toerental 转速 回転数"
