@@ -20,7 +20,10 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from sealscope.compiled import law, plain_code
 from sealscope.fmu.variables import INPUTS, RESULTS, VALUES
 from sealscope.parameters import Rig
+from sealscope.physics.cylinder import mechanical_power
 from sealscope.physics.fluid import P_ATM
+from sealscope.physics.motor import electric_power
+from sealscope.physics.pump import hydraulic_power
 from sealscope.physics.rest import carried_at_rest, holding_current, holding_integral, pressures_at_rest
 from sealscope.physics.rig import (
     CHOICES,
@@ -65,6 +68,7 @@ _FROM = tuple(VALUES.index(name) for name in DERIVED_FROM)
 _OUTWARD_A, _OUTWARD_B = VALUES.index("cylinder.G_ext_A"), VALUES.index("cylinder.G_ext_B")
 _U, _G, _C, _F, _MORE_A, _MORE_B = range(len(INPUTS))
 _VOLTAGE, _Q_1 = OUTPUTS.index("V"), OUTPUTS.index("Q_1")
+_electric, _hydraulic, _mechanical = law(electric_power), law(hydraulic_power), law(mechanical_power)
 #: The arguments of each function of a unit, as C passes them.
 ARGUMENTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -111,9 +115,14 @@ def numbers_of(choices: tuple[bool | tuple[bool, ...], ...], exponent: float, li
 
     @law
     def numbers(v: Any, outward_A: float, outward_B: float) -> Any:
-        V, V_rod, V_hose_A, V_hose_B = v[_FROM[5]], v[_FROM[6]], v[_FROM[7]], v[_FROM[8]]
-        C_d, d_line, closed_A, closed_B, rho = v[_FROM[0]], v[_FROM[1]], v[_FROM[2]], v[_FROM[3]], v[_FROM[4]]
-        derived = derived_numbers(C_d, d_line, closed_A, closed_B, rho, V, V_rod, V_hose_A, V_hose_B, exponent, literal)
+        C_d, d_line, closed_A, closed_B = v[_FROM[0]], v[_FROM[1]], v[_FROM[2]], v[_FROM[3]]
+        open_A, open_B, rho = v[_FROM[4]], v[_FROM[5]], v[_FROM[6]]
+        V, V_rod, V_hose_A, V_hose_B = v[_FROM[7]], v[_FROM[8]], v[_FROM[9]], v[_FROM[10]]
+        q_b, C_st, C_h = v[_FROM[11]], v[_FROM[12]], v[_FROM[13]]
+        derived = derived_numbers(
+            C_d, d_line, closed_A, closed_B, open_A, open_B, rho, V, V_rod, V_hose_A, V_hose_B, q_b, C_st, C_h,
+            exponent, literal,
+        )  # fmt: skip
         taken = to_fixed_tuple(v, _N_PARAMETERS)
         taken = tuple_setitem(taken, _OUTWARD_A, taken[_OUTWARD_A] + outward_A)
         taken = tuple_setitem(taken, _OUTWARD_B, taken[_OUTWARD_B] + outward_B)
@@ -140,7 +149,7 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         p = numbers(v, given)
-        force = carried_at_rest(x_0, p.F_l, p.k_load, p.L, p.k_stop, p.d_stop) + given[_F]
+        force = carried_at_rest(x_0, p.F_l, p.k_load, p.A_opp, p.p_opp, p.L, p.k_stop, p.d_stop) + given[_F]
         V_A, V_B = (p.V_A + p.V_1, p.V_B + p.V_2) if throttled else (p.V_A, p.V_B)
         p_A, p_B = pressures_at_rest(force, p.A_A, p.A_B, V_A, V_B, p.p_charge, made_up)
         state[:] = 0.0
@@ -159,9 +168,9 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
         out = carray(results, _N_RESULTS)
         p, z = numbers(v, given), state_of(state)
         observe(z, given[_U], given[_G], given[_C], p, out)
-        out[_N_OUTPUTS] = out[_VOLTAGE] * z[CURRENT]
-        out[_N_OUTPUTS + 1] = out[_Q_1] * ((z[P_1] - z[P_2]) if throttled else (z[P_A] - z[P_B]))
-        out[_N_OUTPUTS + 2] = (z[P_A] * p.A_A - z[P_B] * p.A_B) * z[VELOCITY]
+        out[_N_OUTPUTS] = _electric(out[_VOLTAGE], z[CURRENT])
+        out[_N_OUTPUTS + 1] = _hydraulic(out[_Q_1], (z[P_1] - z[P_2]) if throttled else (z[P_A] - z[P_B]))
+        out[_N_OUTPUTS + 2] = _mechanical(z[P_A], z[P_B], z[VELOCITY], p.A_A, p.A_B)
         return 0
 
     if implicit:

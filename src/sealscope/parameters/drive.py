@@ -21,11 +21,16 @@ class Motor(Part):
     omega_per_volt: Annotated[float, quantity("commanded speed per volt", "rad/(s V)", gt=0, le=1e4)]
     V_max: Annotated[float, quantity("largest motor voltage", "V", gt=0, le=1e5)]
     i_max: Annotated[float, quantity("largest motor current", "A", gt=0, le=1e5)]
+    T_f: Annotated[float, quantity("friction torque of motor and pump", "N m", absent=0, ge=0, le=1e4)]
+    omega_f: Annotated[float, quantity("speed below which that friction is linear", "rad/s", absent=1, gt=0, le=1e3)]
     integrator: Annotated[Literal["state", "euler"], choice("integral of the speed error, eq. (4.2)")]
 
 
 class Pump(Part):
-    """Bidirectional pump of fixed displacement, eq. (4.1)."""
+    """Bidirectional pump of fixed displacement, eq. (4.1), and its losses.
+
+    Laminar slip is `G_pump`, viscous drag is within `motor.B_M`, constant friction within `motor.T_f`.
+    """
 
     q_b: Annotated[float, quantity("displacement", "m^3/rev", gt=0, le=0.1)]
     G_pump: Annotated[float, quantity("internal leakage conductance of the pump", "m^3/(s Pa)", ge=0, le=1e-6)]
@@ -39,13 +44,17 @@ class Pump(Part):
             le=1e-6,
         ),
     ]
+    C_st: Annotated[float, quantity("turbulent slip coefficient", "1", absent=0, ge=0, le=1)]
+    C_f: Annotated[float, quantity("friction torque over that of the pressure", "1", absent=0, ge=0, le=1)]
+    C_h: Annotated[float, quantity("hydrodynamic torque coefficient", "1", absent=0, ge=0, le=1e6)]
     omega_max: Annotated[float, quantity("speed limit (informative)", "rad/s", gt=0, le=1e4)]
 
 
 class HydraulicLine(Part):
-    """Lines between pump and cylinder, and the one-way throttles in them, eqs. (4.7)-(4.12), (4.16), (4.17).
+    """Lines between pump and cylinder, and what is in them: throttles (eqs. (4.7)-(4.12)), shut-off valves, filters.
 
-    `orifices = "absent"`: the pump is piped to the cylinder directly (p_1 = p_A, p_2 = p_B, V_1 and V_2 unused).
+    `orifices = "absent"`: the pump is piped to the cylinder directly (p_1 = p_A, p_2 = p_B, V_1 and V_2 unused), with
+    neither valves nor filters. A circulation valve connects the ports of the pump; it is shut unless a run opens it.
     """
 
     orifices: Annotated[Literal["absent", "present"], choice("throttles and line volumes in the model")]
@@ -58,6 +67,13 @@ class HydraulicLine(Part):
     dp_0: Annotated[float, quantity("pressure difference below which the throttle is laminar", "Pa", gt=0, le=1e6)]
     V_1: Annotated[float, quantity("volume of the line at pump port 1", "m^3", gt=0, le=1)]
     V_2: Annotated[float, quantity("volume of the line at pump port 2", "m^3", gt=0, le=1)]
+    open_A: Annotated[float, quantity("opening of the shut-off valve in line A", "1", absent=1, ge=0, le=1)]
+    open_B: Annotated[float, quantity("opening of the shut-off valve in line B", "1", absent=1, ge=0, le=1)]
+    G_circ: Annotated[
+        float, quantity("conductance of the circulation valve where it is open", "m^3/(s Pa)", absent=0, ge=0, le=1e-6)
+    ]
+    R_A: Annotated[float, quantity("resistance of the filter in line A", "Pa s/m^3", absent=0, ge=0, le=1e13)]
+    R_B: Annotated[float, quantity("resistance of the filter in line B", "Pa s/m^3", absent=0, ge=0, le=1e13)]
 
 
 class Fluid(Part):
@@ -68,6 +84,12 @@ class Fluid(Part):
     p_charge: Annotated[float, quantity("charge pressure: all pressures at the start", "Pa", ge=0, le=1e8)]
     air: Annotated[float, quantity("free air in the oil, by volume of oil at atmospheric pressure", "1", ge=0, le=0.5)]
     n_air: Annotated[float, quantity("polytropic exponent of the air in the oil", "1", ge=1, le=1.4)]
+    T_oil: Annotated[
+        float, quantity("temperature of the oil at which the rig's values hold", "K", absent=313.15, gt=200, lt=500)
+    ]
+    nu_40: Annotated[float, quantity("kinematic viscosity at 40 deg C", "m^2/s", absent=32e-6, gt=2e-6, le=1e-2)]
+    nu_100: Annotated[float, quantity("kinematic viscosity at 100 deg C", "m^2/s", absent=5.4e-6, gt=1.5e-6, le=1e-2)]
+    alpha: Annotated[float, quantity("thermal expansion of the oil", "1/K", absent=7e-4, ge=0, le=1e-2)]
 
 
 class MakeUp(Part):

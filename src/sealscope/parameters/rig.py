@@ -131,6 +131,7 @@ class Rig(Part):
                 "(makeup.check_valves = present or pilot-operated), got check_valves = absent"
             )
         self._valve_fits()
+        self._lines_hold_what_is_in_them()
         rod = abs(c.A_A - c.A_B) * c.L
         if m.check_valves == "pilot-operated" and m.V_gas <= rod:
             raise ValueError(
@@ -166,6 +167,21 @@ class Rig(Part):
             raise ValueError(
                 f"supply.p_pre must be < p_set + p_return = {with_unit(supply.p_set + supply.p_return, 'Pa')}, so that "
                 f"the accumulator takes oil, got {with_unit(supply.p_pre, 'Pa')}"
+            )
+
+    def _lines_hold_what_is_in_them(self) -> None:
+        """Raise ValueError for shut-off valves or filters in lines that are not there, and for an oil that thickens."""
+        line, oil = self.line, self.fluid
+        for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
+            if getattr(line, name) != absent and line.orifices == "absent":
+                raise ValueError(
+                    f"a {'filter' if absent == 0.0 else 'shut-off valve'} must be in a line (line.orifices = present), "
+                    f"got line.{name} = {getattr(line, name):g} and line.orifices = absent"
+                )
+        if not oil.nu_100 < oil.nu_40:
+            raise ValueError(
+                f"fluid.nu_100 must be < nu_40 = {with_unit(oil.nu_40, 'm^2/s')}: oil thins as it warms, got "
+                f"{with_unit(oil.nu_100, 'm^2/s')}"
             )
 
     def __eq__(self, other: object) -> bool:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from sealscope.compiled import contracted
+from sealscope.physics.fluid import P_ATM
 from sealscope.physics.lanes import select
 
 
@@ -53,3 +55,19 @@ def piston_acceleration(
 ) -> float:
     """Return the acceleration a = (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq [m/s^2], eq. (4.15) with the caps."""
     return (p_A * A_A - p_B * A_B - friction - load + stop) / M_eq
+
+
+@contracted
+def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
+    """Force [N] against +x of an opposing cylinder, fed at p_opp [Pa] through an orifice: A_opp p.
+
+    p = p_opp + v |v| (A_opp/C_opp)^2, the orifice's law solved for the pressure; it falls no lower than vacuum. The oil
+    of that cylinder is taken as stiff (Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice).
+    """
+    ratio = A_opp / C_opp
+    return A_opp * max(p_opp + v * abs(v) * ratio * ratio, -P_ATM)
+
+
+def mechanical_power(p_A: Any, p_B: Any, v: Any, A_A: float, A_B: float) -> Any:
+    """Power [W] of the pressures on the piston: (p_A A_A - p_B A_B) v."""
+    return (p_A * A_A - p_B * A_B) * v

@@ -1,14 +1,21 @@
-"""The oil with air in it."""
+"""The oil: the air in it, and what its temperature changes."""
 
 from __future__ import annotations
 
 import math
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.compiled import contracted
 from sealscope.physics.lanes import anywhere, exponential
 
 #: Atmospheric pressure [Pa]; every pressure of the rig is counted from it.
 P_ATM = 101325.0
+#: 40 and 100 deg C [K], at which viscosities are stated.
+_T_40, _T_100 = 313.15, 373.15
+#: Relative change of the bulk modulus of mineral oils with temperature, as a power of ten [1/K].
+_SOFTER = 0.0024
 #: Least absolute pressure [Pa] at which the law of the air is evaluated: a bubble has a volume.
 _LEAST = 100.0
 
@@ -55,3 +62,30 @@ def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air:
     r, r_0, r_m = air_share(p, air, n_air), air_share(p_0, air, n_air), air_share(0.5 * (p + p_0), air, n_air)
     mean = (1.0 / (1.0 + r) + 4.0 / (1.0 + r_m) + 1.0 / (1.0 + r_0)) / 6.0
     return (1.0 + r_0) / (1.0 + r) * exponential((p - p_0) * mean / K_oil)  # type: ignore[no-any-return]
+
+
+def kinematic_viscosity(T: NDArray[np.float64], nu_40: float, nu_100: float) -> NDArray[np.float64]:
+    """Kinematic viscosity [m^2/s] of an oil at the temperatures T [K], from those at 40 and 100 deg C.
+
+    log log(nu + 0.7) = A - B log T, nu in mm^2/s: Walther's law, ASTM D341 (above 2 mm^2/s).
+    """
+    y_40, y_100 = (math.log(math.log(1e6 * nu + 0.7)) for nu in (nu_40, nu_100))
+    B = (y_40 - y_100) / math.log(_T_100 / _T_40)
+    return np.asarray(1e-6 * (np.exp(np.exp(y_40 - B * np.log(T / _T_40))) - 0.7))
+
+
+def thermal_density(T: NDArray[np.float64], T_0: float, alpha: float) -> NDArray[np.float64]:
+    """Density at the temperatures T [K] over that at T_0 [K]: 1 - alpha (T - T_0).
+
+    Source: Merritt, Hydraulic Control Systems, 1967, section 2.2, density of petroleum fluids; `alpha` [1/K].
+    """
+    return np.asarray(1.0 - alpha * (T - T_0))
+
+
+def thermal_stiffness(T: NDArray[np.float64], T_0: float) -> NDArray[np.float64]:
+    """Bulk modulus at the temperatures T [K] over that at T_0 [K]: 10^(-0.0024 (T - T_0)), of mineral oils.
+
+    Source: A. T. J. Hayward, How to estimate the bulk modulus of hydraulic fluids, Hydraulic Pneumatic Power 16 (1970)
+    28-40: isentropic secant modulus.
+    """
+    return np.asarray(10.0 ** (-_SOFTER * (T - T_0)))

@@ -5,6 +5,8 @@ A PI controller, a limited voltage, a winding with a limited current, a shaft.
 
 from __future__ import annotations
 
+from typing import Any
+
 from sealscope.compiled import contracted
 from sealscope.physics.lanes import select
 
@@ -30,3 +32,8 @@ def winding_current_rate(
 def shaft_acceleration(i: float, omega: float, load_torque: float, C_m: float, B_M: float, J_M: float) -> float:
     """domega/dt [rad/s^2] = (C_m i - B_M omega - T_load)/J_M, eq. (4.5)."""
     return (C_m * i - B_M * omega - load_torque) / J_M
+
+
+def electric_power(V: Any, i: Any) -> Any:
+    """Power [W] into the motor: V i."""
+    return V * i

@@ -1,10 +1,17 @@
-"""The fixed-displacement pump, driven both ways."""
+"""The fixed-displacement pump, driven both ways, and its losses over speed and pressure.
+
+Source of the losses: W. E. Wilson, Positive-displacement pumps and fluid motors, 1950 (laminar slip, viscous drag,
+friction by pressure, constant friction), and W. M. J. Schlosser, Mathematical model for displacement pumps and motors,
+Hydraulic Power Transmission 7 (1961) 252-257 and 324-328 (turbulent slip, hydrodynamic drag). D = q_b/(2 pi) [m^3/rad].
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
-from sealscope.compiled import contracted
+from sealscope.compiled import contracted, kernel
+from sealscope.physics.restrictors import orifice_flow
 
 
 @contracted
@@ -22,3 +29,35 @@ def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
 def pump_torque(dp: float, q_b: float) -> float:
     """Load torque [N m] of the pressure difference on the shaft: q_b (p_1 - p_2) / (2 pi), eqs. (4.5)-(4.6)."""
     return q_b / (2.0 * math.pi) * dp
+
+
+@kernel
+def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[float, float]:
+    """Return c_slip [m^3/(s Pa^0.5)] of the turbulent slip and k_h [N m s^2] of the hydrodynamic torque.
+
+    c_slip = C_st D^(2/3) sqrt(2/rho), k_h = C_h rho D^(5/3)/2, `rho` density [kg/m^3] (Schlosser 1961).
+    """
+    D = q_b / (2.0 * math.pi)
+    return C_st * D ** (2.0 / 3.0) * math.sqrt(2.0 / rho), 0.5 * C_h * rho * D ** (5.0 / 3.0)
+
+
+@contracted
+def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
+    """Flow [m^3/s] that slips back through the pump's gaps, C_st D^(2/3) sqrt(2 |dp|/rho): an orifice's law."""
+    return orifice_flow(dp, c_slip, dp_0)
+
+
+@contracted
+def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float, k_h: float, omega_f: float) -> float:
+    """Return the torque [N m] against the turning of motor and pump beside viscous drag.
+
+    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction and one by pressure, made smooth
+    below `omega_f` [rad/s] (sat: held within +-1), and the hydrodynamic torque.
+    """
+    turning = min(max(omega / omega_f, -1.0), 1.0)
+    return turning * (T_f + C_f * abs(pump_torque(dp, q_b))) + k_h * omega * abs(omega)
+
+
+def hydraulic_power(Q_1: Any, dp: Any) -> Any:
+    """Power [W] that the pump gives the oil: Q_1 (p_1 - p_2)."""
+    return Q_1 * dp

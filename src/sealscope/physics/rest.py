@@ -8,20 +8,23 @@ import numpy as np
 
 from sealscope.compiled import kernel
 from sealscope.errors import InputError
-from sealscope.physics.cylinder import hard_stop_force, load_force
+from sealscope.physics.cylinder import hard_stop_force, load_force, opposing_force
 from sealscope.physics.fluid import P_ATM
-from sealscope.physics.pump import pump_flow, pump_torque
-from sealscope.physics.rig import RigNumbers, rig_numbers, valve_rates
+from sealscope.physics.pump import friction_torque, pump_torque
+from sealscope.physics.rig import RigNumbers, pump_delivery, rig_numbers, valve_rates
 from sealscope.physics.state import CURRENT, INTEGRAL, OMEGA, P_1, P_2, P_A, P_B, POSITION, STATES, state_of
 
 if TYPE_CHECKING:
-    from sealscope.parameters import Rig
+    from sealscope.parameters import Cylinder, Rig
 
 
 @kernel
-def carried_at_rest(x: float, F_l: float, k_load: float, L: float, k_stop: float, d_stop: float) -> float:
+def carried_at_rest(
+    x: float, F_l: float, k_load: float, A_opp: float, p_opp: float, L: float, k_stop: float, d_stop: float
+) -> float:
     """Force [N] against +x that the pressures carry at rest at x [m]: the load less that of a stop."""
-    return load_force(x, F_l, k_load) - hard_stop_force(x, 0.0, L, k_stop, d_stop)
+    load = load_force(x, F_l, k_load) + opposing_force(0.0, A_opp, p_opp, 1.0)
+    return load - hard_stop_force(x, 0.0, L, k_stop, d_stop)
 
 
 @kernel
@@ -80,9 +83,13 @@ def supply_at_rest(force: float, x: float, p: RigNumbers) -> tuple[float, float,
         middle = 0.5 * (low + high)
         p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
-        rises = valve_rates(state_of(y), pump_flow(p.omega_P, middle - p.p_return, p.q_b, p.G_pump), p)[2] > 0.0
+        rises = valve_rates(state_of(y), pump_delivery(p.omega_P, middle - p.p_return, p), p)[2] > 0.0
         low, high = (middle, high) if rises else (low, middle)
     return low, p_A, p_B
+
+
+def _carried(c: Cylinder, x: float) -> float:
+    return carried_at_rest(x, c.F_l, c.k_load, c.A_opp, c.p_opp, c.L, c.k_stop, c.d_stop)  # type: ignore[no-any-return]
 
 
 def side_volumes(rig: Rig) -> tuple[float, float]:
@@ -124,7 +131,7 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
     y[POSITION] = x_0
     if rig.valve.spool == "present":
         return _at_valve(rig, y, push)
-    force = carried_at_rest(x_0, c.F_l, c.k_load, c.L, c.k_stop, c.d_stop) + push
+    force = _carried(c, x_0) + push
     p_A, p_B = rest_pressures(rig, force)
     y[[P_A, P_1]], y[[P_B, P_2]] = p_A, p_B
     y[CURRENT] = holding_current(p_A - p_B, rig.pump.q_b, m.C_m)
@@ -141,7 +148,7 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 def _at_valve(rig: Rig, y: np.ndarray, push: float) -> np.ndarray:
     """Return the state `y` at rest behind a servo valve, under `push` [N] beside the rig's own load."""
     c, m, p = rig.cylinder, rig.motor, rig_numbers(rig)
-    force = carried_at_rest(y[POSITION], c.F_l, c.k_load, c.L, c.k_stop, c.d_stop) + push
+    force = _carried(c, y[POSITION]) + push
     p_1, p_A, p_B = supply_at_rest(force, y[POSITION], p)
     if not rig.supply.p_return <= min(p_A, p_B) <= max(p_A, p_B) <= p_1:
         raise InputError(
@@ -152,6 +159,8 @@ def _at_valve(rig: Rig, y: np.ndarray, push: float) -> np.ndarray:
     y[P_1], y[P_2], y[P_A], y[P_B] = p_1, rig.supply.p_return, p_A, p_B
     y[OMEGA] = rig.supply.omega_P
     y[CURRENT] = holding_current(p_1 - y[P_2], rig.pump.q_b, m.C_m) + m.B_M * y[OMEGA] / m.C_m
+    if len(p.lossy) > 0:
+        y[CURRENT] += friction_torque(y[OMEGA], p_1 - y[P_2], p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f) / m.C_m
     volts = m.R_c * y[CURRENT] + m.C_e * y[OMEGA]
     y[INTEGRAL] = volts / m.K_i
     if y[CURRENT] > m.i_max or volts > m.V_max:

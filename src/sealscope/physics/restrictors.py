@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
-from sealscope.compiled import contracted, kernel
+from sealscope.compiled import contracted, kernel, law
 from sealscope.physics.lanes import anywhere, select
 
 
@@ -12,6 +13,27 @@ from sealscope.physics.lanes import anywhere, select
 def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
     """Flow coefficient c = C_d A sqrt(2/rho) [m^3/(s Pa^0.5)] of an orifice (factor of eqs. 4.9-4.12)."""
     return C_d * area * math.sqrt(2.0 / rho)
+
+
+def behind_shut_off(c: float, c_line: float, opening: Any) -> Any:
+    """Flow coefficient [m^3/(s Pa^0.5)] of a throttle `c` in series with a shut-off valve.
+
+    1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2, solved for C: the valve opens the share `opening` in 0..1 of its line,
+    whose whole area has the coefficient `c_line`. Fully open it leaves `c`, shut 0.
+
+    Source: Merritt, Hydraulic Control Systems, 1967, section 3.4: pressure drops of orifices in series add.
+    """
+    square = opening * opening
+    return c * c_line * opening * (c_line * c_line * square + c * c * (1.0 - square)) ** -0.5
+
+
+_in_series = law(behind_shut_off)
+
+
+@law
+def behind_valve(c: float, c_line: float, opening: float) -> float:
+    """`behind_shut_off`, compiled; a valve that is fully open leaves `c` to the last bit."""
+    return c if opening >= 1.0 else _in_series(c, c_line, opening)
 
 
 @contracted

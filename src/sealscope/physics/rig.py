@@ -26,6 +26,7 @@ from sealscope.physics.cylinder import (
     chamber_volumes,
     hard_stop_force,
     load_force,
+    opposing_force,
     piston_acceleration,
     pressure_rate,
 )
@@ -51,8 +52,14 @@ from sealscope.physics.friction import (
 from sealscope.physics.lanes import select
 from sealscope.physics.leakage import piston_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
-from sealscope.physics.pump import pump_flow, pump_torque
-from sealscope.physics.restrictors import one_way_coefficient, orifice_coefficient, orifice_flow
+from sealscope.physics.pump import friction_torque, loss_coefficients, pump_flow, pump_torque, turbulent_slip
+from sealscope.physics.restrictors import (
+    behind_valve,
+    implicit_orifice_flow,
+    one_way_coefficient,
+    orifice_coefficient,
+    orifice_flow,
+)
 from sealscope.physics.state import (
     BRISTLE,
     CURRENT,
@@ -80,11 +87,13 @@ from sealscope.physics.valve import (
     spool_within_stroke,
 )
 
-#: Parameters that no law takes under its own symbol: informative ones, those within the throttles' coefficients or in
-#: the volumes of a side.
+#: Parameters that no law takes under its own symbol: informative ones, those within the throttles' coefficients, the
+#: pump's losses or the volumes of a side, and those of what only changes within a run.
 _NOT_TAKEN = {
     *("pump.omega_max", "line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "fluid.rho"),
+    *("line.open_A", "line.open_B", "line.G_circ", "pump.C_st", "pump.C_h"),
     *("cylinder.V_hose_A", "cylinder.V_hose_B", "cylinder.V_rod"),
+    *("fluid.T_oil", "fluid.nu_40", "fluid.nu_100", "fluid.alpha"),
 }
 #: Dotted name of each parameter that the laws take, by its symbol, as the models declare them.
 PARAMETERS = {
@@ -100,22 +109,26 @@ _CHOICES = {
     "coulomb_of_difference": ("friction.coulomb_pressure", "difference"),
     "literal_bracket": ("friction.bracket", "literal"),
 }
-#: Numbers that follow from parameters: coefficients of throttle A (from the pump to the cylinder, back) and B, and the
-#: volumes of both sides at mid-stroke; and the parameters they follow from (`derived_numbers`).
-DERIVED = ("c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B")
+#: Numbers that follow from parameters: coefficients of throttle A (from the pump to the cylinder, back) and B, with
+#: their shut-off valves, volumes of both sides at mid-stroke, coefficients of the pump's losses; and the parameters
+#: they follow from (`derived_numbers`).
+DERIVED = ("c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B", "c_slip", "k_h")
 DERIVED_FROM = (
-    *("line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "fluid.rho"),
+    *("line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "line.open_A", "line.open_B", "fluid.rho"),
     *("cylinder.V", "cylinder.V_rod", "cylinder.V_hose_A", "cylinder.V_hose_B"),
+    *("pump.q_b", "pump.C_st", "pump.C_h"),
 )
 #: The numbers of `RigNumbers`.
 NUMBERS = (*PARAMETERS, *DERIVED)
 #: Laws that most rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out. Air
 #: in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has bristles, that differs
 #: between the directions; check valves with pilots, relief valves, an accumulator that exchanges little heat; a damper,
-#: a load that changes with time (of a run, not of a rig); a servo valve between a supply and the cylinder.
+#: a load that changes with time (of a run, not of a rig); a servo valve between a supply and the cylinder; filters in
+#: the lines; losses of motor and pump beyond the linear ones; an opposing cylinder.
 LAWS = (
     *("aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
     *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
+    *("filtered", "lossy", "opposed"),
 )
 #: The choices: truth values, and the laws.
 CHOICES = (*_CHOICES, "made_up", *LAWS)
@@ -143,6 +156,9 @@ if TYPE_CHECKING:
         damped: tuple[bool, ...]
         pushed: tuple[bool, ...]
         valved: tuple[bool, ...]
+        filtered: tuple[bool, ...]
+        lossy: tuple[bool, ...]
+        opposed: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> float: ...
@@ -155,20 +171,30 @@ else:  # numba takes a named tuple apart; its fields are those of the models
 
 @kernel
 def coefficients_of_throttles(
-    C_d: float, d_line: float, closed_A: float, closed_B: float, rho: float, exponent: float, literal: bool
+    C_d: float,
+    d_line: float,
+    closed_A: float,
+    closed_B: float,
+    open_A: float,
+    open_B: float,
+    rho: float,
+    exponent: float,
+    literal: bool,
 ) -> tuple[float, float, float, float]:
     """Return the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
     "Closed" is a share of the area (`exponent` 1, eq. 4.8) or of the diameter (2, the text). Metering "meter-out": free
     flow towards the cylinder and throttled return on both sides (the text and Appendix A); `literal`: as eqs.
-    (4.9)-(4.12) are printed, side B the other way round.
+    (4.9)-(4.12) are printed, side B the other way round. Shut-off valves are in series with them (`behind_valve`).
     """
     free = orifice_coefficient(C_d, math.pi / 4.0 * d_line**2, rho)  # eq. (4.7)
     throttled_A = free * (1.0 - closed_A) ** exponent  # eq. (4.8)
     throttled_B = free * (1.0 - closed_B) ** exponent
+    A_in, A_out = behind_valve(free, free, open_A), behind_valve(throttled_A, free, open_A)
+    B_free, B_throttled = behind_valve(free, free, open_B), behind_valve(throttled_B, free, open_B)
     if literal:
-        return free, throttled_A, throttled_B, free
-    return free, throttled_A, free, throttled_B
+        return A_in, A_out, B_throttled, B_free
+    return A_in, A_out, B_free, B_throttled
 
 
 @kernel
@@ -177,19 +203,25 @@ def derived_numbers(
     d_line: float,
     closed_A: float,
     closed_B: float,
+    open_A: float,
+    open_B: float,
     rho: float,
     V: float,
     V_rod: float,
     V_hose_A: float,
     V_hose_B: float,
+    q_b: float,
+    C_st: float,
+    C_h: float,
     exponent: float,
     literal: bool,
-) -> tuple[float, float, float, float, float, float]:
+) -> tuple[float, float, float, float, float, float, float, float]:
     """Return the numbers of `DERIVED` from the parameters of `DERIVED_FROM`; `exponent`, `literal`: see above."""
     c_A_in, c_A_out, c_B_in, c_B_out = coefficients_of_throttles(
-        C_d, d_line, closed_A, closed_B, rho, exponent, literal
+        C_d, d_line, closed_A, closed_B, open_A, open_B, rho, exponent, literal
     )
-    return c_A_in, c_A_out, c_B_in, c_B_out, V + V_hose_A, V - V_rod + V_hose_B
+    c_slip, k_h = loss_coefficients(q_b, C_st, C_h, rho)
+    return c_A_in, c_A_out, c_B_in, c_B_out, V + V_hose_A, V - V_rod + V_hose_B, c_slip, k_h
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
@@ -200,8 +232,9 @@ def throttle_readings(rig: Rig) -> tuple[float, bool]:
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
     """Return the coefficients of the rig's throttles (`coefficients_of_throttles`)."""
     line = rig.line
+    openings = line.closed_A, line.closed_B, line.open_A, line.open_B
     return coefficients_of_throttles(  # type: ignore[no-any-return]
-        line.C_d, line.d_line, line.closed_A, line.closed_B, rig.fluid.rho, *throttle_readings(rig)
+        line.C_d, line.d_line, *openings, rig.fluid.rho, *throttle_readings(rig)
     )
 
 
@@ -222,6 +255,9 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "damped": rig.cylinder.d_load > 0,
         "pushed": False,
         "valved": rig.valve.spool == "present",
+        "filtered": rig.line.R_A > 0 or rig.line.R_B > 0,
+        "lossy": rig.motor.T_f > 0 or rig.pump.C_st > 0 or rig.pump.C_f > 0 or rig.pump.C_h > 0,
+        "opposed": rig.cylinder.A_opp > 0,
     }
     return RigNumbers(
         *(attrgetter(name)(rig) for name in PARAMETERS.values()),
@@ -266,6 +302,24 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 
 
 @contracted
+def pump_delivery(omega: float, dp: float, p: RigNumbers) -> float:
+    """Flow [m^3/s] that the pump delivers into port 1, by its ideal flow and its slip."""
+    Q_1 = pump_flow(omega, dp, p.q_b, p.G_pump)
+    if len(p.lossy) > 0:
+        Q_1 = Q_1 - turbulent_slip(dp, p.c_slip, p.dp_0)
+    return Q_1
+
+
+@contracted
+def shaft_load(omega: float, dp: float, p: RigNumbers) -> float:
+    """Torque [N m] that pressures and friction put on the shaft, but for viscous drag."""
+    torque = pump_torque(dp, p.q_b)
+    if len(p.lossy) > 0:
+        torque = torque + friction_torque(omega, dp, p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f)
+    return torque
+
+
+@contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
     """Friction [N] on the piston by the law that is in force, and the rate [m/s] of its bristles' deflection.
 
@@ -290,9 +344,13 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Return the throttles' flows Q_A and Q_B [m^3/s].
 
-    Q_A runs from line 1 into chamber A, eqs. (4.9)-(4.10), and Q_B from chamber B into line 2, eqs. (4.11)-(4.12).
+    Q_A runs from line 1 into chamber A, eqs. (4.9)-(4.10), and Q_B from chamber B into line 2, eqs. (4.11)-(4.12). A
+    filter in series takes R Q of the pressure difference (Darcy's law).
     """
     dp_A, dp_B = y[P_1] - y[P_A], y[P_B] - y[P_2]
+    if len(p.filtered) > 0:
+        Q_A = implicit_orifice_flow(dp_A, p.R_A, p.c_A_in, p.c_A_out, p.dp_0)
+        return Q_A, implicit_orifice_flow(dp_B, p.R_B, p.c_B_out, p.c_B_in, p.dp_0)
     Q_A = orifice_flow(dp_A, one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
     return Q_A, orifice_flow(dp_B, one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
 
@@ -456,16 +514,18 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     error = speed_error(y, u, p)  # eq. (4.2) as a state
     voltage = controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
     current = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
-    spin = shaft_acceleration(y[CURRENT], y[OMEGA], pump_torque(dp_pump, p.q_b), p.C_m, p.B_M, p.J_M)
+    spin = shaft_acceleration(y[CURRENT], y[OMEGA], shaft_load(y[OMEGA], dp_pump, p), p.C_m, p.B_M, p.J_M)
     stop = hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
     load = load_force(x, p.F_l, p.k_load)
     if len(p.damped) > 0:
         load = load + p.d_load * v
+    if len(p.opposed) > 0:
+        load = load + opposing_force(v, p.A_opp, p.p_opp, p.C_opp)
     if len(p.pushed) > 0:
         load = load + F
     friction, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
     push = piston_acceleration(p_A, p_B, friction, load, stop, p.A_A, p.A_B, p.M_eq)
-    Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
+    Q_1 = pump_delivery(y[OMEGA], dp_pump, p)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
     V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
@@ -514,7 +574,7 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     for m in range(len(y)):
         row[m] = y[m]
     n = len(y)
-    Q_1 = pump_flow(y[OMEGA], pump_difference(y, p), p.q_b, p.G_pump)
+    Q_1 = pump_delivery(y[OMEGA], pump_difference(y, p), p)
     Q_A, Q_B = throttle_flows(y, p) if p.throttled else (Q_1, Q_1)
     if len(p.valved) > 0:
         Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)

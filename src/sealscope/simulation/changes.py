@@ -27,9 +27,16 @@ LONGEST_BLOCK, SHORTEST_BLOCK = 0.5, 0.05
 RESOLUTION = 5e-4
 #: Parameters that drift together under one name.
 GROUPS = {"friction": ("friction.F_pr", "friction.F_cfr", "friction.F_v")}
-_THROTTLES = ("c_A_in", "c_A_out", "c_B_in", "c_B_out")
-#: Parameters that the compiled laws know only within the throttles' coefficients, which go with this power of them.
-_POWERS = {"line.C_d": 1.0, "line.d_line": 2.0, "fluid.rho": -0.5}
+THROTTLES = ("c_A_in", "c_A_out", "c_B_in", "c_B_out")
+#: Parameters that the compiled laws know within numbers that follow from them, which go with these powers of them.
+_POWERS = {
+    "line.C_d": tuple((field, 1.0) for field in THROTTLES),
+    "line.d_line": tuple((field, 2.0) for field in THROTTLES),
+    "fluid.rho": (*((field, -0.5) for field in THROTTLES), ("c_slip", -0.5), ("k_h", 1.0)),
+    "pump.q_b": (("q_b", 1.0), ("c_slip", 2.0 / 3.0), ("k_h", 5.0 / 3.0)),
+    "pump.C_st": (("c_slip", 1.0),),
+    "pump.C_h": (("k_h", 1.0),),
+}
 #: What is not a state of the machine that could drift: geometry, choices, the start.
 _FIXED = {"cylinder.L", "cylinder.V", "fluid.p_charge", "makeup.V_gas"}
 _OF_INSTRUMENTS = {"noise", "hum", "offset", "gain_error", "scale_error", "common_noise"}
@@ -40,7 +47,7 @@ class Effect:
     """One number of the rig that changes: value = (own value + sum of `added`) x product of the others.
 
     `change(t)` at times t [s]: what is added, or the factor; `resolution`: most that it may change from one block to
-    the next; `jumps`: times [s] at which it may jump or bend.
+    the next; `jumps`: times [s] at which it may jump or bend; `shortest`: length [s] below which no block is cut.
     """
 
     field: str
@@ -48,6 +55,7 @@ class Effect:
     resolution: float
     added: bool = False
     jumps: tuple[float, ...] = ()
+    shortest: float = SHORTEST_BLOCK
 
 
 def values_of(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
@@ -82,9 +90,9 @@ def jumps_of(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
 class Schedule:
     """The rig's numbers over a run, constant within blocks: `bounds` (n + 1,) output indices, one number set a block.
 
-    A block is at most 0.5 s long, and so short (down to 0.05 s) that no effect moves by more than its resolution; a
-    jump falls on a block's boundary, within one output interval. Within a block a number has its value at the middle.
-    Neighbours with the same numbers are one block.
+    A block is at most 0.5 s long, and so short (down to the effect's shortest) that no effect moves by more than its
+    resolution; a jump falls on a block's boundary, within one output interval. Within a block a number has its value at
+    the middle. Neighbours with the same numbers are one block.
     """
 
     def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
@@ -115,10 +123,14 @@ class Schedule:
         starts, stops = self.bounds[:-1], self.bounds[1:]
         parts = np.ones(starts.size)
         for effect in effects:
-            parts = np.maximum(parts, moved_per_block(effect, self.bounds, rate))
-        least = max(1, round(SHORTEST_BLOCK * rate))
-        parts = np.minimum(parts, np.maximum(1, (stops - starts) // least)).astype(np.int64)
-        cuts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(starts, stops, parts, strict=True) if n > 1]
+            least = max(1, round(effect.shortest * rate))
+            most = np.maximum(1, (stops - starts) // least)
+            parts = np.maximum(parts, np.minimum(moved_per_block(effect, self.bounds, rate), most))
+        cuts = [
+            np.linspace(a, b, n, endpoint=False)
+            for a, b, n in zip(starts, stops, parts.astype(np.int64), strict=True)
+            if n > 1
+        ]
         return np.unique(np.r_[self.bounds, np.rint(np.concatenate([*cuts, self.bounds[:0]])).astype(np.int64)])
 
     def within(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
@@ -333,7 +345,7 @@ def fields_of(parameter: str) -> tuple[tuple[str, float], ...]:
     if parameter in GROUPS:
         return tuple(field for name in GROUPS[parameter] for field in fields_of(name))
     if parameter in _POWERS:
-        return tuple((field, _POWERS[parameter]) for field in _THROTTLES)
+        return _POWERS[parameter]
     group, _, symbol = parameter.rpartition(".")
     if group.startswith(("sensors", "daq")) or parameter in _FIXED:
         return ()

@@ -18,7 +18,7 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Effect, ParameterDrift, Readings
 from sealscope.simulation.commands import Command, Sine, check_command
 from sealscope.simulation.courses import Force, Position, command_or_target, parse_force
-from sealscope.simulation.faults import Fault, Leak, parse_fault, parse_leak
+from sealscope.simulation.faults import Fault, Leak, Thinned, parse_fault, parse_leak
 from sealscope.units import parse_quantity
 
 if TYPE_CHECKING:
@@ -297,6 +297,24 @@ class Experiment:
         """Return what changes in the machine within the run."""
         drifting = [effect for drift in self.drifts for effect in drift.effects()]
         return (*drifting, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
+
+    def flowing(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
+        """Return leaks as they flow in the run's oil: a laminar one passes more where the oil is warmer than the rig's.
+
+        Their coefficients are those at the rig's own viscosity.
+        """
+        for fault in self.thins:
+            viscosity = fault.viscosity(self.rig)
+            leaks = tuple(
+                replace(leak, opening=Thinned(leak.opening, viscosity)) if viscosity and leak.law == "laminar" else leak
+                for leak in leaks
+            )
+        return leaks
+
+    @property
+    def thins(self) -> tuple[Fault, ...]:
+        """The faults that change the oil's viscosity within the run."""
+        return tuple(fault for fault in self.faults if fault.viscosity(self.rig) is not None)
 
     def readings(self) -> Readings:
         """Return what changes at the instruments within the run."""

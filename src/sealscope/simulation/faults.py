@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
-from sealscope.simulation.changes import GROUPS, Adjustment, Effect, Hold
+from sealscope.simulation.changes import GROUPS, RESOLUTION, THROTTLES, Adjustment, Effect, Hold, fields_of
 from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, number_text, plain_text, seconds
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
@@ -120,10 +120,64 @@ class Tabulated:
         return f"table of {self.t.size} points over {self.t[0]:g}..{self.t[-1]:g} s"
 
 
+@dataclass(frozen=True)
+class Between:
+    """Opens evenly within `ramp` [s] from `start` on, and shuts as evenly from `stop` [s] on (infinity: never)."""
+
+    start: float
+    stop: float = math.inf
+    ramp: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.ramp) and self.ramp >= 0.0):
+            raise InputError(f"a ramp must be >= 0 s and finite, got {self.ramp:g} s")
+        if not self.stop >= self.start + self.ramp:
+            raise InputError(
+                f"what begins at {self.start:g} s and takes {self.ramp:g} s must end later than that, got "
+                f"{self.stop:g} s"
+            )
+
+    def share(self, t: Array) -> Array:
+        """Return the opening at times t [s]."""
+        if self.ramp == 0.0:
+            return np.where((t >= self.start) & (t < self.stop), 1.0, 0.0)
+        return np.clip(np.minimum(t - self.start, self.stop + self.ramp - t) / self.ramp, 0.0, 1.0)
+
+    def onset(self) -> float:
+        """Return `start` [s]."""
+        return self.start
+
+    def __str__(self) -> str:
+        until = f" to {number_text(self.stop)} s" if math.isfinite(self.stop) else ""
+        within = f" within {number_text(self.ramp)} s" if self.ramp else ""
+        return f"from {number_text(self.start)} s{until}{within}"
+
+
+@dataclass(frozen=True, eq=False)
+class Thinned:
+    """The `opening` of a laminar gap, as a share of what it passes at the rig's viscosity: over `viscosity` at t."""
+
+    opening: Opening
+    viscosity: Callable[[Array], Array]
+
+    def share(self, t: Array) -> Array:
+        """Return the opening at times t [s] over the oil's viscosity, that of the rig being 1."""
+        return self.opening.share(t) / self.viscosity(t)
+
+    def onset(self) -> float:
+        """Return the onset [s] of the gap."""
+        return self.opening.onset()
+
+    def __str__(self) -> str:
+        return f"{self.opening}, in oil that changes its temperature"
+
+
 def bends(opening: Opening) -> tuple[float, ...]:
     """Return the times [s] at which an opening jumps or bends, as far as its form tells."""
     if isinstance(opening, Growing):
         return opening.start, opening.stop
+    if isinstance(opening, Between):
+        return opening.start, opening.start + opening.ramp, opening.stop, opening.stop + opening.ramp
     if isinstance(opening, Tabulated) and opening.t.size < 1000:
         return tuple(map(float, opening.t))
     return (opening.onset(),)
@@ -187,6 +241,10 @@ class Fault:
     def commanded(self, command: Command) -> Command:
         """Return the command that the rig gets instead of `command`."""
         return command
+
+    def viscosity(self, rig: Rig) -> Callable[[Array], Array] | None:
+        """Return the oil's viscosity over that of the rig, as a function of times [s]; None where it stays."""
+        return None
 
     def _times(self, name: str, factor: float) -> Effect:
         """Return a number that is multiplied by `factor` when the fault is whole."""
@@ -313,6 +371,167 @@ class AirInOil(Fault):
 
     def __str__(self) -> str:
         return f"air {number_text(self.share)} {self.opening}"
+
+
+#: A valve that moves is held within blocks of one output of the solver, whatever their length [s].
+_VALVE_BLOCK = 0.0
+
+
+@dataclass(frozen=True)
+class ShutOff(Fault):
+    """The shut-off valve in line A or B moves to the opening `to` (0: shut), and back when its opening ends.
+
+    It is no fault of the machine, but an operation of it; `line.open_A`, `line.open_B` are where the valves stand
+    before.
+    """
+
+    side: Literal["A", "B"]
+    to: float = 0.0
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "shut-off valve"
+
+    def __post_init__(self) -> None:
+        if self.side not in ("A", "B"):
+            raise InputError(f"a shut-off valve must be in line A or B, got {self.side!r}")
+        if not 0.0 <= self.to <= 1.0:
+            raise InputError(f"a shut-off valve must open 0 % to 100 %, got {100.0 * self.to:g} %")
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return the change of the coefficients of the line's throttle; a valve needs a line."""
+        from sealscope.physics.restrictors import behind_shut_off, orifice_coefficient
+        from sealscope.physics.rig import throttle_coefficients
+
+        line = rig.line
+        if line.orifices == "absent":
+            raise InputError(f"a shut-off valve must be in a line (line.orifices = present), got absent ({self})")
+        c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)
+        whole = throttle_coefficients(rig.with_overrides({"line.open_A": 1.0, "line.open_B": 1.0}))
+        before = line.open_A if self.side == "A" else line.open_B
+
+        def effect(name: str, c: float) -> Effect:
+            own = c if before >= 1.0 else behind_shut_off(c, c_line, before)
+
+            def change(t: Array) -> Array:
+                s = before + (self.to - before) * self.opening.share(t)
+                return np.asarray(np.where(s >= 1.0, c, behind_shut_off(c, c_line, s)) - own)
+
+            jumps = bends(self.opening)
+            return Effect(name, change, 1e-6 * c, added=True, jumps=jumps, shortest=_VALVE_BLOCK)
+
+        return tuple(effect(name, c) for name, c in zip(THROTTLES, whole, strict=True) if name[2] == self.side)
+
+    def __str__(self) -> str:
+        return f"shut-off {self.side} to {number_text(100.0 * self.to)} % {self.opening}"
+
+
+@dataclass(frozen=True)
+class Circulation(Fault):
+    """The circulation valve between the ports of the pump opens: Q = `line.G_circ` (p_1 - p_2) beside the pump's slip.
+
+    It is no fault of the machine, but an operation of it. Q_1 is then what is left of the pump's flow.
+    """
+
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "circulation valve"
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return the change of `G_pump`; the rig must have such a valve."""
+        G = rig.line.G_circ
+        if G == 0:
+            raise InputError(f"a circulation valve must have line.G_circ > 0, got 0 ({self})")
+        return (replace(self._plus("G_pump", G), shortest=_VALVE_BLOCK),)
+
+    def __str__(self) -> str:
+        return f"circulation {self.opening}"
+
+
+@dataclass(frozen=True)
+class FilterClogs(Fault):
+    """The filter of line A or B clogs: its resistance becomes `factor` times what it was.
+
+    While it grows evenly under a steady duty, that is cake filtration, R = R_0 (1 + V/V_c) over the volume V that has
+    passed (J. Hermia, Constant pressure blocking filtration laws, Trans. IChemE 60 (1982) 183-187).
+    """
+
+    side: Literal["A", "B"]
+    factor: float
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "filter"
+
+    def __post_init__(self) -> None:
+        if self.side not in ("A", "B"):
+            raise InputError(f"a filter must be in line A or B, got {self.side!r}")
+        _check_factor(self.factor, "a filter's resistance")
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return the change of the filter's resistance; the rig must have the filter."""
+        name = f"R_{self.side}"
+        if getattr(rig.line, name) == 0:
+            raise InputError(f"a filter that clogs must have line.{name} > 0, got 0 ({self})")
+        return (self._times(name, self.factor),)
+
+    def __str__(self) -> str:
+        return f"filter {self.side} x{number_text(self.factor)} {self.opening}"
+
+
+@dataclass(frozen=True)
+class OilTemperature(Fault):
+    """The oil becomes `change` [K] warmer than `fluid.T_oil`: its viscosity, density and bulk modulus move.
+
+    Laminar gaps (pump, rod seals, piston, filters: R = 1/G) pass oil as 1/viscosity, viscous friction of piston and
+    shaft goes with it. It is no fault of the machine, but looks like one.
+    """
+
+    change: float
+    opening: Opening = field(default_factory=From)
+    kind: ClassVar[str] = "oil temperature"
+
+    def __post_init__(self) -> None:
+        if not abs(self.change) <= 100.0:
+            raise InputError(f"the oil's temperature must change by at most 100 K, got {self.change:g} K")
+
+    def _warmth(self, rig: Rig, t: Array) -> Array:
+        return np.asarray(rig.fluid.T_oil + self.change * self.opening.share(t))
+
+    def viscosity(self, rig: Rig) -> Callable[[Array], Array]:
+        """Return the dynamic viscosity over that of the rig, as a function of times [s]."""
+        from sealscope.physics.fluid import kinematic_viscosity, thermal_density
+
+        oil = rig.fluid
+        at_rig = float(kinematic_viscosity(np.asarray(oil.T_oil), oil.nu_40, oil.nu_100))
+
+        def ratio(t: Array) -> Array:
+            T = self._warmth(rig, t)
+            thick = kinematic_viscosity(T, oil.nu_40, oil.nu_100) / at_rig
+            return np.asarray(thick * thermal_density(T, oil.T_oil, oil.alpha))
+
+        return ratio
+
+    def effects(self, rig: Rig) -> tuple[Effect, ...]:
+        """Return the change of all numbers that go with the oil."""
+        from sealscope.physics.fluid import thermal_density, thermal_stiffness
+
+        thick, T_0 = self.viscosity(rig), rig.fluid.T_oil
+        effects = []
+
+        def add(name: str, factor: Callable[[Array], Array]) -> None:
+            effects.append(Effect(name, factor, RESOLUTION, jumps=bends(self.opening)))
+
+        for name in ("F_v", "B_M", "R_A", "R_B"):
+            add(name, thick)
+        for name in ("G_pump", "G_ext_A", "G_ext_B"):
+            add(name, lambda t: 1.0 / thick(t))
+        add("K_oil", lambda t: thermal_stiffness(self._warmth(rig, t), T_0))
+
+        def lighter(power: float) -> Callable[[Array], Array]:
+            return lambda t: np.asarray(thermal_density(self._warmth(rig, t), T_0, rig.fluid.alpha) ** power)
+
+        for name, power in fields_of("fluid.rho"):
+            add(name, lighter(power))
+        return tuple(effects)
+
+    def __str__(self) -> str:
+        return f"oil {self.change:+.12g} K {self.opening}"
 
 
 def _check_sensor(channel: str, value: float, what: str) -> None:
@@ -455,6 +674,8 @@ class ChangedDuty:
 
 #: When, in texts of leaks and faults: `from 90 s`, `growing from 1 min to 120 s`.
 _WHEN = rf"(?:\s+(?:from\s+(?P<at>{TIME})|growing\s+from\s+(?P<start>{TIME})\s+to\s+(?P<stop>{TIME})))?"
+#: When a valve is operated: `from 60 s`, `from 60 s to 90 s within 0.5 s`.
+_SPAN = rf"(?:\s+from\s+(?P<since>{TIME})(?:\s+to\s+(?P<until>{TIME}))?)?(?:\s+within\s+(?P<ramp>{TIME}))?"
 _MEAN = rf"(?P<mean>{UNSIGNED}\s*(?:\[[^\]]+\]|[a-zA-Z][a-zA-Z^0-9]*/[a-zA-Z]+))"
 _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(?P<law>laminar|orifice))?{_WHEN}"
 _FACTOR = rf"(?:x\s*(?P<times>{NUMBER})|(?P<percent>[-+]\s*{UNSIGNED})\s*%)"
@@ -469,6 +690,12 @@ def _opening(part: _Part) -> From | Growing:
     if part["start"] is not None and part["stop"] is not None:
         return Growing(seconds(part["start"]), seconds(part["stop"]))
     return From(seconds(part["at"]))
+
+
+def _between(part: _Part) -> Between:
+    """Return the opening that the groups of `_SPAN` say."""
+    until = math.inf if part["until"] is None else seconds(part["until"])
+    return Between(seconds(part["since"]), until, seconds(part["ramp"]))
 
 
 def parse_leak(text: str) -> Leak | None:
@@ -549,6 +776,16 @@ _FORMS: tuple[tuple[str, Callable[[_Part], Fault]], ...] = (
     ),
     (rf"friction\s+{_FACTOR}{_WHEN}", lambda p: FrictionChange(_factor(p), _opening(p))),
     (rf"air\s+{_SHARE}{_WHEN}", lambda p: AirInOil(_share(p), _opening(p))),
+    (
+        rf"shut-off\s+(?P<side>[AB])\s+to\s+{_SHARE}{_SPAN}",
+        lambda p: ShutOff("A" if p["side"] == "A" else "B", _share(p), _between(p)),
+    ),
+    (rf"circulation{_SPAN}", lambda p: Circulation(_between(p))),
+    (
+        rf"filter\s+(?P<side>[AB])\s+{_FACTOR}{_WHEN}",
+        lambda p: FilterClogs("A" if p["side"] == "A" else "B", _factor(p), _opening(p)),
+    ),
+    (rf"oil\s+(?P<kelvin>[-+]\s*{UNSIGNED})\s*K{_WHEN}", lambda p: OilTemperature(_number(p["kelvin"]), _opening(p))),
     (rf"{_SENSOR}\s+offset\s+{_SIZE}{_WHEN}", _offset),
     (rf"{_SENSOR}\s+gain\s+{_SHARE}{_WHEN}", lambda p: SensorGain(p["channel"] or "", _share(p), _opening(p))),
     (rf"{_SENSOR}\s+stuck(?:\s+from\s+(?P<since>{TIME})(?:\s+to\s+(?P<until>{TIME}))?)?", _stuck),
@@ -566,7 +803,9 @@ def parse_fault(text: str) -> Fault | None:
     The forms are ``pump leak x3 from 90 s``, ``pump leak G = 5e-13``, ``rod seal A 0.01 L/min from 90 s`` (flow at the
     charge pressure), ``friction +20 % growing from 60 s to 120 s``, ``air 1 % from 90 s``, ``sensor p_A offset 2 psi
     from 90 s``, ``sensor p_A gain -1 %``, ``sensor p_A stuck from 90 s to 100 s``, and ``duty amplitude x1.5 frequency
-    x0.8 from 90 s``. Raises InputError that shows the forms when the text is none of them.
+    x0.8 from 90 s``. Operations that are no faults: ``shut-off A to 0 % from 60 s to 90 s within 0.5 s``, ``circulation
+    from 60 s to 90 s within 0.5 s``, ``filter A x10 growing from 1 min to 5 min``, ``oil +20 K growing from 0 s to 10
+    min``. Raises InputError that shows the forms when the text is none of them.
     """
     stripped = plain_text(text, "fault")
     if stripped.lower() in ("none", "no fault"):
@@ -577,5 +816,6 @@ def parse_fault(text: str) -> Fault | None:
     raise InputError(
         "fault must be like 'pump leak x3 from 90 s', 'rod seal A 0.01 L/min from 90 s', 'friction +20 % growing from "
         "60 s to 120 s', 'air 1 % from 90 s', 'sensor p_A offset 2 psi from 90 s', 'sensor p_A gain 1 %', 'sensor p_A "
-        f"stuck from 90 s', 'duty amplitude x1.5 from 90 s' or 'none', got {text!r}"
+        "stuck from 90 s', 'duty amplitude x1.5 from 90 s', 'shut-off A to 0 % from 60 s to 90 s within 0.5 s', "
+        f"'circulation from 60 s', 'filter A x10 from 90 s', 'oil +20 K from 90 s' or 'none', got {text!r}"
     )

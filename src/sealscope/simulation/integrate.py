@@ -128,7 +128,7 @@ class RunInputs:
     """Command and leakage of an experiment; `leaks` have their coefficients."""
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
-        self._leaks = leaks
+        self._leaks = experiment.flowing(leaks)
         # of a target, the controller's voltage takes the place of this (`Feedback`)
         self._command = experiment.commanded if experiment.target is None else Sine(0.0, 0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
@@ -388,11 +388,11 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
     refuse_long(h, longest_step(p), "speed loop, oil columns and friction of this rig")
-    limit = DECAY_LIMIT / stiffest_rate(p)
-    if method == "rk4" and p.throttled and h > limit:
+    rate = stiffest_rate(p)
+    if method == "rk4" and p.throttled and h * rate > DECAY_LIMIT:
         raise SimulationFailed(
-            f"step must be <= {limit:.2g} s for rk4 with throttles (line volumes answer within "
-            f"{1 / stiffest_rate(p):.2g} s), got {h:.3g} s; use method imex"
+            f"step must be <= {DECAY_LIMIT / rate:.2g} s for rk4 with throttles (line volumes answer within "
+            f"{1 / rate:.2g} s), got {h:.3g} s; use method imex"
         )
 
 

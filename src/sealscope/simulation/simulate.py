@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 #: Called with what is being done and how far it is, 0..1.
 Progress = Callable[[str, float], None]
-#: What the truth of a run holds at each sample.
+#: What the truth of a run holds at each sample, beside the powers (`powers`).
 TRUE_OUTPUTS = (
     *("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak", "q_ext", "q_up"),
     *("x_s", "i", "V"),
@@ -188,10 +188,29 @@ def simulate_with_truth(experiment: Experiment, progress: Progress | None = None
     units = {name: CHANNEL_UNITS[name] for name in channels}
     recording = replace(recorded, channels=channels, units=units, provenance=provenance, history=history)
     outputs = {name: path[name][: n * factor : factor] for name in TRUE_OUTPUTS}
+    outputs |= powers(outputs, experiment.rig)
     dp, dp_0 = path["p_A"] - path["p_B"], experiment.rig.line.dp_0
-    mean = sum(mean_while_open(leak, path.t, leak_flow(leak, path.t, dp, dp_0)) for leak in leaks) / LITRE_PER_MINUTE
+    flows = (leak_flow(leak, path.t, dp, dp_0) for leak in experiment.flowing(leaks))
+    mean = sum(mean_while_open(leak, path.t, flow) for leak, flow in zip(leaks, flows, strict=True)) / LITRE_PER_MINUTE
     truth = Truth(leaks, experiment.onset(), mean, times, outputs, experiment.faults, experiment.drifts)
     return Run(recording, truth, proof)
+
+
+def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
+    """Return the powers [W] of a run: into the motor, from the pump into the oil, from the pressures into the piston.
+
+    A servo valve's pump feeds the supply: its power is that of the supply.
+    """
+    from sealscope.physics.cylinder import mechanical_power
+    from sealscope.physics.motor import electric_power
+    from sealscope.physics.pump import hydraulic_power
+
+    o, c = outputs, rig.cylinder
+    return {
+        "P_electric": np.asarray(electric_power(o["V"], o["i"])),
+        "P_hydraulic": np.asarray(hydraulic_power(o["Q_1"], o["p_1"] - o["p_2"])),
+        "P_mechanical": np.asarray(mechanical_power(o["p_A"], o["p_B"], o["v"], c.A_A, c.A_B)),
+    }
 
 
 def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:

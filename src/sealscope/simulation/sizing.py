@@ -96,7 +96,8 @@ def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] |
                     f"this command, got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
                 )
             size = now.coefficient or 0.0
-            unit = mean_while_open(now, run.t, leak_flow(replace(now, coefficient=1.0), run.t, dp, dp_0))
+            (flowing,) = experiment.flowing((replace(now, coefficient=1.0),))
+            unit = mean_while_open(now, run.t, leak_flow(flowing, run.t, dp, dp_0))
             if not unit > 0:
                 raise InputError(f"a leak with a mean flow must be open within the run, got {leak}")
             got = unit * size

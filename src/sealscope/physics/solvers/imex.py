@@ -88,6 +88,8 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
         K_1, K_2 = bulk_modulus(moved[P_1], p), bulk_modulus(moved[P_2], p)
         g_A = step * (pressure_rate(1.0, V_A, K_A) + pressure_rate(1.0, p.V_1, K_1))
         g_B = step * (pressure_rate(1.0, V_B, K_B) + pressure_rate(1.0, p.V_2, K_2))
+        if len(p.filtered) > 0:  # p_1 - p_A = d + R Q once the flow has passed: the filter adds to g
+            g_A, g_B = g_A + p.R_A, g_B + p.R_B
         Q_A = implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
         Q_B = implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
         s = throttle_rates(moved, Q_A, Q_B, p)

@@ -53,7 +53,11 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     ends = _end_volumes(p)
     chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
     ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if p.throttled else chambers
-    loop = _longest_for_pair(p.R_c / p.L_c + p.B_M / p.J_M, (p.R_c * p.B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M))
+    B_M, G_pump = p.B_M, p.G_pump
+    if len(p.lossy) > 0:  # friction at standstill, under the largest torque of the motor; slip at no pressure
+        B_M += (p.T_f + p.C_f * p.C_m * p.i_max) / p.omega_f
+        G_pump += p.c_slip / math.sqrt(p.dp_0)
+    loop = _longest_for_pair(p.R_c / p.L_c + B_M / p.J_M, (p.R_c * B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M))
     column = (p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) + p.k_load) / p.M_eq
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
     breakaway = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
@@ -63,7 +67,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     if len(p.bristled) > 0:
         stuck = _longest_for_pair((p.sigma_1 + p.F_v + p.d_load) / p.M_eq, column + p.sigma_0 / p.M_eq)
     ports = 0.0 if len(p.valved) > 0 else ports  # the pump works on the supply: see there
-    pump = _longest_for_pair(ports * p.G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
+    pump = _longest_for_pair(ports * G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
     leak = _longest_for_pair(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
     # Q = G dp (dp - p_crack)/p_open of a pilot-operated valve is steepest where it is fully open
     steepest = 2.0 + p.p_crack / p.p_open if len(p.piloted) > 0 else 1.0
@@ -85,7 +89,8 @@ def _longest_of_valve(p: RigNumbers, ends: tuple[tuple[float, float], ...]) -> f
     spool = _longest_for_pair(2.0 * p.zeta_s * p.omega_s, p.omega_s**2)
     edges = _longest_for_pair(most * chamber, 0.0)
     pump = supply * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M
-    line = _longest_for_pair(supply * (p.G_pump + p.G_set + 2.0 * most), pump)
+    slip = p.c_slip / math.sqrt(p.dp_0)
+    line = _longest_for_pair(supply * (p.G_pump + slip + p.G_set + 2.0 * most), pump)
     return min(spool, edges, line)
 
 

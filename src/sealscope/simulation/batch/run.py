@@ -100,6 +100,11 @@ def refuse(experiment: Experiment, place: int) -> None:
         raise no(f"no fault of a sensor, got {', '.join(str(fault) for fault in experiment.faults)}")
     if experiment.rig.daq.jitter != 0:
         raise no(f"daq.jitter = 0, got {experiment.rig.daq.jitter}")
+    if any(effect.shortest < SHORTEST_BLOCK for effect in experiment.effects()):
+        moving = [str(fault) for fault in experiment.faults if fault.kind in ("shut-off valve", "circulation valve")]
+        raise no(f"valves in the lines that stand still, got {', '.join(moving)}")
+    if experiment.leaks and experiment.thins:
+        raise no("no leak while the oil's temperature changes")
     for name in CHAMBERS:
         sensor = getattr(experiment.rig.sensors, name)
         for field in ("stuck_rate", "drop_rate", "lag", "hum_harmonics"):

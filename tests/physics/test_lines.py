@@ -1,0 +1,346 @@
+"""What stands in the lines and loads the drive: shut-off valves, filters, losses, an opposing cylinder, warm oil.
+
+Each against a closed form, then all of them at once: oil, energy, an independent program.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import simpson, solve_ivp
+from scipy.optimize import brentq
+
+from sealscope.errors import InputError
+from sealscope.parameters import load_rig
+from sealscope.physics.cylinder import opposing_force
+from sealscope.physics.fluid import kinematic_viscosity, thermal_density, thermal_stiffness
+from sealscope.physics.pump import friction_torque, loss_coefficients, turbulent_slip
+from sealscope.physics.rest import initial_state
+from sealscope.physics.restrictors import behind_shut_off, behind_valve, implicit_orifice_flow, orifice_flow
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.faults import Circulation, ShutOff, parse_fault
+from sealscope.simulation.simulate import simulate_with_truth
+
+LINES = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %", "p_charge": "2 MPa"}
+LOSSES = {"T_f": 0.09, "C_f": 0.03, "C_h": 60.0, "C_st": 2e-5, "G_pump": 2e-13}
+#: All parts at once.
+PARTS = {
+    **LINES,
+    **LOSSES,
+    **{"R_A": 2e9, "R_B": 5e9, "open_B": 0.3, "G_circ": 1e-9, "B_M": 1e-3},
+    **{"A_opp": "100[mm^2]", "p_opp": "1 MPa", "C_opp": 1e-7},
+}
+#: The line shuts and the pump's oil circulates meanwhile.
+OPERATED = ("shut-off A to 0 % from 1 s to 1.6 s within 0.2 s", "circulation from 1 s to 1.6 s within 0.2 s")
+
+
+def rig_with(**values):
+    return load_rig("thesis").with_overrides(values)
+
+
+@given(c=st.floats(1e-8, 1e-5), c_line=st.floats(1e-7, 1e-5), s=st.floats(1e-3, 0.999), dp=st.floats(1e3, 2e7))
+def test_a_shut_off_valve_s_pressure_drop_adds_to_that_of_the_throttle(c, c_line, s, dp):
+    """Throttle and what the valve takes beyond its open line, each by the root of its own pressure drop."""
+
+    def left(Q):
+        return (Q / c) ** 2 + (Q / (s * c_line)) ** 2 - (Q / c_line) ** 2 - dp
+
+    Q = brentq(left, 0.0, c * math.sqrt(dp) * (1 + 1e-9), xtol=1e-20)
+    assert behind_shut_off(c, c_line, s) * math.sqrt(dp) == pytest.approx(Q, rel=1e-9)
+    assert (behind_valve(c, c_line, 1.0), behind_valve(c, c_line, 0.0)) == (c, 0.0)
+
+
+@given(dp=st.floats(-2e7, 2e7), R=st.floats(1e6, 1e12))
+def test_a_filter_takes_its_share_of_the_pressure_difference_by_darcy_s_law(dp, R):
+    Q = implicit_orifice_flow(dp, R, 1.2e-6, 6e-7, 2000.0)
+    assert orifice_flow(dp - R * Q, 1.2e-6 if dp > 0 else 6e-7, 2000.0) == pytest.approx(Q, rel=1e-7, abs=1e-17)
+
+
+@given(omega=st.floats(2.0, 500.0), dp=st.floats(1e4, 2e7), rho=st.floats(800.0, 1000.0))
+def test_losses_go_with_speed_pressure_and_size_as_published(omega, dp, rho):
+    q_b, C_st, C_h = 4.9e-6, 1e-4, 50.0
+    D = q_b / (2 * math.pi)
+    c_slip, k_h = loss_coefficients(q_b, C_st, C_h, rho)
+    assert turbulent_slip(dp, c_slip, 2000.0) == pytest.approx(C_st * D ** (2 / 3) * math.sqrt(2 * dp / rho), rel=0.02)
+    torque = friction_torque(omega, -dp, q_b, 0.09, 0.05, k_h, 1.0)
+    assert torque == pytest.approx(0.09 + 0.05 * D * dp + C_h * rho * D ** (5 / 3) * omega**2 / 2, rel=1e-12)
+    assert friction_torque(-omega, dp, q_b, 0.09, 0.05, k_h, 1.0) == -torque
+    assert friction_torque(0.25, dp, q_b, 0.09, 0.0, 0.0, 1.0) == pytest.approx(0.0225)  # smooth through standstill
+
+
+@given(v=st.floats(-0.5, 0.5), A=st.floats(1e-5, 1e-2), p=st.floats(0.0, 1e7), C=st.floats(1e-7, 1e-4))
+def test_an_opposing_cylinder_s_oil_passes_its_orifice(v, A, p, C):
+    inside = opposing_force(v, A, p, C) / A
+    if inside > -101325.0:
+        assert C * math.copysign(math.sqrt(abs(inside - p)), inside - p) == pytest.approx(A * v, rel=1e-6, abs=1e-4 * C)
+
+
+def test_viscosity_follows_the_chart():
+    """32 and 5.4 mm^2/s at 40 and 100 deg C are 8.5 at 80 deg C (ASTM D341)."""
+    T = np.array([313.15, 353.15, 373.15])
+    assert np.round(1e6 * kinematic_viscosity(T, 32e-6, 5.4e-6), 1).tolist() == [32.0, 8.5, 5.4]
+    assert thermal_density(np.array([333.15]), 313.15, 7e-4) == pytest.approx(1 - 0.014)
+    assert thermal_stiffness(np.array([333.15]), 313.15) == pytest.approx(10**-0.048)
+
+
+@pytest.fixture(scope="module")
+def stops(drive):
+    """The piston has reached a constant speed; both lines shut at 0.6 s, at once or within 0.4 s."""
+    values = {"p_charge": "8 MPa", "F_pr": 0.1, "F_cfr": 0.0, "F_v": 0.1, "G_circ": 1e-9, "orifices": "present"}
+    rig = rig_with(**values)
+
+    def run(ramp):
+        words = [f"shut-off {side} to 0 % from 0.6 s within {ramp} s" for side in "AB"]
+        words.append(f"circulation from 0.6 s within {ramp} s")
+        effects = [effect for text in words for effect in parse_fault(text).effects(rig)]
+        u = {"u": lambda t: 3.0 - 3.0 * np.cos(np.pi * np.minimum(t / 0.5, 1.0))}
+        return drive(rig, 1.2, **u, rate=4000.0, effects=effects)
+
+    return rig, run(0.0), run(0.4)
+
+
+def test_a_line_that_shuts_at_once_surges_and_one_that_shuts_slowly_does_not(stops):
+    """Of a mass on two shut-in columns: v sqrt(M K/(2 V)), without friction."""
+    rig, at_once, slowly = stops
+    before = at_once.t < 0.6
+    v = at_once["v"][before][-1]
+    assert v > 0.02
+    level = at_once["p_B"][before][-1]
+    surge = v * math.sqrt(rig.cylinder.M_eq * rig.fluid.K_oil / (2.0 * rig.cylinder.V))
+    after = at_once["p_B"][(at_once.t >= 0.6) & (at_once.t < 0.62)] - level
+    assert after.max() == pytest.approx(surge, rel=0.03)
+    assert np.abs(slowly["p_B"][slowly.t >= 0.6] - level).max() < 0.1 * surge
+    assert np.abs(slowly["v"][slowly.t > 1.1]).max() < 0.1 * v  # rings down
+    for run in (at_once, slowly):  # what the pump gives circulates
+        np.testing.assert_allclose(run["Q_A"][run.t > 1.05], 0.0, atol=1e-12)
+        over = rig.line.G_circ * (run["p_1"] - run["p_2"])
+        np.testing.assert_allclose((rig.pump.q_b / (2 * math.pi) * run["omega"])[-400:], over[-400:], rtol=1e-3)
+
+
+def flows(rig, run):
+    """Flows [m^3/s] past piston and pump, and pressure drops [Pa] of the lines, written from the outputs."""
+    D, dp = rig.pump.q_b / (2 * math.pi), run["p_1"] - run["p_2"]
+    slip = rig.pump.C_st * D ** (2 / 3) * math.sqrt(2 / rig.fluid.rho) * dp / (dp**2 + rig.line.dp_0**2) ** 0.25
+    return D, dp, slip
+
+
+@pytest.fixture(scope="module")
+def finely(drive):
+    """All parts, with fixed volumes and a leak, while line A shuts and opens again, at a step of 10 us."""
+    rig = rig_with(**PARTS)
+    effects = [effect for text in OPERATED for effect in parse_fault(text).effects(rig)]
+    effects = [replace(effect, shortest=1e-3) for effect in effects]  # outputs have the flows of their steps
+    step = 1e-5
+    u = {"u": lambda t: 4.0 * np.sin(3.0 * t)}
+    return rig, drive(rig, 2.0 + step, **u, G=1e-12, rate=1e5, step=step, effects=effects)
+
+
+@pytest.mark.slow
+def test_no_oil_is_lost(finely):
+    rig, run = finely
+    c, line, K = rig.cylinder, rig.line, rig.fluid.K_oil
+    held = (c.V * (run["p_A"] + run["p_B"]) + line.V_1 * run["p_1"] + line.V_2 * run["p_2"]) / K
+    assert np.abs(held - held[0]).max() <= 1e-9 * c.V
+    assert np.ptp(run["p_1"]) > 2e5
+
+
+@pytest.mark.slow
+def test_what_the_wires_bring_is_found_again(finely):
+    rig, run = finely
+    m, c, f, line, K = rig.motor, rig.cylinder, rig.friction, rig.line, rig.fluid.K_oil
+    D, dp, slip = flows(rig, run)
+    omega, v = run["omega"], run["v"]
+    Q_A, Q_B = run["Q_A"], run["Q_B"]
+    F_C = f.F_pr + f.F_cfr * (run["p_A"] + run["p_B"])
+    speed = np.abs(v)
+    running = F_C * (1 + (f.K_brk - 1) * np.exp(-f.C_c * speed)) + f.F_v * speed
+    standing = speed / f.v_th * (F_C * (1 + (f.K_brk - 1) * np.exp(-f.C_c * f.v_th)) + f.F_v * f.v_th)
+    rubbing = np.clip(np.abs(omega), 0, 1) * (m.T_f + rig.pump.C_f * D * np.abs(dp))
+    drag = 0.5 * rig.pump.C_h * rig.fluid.rho * D ** (5 / 3) * omega**2
+    opposing = c.A_opp * (c.p_opp + v * speed * (c.A_opp / c.C_opp) ** 2)
+
+    def total(power):
+        return float(simpson(power, x=run.t))
+
+    def gained(energy):
+        return float(energy[-1] - energy[0])
+
+    terms = {
+        "copper": total(m.R_c * run["i"] ** 2),
+        "viscous": total(m.B_M * omega**2),
+        "rubbing": total(rubbing * np.abs(omega)),
+        "hydrodynamic": total(drag * np.abs(omega)),
+        "slip and circulation": total((D * omega - run["Q_1"]) * dp),
+        "lines": total(Q_A * (run["p_1"] - run["p_A"]) + Q_B * (run["p_B"] - run["p_2"])),
+        "piston leakage": total(1e-12 * (run["p_A"] - run["p_B"]) ** 2),
+        "friction": total(np.where(speed > f.v_th, running, standing) * speed),
+        "opposing cylinder": total(opposing * v),
+        "winding": gained(0.5 * m.L_c * run["i"] ** 2),
+        "rotor": gained(0.5 * m.J_M * omega**2),
+        "piston": gained(0.5 * c.M_eq * v**2),
+        "oil": gained(
+            0.5 * (c.V * (run["p_A"] ** 2 + run["p_B"] ** 2) + line.V_1 * run["p_1"] ** 2 + line.V_2 * run["p_2"] ** 2)
+        )
+        / K,
+    }
+    came = total(run["V"] * run["i"])
+    assert came > 5.0
+    assert sum(terms.values()) == pytest.approx(came, rel=1e-6), terms
+    for name in ("rubbing", "hydrodynamic", "slip and circulation", "lines", "opposing cylinder"):
+        assert abs(terms[name]) > 1e-4 * came, (name, terms)
+    moving = (run.t < 1.0) | (run.t > 1.8)
+    np.testing.assert_allclose((D * omega - run["Q_1"] - slip)[moving], (rig.pump.G_pump * dp)[moving], atol=1e-15)
+
+
+@pytest.mark.slow
+def test_a_run_starts_in_equilibrium_against_an_opposing_cylinder(drive):
+    rig = rig_with(**{**PARTS, "p_opp": "3 MPa", "G_pump": 0.0, "C_st": 0.0})
+    run = drive(rig, 0.5, u=0.0)
+    carried = run["p_A"][0] * rig.cylinder.A_A - run["p_B"][0] * rig.cylinder.A_B
+    assert carried == pytest.approx(300.0)
+    assert np.abs(run["x"]).max() < 1e-9
+    assert np.abs(run["omega"]).max() < 1e-6
+
+
+def test_the_supply_of_a_valve_turns_against_the_losses():
+    """C_m i = D dp + B_M omega + T_f + C_f D dp + k_h omega^2, with the speed loop's integral behind the voltage."""
+    rig = load_rig("servo-valve").with_overrides(LOSSES)
+    y, m, omega = initial_state(rig, 0.0), rig.motor, rig.supply.omega_P
+    pressed = rig.pump.q_b / (2 * math.pi) * (y[8] - y[9])
+    drag = 30.0 * rig.fluid.rho * (rig.pump.q_b / (2 * math.pi)) ** (5 / 3) * omega**2
+    assert m.C_m * y[1] == pytest.approx(1.03 * pressed + m.B_M * omega + 0.09 + drag, rel=1e-12)
+    assert m.K_i * y[0] == pytest.approx(m.R_c * y[1] + m.C_e * omega, rel=1e-12)
+
+
+def oracle(t, y, warm):
+    """dy/dt of all parts in plain Python, with their numbers typed in: 4 sin 3t, a leak; `warm` [K] of the oil."""
+    integral, i, w, _, v, pa, pb, p1, p2 = y
+    T = 313.15 + warm * min(max(t / 2.0, 0.0), 1.0)
+    logs = [math.log(math.log(nu + 0.7)) for nu in (32.0, 5.4)]
+    nu = math.exp(math.exp(logs[0] - (logs[0] - logs[1]) / math.log(373.15 / 313.15) * math.log(T / 313.15))) - 0.7
+    light = 1 - 7e-4 * (T - 313.15)
+    mu = nu / 32.0 * light
+    K = 689e6 * 10 ** (-0.0024 * (T - 313.15))
+    rho, A, V, M, V1, D = RHO * light, 633e-6, 234e-6, 12.3, 44e-6, 4.9e-6 / (2 * math.pi)
+    shut = 1.0 - min(max(min((t - 1.0) / 0.2, (1.8 - t) / 0.2), 0.0), 1.0)
+    circulating = (1.0 - shut) * 1e-9
+    wd = 100 * math.pi / 30 * 4.0 * math.sin(3.0 * t)
+    dp = p1 - p2
+    slip = 2e-5 * D ** (2 / 3) * math.sqrt(2 / rho) * dp / (dp * dp + 2000.0**2) ** 0.25
+    Q1 = D * w - slip - (2e-13 + circulating) / mu * dp
+    torque = D * dp + min(max(w, -1.0), 1.0) * (0.09 + 0.03 * abs(D * dp)) + 30.0 * rho * D ** (5 / 3) * w * abs(w)
+
+    def line(over, free_in, s, R):
+        """Flow of valve, throttle and filter in series under `over` [Pa]."""
+        c_line = 0.92 * math.pi / 4 * 7e-3**2 * math.sqrt(2 / rho)
+        c = c_line if (over > 0) == free_in else 0.5 * c_line
+        c = 0.0 if s <= 0 else 1 / math.sqrt(1 / c**2 + (1 / s**2 - 1) / c_line**2)
+        if c == 0.0 or over == 0.0:
+            return 0.0
+        d, step = 0.0, math.inf  # what is left for the orifice, by Newton's method from below: the sum is concave
+        while step > 1e-12 * abs(over):
+            root = (d * d + 2000.0**2) ** 0.25
+            step = (abs(over) - d - R * c * d / root) / (1 + R * c * (0.5 * d * d + 2000.0**2) / root**5)
+            d += step
+        return math.copysign(c * d / (d * d + 2000.0**2) ** 0.25, over)
+
+    QA, QB = line(p1 - pa, True, shut, 2e9 * mu), line(pb - p2, False, 0.3, 5e9 * mu)
+    leak = 1e-12 / mu * (pa - pb)
+    fc = 25 + 1e-6 * (pa + pb)
+    if abs(v) > 0.01:
+        f = fc * (1 + 2 * math.exp(-10 * abs(v))) * math.copysign(1, v) + 300 * mu * v
+    else:
+        f = v / 0.01 * (fc * (1 + 2 * math.exp(-10 * 0.01)) + 300 * mu * 0.01)
+    force = 1e-4 * (1e6 + v * abs(v) * (1e-4 / 1e-7) ** 2)
+    return [
+        wd - w,
+        (1.2 * (wd - w) + 0.1 * integral - 0.73 * i - 0.6963 * w) / 3.55e-3,
+        (0.6963 * i - 1e-3 * mu * w - torque) / 8.74e-4,
+        v,
+        ((pa - pb) * A - f - force) / M,
+        K / V * (QA - A * v - leak),
+        K / V * (A * v + leak - QB),
+        K / V1 * (Q1 - QA),
+        K / V1 * (QB - Q1),
+    ]
+
+
+RHO = 847.0
+
+
+@pytest.mark.slow
+def test_an_independent_program_finds_the_same():
+    """All parts at once, in oil that becomes 3 K warmer: within 100 Pa and 1e-6 m."""
+    faults = (*OPERATED, "oil +3 K growing from 0 s to 2 s")
+    experiment = Experiment.of(
+        set=PARTS, command="4 sin(3t)", leak="G = 1e-12", fault=faults, duration=2.2, rate=4000.0, error=5.0
+    )
+    assert experiment.rig.fluid.rho == RHO
+    truth = simulate_with_truth(experiment).truth
+    y = initial_state(experiment.rig, 0.0)[:10][[0, 1, 2, 4, 5, 6, 7, 8, 9]]
+    t = truth.t[::20]
+    atol = 1e-8 * np.array([1, 1, 10, 1e-3, 1e-2, 1e4, 1e4, 1e4, 1e4])
+    theirs = solve_ivp(oracle, (0.0, t[-1]), y, "Radau", t, args=(3.0,), rtol=1e-8, atol=atol, max_step=0.01)
+    assert theirs.success
+    assert np.abs(truth.outputs["x"][::20] - theirs.y[3]).max() < 1e-6
+    for name, row in (("p_A", 5), ("p_B", 6), ("p_1", 7), ("p_2", 8)):
+        assert np.sqrt(np.mean((truth.outputs[name][::20] - theirs.y[row]) ** 2)) < 100.0
+    assert np.ptp(theirs.y[3]) > 0.002
+    o = truth.outputs
+    np.testing.assert_allclose(o["P_electric"], o["V"] * o["i"])
+    np.testing.assert_allclose(o["P_hydraulic"], o["Q_1"] * (o["p_1"] - o["p_2"]))
+
+
+@pytest.mark.parametrize("warmer", [-10.0, 25.0])
+def test_a_leak_passes_what_the_oil_s_viscosity_lets_it(warmer):
+    """Q_L = G dp mu_0/mu, whatever was asked for: a mean is what flows while it is open."""
+    leak, fault = "0.02 L/min", f"oil {warmer:+g} K"
+    truth = simulate_with_truth(Experiment.of(leak=leak, fault=fault, duration=1.0)).truth
+    assert truth.mean_leak_lpm == pytest.approx(0.02, rel=2e-3)
+    dp = truth.outputs["p_A"] - truth.outputs["p_B"]
+    G = truth.leaks[0].coefficient
+    thick = parse_fault(fault).viscosity(load_rig("thesis"))(np.zeros(1))[0]
+    np.testing.assert_allclose(truth.outputs["q_leak"], G / thick * dp, rtol=1e-9, atol=1e-15)
+    assert (thick < 1.0) == (warmer > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "fault", "rule"),
+    [
+        ({"R_A": 1e9}, None, r"a filter must be in a line .*, got line.R_A = 1e\+09 and line.orifices = absent"),
+        ({"open_B": 0.5}, None, r"a shut-off valve must be in a line .* got line.open_B = 0.5"),
+        ({}, "shut-off A to 0 %", r"a shut-off valve must be in a line \(line.orifices = present\), got absent"),
+        ({}, "circulation from 1 s", r"a circulation valve must have line.G_circ > 0, got 0"),
+        (LINES, "filter B x3", r"a filter that clogs must have line.R_B > 0, got 0"),
+        (LINES, "shut-off B to 120 %", r"must open 0 % to 100 %, got 120 %"),
+        (LINES, "shut-off B to 0 % from 2 s to 2.1 s within 0.5 s", r"takes 0.5 s must end later .* got 2.1 s"),
+        ({}, "oil +200 K", r"temperature must change by at most 100 K, got 200 K"),
+        ({"nu_100": "40[mm^2/s]"}, None, r"nu_100 must be < nu_40 = 3.2e-05 m\^2/s"),
+    ],
+)
+def test_an_impossible_line_is_one_line(values, fault, rule):
+    with pytest.raises(InputError, match=rule) as refused:
+        Experiment.of(set=values, fault=fault, duration=3.0)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_batch_refuses_valves_that_move_and_thinning_leaks():
+    from sealscope.simulation.batch.run import refuse
+
+    moving = Experiment.of(set={**LINES, "G_circ": 1e-9}, fault=OPERATED, duration=2.0)
+    with pytest.raises(InputError, match=r"must have valves in the lines that stand still, got shut-off A to 0 %"):
+        refuse(moving, 0)
+    with pytest.raises(InputError, match=r"no leak while the oil's temperature changes"):
+        refuse(Experiment.of(leak="0.01 L/min", fault="oil +5 K", duration=2.0), 0)
+
+
+def test_operations_are_read_back_from_their_own_words():
+    for fault in (*OPERATED, "filter A x10 growing from 1 s to 3 s", "oil -5 K from 1 s"):
+        assert str(parse_fault(str(parse_fault(fault)))) == str(parse_fault(fault))
+    assert parse_fault(OPERATED[0]) == ShutOff("A", 0.0, parse_fault(OPERATED[0]).opening)
+    assert isinstance(parse_fault("circulation"), Circulation)
