@@ -2,8 +2,9 @@
 
     python benchmarks/identification.py [--rigs 30] [--seed 28] [--base thesis-closed-loop]
 
-Each rig is the base with areas, bulk modulus, pump leakage, friction, load and speed loop of its own, recorded twice
-for 60 s: a closed loop over a multi-sine whose controller knows the base, with and without a load that steps.
+Each rig is the base with areas, bulk modulus, pump leakage, friction, load and speed loop of its own (behind a servo
+valve: rated flow and overlaps in place of areas and speed loop), recorded twice for 60 s: a closed loop over a
+multi-sine whose controller knows the base, with and without a load that swings.
 """
 
 from __future__ import annotations
@@ -30,17 +31,26 @@ SHARES = {
     "motor.K_i": 0.3,
     "motor.omega_per_volt": 0.05,
 }
+#: Those of a machine behind a servo valve, whose areas are stated.
+VALVE_SHARES = {name: share for name, share in SHARES.items() if name.startswith(("fluid", "friction"))} | {
+    "valve.Q_N": 0.2
+}
+#: Overlaps of its edges, either way [m].
+LAP = 10e-6
 
 
 def drawn_rig(base: str, number: int, seed: int = 15) -> dict[str, float]:
     """Return the overrides of a rig of its own."""
     random, rig = np.random.default_rng([seed, number]), load_rig(base)
     values: dict[str, float] = {}
-    for name, share in SHARES.items():
+    valved = rig.valve.spool == "present"
+    for name, share in (VALVE_SHARES if valved else SHARES).items():
         factor = 1.0 + share * random.uniform(-1.0, 1.0)
         for side in ("_A", "_B") if name == "cylinder.A" else ("",):
             values[name + side] = float(rig[name + side]) * factor
     values["pump.G_pump"] = random.uniform(0.0, 2e-12)
+    for edge in ("PA", "AT", "PB", "BT") if valved else ():
+        values[f"valve.o_{edge}"] = random.uniform(-LAP, LAP)
     values["cylinder.F_l"] = random.uniform(-200.0, 200.0)
     return values
 
@@ -49,7 +59,7 @@ def judged(task: tuple[str, int, int]) -> dict[str, dict[str, float]]:
     """Simulate a rig's recordings, identify, and return the truth and the interval of each estimate."""
     base, number, seed = task
     values = drawn_rig(base, number, seed)
-    size = 1.0 if base == "thesis-closed-loop" else 0.6
+    size = 0.6 if base == "single-rod-eha" else 1.0
     loads = (None, "1 kN sin(0.7t) + 1 kN")
     recordings = []
     for k, load in enumerate(loads):

@@ -105,11 +105,34 @@ def test_another_kind_of_machine_is_said(recording):
     assert "no pump-controlled machine" in (other.mismatch or "")
 
 
+@pytest.mark.slow
+def test_a_machine_behind_a_servo_valve_is_identified_and_no_other_one_taken_for_it(recording):
+    unlike = {"Q_N": 1.9e-4, "K_oil": 760e6, "o_PA": 8e-6, "o_AT": -5e-6, "o_PB": 3e-6, "o_BT": -2e-6}
+    words = {"rig": "servo-valve", "command": DUTY, "controller": "pi", "duration": 16.0}
+    behind = ss.simulate(**words, set=unlike, load="1 kN sin(0.7t) + 1 kN")
+    found = identify([behind], "servo-valve")
+    for name, truth in unlike.items():
+        estimate = found[f"{'fluid' if name == 'K_oil' else 'valve'}.{name}"]
+        assert abs(estimate.value - truth) < 4.0 * estimate.sd
+        assert estimate.sd < 0.03 * max(abs(truth), 1e-6)
+    told = dict(found.untold)
+    assert "rated flow only" in told["cylinder.A_A, cylinder.A_B"]
+    assert told["friction"] == "friction needs a recording in which the load is constant"
+    assert "a rig has no parameter for it" in told["leakage of the piston"]
+    assert "no machine behind a servo valve" in (identify([recording], "servo-valve").mismatch or "")
+    with pytest.raises(InputError, match="and p_B of a machine behind a pump, got a recording without theta"):
+        identify([behind], "thesis-closed-loop")
+    single = ss.simulate(**words | {"set": {"A_B": "400[mm^2]", "V_rod": "40[cm^3]"}, "duration": 12.0})
+    assert "got 1.58: take a rig of a single-rod cylinder" in (identify([single], "servo-valve").mismatch or "")
+
+
 def test_what_cannot_be_identified_is_one_line(recording):
     with pytest.raises(InputError, match="identification must have one recording or more, got none"):
         identify([], "thesis")
     short = ss.Recording(recording.t, {"p_A": recording["p_A"]}, {"p_A": "Pa"}, recording.rate)
-    with pytest.raises(InputError, match="must have theta, x, p_A and p_B, got a recording without theta"):
+    with pytest.raises(
+        InputError, match="must have theta, x, p_A and p_B of a machine behind a pump, got a recording without theta"
+    ):
         identify([short], "thesis")
 
 

@@ -29,6 +29,8 @@ def friction(recordings: Sequence[Recording], rig: Rig, area_A: float, area_B: f
     A_A p_A - A_B p_B - M a = F_l + sign(v) (F_pr + F_cfr (p_A + p_B)) (1 + (K_brk - 1) exp(-C_c |v|)) + F_v v
     (eqs. (4.20), (4.21)) over rows in which the piston slides; F_cfr, C_c, M_eq are the rig's as stated. Areas in m^2.
     """
+    if rig.cylinder.A_opp > 0:
+        return "friction is not told from the force of an opposing cylinder (cylinder.A_opp > 0)"
     tables = [_rows(recording, rig, area_A, area_B) for recording in recordings]
     steady = [table for table in tables if len(table) and _constant_load(table)]
     if not steady:
