@@ -109,12 +109,20 @@ def _arithmetic(name: str) -> Any:
     return lambda builder, a, b: getattr(builder, name)(a, b, flags=_FLAGS)
 
 
+def _quotient(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Return lanes over one number: times its reciprocal, which is found once where the number does not change."""
+    number = context.cast(builder, args[1], sig.args[1], types.float64)
+    reciprocal = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), number)
+    return builder.fmul(args[0], _spread(builder, reciprocal), flags=_FLAGS)
+
+
 _ARITHMETIC = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
 _ORDER = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">=", operator.eq: "=="}
 for _function, _name in _ARITHMETIC.items():
     _define(_function, LANES, _arithmetic(_name))
 for _function, _sign in _ORDER.items():
     _define(_function, MASK, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
+lower_builtin(operator.truediv, Lanes, types.Number)(_quotient)
 _define(operator.neg, LANES, lambda builder, a: builder.fneg(a))
 
 
@@ -208,11 +216,12 @@ def _power_of_two(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     lanes = isinstance(kinds[0], Lanes)
     whole, real = (_LONG, _DOUBLE) if lanes else (ir.IntType(64), ir.DoubleType())
 
-    def constant(value: int) -> Any:
-        return ir.Constant(whole, [value] * WIDTH if lanes else value)
+    def constant(kind: Any, value: float) -> Any:
+        return ir.Constant(kind, [value] * WIDTH if lanes else value)
 
-    exponent = builder.add(builder.fptosi(values[0], whole), constant(1023))
-    return builder.bitcast(builder.shl(exponent, constant(52)), real)
+    # the last bits of 1.5 * 2^52 + k are those of the whole number k: no conversion, which lanes have only one by one
+    biased = builder.bitcast(builder.fadd(values[0], constant(real, _ROUND + 1023.0)), whole)
+    return builder.bitcast(builder.shl(biased, constant(whole, 52)), real)
 
 
 lowered(power_of_two, 1, lambda kinds, _: kinds[0], _power_of_two)

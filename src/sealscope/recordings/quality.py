@@ -5,8 +5,10 @@ Each test of a channel's values lets quantised, slow and resting signals pass.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -352,23 +354,32 @@ def hum(values: Array, rate: float) -> list[HumLine]:
         return []
     x = np.arange(count) - (count - 1) / 2
     centred = values - values.mean()
-    centred = centred - x * (x @ centred) / (x @ x)
+    centred -= x * ((x @ centred) / (x @ x))
     if not centred.any():
         return []
-    window = np.hanning(count)
+    window = _hann(count)
     size = next_fast_len(count, real=True)
-    amplitudes = 2 * np.abs(np.fft.rfft(centred * window, size)) / window.sum()
-    frequencies = np.fft.rfftfreq(size, 1 / rate)
+    centred *= window
+    spectrum = np.fft.rfft(centred, size)
+    squares = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
+    step = rate / size
     # amplitude^2/2 summed over bins counts each line's power 1.5 size/count times, as wide as Hann's window makes it
-    power = float((amplitudes[frequencies >= _HUM_POWER_FROM] ** 2).sum()) / 2 / (1.5 * size / count)
+    power = float(squares[math.ceil(_HUM_POWER_FROM / step - 1e-9) :].sum()) / 2 / (1.5 * size / count)
     lines = []
     for mains in (50.0, 60.0):
         if mains + _HUM_BAND >= rate / 2:
             continue
-        off = np.abs(frequencies - mains)
+        bins = np.arange(int((mains - _HUM_BAND) / step), int((mains + _HUM_BAND) / step) + 2)
+        off, amplitudes = np.abs(bins * step - mains), np.sqrt(squares[bins])
         near = off <= max(0.1, 0.5 * rate / count)
         beside = (off > max(0.5, 2.5 * rate / count)) & (off <= _HUM_BAND)
         peak, rest = float(amplitudes[near].max(initial=0.0)), amplitudes[beside]
         if rest.size >= 10 and peak > _HUM_OVER_REST * rest.max() and peak > _HUM_OVER_FLOOR * np.median(rest):
             lines.append(HumLine(mains, peak, min(1.0, peak**2 / 2 / power)))
     return lines
+
+
+@lru_cache(2)
+def _hann(count: int) -> Array:
+    """Return Hann's window (count,), the same for all channels of a recording."""
+    return np.hanning(count)

@@ -318,3 +318,11 @@ def test_two_samples_are_the_scan_at_one_instant() -> None:
     assert single_null.shape == (999, 3)
     assert np.median(null) == pytest.approx(1.386, rel=0.25)  # chi-squared with 2 degrees of freedom
     np.testing.assert_array_equal(made.null(999, after=20)[0], null)
+
+
+@settings(max_examples=20, deadline=None)
+@given(step=st.floats(0.0, 2.5), probability=st.sampled_from([0.02, 0.2]), seed=st.integers(0, 2**32 - 1))
+def test_an_alarm_is_a_score_over_the_threshold(step: float, probability: float, seed: int) -> None:
+    """Orders that stop early say what all of them together say."""
+    made = StepScan(stepped(np.random.default_rng(seed), 40, 20, step), [0, 2])
+    assert made.alarms(probability) == (made.observed().joint.max() > made.thresholds(probability)[0])

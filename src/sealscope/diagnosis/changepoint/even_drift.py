@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from sealscope.recordings.recording import Array
@@ -18,24 +16,32 @@ def step_near(
     (least squares) within `reach` [s] of each edge that is within `near` [s] (two blocks at least) of the onset. The
     block that holds the onset counts on neither side. (0, 0) without `fewest` blocks on either side.
     """
-    best = (0.0, 0.0)
     near = max(near, 2.0 * half)
     first, last = np.searchsorted(t, [onset - reach - near, onset + reach + near])
     t, values = t[first:last], values[first:last]
     edges = t[:-1] + half
+    edges = edges[np.abs(edges - onset) <= near]
     whole = np.isfinite(values) & (np.abs(t - onset) >= half)
-    for edge in edges[np.abs(edges - onset) <= near]:
-        within = whole & (np.abs(t - edge) < reach)
-        after = within & (t > edge)
-        if min(np.count_nonzero(after), np.count_nonzero(within & ~after)) < fewest:
-            continue
-        x = np.stack([np.ones(within.sum()), t[within] - edge, after[within].astype(np.float64)], axis=1)
-        inverse = np.linalg.inv(x.T @ x)
-        beta = inverse @ (x.T @ values[within])
-        rest = values[within] - x @ beta
-        deviation = math.sqrt(float(rest @ rest) / (rest.size - 3) * float(inverse[2, 2]))
-        size = float(beta[2])
-        ratio = size / max(deviation, 1e-12 * (1.0 + abs(size)))
-        if abs(ratio) > abs(best[1]):
-            best = (size, ratio)
-    return best
+    away = t - edges[:, None]  # from every edge
+    after = whole & (away > 0.0) & (away < reach)
+    before = whole & (away <= 0.0) & (away > -reach)
+    enough = np.minimum(np.count_nonzero(after, axis=1), np.count_nonzero(before, axis=1)) >= fewest
+    if not np.any(enough):
+        return 0.0, 0.0
+    away, after, weight = away[enough], after[enough], (before | after)[enough].astype(np.float64)
+    # without the mean and the line, of the step and of the values (Frisch, Waugh): one coefficient is left
+    count = weight.sum(axis=1, keepdims=True)
+    line, step, rest = (
+        weight * (each - np.sum(weight * each, axis=1, keepdims=True) / count)
+        for each in (away, after.astype(np.float64), np.broadcast_to(np.where(whole, values, 0.0), away.shape))
+    )
+    along = np.sum(line**2, axis=1, keepdims=True)
+    step -= np.sum(line * step, axis=1, keepdims=True) / along * line
+    rest -= np.sum(line * rest, axis=1, keepdims=True) / along * line
+    own = np.sum(step**2, axis=1)
+    size = np.sum(step * rest, axis=1) / own
+    rest -= size[:, None] * step
+    deviation = np.sqrt(np.sum(rest**2, axis=1) / (count[:, 0] - 3.0) / own)
+    ratio = size / np.maximum(deviation, 1e-12 * (1.0 + np.abs(size)))
+    best = int(np.argmax(np.abs(ratio)))
+    return float(size[best]), float(ratio[best])

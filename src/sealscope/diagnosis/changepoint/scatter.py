@@ -12,8 +12,13 @@ against "it did not", by generalised least squares; without drift
     T2(k) = n / (k (n - k)) c_k' S^-1 c_k,   c_k = sum_{i <= k} (x_i - mean)
 
 (Srivastava & Worsley, Likelihood ratio tests for a change in the multivariate normal mean, JASA 81 (1986) 199-204).
-Cosines (DCT-II) make it quick: of a random walk whose level is unknown they are the Karhunen-Loeve functions, so that
-scatter and walk are independent from cosine to cosine, with the variance 1 + lambda / (4 sin^2(pi m / 2n)).
+Cosines (DCT-II) are the Karhunen-Loeve functions of a random walk whose level is unknown: scatter and walk are
+independent from cosine to cosine, with the variance 1 + lambda / (4 sin^2(pi m / 2n)). The denominators are the
+eigenvalues of D'D, D the differences of neighbours, so that the scores of all steps solve one tridiagonal system,
+
+    (D D' + lambda I) score = D x,   an even drift's being their mean,
+
+in time and memory linear in n.
 
 The threshold is the quantile of max T2 over random orders of the same blocks with random walks of B added: without an
 abrupt change every order is as likely as the one observed. Pairs of neighbours are moved together, so that the short
@@ -26,13 +31,14 @@ the likelihood of its cosines; which of B, 2 B and 4 B makes it likeliest says h
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.shapes import least_blocks
-from sealscope.diagnosis.changepoint.tails import seed_of, upper_quantile
+from sealscope.diagnosis.changepoint.tails import seed_of, upper_quantile, upper_rank
 from sealscope.recordings.recording import Array
 
 #: Directions whose scatter is less than this share of the largest are sums of others.
@@ -105,16 +111,16 @@ class StepScan:
         unit[unit == 0] = 1.0
         m = np.arange(1, n)
         self.walk = np.concatenate([[0.0], 0.25 / np.sin(0.5 * np.pi / n * m) ** 2])
-        self.single_pass = self._passed(np.diag(walks) / unit**2)
-        self.single_gain = self._gain(self.single_pass)
+        self.single_strength = np.diag(walks) / unit**2
+        self.single_gain = self._gain(self._passed(self.single_strength))
         part = np.ix_(self.used, self.used)
-        self.to, strength = _independent(scatter[part], walks[part], unit[self.used])
-        self.passed = self._passed(strength)
+        self.to, self.strength = _independent(scatter[part], walks[part], unit[self.used])
+        self.passed = self._passed(self.strength)
         place = [self.used.index(column) for column in joint]
         self.steps = np.concatenate([self.to[place].T, self.to.T @ self.drift.other[self.used]], axis=1)
         self.quadratic = _quadratic(self.steps, self._gain(self.passed), len(joint))
-        self.ramp = _cosines(np.linspace(0.0, 1.0, n)[:, None])[:, 0]
-        ramp_gain = np.sum(self.passed * self.ramp[:, None] ** 2, axis=0)
+        ramp = _cosines(np.linspace(0.0, 1.0, n)[:, None])
+        ramp_gain = np.sum(self.passed * ramp**2, axis=0)
         self.ramp_quadratic = _quadratic(self.steps, ramp_gain[None], len(joint))[0]
 
     def _passed(self, strength: Array) -> Array:
@@ -141,21 +147,22 @@ class StepScan:
         Each is first brought to the scatter of the series that this scan was made for, so that each is judged by its
         own scatter, as that one is.
         """
-        from scipy.fft import idct
+        return self._of_differences(np.diff(x, axis=1))
 
-        differences = np.diff(x, axis=1)
-        unit = np.sqrt(0.5 * np.mean(differences**2, axis=1, keepdims=True))
+    def _of_differences(self, differences: Array) -> tuple[Array, Array, Array]:
+        """Return what a call does, of the differences (m, n-1, f) of neighbours in the series."""
+        unit = np.sqrt(0.5 / (self.n - 1) * np.einsum("mkf,mkf->mf", differences, differences))
         unit[unit == 0] = np.inf
-        alone = -np.cumsum(idct(_cosines(x / unit) * self.single_pass, axis=1, norm="ortho"), axis=1)[:, :-1]
-        passed = _cosines(_rescattered(x[..., self.used] @ self.to)) * self.passed
-        score = -np.cumsum(idct(passed, axis=1, norm="ortho"), axis=1)[:, :-1] @ self.steps
-        single = alone / np.sqrt(self.single_gain)
+        single = _scores(differences, self.single_strength).transpose(1, 2, 0) / unit[:, None]
+        single /= np.sqrt(self.single_gain)
+        judged = differences[..., self.used] @ self.to
+        score = np.tensordot(_scores(judged @ _to_unit_scatter(judged), self.strength), self.steps, axes=(0, 0))
         by_step = score.transpose(1, 0, 2)
         t2 = np.einsum("kmb,kmb->mk", np.matmul(by_step, self.quadratic), by_step)
         for series in (t2, single):
             series[:, : self.least - 1] = 0.0
             series[:, self.n - self.least :] = 0.0
-        slope = np.einsum("mnj,n->mj", passed, self.ramp) @ self.steps
+        slope = score.mean(axis=1)
         return t2, single, np.einsum("ma,ab,mb->m", slope, self.ramp_quadratic, slope)
 
     def observed(self) -> Scan:
@@ -165,7 +172,8 @@ class StepScan:
 
     def cost(self) -> float:
         """Return twice the negative log likelihood of x, beside its best step, but for a constant."""
-        squares = _cosines(_rescattered(self.x[None][..., self.used] @ self.to))[0, 1:] ** 2
+        judged = self.x[:, self.used] @ self.to
+        squares = _cosines(judged @ _to_unit_scatter(np.diff(judged, axis=0)[None])[0])[1:] ** 2
         passed = self.passed[1:]
         return float(np.sum(squares * passed - np.log(passed)) - self.observed().joint.max())
 
@@ -178,43 +186,67 @@ class StepScan:
         scans = [StepScan(self.x, self.joint, own, least=self.least, wander=wander) for wander in WANDERS]
         return min(scans, key=lambda scan: scan.cost() - _LIKELIER * (scan.wander == self.wander))
 
-    def orders(self, count: int, random: np.random.Generator) -> Array:
-        """Return `count` series (count, n, f) as x would be without a step: its blocks in a random order, and walks."""
-        moved = self.x[_orders(self.n, count, random)]
+    def _orders(self, count: int, random: np.random.Generator) -> Array:
+        """Return `count` series as x would be without a step, as the differences (count, n-1, f) of neighbours.
+
+        The blocks of x come in a random order, and walks are added.
+        """
+        differences = np.diff(self.x[_orders(self.n, count, random)], axis=1)
         walks = self.drift.walks
         if walks.any():
-            moved = moved + np.cumsum(random.standard_normal((count, self.n, walks.shape[1])), axis=1) @ walks.T
-        return moved
+            differences += random.standard_normal((count, self.n, walks.shape[1]))[:, 1:] @ walks.T
+        return differences
 
     def null(self, count: int, *, after: int | None = None) -> tuple[Array, Array, Array]:
         """Return T2 (count,), |single| (count, f) and trend T2 (count,) of `count` series without a step.
 
         The largest over all steps, or those of a step after the block `after` alone. The seed is that of the series.
         """
-        random = np.random.default_rng(seed_of(self.x))
-        t2_max, single_max, trend = np.empty(count), np.empty((count, self.f)), np.empty(count)
         steps = slice(None) if after is None else slice(after - 1, after)
+        batches = [
+            (t2[:, steps].max(axis=1), np.abs(single[:, steps]).max(axis=1), trend)
+            for t2, single, trend in self._nulls(count)
+        ]
+        joint, alone, trends = zip(*batches, strict=True)
+        return np.concatenate(joint), np.concatenate(alone), np.concatenate(trends)
+
+    def _nulls(self, count: int) -> Iterator[tuple[Array, Array, Array]]:
+        """Yield the statistics of `count` series without a step, some at a time."""
+        random = np.random.default_rng(seed_of(self.x))
         for first in range(0, count, _BATCH):
-            here = slice(first, min(first + _BATCH, count))
-            t2, single, trend[here] = self(self.orders(here.stop - first, random))
-            t2_max[here] = t2[:, steps].max(axis=1)
-            single_max[here] = np.abs(single[:, steps]).max(axis=1)
-        return t2_max, single_max, trend
+            yield self._of_differences(self._orders(min(_BATCH, count - first), random))
 
     def thresholds(self, probability: float, *, after: int | None = None) -> tuple[float, Array, float]:
         """Return what T2, |single| (f,) and trend T2 exceed with `probability` without a step, as `null` has them.
 
         From so many random orders that at least 20 exceed the threshold: a relative error of its tail under 25 %.
         """
-        orders = max(999, int(np.ceil(20.0 / probability)) - 1)
-        nulls = self.null(orders, after=after)
+        nulls = self.null(_count(probability), after=after)
         self._joint = nulls[0]
         t2, single, trend = (upper_quantile(null, probability) for null in nulls)
         return float(t2), single, float(trend)
 
+    def alarms(self, probability: float) -> bool:
+        """Return whether the largest T2 of x exceeds the threshold of `thresholds`.
+
+        Orders are made until so many exceed it as the threshold cannot: few, where x has no step.
+        """
+        count, largest = _count(probability), float(self.observed().joint.max())
+        exceeding = count - upper_rank(count, probability)
+        for t2, *_ in self._nulls(count):
+            exceeding -= int(np.count_nonzero(t2.max(axis=1) >= largest))
+            if exceeding < 0:
+                return False
+        return True
+
     def chance(self, score: float) -> float:
         """Return the probability of a T2 of `score` or more without a step, by the random orders of `thresholds`."""
         return float((1 + np.count_nonzero(self._joint >= score)) / (1 + self._joint.size))
+
+
+def _count(probability: float) -> int:
+    """Return the number of random orders of which 20 exceed the threshold, 999 at least."""
+    return max(999, int(np.ceil(20.0 / probability)) - 1)
 
 
 def _cosines(x: Array) -> Array:
@@ -224,13 +256,29 @@ def _cosines(x: Array) -> Array:
     return np.asarray(dct(x, axis=-2, norm="ortho"))
 
 
-def _rescattered(z: Array) -> Array:
-    """Return a stack of series z (m, n, r), each turned and stretched as little as gives it the scatter I."""
-    differences = np.diff(z, axis=1)
+def _scores(differences: Array, strength: Array) -> Array:
+    """Return the score (j, m, n-1) of a step after each block, from differences (m, n-1, j) of neighbours.
+
+    It is (D D' + lambda I)^-1 D x, with the walk's variance a block lambda = `strength` (j,), in units of the scatter.
+    """
+    from scipy.linalg.lapack import dpttrf, dpttrs
+
+    scores = np.array(differences.transpose(2, 0, 1), order="C")
+    for own, walk in zip(scores, strength, strict=True):
+        diagonal, beside, _ = dpttrf(np.full(own.shape[1], 2.0 + walk), np.full(own.shape[1] - 1, -1.0))
+        dpttrs(diagonal, beside, own.T, overwrite_b=True)
+    return scores
+
+
+def _to_unit_scatter(differences: Array) -> Array:
+    """Return what turns and stretches each of a stack of series as little as gives it the scatter I: (m, r, r).
+
+    From the differences (m, n-1, r) of neighbours.
+    """
     scatter = np.matmul(differences.transpose(0, 2, 1), differences) / (2.0 * differences.shape[1])
     values, vectors = np.linalg.eigh(scatter)
     root = vectors / np.sqrt(np.maximum(values, _RANK))[:, None, :]
-    return np.asarray(z @ (root @ vectors.transpose(0, 2, 1)))
+    return np.asarray(root @ vectors.transpose(0, 2, 1))
 
 
 def _independent(scatter: Array, walks: Array, unit: Array) -> tuple[Array, Array]:

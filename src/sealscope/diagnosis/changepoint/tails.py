@@ -35,9 +35,12 @@ def upper_quantile(null: Array, probability: float) -> Array:
 
     Its order statistic of rank ceil((1 - p)(m + 1)), so that the probability is at most p.
     """
-    m = null.shape[0]
-    rank = min(m, int(np.ceil((1.0 - probability) * (m + 1) - 1e-9)))
-    return np.asarray(np.sort(null, axis=0)[rank - 1])
+    return np.asarray(np.sort(null, axis=0)[upper_rank(null.shape[0], probability) - 1])
+
+
+def upper_rank(m: int, probability: float) -> int:
+    """Return the rank of the order statistic of a sample of m that is `upper_quantile`, the least being 1."""
+    return min(m, int(np.ceil((1.0 - probability) * (m + 1) - 1e-9)))
 
 
 def seed_of(series: Array) -> int:

@@ -147,7 +147,7 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
     noise_scan = StepScan(x[:, d1], list(range(len(d1))), HealthyDrift(drift.walks[d1], np.zeros((len(d1), 0))))
     noise = noise_scan.observed()
     even = result
-    noisy = float(noise.joint.max()) > noise_scan.thresholds(probability)[0]
+    noisy = noise_scan.alarms(probability)
     if noisy:
         beyond = excess(x, int(np.argmax(noise.joint)) + 1)
         over_noise = StepScan(beyond, list(range(beyond.shape[1])), drift_beyond_noise(blocks))
