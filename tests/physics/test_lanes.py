@@ -178,6 +178,6 @@ def test_a_parameter_is_listed_once_and_every_list_of_numbers_follows(check_rig)
     symbols = {row.symbol: row.value for row in rig.table() if not row.name.startswith(("sensors.", "daq."))}
     within = {"omega_max", "C_d", "d_line", "closed_A", "closed_B", "rho", "V_hose_A", "V_hose_B", "V_rod"}
     taken = {symbol for symbol, value in symbols.items() if isinstance(value, float)} - within
-    assert set(NUMBERS) - taken == {"c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B"}
+    assert set(NUMBERS) - taken == {"c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B", "c_slip", "k_h"}
     assert all(getattr(numbers, symbol) == symbols[symbol] for symbol in taken)
     assert len(numbers) == len(NUMBERS) + len(CHOICES)
