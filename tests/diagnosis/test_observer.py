@@ -325,8 +325,8 @@ def test_a_stream_says_what_the_batch_says(formulation: str, cuts: list[int]) ->
     units = {"u": "V", "theta": "rad", "x": "m", "p_A": "Pa", "p_B": "Pa"}
     recording = Recording(t, channels, units, 500.0).only(VIEWS[formulation])
     names = channels_of(formulation_of(recording), recording)  # type: ignore[arg-type]
-    batch = ObserverStream(rig, names, 500.0, 3.0).update(recording)
-    stream = ObserverStream(rig, names, 500.0, 3.0)
+    batch = ObserverStream(assume(rig), names, 500.0, 3.0).update(recording)
+    stream = ObserverStream(assume(rig), names, 500.0, 3.0)
     edges = [0, *sorted(set(cuts)), len(recording)]
     for first, last in pairwise(edges):
         stream.update(recording.samples(slice(first, last)))
@@ -341,15 +341,15 @@ def test_a_stream_refuses_gaps(thesis: Rig) -> None:
         t, {n: np.where(t == 0.5, np.nan, t) for n in PRESSURES}, {"u": "V", "p_A": "Pa", "p_B": "Pa"}, 500.0
     )
     with pytest.raises(InputError, match="must be finite"):
-        ObserverStream(thesis, PRESSURES, 500.0, 3.0).update(bad)
+        ObserverStream(assume(thesis), PRESSURES, 500.0, 3.0).update(bad)
     with pytest.raises(InputError, match="> 0"):
-        ObserverStream(thesis, PRESSURES, 500.0, 0.0)
+        ObserverStream(assume(thesis), PRESSURES, 500.0, 0.0)
 
 
 def test_start_parameters_follow_the_rig(thesis: Rig) -> None:
     number = PARAMETERS.index("volume_slope")
-    assert start_parameters(thesis)[0][number] == 0.0
-    assert start_parameters(thesis.with_overrides({"cylinder.volumes": "position"}))[0][number] == 1.0
+    assert start_parameters(assume(thesis))[0][number] == 0.0
+    assert start_parameters(assume(thesis.with_overrides({"cylinder.volumes": "position"})))[0][number] == 1.0
 
 
 def test_the_block_in_which_a_large_leak_begins_teaches_the_slow_states_nothing():

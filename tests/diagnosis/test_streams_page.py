@@ -30,8 +30,16 @@ def test_the_watched_machine_is_saved_and_continued(
     assert low <= 0.0042 <= high
 
 
+def test_a_machine_without_a_position_is_watched_too(capsys: pytest.CaptureFixture[str]) -> None:
+    exec(compile(EXAMPLES[1], PAGE.name, "exec"), {"__name__": "page"})
+    said = re.fullmatch(r"by pressures: [\d.]+ L/min \(([\d.]+) to ([\d.]+)\) since (\d+) s\n", capsys.readouterr().out)
+    assert said is not None
+    assert float(said[1]) <= 0.015 <= float(said[2])
+    assert abs(int(said[3]) - 600) <= 15
+
+
 def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    code = EXAMPLES[1]
+    code = EXAMPLES[2]
     exec(compile(code, PAGE.name, "exec"), {"__name__": "page"})
     first, last = capsys.readouterr().out.splitlines()
     when = re.fullmatch(r"(\d+) s: a leak", first)

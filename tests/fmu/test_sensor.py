@@ -41,7 +41,7 @@ def in_python(formulation, recording):
     if formulation == "speed":
         drive[1:] = 0.5 * (drive[1:] + recording["omega"][:-1])
     noise = np.array([max(fine_variance(p[:n]), 1e4) for p in (p_A, p_B)])
-    q, deviations = start_parameters(rig)
+    q, deviations = start_parameters(a)
     bank = slice(n, 2 * n)
     q[3] = find_stiffness(
         a, formulation == "command", rate, (q, deviations), noise, (drive[bank], p_A[bank], p_B[bank])
@@ -124,7 +124,7 @@ def conductances(a, rig, formulation, recording):
         own.update(recording["theta"], recording["x"], dp)
         return own.blocks.estimates().G
     drive, noise = recording["u" if formulation == "command" else "omega"], np.array([1e6, 1e6])
-    own = PressureFilter(a, formulation == "command", recording.rate, 1000, start_parameters(rig), noise)
+    own = PressureFilter(a, formulation == "command", recording.rate, 1000, start_parameters(a), noise)
     own.update(drive, recording["p_A"], recording["p_B"])
     return own.blocks.estimates().G
 

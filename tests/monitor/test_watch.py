@@ -205,7 +205,7 @@ def test_a_dismissed_leak_is_compared_with_nothing_before():
     "damage",
     [
         {"version": 99},
-        {"estimator": {"area": 1}},
+        {"estimators": {"volumes": {"area": 1}}},
         {"samples": None},
         {"leak": {"raised_s": "x"}},
         {"means": {"shape": [1e12, 4], "f8": ""}},

@@ -163,7 +163,7 @@ class SensorChoice(NamedTuple):
     @classmethod
     def of(cls, rig: Rig, formulation: Formulation) -> SensorChoice:
         """Return a rig's choice."""
-        start, deviations = (tuple(map(float, values)) for values in start_parameters(rig))
+        start, deviations = (tuple(map(float, values)) for values in start_parameters(assume(rig)))
         choices = tuple(assume(rig))[len(NUMBERS) :]
         return cls(formulation, choices, *throttle_readings(rig), start, deviations)
 

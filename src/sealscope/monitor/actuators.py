@@ -295,6 +295,7 @@ class WatchedActuators:
             "blocks": actuator.watch.blocks,
             "t": None if last is None else last.t,
             "status": "waits for samples" if last is None else last.status,
+            "by": actuator.watch.by,
             "total_lpm": None if last is None else last.total_lpm,
             "leak_lpm": None if last is None else last.leak_lpm,
             "leak_interval_lpm": None if last is None else last.leak_interval_lpm,

@@ -19,6 +19,7 @@ from sealscope.diagnosis.changepoint.random_walk import FEWEST, WalkStep, find_l
 from sealscope.diagnosis.observer.against_baseline import compare
 from sealscope.diagnosis.observer.estimates import Estimates
 from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, orifice_over_laminar, states_flow, within
+from sealscope.diagnosis.observer.model import assume
 from sealscope.diagnosis.observer.stream import Formulation, ObserverStream, channels_of, formulation_of, whole
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
@@ -80,7 +81,7 @@ class Observer:
         """Return the conductance over a recording that is `usable`."""
         formulation = formulation_of(recording) or "command"
         block_s = block_length(find_cycle(recording))
-        stream = ObserverStream(self.rig, channels_of(formulation, recording), recording.rate, block_s)
+        stream = ObserverStream(assume(self.rig), channels_of(formulation, recording), recording.rate, block_s)
         estimates = stream.update(recording)
         start = float(recording.t[0]) + stream.block_s * np.arange(estimates.G.size)
         gaps = touched(recording, stream.block * np.arange(start.size + 1))

@@ -106,6 +106,10 @@ class BlockRows:
         if len(rows):
             self._rows.append(rows.copy())
 
+    def clear(self) -> None:
+        """Keep no row that was added."""
+        self._rows = []
+
     def estimates(self) -> Estimates:
         """Return the estimates of all blocks so far."""
         rows = np.concatenate(self._rows) if self._rows else self.buffer(0)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.observer.estimates import Estimates
 from sealscope.diagnosis.observer.model import G_UNIT, PARAMETERS, STIFFNESS
@@ -35,7 +36,7 @@ _CORRELATION = 0.25
 #: Mean square in a single block: a slipping encoder, a stuck reading.
 _WORST: dict[Formulation, float] = {"volume": 400.0, "speed": 4.0, "command": 4.0}
 #: Largest deviation of a block's conductance at which a leak can be seen at all, in units of `G_UNIT`.
-_BLIND = 12.0
+BLIND = 12.0
 #: Range of the factors that a machine of the rig's kind may have.
 _FACTORS = {"coulomb": (0.3, 3.0), "viscous": (0.0, 4.0), "gain": (0.6, 1.6), "breakaway": (0.0, 3.0)}
 _SCALE = 0.5
@@ -81,11 +82,19 @@ def orifice_over_laminar(dp: Array, formulation: Formulation) -> float:
     return float(np.mean(size**0.5) * np.mean(size**2) / (np.mean(size**1.5) * np.mean(size)))
 
 
+def described(estimates: Estimates, formulation: Formulation) -> NDArray[np.bool_]:
+    """Return the blocks (k,) that the model describes, by their innovations."""
+    low, high = _SQUARE[formulation]
+    finite = np.isfinite(estimates.parameters).all(axis=1) & np.isfinite(estimates.G) & np.isfinite(estimates.sd)
+    fits = (estimates.square >= low) & (estimates.square <= high)
+    return np.asarray(finite & fits & ((formulation == "volume") | (np.abs(estimates.correlation) <= _CORRELATION)))
+
+
 def misfit(estimates: Estimates, formulation: Formulation, rig: Rig) -> str | None:
     """Return why the estimates cannot be trusted, in one line, by innovations and parameters; None where they can."""
     if not all(np.all(np.isfinite(values)) for values in (estimates.G, estimates.sd, estimates.parameters)):
         return "the observer lost the recording: its model does not describe it"
-    if float(np.median(estimates.sd)) > _BLIND:
+    if float(np.median(estimates.sd)) > BLIND:
         return "the piston hardly moves or carries no pressure: a leak cannot be seen by the observer"
     first = estimates.G.size // 5
     square, correlation = (float(np.mean(values[first:])) for values in (estimates.square, estimates.correlation))

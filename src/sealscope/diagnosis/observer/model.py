@@ -75,13 +75,13 @@ def compliance(a: RigNumbers) -> float:
     return a.V / (2.0 * a.K_oil)
 
 
-def start_parameters(rig: Rig) -> tuple[Array, Array]:
+def start_parameters(a: RigNumbers) -> tuple[Array, Array]:
     """Return the parameters (8,) at the start and their deviations (8,).
 
     `volume_slope` starts at 1 where the rig's volumes depend on the position, else at 0.
     """
     start, deviations = np.array(_START), np.array(_DEVIATIONS)
-    start[PARAMETERS.index("volume_slope")] = 1.0 if rig.cylinder.volumes == "position" else 0.0
+    start[PARAMETERS.index("volume_slope")] = 1.0 if a.position_dependent else 0.0
     return start, deviations
 
 

@@ -50,6 +50,8 @@ ROUNDS = ((6.3, 6), (12.6, 1))
 #: Length [s] of the beginning that `find_stiffness` reads.
 SEARCH_SECONDS = ROUNDS[-1][0]
 _NEVER = 1 << 62
+#: Arrays of a `PressureFilter` that samples change.
+MEMORY = ("z", "q", "P", "sums")
 
 
 @law

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from sealscope.diagnosis.observer.estimates import BlockRows, Estimates
-from sealscope.diagnosis.observer.model import assume, compliance, displacement, mean_area, start_parameters
-from sealscope.diagnosis.observer.pressure_filter import SEARCH_SECONDS, PressureFilter, find_stiffness
+from sealscope.diagnosis.observer.model import (
+    G_PRIOR,
+    PARAMETERS,
+    compliance,
+    displacement,
+    mean_area,
+    start_parameters,
+    walks,
+)
+from sealscope.diagnosis.observer.pressure_filter import MEMORY, SEARCH_SECONDS, PressureFilter, find_stiffness
 from sealscope.diagnosis.observer.volume_filter import VolumeFilter
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
@@ -17,7 +25,7 @@ from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
-    from sealscope.parameters import Rig
+    from sealscope.physics.rig import RigNumbers
 
 #: What the observer reads: `volume` angle (or speed) and position, no friction in it; `speed` on the pressures
 #: and the angle or speed; `command` on the pressures and the command.
@@ -58,20 +66,25 @@ def channels_of(formulation: Formulation, recording: Recording) -> tuple[str, ..
 class ObserverStream:
     """The observer on a stream: `update` takes the next samples, `estimates` are those of all blocks so far.
 
-    `channels`: as `channels_of` gives them; `rate` [Hz]; `block_s` [s]: length of a block, best a whole number of the
-    duty's cycles. The first seconds (`SEARCH_SECONDS`) are stored until the readings' noise, the senses of the channels
-    and the oil's stiffness are estimated; after that memory grows by one row a block.
+    `a`: the assumed machine (`model.assume`); `channels`: as `channels_of` gives them; `rate` [Hz]; `block_s` [s]:
+    length of a block, best a whole number of the duty's cycles; `start`: parameters (8,) of the pressures' formulations
+    at the start, by default `start_parameters`. The first seconds (`SEARCH_SECONDS`) are stored until the readings'
+    noise, the senses of the channels and the oil's stiffness are estimated; after that memory grows by one row a block,
+    unless the rows are `drained`.
 
     Raises InputError for a rate or a block length that is not positive.
     """
 
-    def __init__(self, rig: Rig, channels: Sequence[str], rate: float, block_s: float) -> None:
+    def __init__(
+        self, a: RigNumbers, channels: Sequence[str], rate: float, block_s: float, start: Array | None = None
+    ) -> None:
         if not (rate > 0 and block_s > 0):
             raise InputError(f"rate and block length must be > 0, got {rate} Hz and {block_s} s")
-        self.rig, self._numbers, self.rate = rig, assume(rig), float(rate)
+        self._numbers, self.rate = a, float(rate)
         self.channels = tuple(channels)
         self.block = max(2, round(block_s * rate))
         self.block_s = self.block / self.rate
+        self._start = start
         self._stored: list[dict[str, Array]] = []
         self._count = 0
         self._last: dict[str, float] = {}
@@ -94,6 +107,63 @@ class ObserverStream:
     def estimates(self) -> Estimates:
         """Estimates of all blocks so far."""
         return BlockRows(1).estimates() if self._filter is None else self._filter.blocks.estimates()
+
+    @property
+    def begun(self) -> bool:
+        """Whether the first seconds are over and the filter runs."""
+        return self._filter is not None
+
+    def drained(self) -> Estimates:
+        """Return the estimates of the blocks since the last call, and keep them no longer."""
+        estimates = self.estimates
+        if self._filter is not None:
+            self._filter.blocks.clear()
+        return estimates
+
+    def resume(self, gap_s: float) -> None:
+        """Go on by the pressures after a gap [s]: the states begin anew, the parameters have walked on meanwhile."""
+        before = self._filter
+        if not isinstance(before, PressureFilter):
+            return
+        variances = np.diag(before.P)[-len(PARAMETERS) :] + walks(gap_s)
+        variances[0] = G_PRIOR**2
+        start = before.q.copy(), np.sqrt(variances)
+        self._filter = PressureFilter(self._numbers, before.commanded, self.rate, self.block, start, before.noise)
+        self._last = {}
+
+    def memory(self) -> dict[str, dict[str, Array]]:
+        """Return what a stream by the pressures knows, its rows drained: `recall` continues with the same bits."""
+        begun = isinstance(self._filter, PressureFilter)
+        return {
+            "stored": {name: np.concatenate([piece[name] for piece in self._stored]) for name in self.channels}
+            if self._stored
+            else {},
+            "last": {name: np.array([value]) for name, value in self._last.items()},
+            "start": {} if self._start is None else {"q": self._start},
+            "turn": {"turn": np.array([self._turn])} if begun else {},
+            "filter": {name: getattr(self._filter, name) for name in ("noise", *MEMORY)} if begun else {},
+        }
+
+    def recall(self, memory: Mapping[str, Mapping[str, Array]]) -> None:
+        """Continue from a `memory`; raises InputError where it does not fit."""
+        try:
+            self._start = memory["start"].get("q")
+            stored = {name: memory["stored"][name] for name in self.channels} if memory["stored"] else {}
+            self._stored = [stored] if stored else []
+            self._count = stored["p_A"].size if stored else 0
+            self._last = {name: float(value[0]) for name, value in memory["last"].items()}
+            if memory["filter"]:
+                self._turn = float(memory["turn"]["turn"][0])
+                arrays = dict(memory["filter"])
+                commanded = "u" in self.channels
+                start = start_parameters(self._numbers)
+                self._filter = PressureFilter(
+                    self._numbers, commanded, self.rate, self.block, start, arrays.pop("noise").copy()
+                )
+                for name in MEMORY:
+                    getattr(self._filter, name)[...] = arrays[name]
+        except (KeyError, IndexError, ValueError) as error:
+            raise InputError(f"the observer's memory does not fit: {error!r}") from None
 
     def _take(self, samples: dict[str, Array]) -> None:
         if self._filter is None:
@@ -125,7 +195,9 @@ class ObserverStream:
             return
         self._turn = _sense(slow["u"][1:] if "u" in slow else _speed(slow), dp)
         variances = np.array([max(_fine_rms(first[name]), LEAST_PRESSURE) ** 2 for name in CHAMBERS])
-        start = start_parameters(self.rig)
+        start = start_parameters(a)
+        if self._start is not None:
+            start = self._start, start[1]
         drive = self._drive(first, remember=False)
         commanded = "u" in self.channels
         q, deviations = start[0].copy(), start[1].copy()

@@ -46,6 +46,12 @@ def metrics_text(
     for key, name, kind, text in _METRICS:
         rows = [((("actuator", actuator),), summary.get(key)) for actuator, summary in summaries.items()]
         lines += _family(name, kind, text, rows)
+    ways = [
+        ((("actuator", actuator), ("by", summary["by"])), 1)
+        for actuator, summary in summaries.items()
+        if "by" in summary
+    ]
+    lines += _family("sealscope_watched", "gauge", "What an actuator is watched by: volumes, or pressures", ways)
     dropped = [
         ((("actuator", actuator), ("reason", reason)), count)
         for actuator, summary in summaries.items()

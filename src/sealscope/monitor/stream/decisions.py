@@ -2,8 +2,9 @@
 
 Three tests look at the conductance of pump and piston, each at another pace:
 
-- *step*: the last blocks are searched for a rise that no smooth drift explains (`volume_balance.evidence.judge`, as
-  `SequentialBalance` does), when two cheap contrasts and the score of the frozen balance have shown one worth it;
+- *step*: the last blocks are searched for a rise that no smooth drift explains (by volumes in a fit of the balance,
+  `volume_balance.evidence.judge`, as `SequentialBalance` does; by pressures in the conductances), when two cheap
+  contrasts and the score of the conductances have shown one worth it;
 - *rise*: the same search over means of `GROUP` blocks, some fifty minutes;
 - *level*: a mean of `GROUP` blocks over `WARMEST` times the least one of the baseline: more than oil that warms by 30 K
   makes of it.
@@ -160,7 +161,7 @@ def step_of(
         return None, None
     if evidence.cause not in _CAUSES:
         return None, evidence.cause or "another cause"
-    if (duty := _other_duty(blocks, evidence.onset_s)) is not None:
+    if (duty := other_duty(blocks.t, duty_of(blocks), evidence.onset_s)) is not None:
         return None, duty
     return _rise(evidence, blocks, g), None
 
@@ -190,18 +191,23 @@ def _rise(evidence: Evidence, blocks: BalanceBlocks, g: Array) -> ConductanceRis
     )
 
 
-def _other_duty(blocks: BalanceBlocks, onset: float) -> str | None:
-    """Return that the duty changed with the rise, or None."""
-    duty, after = duty_of(blocks), blocks.t >= onset
+def other_duty(t: Array, duty: Array, onset: float) -> str | None:
+    """Return that the duty (n, 2) of blocks with the middles `t` (n,) changed with the rise, or None."""
+    after = t >= onset
     if min(after.sum(), (~after).sum()) < 3:
         return None
     moved = np.abs(np.median(duty[after], axis=0) - np.median(duty[~after], axis=0))
     return "changed duty" if float(moved.max()) > _OTHER_DUTY else None
 
 
-def slow_rise_of(t: Array, g: Array, sd: Array, probability: float) -> ConductanceRise | None:
-    """Return the rise that means of blocks show: middles `t` (n,), conductances `g` (n,), deviations `sd` (n,)."""
-    if g.size < FEWEST or not worth_a_search(g) or not near_an_alarm(t, g, probability):
+def rise_of(
+    test: str, t: Array, g: Array, sd: Array, probability: float, *, again: bool = False
+) -> ConductanceRise | None:
+    """Return the rise that blocks show, or means of them: middles `t` (n,), conductances `g` and deviations `sd` (n,).
+
+    `again`: an alarm stands, and is to be stated anew.
+    """
+    if g.size < FEWEST or not (again or (worth_a_search(g) and near_an_alarm(t, g, probability))):
         return None
     step = find_step(t, g, sd, probability)
     if not step.alarm:
@@ -211,7 +217,7 @@ def slow_rise_of(t: Array, g: Array, sd: Array, probability: float) -> Conductan
         f"(score {step.score:.1f}, threshold {step.threshold:.1f})"
     )
     return ConductanceRise(
-        "rise",
+        test,
         step.onset,
         step.onset_interval,
         step.size,

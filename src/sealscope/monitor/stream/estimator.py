@@ -32,11 +32,15 @@ class BlockConductance:
 
 
 class NotJudged(NamedTuple):
-    """Why a block shows nothing: its status, and under what and how many times it is counted ("": it is not)."""
+    """Why a block shows nothing: its status, and under what and how many times it is counted ("": it is not).
+
+    `apart`: what comes after it is compared with nothing before it.
+    """
 
     status: str
     counted: str = ""
     number: int = 1
+    apart: bool = False
 
 
 class RecentBlocks(NamedTuple):
@@ -51,11 +55,14 @@ class ConductanceEstimator(Protocol):
     """An estimator of the conductance, block by block.
 
     `levels`: whether the conductance itself can be stated, and not only its changes; `size_error`: relative error of a
-    size.
+    size; `orifice`: mean flow of an orifice over that of a laminar leak that shows as the same conductance, by which
+    the upper end of an interval is wider; `pace`: blocks between two looks for a step.
     """
 
     levels: bool
     size_error: float
+    orifice: float
+    pace: int
 
     @property
     def litres(self) -> bool:
@@ -80,6 +87,8 @@ class ConductanceEstimator(Protocol):
 
     def step(self, probability: float, *, again: bool) -> tuple[ConductanceRise | None, str | None]:
         """Return the rise that the last blocks show, and what forbids to compare them, in a few words.
+
+        It is asked after each block and looks after each `pace` of them.
 
         `again`: an alarm stands, and is to be stated anew.
         """

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 
-#: Channels that a stream keeps, where they are recorded.
-CHANNELS = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2")
+#: Channels that a stream knows.
+CHANNELS = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u")
 #: Rates that differ by less than this share are one rate.
 _SAME_RATE = 0.01
 #: Two samples follow each other where their times differ by so many steps.
@@ -25,15 +25,33 @@ _FOLLOWS = (0.5, 1.5)
 _RATES = (10.0, 100_000.0)
 
 
+def channels_to_watch(samples: Recording) -> tuple[str, ...]:
+    """Return the channels by which an actuator is watched, of those of its samples; () where they do not suffice.
+
+    The balance of volumes reads position, angle or speed, and all pressures; without a position the chamber pressures
+    and what moves the machine suffice.
+    """
+    there = {name for name in CHANNELS if name in samples}
+    if not {"p_A", "p_B"} <= there:
+        return ()
+    if "x" in there and {"theta", "omega"} & there:
+        return tuple(name for name in CHANNELS if name in there - {"u"})
+    if {"u", "theta", "omega"} & there:
+        return tuple(name for name in CHANNELS if name in there - {"x", "p_1", "p_2"})
+    return ()
+
+
 @dataclass
 class SampleJoiner:
     """The samples of one actuator since the last whole block, without holes.
 
     `late_s`: samples up to this much older than the newest are late or repeated, and dropped; older ones show that the
-    clock was set back. `counters`: samples that were dropped and interruptions, by reason.
+    clock was set back. `settled`: a position that is recorded later is left out. `counters`: samples that were dropped
+    and interruptions, by reason.
     """
 
     late_s: float = 60.0
+    settled: bool = False
     names: tuple[str, ...] = ()
     rate: float = 0.0
     newest: float = float("-inf")
@@ -84,10 +102,12 @@ class SampleJoiner:
 
     def _fits(self, samples: Recording) -> bool:
         """Return whether the samples have the stream's channels and SI units; count them where they do not."""
-        names = self.names or tuple(name for name in CHANNELS if name in samples)
+        names, offered = self.names, channels_to_watch(samples)
+        if not names or ("x" in offered and "x" not in names and not self.settled):
+            names = offered
         missing = [name for name in names if name not in samples]
-        if not self.names and not ({"x", "p_A", "p_B"} <= {*names} and {"theta", "omega"} & {*names}):
-            missing = ["x, p_A, p_B and theta or omega"]
+        if not names:
+            missing = ["p_A, p_B and x with theta or omega, or u, theta or omega"]
         if missing:
             self.count(f"samples without {missing[0]}", len(samples))
             return False
@@ -98,8 +118,10 @@ class SampleJoiner:
         if not _RATES[0] <= samples.rate <= _RATES[1]:
             self.count(f"samples at a rate outside {_RATES[0]:g} to {_RATES[1]:g} Hz", len(samples))
             return False
-        if not self.names:
-            self.names, self.rate = names, samples.rate
+        if names != self.names:
+            if self.names:
+                self.count("began anew: a position is recorded, too")
+            self.names, self.rate, self.t = names, samples.rate, np.empty(0)
             self.channels = {name: np.empty(0) for name in names}
         return True
 
@@ -139,6 +161,7 @@ class SampleJoiner:
         """Return all of it as plain values."""
         return {
             "late_s": self.late_s,
+            "settled": self.settled,
             "names": list(self.names),
             "rate": self.rate,
             "newest": None if self.newest == float("-inf") else self.newest,
@@ -155,6 +178,7 @@ class SampleJoiner:
         channels = part_of(state, "channels", Mapping)
         return cls(
             float(part_of(state, "late_s", (float, int))),
+            bool(part_of(state, "settled", bool)),
             names,
             float(part_of(state, "rate", (float, int))),
             float("-inf") if newest is None else float(newest),

@@ -35,7 +35,7 @@ _FIT_BLOCKS = 60
 class VolumeEstimator:
     """The frozen balance of volumes; see `estimator.ConductanceEstimator`."""
 
-    levels, size_error = True, LEVEL
+    levels, size_error, orifice, pace = True, LEVEL, 1.0, 1
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry

@@ -22,12 +22,13 @@ from sealscope.monitor.stream.decisions import (
     ConductanceRise,
     level_rise_of,
     probability_of,
-    slow_rise_of,
+    rise_of,
 )
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 from sealscope.monitor.stream.estimator import PAUSE_S, BlockConductance, ConductanceEstimator, NotJudged, RecentBlocks
 from sealscope.monitor.stream.joining import SampleJoiner
 from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
+from sealscope.monitor.stream.pressures import PressureEstimator
 from sealscope.monitor.stream.volumes import VolumeEstimator
 from sealscope.recordings.recording import Array, Recording
 
@@ -46,13 +47,21 @@ _SHIFT_HOURS = 8.0
 _RECENT = 8
 
 
+_ESTIMATORS: dict[str, type[VolumeEstimator] | type[PressureEstimator]] = {
+    "volumes": VolumeEstimator,
+    "pressures": PressureEstimator,
+}
+
+
 class Watch:
-    """The volume balance of one running actuator, whose state can be saved; `watch` makes one.
+    """One running actuator, whose state can be saved; `watch` makes one.
+
+    Where the position is recorded it is watched by the balance of volumes, else by the pressures and the command.
 
     Parameters
     ----------
     rig : Rig
-        Gives the piston's area and the pump's displacement.
+        Gives the piston's area and the pump's displacement; without a position all of the machine's model.
     false_alarms_per_1000_h : float
         False alarms of a healthy machine per 1000 operating hours, at most.
     learn_hours : float
@@ -84,7 +93,7 @@ class Watch:
         probability_of("step", false_alarms_per_1000_h, BLOCK_SECONDS)
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
-        self.estimator: ConductanceEstimator = VolumeEstimator.of(rig)
+        self._estimators: dict[str, ConductanceEstimator] = {by: kind.of(rig) for by, kind in _ESTIMATORS.items()}
         self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
@@ -95,6 +104,16 @@ class Watch:
         self._learning = BaselineLearning()
         self._means = np.empty((0, 4))  # t, g, sd, offset of means of GROUP blocks
         self._group = np.empty((0, 4))  # the same of the blocks of the mean to come
+
+    @property
+    def by(self) -> str:
+        """What the actuator is watched by: "volumes" where its position is recorded, else "pressures"."""
+        return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
+
+    @property
+    def estimator(self) -> ConductanceEstimator:
+        """What turns blocks into conductances."""
+        return self._estimators[self.by]
 
     @property
     def counters(self) -> dict[str, int]:
@@ -113,7 +132,8 @@ class Watch:
         ----------
         samples : Recording
             The next samples, in SI units: ``p_A``, ``p_B``, ``x``, ``theta`` or ``omega``, and ``p_1``, ``p_2`` where
-            there are any. What does not fit is dropped and counted (`counters`).
+            there are any; or ``p_A``, ``p_B`` and ``u``, ``omega`` or ``theta``. What does not fit is dropped and
+            counted (`counters`).
         follows : bool, default True
             False where the clock begins anew, as with a file of its own.
 
@@ -166,6 +186,8 @@ class Watch:
                 seconds = self.estimator.seconds_of(first)
                 if seconds is not None:
                     self._seconds = seconds
+                    self._samples.settled = True
+                    self._estimators = {self.by: self.estimator}
                     return True
             self._samples.taken(count // 2)
             self._samples.count("half minutes at rest or with missing values before the first block")
@@ -183,6 +205,8 @@ class Watch:
         """Return the estimate of a block that ends at the clock `end` [s], from what the estimator shows of it."""
         self.blocks += 1
         if isinstance(shown, NotJudged):
+            if shown.apart:
+                self._forget(0)
             if shown.counted:
                 self._samples.count(shown.counted, shown.number)
             return BlockEstimate(self.blocks, end, shown.status)
@@ -215,7 +239,7 @@ class Watch:
         again = leak is not None and leak.test == "step" and leak.onset_s > float(series.t[0])
         if leak is not None and not again:
             return
-        probability = probability_of("step", self.false_alarms_per_1000_h, self.block_seconds)
+        probability = probability_of("step", self.false_alarms_per_1000_h, self.estimator.pace * self.block_seconds)
         rise, other = self.estimator.step(probability, again=again)
         if other is not None and leak is None:
             self._samples.count(f"blocks not compared: {other}"[:120])
@@ -245,12 +269,12 @@ class Watch:
             return
         t, g, sd, offset = self._means.T
         seconds = GROUP * self.block_seconds
-        rise = slow_rise_of(t, g, sd, probability_of("rise", self.false_alarms_per_1000_h, seconds))
+        rise = rise_of("rise", t, g, sd, probability_of("rise", self.false_alarms_per_1000_h, seconds))
         before = g[:-1]
         if rise is not None:
             before = g[t < rise.onset_s][-4:]
         elif self.baseline is not None:
-            deviation = math.hypot(float(sd[-1]), float(offset[-1]))
+            deviation = math.hypot(float(sd[-1]), float(offset[-1]) * (1.0 if self.estimator.levels else WARMEST - 1.0))
             probability = probability_of("level", self.false_alarms_per_1000_h, seconds)
             rise = level_rise_of(float(mean[0]), float(mean[1]), deviation, self.baseline, probability)
             before = np.array([self.baseline.level])
@@ -261,7 +285,8 @@ class Watch:
     def _raise(self, rise: ConductanceRise, raised: float, before: float, flow: float) -> None:
         size = rise.size * flow
         half = 1.96 * math.hypot(rise.size_sd, self.estimator.size_error * rise.size) * flow
-        lpm, interval = (size, (max(0.0, size - half), size + half)) if self.estimator.litres else (None, None)
+        upper = self.estimator.orifice * (size + half)
+        lpm, interval = (size, (max(0.0, size - half), upper)) if self.estimator.litres else (None, None)
         self.leak = WatchedLeak(
             raised,
             rise.onset_s,
@@ -296,15 +321,14 @@ class Watch:
         elif self.baseline is not None:
             base = self.baseline
             beyond = total - base.level, total - base.high - 1.96 * sd, total - base.low + 1.96 * sd
-        return BlockEstimate(
-            self.blocks,
-            end,
-            status,
-            total * flow if self.estimator.levels else None,
-            (max(0.0, total - half) * flow, max(0.0, total + half) * flow) if self.estimator.levels else None,
-            None if beyond is None else beyond[0] * flow,
-            None if beyond is None else (max(0.0, beyond[1]) * flow, max(0.0, beyond[2]) * flow),
-        )
+        estimator = self.estimator
+        total_lpm = leak_lpm = total_interval = leak_interval = None
+        if estimator.levels:
+            total_lpm, total_interval = total * flow, (max(0.0, total - half) * flow, max(0.0, total + half) * flow)
+        if beyond is not None:
+            leak_lpm, low, high = (value * flow for value in beyond)
+            leak_interval = max(0.0, low), estimator.orifice * max(0.0, high)
+        return BlockEstimate(self.blocks, end, status, total_lpm, total_interval, leak_lpm, leak_interval)
 
     def state(self) -> dict[str, Any]:
         """Return all that the watch knows as plain values that JSON holds; `from_state` continues with the same bits.
@@ -322,7 +346,7 @@ class Watch:
             "baseline_version": self._version,
             "seconds": self._seconds,
             "samples": self._samples.state(),
-            "estimator": self.estimator.state(),
+            "estimators": {by: estimator.state() for by, estimator in self._estimators.items()},
             "learning": self._learning.state(),
             "baseline": None if self.baseline is None else asdict(self.baseline),
             "leak": None if self.leak is None else asdict(self.leak),
@@ -358,7 +382,12 @@ class Watch:
         watch.blocks, watch._version = int(number["blocks"]), int(number["baseline_version"])
         watch._seconds = number["seconds"]
         watch._samples = SampleJoiner.from_state(part_of(state, "samples", Mapping))
-        watch.estimator = VolumeEstimator.from_state(part_of(state, "estimator", Mapping))
+        estimators = part_of(state, "estimators", Mapping)
+        watch._estimators = {
+            by: kind.from_state(part_of(estimators, by, Mapping))
+            for by, kind in _ESTIMATORS.items()
+            if not watch._samples.settled or by == watch.by
+        }
         watch._learning = BaselineLearning.from_state(part_of(state, "learning", Mapping))
         baseline, leak = (part_of(state, name, (Mapping, type(None))) for name in ("baseline", "leak"))
         watch.baseline = None if baseline is None else plain_dataclass(WatchBaseline, baseline, "baseline")
@@ -380,7 +409,7 @@ def watch(
     Parameters
     ----------
     rig : Rig, str or path, default "thesis"
-        Gives the piston's area and the pump's displacement.
+        Gives the piston's area and the pump's displacement; without a position all of the machine's model.
     false_alarms_per_1000_h : float, default 1
         False alarms of a healthy machine per 1000 operating hours, at most.
     learn_hours : float, default 8

@@ -1,0 +1,164 @@
+"""An actuator watched from its pressures and the command: L/min and an alarm, disorder, restarts, other duties."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+import sealscope as ss
+from sealscope.diagnosis.observer.model import G_UNIT
+from sealscope.errors import InputError
+from sealscope.monitor.stream.estimates import BlockEstimate
+from sealscope.monitor.stream.watch import Watch
+from sealscope.recordings.recording import Recording
+from sealscope.simulation.changes import Linear, ParameterDrift
+
+#: Leak of the worn machine [L/min], and since when [s].
+LEAK, OPENS, LENGTH = 0.015, 620.0, 780.0
+LEARN = 0.08
+CHANNELS = ("p_A", "p_B", "u")
+
+
+def simulated(**values: object) -> Recording:
+    return ss.simulate(command="5 sin(2t)", seed=1, set={"pump.G_pump": 2e-13}, **values).only(CHANNELS)
+
+
+WORN = simulated(duration=LENGTH, leak=f"{LEAK} L/min from {OPENS} s")
+
+
+def run(recording: Recording, size: int, watch: Watch | None = None) -> tuple[Watch, list[BlockEstimate]]:
+    """The watch and its estimates after samples in pieces of this size."""
+    watch = watch or ss.watch("thesis", learn_hours=LEARN)
+    estimates = []
+    for first in range(0, len(recording), size):
+        estimates += watch.update(recording.samples(slice(first, first + size)))
+    return watch, estimates
+
+
+WHOLE = run(WORN, len(WORN))
+#: Seconds of sound running, after which the baseline is known, and the state then.
+SOUND = 500.0
+
+
+def part(first: float, last: float) -> Recording:
+    return WORN.samples(slice(round(first * 500.0), round(last * 500.0)))
+
+
+def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
+    watch, estimates = WHOLE
+    assert watch.by == "pressures"
+    assert watch.leak is not None and watch.baseline is not None
+    assert OPENS < watch.leak.raised_s < OPENS + 120.0
+    low, high = watch.leak.onset_interval_s
+    assert low <= OPENS <= high
+    low_lpm, high_lpm = estimates[-1].leak_interval_lpm
+    assert low_lpm <= LEAK <= high_lpm
+    assert estimates[-1].leak_lpm == pytest.approx(LEAK, rel=0.3)
+    assert watch.leak.cause == "piston or pump leak"
+    sound = [estimate for estimate in estimates if estimate.status == "watched" and estimate.t < OPENS]
+    assert len(sound) > 20
+    assert all(estimate.leak_interval_lpm[0] == 0.0 for estimate in sound)
+    assert all(estimate.total_lpm is None for estimate in estimates)  # the level is not known well enough
+    assert watch.baseline.lpm is None
+    assert watch.baseline.level == pytest.approx(2e-13, abs=1.5 * G_UNIT)
+
+
+@settings(
+    max_examples=1,
+    deadline=None,
+    phases=(Phase.explicit, Phase.reuse, Phase.generate),
+    suppress_health_check=[HealthCheck.too_slow],
+)
+@given(size=st.integers(1_000, 60_000), stop=st.integers(3_000, 350_000))
+def test_cuts_and_restarts_change_nothing(size: int, stop: int):
+    first, before = run(WORN.samples(slice(0, stop)), size)
+    again = Watch.from_state(json.loads(json.dumps(first.state(), allow_nan=False)))
+    _, after = run(WORN.samples(slice(stop, len(WORN))), size, again)
+    assert before + after == WHOLE[1]
+    assert json.dumps(again.state()) == json.dumps(WHOLE[0].state())
+
+
+@pytest.fixture(scope="module")
+def learned() -> str:
+    return json.dumps(run(part(0, SOUND), 50_000)[0].state())
+
+
+def moved(recording: Recording, seconds: float) -> Recording:
+    return Recording(recording.t + seconds, recording.channels, recording.units, recording.rate)
+
+
+def test_a_short_gap_is_bridged_and_after_a_pause_nothing_before_counts(learned: str):
+    watch = Watch.from_state(json.loads(learned))
+    level = watch.baseline.level
+    _, bridged = run(part(510, 580), 5_000, watch)
+    assert [estimate.status for estimate in bridged][:4] == ["settling"] * 3 + ["watched"]
+    shown = [estimate.leak_lpm for estimate in bridged if estimate.leak_lpm is not None]
+    assert abs(np.mean(shown)) < 0.004
+    _, paused = run(moved(part(640, 780), 3600.0), 5_000, watch)  # it leaks, and the onset lies within the pause
+    assert {estimate.status for estimate in paused} == {"settling"}
+    assert watch.leak is None and watch.baseline.level == level
+    assert watch.counters["gap"] == 2
+
+
+def test_another_duty_and_a_lost_machine_are_not_judged(learned: str):
+    watch = Watch.from_state(json.loads(learned))
+    half = part(500, 560)
+    faster = Recording(half.t, {**half.channels, "u": 1.4 * half["u"]}, half.units, half.rate)
+    _, estimates = run(faster, 5_000, watch)
+    assert {estimate.status for estimate in estimates} <= {"not described by the model", "settling", "another duty"}
+    broken = Recording(
+        half.t + 60.0, {**half.channels, "p_A": np.where(half.t > 530.0, np.nan, half["p_A"])}, half.units, half.rate
+    )
+    _, estimates = run(broken, 5_000, watch)
+    assert "missing values" in {estimate.status for estimate in estimates}
+    assert watch.leak is None
+
+
+def test_slow_samples_are_said_to_be_too_slow():
+    slow = simulated(duration=90.0, rate=100.0)
+    watch, estimates = run(slow, 10_000)
+    assert {estimate.status for estimate in estimates} == {"sampled at less than 250 Hz"}
+    assert watch.leak is None
+
+
+def test_a_position_that_comes_with_the_second_block_is_used():
+    watch = ss.watch("thesis", learn_hours=LEARN)
+    whole = ss.simulate(command="5 sin(2t)", duration=70.0, seed=2)
+    watch.update(whole.between(0, 1).only(CHANNELS))
+    assert watch.by == "pressures"
+    watch.update(whole.between(1, 70))
+    assert watch.by == "volumes"
+    assert watch.counters == {"began anew: a position is recorded, too": 1}
+
+
+@pytest.mark.slow
+def test_oil_that_warms_is_no_leak():
+    warm = [
+        ParameterDrift("pump.G_pump", Linear(0.5, 600.0)),
+        ParameterDrift("friction.F_v", Linear(-0.3, 600.0)),
+        ParameterDrift("fluid.K_oil", Linear(-0.05, 600.0)),
+    ]
+    watch, estimates = run(simulated(duration=600.0, drifts=warm), 50_000)
+    assert watch.leak is None
+    assert estimates[-1].status == "watched"
+
+
+@pytest.mark.parametrize("damage", ["machine", "observer", "recent", "drive"])
+def test_a_damaged_state_is_refused_in_one_line(damage: str):
+    state = WHOLE[0].state()
+    pressures = {**state["estimators"]["pressures"], damage: {"x": 1}}
+    with pytest.raises(InputError) as raised:
+        Watch.from_state({**state, "estimators": {"pressures": pressures}})
+    assert "\n" not in str(raised.value)
+
+
+def test_a_rig_of_assumptions_states_no_litres():
+    watch = ss.watch(ss.load_rig("thesis").as_assumed("for this test"), learn_hours=LEARN)
+    _, estimates = run(part(0, SOUND), 50_000, watch)
+    assert watch.baseline is not None
+    assert all(replace(estimate, status="") == BlockEstimate(estimate.number, estimate.t, "") for estimate in estimates)
