@@ -1,12 +1,12 @@
 """What watching costs: processor time a block, actuators a core, bytes of state, and time from message to store.
 
-    python benchmarks/bench_monitor.py [--seconds 600] [--actuators 20] [--paced 0]
+    python benchmarks/bench_monitor.py [--seconds 600] [--actuators 20] [--paced 0] [--by volumes]
 
-Simulated actuators (p_A, p_B, x, theta at 500 Hz, blocks of about 3 s in messages of 1 s) are watched by the library
-alone, then by a service on one core, from the bytes of the messages (JSON, then CBOR) to the database in a temporary
-folder with full synchronisation. Its threads are fed as fast as they take; with `--paced N` N actuators then send a
-message each second for a minute, and the time from message to stored is what an alarm waits. The share of blocks that
-were searched for a rise is part of the cost.
+Simulated actuators (p_A, p_B, x, theta, or `--by pressures` p_A, p_B, u, at 500 Hz, blocks of about 3 s in messages of
+1 s) are watched by the library alone, then by a service on one core, from the bytes of the messages (JSON, then CBOR)
+to the database in a temporary folder with full synchronisation. Its threads are fed as fast as they take; with
+`--paced N` N actuators then send a message each second for a minute, and the time from message to stored is what an
+alarm waits. The share of blocks that were searched for a rise is part of the cost.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from sealscope.monitor.settings import MonitorSettings
 from sealscope.monitor.sources.source_block import decoded
 from sealscope.monitor.stream import decisions
 
-CHANNELS = ("p_A", "p_B", "x", "theta")
+CHANNELS = {"volumes": ("p_A", "p_B", "x", "theta"), "pressures": ("p_A", "p_B", "u")}
 LEARN_H = 100.0 / 3600.0
-#: Messages until the baseline is learned, and how long the paced ones are measured [s].
-LEARNED, PACED_S = 180, 60.0
+#: Messages until the baseline is learned, after the observer by pressures has settled, and how long the paced ones are
+#: measured [s].
+LEARNED, PACED_S = {"volumes": 180, "pressures": 330}, 60.0
 
 
-def pieces(seconds: float, seed: int, leak: str | None = None) -> list[ss.Recording]:
+def pieces(seconds: float, by: str) -> list[ss.Recording]:
     """Messages of 1 s."""
-    recording = ss.simulate(command="3 sin(4t)", duration=seconds, seed=seed, leak=leak).only(CHANNELS)
+    recording = ss.simulate(command="3 sin(4t)", duration=seconds, seed=0).only(CHANNELS[by])
     return [recording.samples(slice(k, k + 500)) for k in range(0, len(recording), 500)]
 
 
@@ -46,27 +47,28 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0, help="simulated time of each actuator")
     parser.add_argument("--actuators", type=int, default=20, help="actuators in the service")
     parser.add_argument("--paced", type=int, default=0, help="actuators that send at their own pace")
+    parser.add_argument("--by", choices=tuple(CHANNELS), default="volumes", help="what they are watched by")
     chosen = parser.parse_args()
 
-    messages = pieces(chosen.seconds, 0)
+    messages = pieces(chosen.seconds, chosen.by)
     watch = ss.watch("thesis", learn_hours=LEARN_H)
-    warm = 200
+    warm = LEARNED[chosen.by] + 20
     for samples in messages[:warm]:
         watch.update(samples)
-    searched = 0
-    fit = decisions.fit_balance
+    searched, search = 0, "fit_balance" if chosen.by == "volumes" else "find_step"
+    fit = getattr(decisions, search)
 
     def counted(*arguments: object, **options: object) -> object:
         nonlocal searched
         searched += 1
         return fit(*arguments, **options)  # type: ignore[arg-type]
 
-    decisions.fit_balance = counted  # type: ignore[assignment]
+    setattr(decisions, search, counted)
     blocks, start = watch.blocks, time.process_time()
     for samples in messages[warm:]:
         watch.update(samples)
     spent, blocks = time.process_time() - start, watch.blocks - blocks
-    decisions.fit_balance = fit
+    setattr(decisions, search, fit)
     state = json.dumps(watch.state())
     print(f"library: {1e3 * spent / blocks:.2f} ms a block of {(len(messages) - warm) / blocks:.2f} s", end="; ")
     print(f"{blocks / spent:.0f} blocks/s, {(len(messages) - warm) / spent:.0f} actuators a core", end="; ")
@@ -77,14 +79,14 @@ def main() -> None:
     forms = {"JSON": lambda values: json.dumps(values).encode(), "CBOR": cbor2.dumps, "CBOR, typed arrays": typed}
     for form, dumps in forms.items():
         payloads = [dumps(message(samples)) for samples in messages]
-        spent, took, _ = served(payloads, chosen.actuators, 0.0)
+        spent, took, _ = served(payloads, chosen.actuators, 0.0, LEARNED[chosen.by])
         print(
             f"service, {form} of {len(payloads[-1])} bytes: {1e3 * spent:.2f} ms of processor a message of 1 s",
             end="; ",
         )
         print(f"{1.0 / spent:.0f} actuators a core; as fast as it takes {1.0 / took:.0f} messages/s", flush=True)
     if chosen.paced:
-        spent, _, waits = served(payloads, chosen.paced, PACED_S)
+        spent, _, waits = served(payloads, chosen.paced, PACED_S, LEARNED[chosen.by])
         median, rare = np.percentile(waits, [50, 99])
         print(f"{chosen.paced} actuators, {form}, a message each second for {PACED_S:.0f} s:", end=" ")
         print(
@@ -95,13 +97,17 @@ def main() -> None:
 
 def message(samples: ss.Recording) -> dict[str, object]:
     """Samples as a message of 9 digits."""
-    channels = {name: [float(f"{value:.9g}") for value in samples[name]] for name in CHANNELS}
+    channels = {name: [float(f"{value:.9g}") for value in samples[name]] for name in samples.channels}
     return {"t": float(samples.t[0]), "rate": samples.rate, **channels}
 
 
 def typed(values: dict[str, object]) -> bytes:
     """A message as CBOR with its channels as arrays of floats (RFC 8746)."""
-    arrays = {name: cbor2.CBORTag(86, np.array(values[name], "<f8").tobytes()) for name in CHANNELS}
+    arrays = {
+        name: cbor2.CBORTag(86, np.array(value, "<f8").tobytes())
+        for name, value in values.items()
+        if isinstance(value, list)
+    }
     return cbor2.dumps({**values, **arrays})
 
 
@@ -110,7 +116,7 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def served(payloads: list[bytes], count: int, paced: float) -> tuple[float, float, list[float]]:
+def served(payloads: list[bytes], count: int, paced: float, learned: int) -> tuple[float, float, list[float]]:
     """Return processor time and time a message [s] of a service that has learned, and how long each message took.
 
     `paced`: each actuator sends a message a second for so long [s]; 0: as fast as the service takes them.
@@ -136,18 +142,18 @@ def served(payloads: list[bytes], count: int, paced: float) -> tuple[float, floa
             while done[0] < number:
                 time.sleep(0.01)
 
-        rounds = int(paced) or min(100, len(payloads) - LEARNED)
-        for payload in payloads[:LEARNED]:
+        rounds = int(paced) or min(100, len(payloads) - learned)
+        for payload in payloads[:learned]:
             for name in names:
                 send(name, payload, False)
-        settle(LEARNED * count)
+        settle(learned * count)
         began, clock = time.process_time(), time.perf_counter()
-        for k, payload in enumerate(payloads[LEARNED : LEARNED + rounds]):
+        for k, payload in enumerate(payloads[learned : learned + rounds]):
             for n, name in enumerate(names):
                 if paced:
                     time.sleep(max(0.0, clock + k + n / count - time.perf_counter()))
                 send(name, payload, True)
-        settle((LEARNED + rounds) * count)
+        settle((learned + rounds) * count)
         total = rounds * count
         measured.extend([(time.process_time() - began) / total, (time.perf_counter() - clock) / total])
 

@@ -4,6 +4,9 @@ The observer runs along with the machine (`diagnosis.observer`): friction, stiff
 its states, so that what changes in them as the oil warms is not taken for a leak. Each block gives a conductance of its
 own. Its level is known to some 0.75 `G_UNIT` only, so that changes are stated and levels are not.
 
+The observer's oil is neither lost nor gained, so that the mean of both pressures stays. A machine's does not: oil
+warms, accumulators give way. What a block's mean has beyond that of the first one is taken from both pressures.
+
 After a gap the observer goes on with what it knew of the machine; after a pause, or where it has lost the machine, it
 searches the oil's stiffness anew, and nothing before is compared with what comes after.
 """
@@ -63,6 +66,7 @@ class PressureEstimator:
         self._seconds = 0.0
         self._stream: ObserverStream | None = None
         self._known: Array | None = None  # parameters of the last block that the model described
+        self._mean = float("nan")  # mean of both pressures when the observer began
         self._next = float("nan")  # clock at which the next block begins if it follows
         self._settling, self._lost = 0, 0
         self._appended = 0
@@ -99,6 +103,7 @@ class PressureEstimator:
         begun, apart = self._follow(float(block.t[0]), block.rate)
         self._next = float(block.t[-1]) + 1.0 / block.rate
         assert self._stream is not None
+        samples = self._levelled(samples, apart)
         if begun:  # the first sample only sets the observer's states
             channels = {name: np.append(samples[name][:1], samples[name]) for name in samples.channels}
             before = samples.t[0] - 1.0 / block.rate
@@ -134,6 +139,14 @@ class PressureEstimator:
         self._stream = ObserverStream(self._a, (*CHAMBERS, self._drive), rate, self._seconds, self._known)
         self._settling, self._lost = _SETTLING, 0
         return True, True
+
+    def _levelled(self, samples: Recording, apart: bool) -> Recording:
+        """Return samples whose pressures have the mean of the beginning, which is this block's where it is `apart`."""
+        mean = float(np.mean([samples[name] for name in CHAMBERS]))
+        if apart:
+            self._mean = mean
+        channels = {name: samples[name] - (mean - self._mean) * (name in CHAMBERS) for name in samples.channels}
+        return Recording(samples.t, channels, samples.units, samples.rate)
 
     def _not_described(self, rows: Estimates) -> NotJudged:
         """Count a block that the model does not describe; after some of them, or where it diverged, begin anew."""
@@ -199,6 +212,7 @@ class PressureEstimator:
             "drive": self._drive,
             "seconds": self._seconds,
             "known": None if self._known is None else plain_array(self._known),
+            "mean": None if np.isnan(self._mean) else self._mean,
             "next": None if np.isnan(self._next) else self._next,
             "settling": self._settling,
             "lost": self._lost,
@@ -219,17 +233,18 @@ class PressureEstimator:
         estimator = cls(_numbers_of(part_of(state, "machine", Mapping)), bool(part_of(state, "litres", bool)))
         estimator._drive = part_of(state, "drive", str)
         estimator._seconds = float(part_of(state, "seconds", (float, int)))
-        known, after, rate, observer = (
+        known, mean, after, rate, observer = (
             part_of(state, name, kind)
             for name, kind in (
                 ("known", (Mapping, type(None))),
+                ("mean", (float, int, type(None))),
                 ("next", (float, int, type(None))),
                 ("rate", (float, int, type(None))),
                 ("observer", (Mapping, type(None))),
             )
         )
         estimator._known = None if known is None else array_of(known, "known")
-        estimator._next = float("nan") if after is None else float(after)
+        estimator._mean, estimator._next = (float("nan") if value is None else float(value) for value in (mean, after))
         estimator._settling, estimator._lost, estimator._appended = (
             int(part_of(state, name, int)) for name in ("settling", "lost", "appended")
         )
