@@ -1,12 +1,15 @@
 """What watching costs: processor time a block, actuators a core, bytes of state, and time from message to store.
 
-    python benchmarks/bench_monitor.py [--seconds 600] [--actuators 20] [--paced 0] [--by volumes]
+    python benchmarks/bench_monitor.py [--seconds 600] [--actuators 20] [--paced 0] [--in-phase] [--by volumes]
 
 Simulated actuators (p_A, p_B, x, theta, or `--by pressures` p_A, p_B, u, at 500 Hz, blocks of about 3 s in messages of
 1 s) are watched by the library alone, then by a service on one core, from the bytes of the messages (JSON, then CBOR)
-to the database in a temporary folder with full synchronisation. Its threads are fed as fast as they take; with
-`--paced N` N actuators then send a message each second for a minute, and the time from message to stored is what an
-alarm waits. The share of blocks that were searched for a rise is part of the cost.
+to the database in a temporary folder with full synchronisation, restored from a database in which each has learned. Its
+threads are fed as fast as they take; with `--paced N` N actuators then send a message each second for a minute, and the
+time from message to stored is what an alarm waits. They begin to send one after another within three seconds, as
+machines do that nobody started at one instant; with `--in-phase` all begin together, and every third second or so all
+blocks of the detectors are complete at once. The share of blocks that were searched for a rise is part of the cost. The
+load of the machine is printed beside the times.
 """
 
 from __future__ import annotations
@@ -21,10 +24,13 @@ from pathlib import Path
 
 import cbor2
 import numpy as np
+from sqlalchemy import select
 
 import sealscope as ss
+from sealscope.monitor.actuators import WatchedActuators
+from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import MonitorSettings
+from sealscope.monitor.settings import ActuatorSettings, MonitorSettings
 from sealscope.monitor.sources.source_block import decoded
 from sealscope.monitor.stream import decisions
 
@@ -33,6 +39,8 @@ LEARN_H = 100.0 / 3600.0
 #: Messages until the baseline is learned, after the observer by pressures has settled, and how long the paced ones are
 #: measured [s].
 LEARNED, PACED_S = {"volumes": 180, "pressures": 330}, 60.0
+#: Seconds within which the paced ones begin.
+PHASES = 3
 
 
 def pieces(seconds: float, by: str) -> list[ss.Recording]:
@@ -48,6 +56,7 @@ def main() -> None:
     parser.add_argument("--actuators", type=int, default=20, help="actuators in the service")
     parser.add_argument("--paced", type=int, default=0, help="actuators that send at their own pace")
     parser.add_argument("--by", choices=tuple(CHANNELS), default="volumes", help="what they are watched by")
+    parser.add_argument("--in-phase", action="store_true", help="all of them begin at one instant")
     chosen = parser.parse_args()
 
     messages = pieces(chosen.seconds, chosen.by)
@@ -79,20 +88,22 @@ def main() -> None:
     forms = {"JSON": lambda values: json.dumps(values).encode(), "CBOR": cbor2.dumps, "CBOR, typed arrays": typed}
     for form, dumps in forms.items():
         payloads = [dumps(message(samples)) for samples in messages]
-        spent, took, _ = served(payloads, chosen.actuators, 0.0, LEARNED[chosen.by])
+        spent, took, _ = served(payloads, chosen.actuators, 0.0, LEARNED[chosen.by], 1)
         print(
             f"service, {form} of {len(payloads[-1])} bytes: {1e3 * spent:.2f} ms of processor a message of 1 s",
             end="; ",
         )
         print(f"{1.0 / spent:.0f} actuators a core; as fast as it takes {1.0 / took:.0f} messages/s", flush=True)
     if chosen.paced:
-        spent, _, waits = served(payloads, chosen.paced, PACED_S, LEARNED[chosen.by])
+        phases = 1 if chosen.in_phase else PHASES
+        spent, _, waits = served(payloads, chosen.paced, PACED_S, LEARNED[chosen.by], phases)
         median, rare = np.percentile(waits, [50, 99])
         print(f"{chosen.paced} actuators, {form}, a message each second for {PACED_S:.0f} s:", end=" ")
         print(
             f"{100.0 * spent * chosen.paced:.0f} % of a core; message to stored: median {1e3 * median:.0f} ms", end=", "
         )
-        print(f"p99 {1e3 * rare:.0f} ms, most {max(waits):.2f} s; resident {resident() / 1e6:.0f} MB")
+        print(f"p99 {1e3 * rare:.0f} ms, most {max(waits):.2f} s; resident {resident() / 1e6:.0f} MB", end="; ")
+        print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
 def message(samples: ss.Recording) -> dict[str, object]:
@@ -116,10 +127,34 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def served(payloads: list[bytes], count: int, paced: float, learned: int) -> tuple[float, float, list[float]]:
+def learn(settings: MonitorSettings, payloads: list[bytes], learned: int, phases: int) -> None:
+    """Write a database in which all actuators have learned: the rows of some that have, under the names of all."""
+    store = MonitorStore(settings.database)
+    teachers = [ActuatorSettings(name=f"teacher {k}", learn_hours=LEARN_H) for k in range(phases)]
+    watched = WatchedActuators(teachers, store)
+    for k, teacher in enumerate(teachers):
+        for payload in payloads[k:learned]:
+            watched.take([decoded(payload, teacher.name)])
+    with store.writing() as connection:
+        for table in (store.tables.actuators, store.tables.pending):
+            rows = [dict(row._mapping) for row in connection.execute(select(table))]
+            connection.execute(table.delete())
+            for n, actuator in enumerate(settings.actuator):
+                of = [row for row in rows if row["actuator"] == teachers[n % phases].name]
+                if of:
+                    connection.execute(table.insert(), [{**row, "actuator": actuator.name} for row in of])
+        for table in (store.tables.blocks, store.tables.estimates):
+            connection.execute(table.delete())
+    store.engine.dispose()
+
+
+def served(
+    payloads: list[bytes], count: int, paced: float, learned: int, phases: int
+) -> tuple[float, float, list[float]]:
     """Return processor time and time a message [s] of a service that has learned, and how long each message took.
 
-    `paced`: each actuator sends a message a second for so long [s]; 0: as fast as the service takes them.
+    `paced`: each actuator sends a message a second for so long [s]; 0: as fast as the service takes them; `phases`: the
+    actuators begin with the first message, the second, and so on up to so many.
     """
     names = [f"press {k}" for k in range(count)]
     waits: list[float] = []
@@ -128,13 +163,12 @@ def served(payloads: list[bytes], count: int, paced: float, learned: int) -> tup
     def source(service: object) -> None:
         done = [0]
 
-        def send(name: str, payload: bytes, kept: bool) -> None:
+        def send(name: str, payload: bytes) -> None:
             began = time.perf_counter()
 
             def stored() -> None:
                 done[0] += 1
-                if kept:
-                    waits.append(time.perf_counter() - began)
+                waits.append(time.perf_counter() - began)
 
             service.hand(decoded(payload, name, stored))  # type: ignore[attr-defined]
 
@@ -143,17 +177,13 @@ def served(payloads: list[bytes], count: int, paced: float, learned: int) -> tup
                 time.sleep(0.01)
 
         rounds = int(paced) or min(100, len(payloads) - learned)
-        for payload in payloads[:learned]:
-            for name in names:
-                send(name, payload, False)
-        settle(learned * count)
         began, clock = time.process_time(), time.perf_counter()
-        for k, payload in enumerate(payloads[learned : learned + rounds]):
+        for k in range(rounds):
             for n, name in enumerate(names):
                 if paced:
                     time.sleep(max(0.0, clock + k + n / count - time.perf_counter()))
-                send(name, payload, True)
-        settle((learned + rounds) * count)
+                send(name, payloads[learned + k])
+        settle(rounds * count)
         total = rounds * count
         measured.extend([(time.process_time() - began) / total, (time.perf_counter() - clock) / total])
 
@@ -165,6 +195,7 @@ def served(payloads: list[bytes], count: int, paced: float, learned: int) -> tup
                 "actuator": [{"name": name} for name in names],
             }
         )
+        learn(settings, payloads, learned, phases)
         service = Service(settings, stdout=io.StringIO(), sources=[source])
         service.run()
         service.store.engine.dispose()

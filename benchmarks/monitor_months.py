@@ -18,7 +18,8 @@ Ornstein-Uhlenbeck process of 3 % and 40 min, friction (dp) another of 10 % and 
 leak begins; an alarm is false where none is there, and is dismissed as a person would.
 
 Five of the actuators leak from the tenth day on: a growth from 0 to 0.005 L/min in a week, steps of 0.002, 0.0042 and
-0.015 L/min, and 0.0042 L/min past a rod seal to the outside (blocks of a recording with that fault).
+0.015 L/min, and 0.0042 L/min, at the charge pressure, past a rod seal to the outside (blocks of a recording with that
+fault).
 
 Each actuator is a row of `results/monitor_months.csv`; a second call goes on with those that are missing, and the sum
 over all rows with the same settings is printed.
@@ -62,9 +63,12 @@ COLUMNS = (
 Libraries = dict[tuple[float, float] | str, list[BalanceBlocks]]
 
 
-def libraries(seed: int) -> tuple[ss.Recording, Libraries]:
-    """Return a recording, and blocks, each with its own noise, by charge pressure and noise, and of an outer leak."""
-    detector, made = VolumeBalance(ss.load_rig("thesis")), Libraries()
+def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:
+    """Return a recording, blocks, each with its own noise, by charge pressure and noise, and the outer leak [L/min].
+
+    The outer leak is stated at the charge pressure, and flows under that of its chamber.
+    """
+    detector, made, outside_lpm = VolumeBalance(ss.load_rig("thesis")), Libraries(), 0.0
     first = None
     for number, key in enumerate([*((charge, noise) for charge in CHARGES for noise in NOISES), OUTSIDE]):
         charge, noise = key if isinstance(key, tuple) else (CHARGES[1], NOISES[0])
@@ -80,11 +84,13 @@ def libraries(seed: int) -> tuple[ss.Recording, Libraries]:
             fault=f"rod seal A {OUTSIDE_LPM} L/min" if key == OUTSIDE else None,
         ).only(("x", "theta", "p_A", "p_B"))
         first = first or recording
+        if key == OUTSIDE:
+            outside_lpm = OUTSIDE_LPM * float(recording["p_A"].mean()) / (1e6 * charge)
         length = block_samples(recording.between(0.0, 60.0), 3.0)
         blocks = detector.blocks(recording, length, balance_channels(recording))
         made[key] = [blocks.chosen(np.array([k])) for k in range(25, len(blocks))]
     assert first is not None
-    return first, made
+    return first, made, outside_lpm
 
 
 def changed(block: BalanceBlocks, t: float, g: float, friction: float) -> BalanceBlocks:
@@ -125,12 +131,14 @@ def warmed(warm: float, seconds: float, tau: float) -> float:
 class Life:
     """One actuator over a month."""
 
-    def __init__(self, recording: ss.Recording, made: Libraries, chosen: argparse.Namespace, number: int) -> None:
+    def __init__(
+        self, recording: ss.Recording, made: Libraries, outside_lpm: float, chosen: argparse.Namespace, number: int
+    ) -> None:
         self.random = np.random.default_rng([chosen.seed, number])
         usual = made[CHARGES[1], NOISES[0]]
         self.seconds = usual[0].seconds
         self.flow = float(np.mean([block.abs_dp[0] for block in usual])) / LITRE_PER_MINUTE
-        self.made, self.chosen = made, chosen
+        self.made, self.outside_lpm, self.chosen = made, outside_lpm, chosen
         self.kind = KINDS[number] if number < len(KINDS) else ""
         self.watch = ss.watch("thesis", false_alarms_per_1000_h=chosen.rate, learn_hours=LEARN_H)
         self.watch.update(recording.between(0.0, 61.0))
@@ -186,7 +194,7 @@ class Life:
                         "delay_h": (clock + self.seconds - onset) / 3600.0,
                         "delay_watched_h": (ran - leaked) / 3600.0,
                         "test": watch.leak.test,
-                        "true_lpm": OUTSIDE_LPM if outside else lpm * scaled,
+                        "true_lpm": self.outside_lpm if outside else lpm * scaled,
                         "stated_lpm": estimate.leak_lpm,
                         "stated_low_lpm": low,
                         "stated_high_lpm": high,
@@ -249,11 +257,16 @@ def watch_all(chosen: argparse.Namespace, same: dict[str, float]) -> None:
     if not left:
         return
     began = time.monotonic()
-    recording, made = libraries(chosen.seed)
+    recording, made, outside_lpm = libraries(chosen.seed)
     for number in left:
         if time.monotonic() - began > 60.0 * chosen.stop_after:
             break
-        row = {"seed": chosen.seed, "actuator": number, **same, **Life(recording, made, chosen, number).lived()}
+        row = {
+            "seed": chosen.seed,
+            "actuator": number,
+            **same,
+            **Life(recording, made, outside_lpm, chosen, number).lived(),
+        }
         with RESULTS.open("a", newline="") as file:
             csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n").writerow(row)
         print(row, flush=True)

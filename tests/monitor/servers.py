@@ -38,13 +38,13 @@ def free_port() -> int:
 
 
 class Broker:
-    """A broker whose sessions survive its restart."""
+    """A broker whose sessions survive its restart; `guards`: lines of its settings that say whom it lets in."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, guards: str = "allow_anonymous true") -> None:
         self.port = free_port()
         self._config = folder / "mosquitto.conf"
         self._config.write_text(
-            f"listener {self.port} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 0\n"
+            f"listener {self.port} 127.0.0.1\n{guards}\nmax_queued_messages 0\n"
             f"persistence true\npersistence_location {folder}/\nuser root\n"
         )
         self.start()

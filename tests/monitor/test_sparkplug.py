@@ -510,6 +510,8 @@ def test_a_node_is_born_tells_and_dies(tmp_path, monkeypatch):
 
 def test_settings_of_sparkplug_are_checked(tmp_path):
     broker = "\n[mqtt]\n"
+    with pytest.raises(InputError, match=r"are no primary host of Sparkplug: leave mqtt.host_id out"):
+        settings_in(tmp_path, f'{broker}host_id = "a"\n[share]\nname = "a"\n', "postgresql://nowhere/monitor")
     with pytest.raises(InputError, match=r"Sparkplug B, needs the table \[mqtt\]"):
         settings_in(tmp_path, "[sparkplug]\n")
     device = '[[actuator]]\nname = "{}"\nsparkplug = "{}"\n'

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -20,7 +22,7 @@ from sealscope.monitor.service import Service
 from sealscope.monitor.settings import read_settings
 
 from .plant import CHANNELS, rows_of, served, settings_in, until
-from .servers import MOSQUITTO, Broker
+from .servers import MOSQUITTO, NO_POSTGRESQL, Broker, PostgreSQL
 from .test_broker import Running, broker  # noqa: F401 (a fixture)
 from .test_service import LINES, SOUND, WORN
 
@@ -80,9 +82,8 @@ class Wire:
         self.on_message(topic, decoded)
 
     def publish(self, topic: str, payload: Any) -> None:
-        self._client.publish(
-            topic, payload.encode(include_dtypes=isinstance(payload, spb.NCmd)), qos=0
-        ).wait_for_publish(5.0)
+        # not waited for: a callback that did would hold up the thread that sends
+        self._client.publish(topic, payload.encode(include_dtypes=isinstance(payload, spb.NCmd)), qos=0)
 
     def of(self, start: str) -> list[Any]:
         return [payload for topic, payload in self.heard if topic.startswith(f"spBv1.0/{start}")]
@@ -146,6 +147,14 @@ class EdgeNode:
             self._wire.publish(f"spBv1.0/plant/DDATA/edge/{device}", payload)
 
 
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[Any, ...]]]:
+    """The rows of a monitor that has taken the same samples as lines."""
+    folder = tmp_path_factory.mktemp("plain")
+    served(settings_in(folder), LINES)
+    return rows_of(str(folder / "monitor.db"))
+
+
 @pytest.fixture
 def settings_file(broker: Broker, tmp_path: Path) -> Path:  # noqa: F811
     file = tmp_path / "monitor.toml"
@@ -153,10 +162,11 @@ def settings_file(broker: Broker, tmp_path: Path) -> Path:  # noqa: F811
     return file
 
 
-def test_samples_and_alarms_over_sparkplug(broker: Broker, settings_file: Path, tmp_path: Path):  # noqa: F811
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
+def test_samples_and_alarms_over_sparkplug(
+    broker: Broker,  # noqa: F811
+    settings_file: Path,
+    undisturbed: dict[str, list[tuple[Any, ...]]],
+):
     wire = Wire(broker.port)
     node = EdgeNode(wire)
     wire.on_message = lambda topic, payload: node.bear() if topic == "spBv1.0/plant/NCMD/edge" else None
@@ -165,10 +175,7 @@ def test_samples_and_alarms_over_sparkplug(broker: Broker, settings_file: Path, 
     try:
         assert values(wire.until("plant/NCMD/edge", 1)[0]) == {"Node Control/Rebirth": True}
         wire.until("plant/DBIRTH/edge", 2)
-        for start in range(0, len(WORN), 150):
-            for k, (device, recording) in enumerate((("press 1", WORN), ("press 2", SOUND))):
-                node.tell(k, device, recording.samples(slice(start, start + 150)))
-            time.sleep(0.02)  # of QoS 0 a broker keeps none
+        told_in_parts(node, 0, len(WORN))
         blocks = 2 * -(-len(WORN) // 150)
         running.until(blocks)
         assert len(rows_of(settings.database)["blocks"]) == blocks
@@ -186,7 +193,7 @@ def test_samples_and_alarms_over_sparkplug(broker: Broker, settings_file: Path, 
     finally:
         running.end()
     assert running.service.actuators.counters == {}
-    ours, theirs = rows_of(settings.database), rows_of(str(plain / "monitor.db"))
+    ours, theirs = rows_of(settings.database), undisturbed
     assert [row[:2] + row[3:4] for row in ours["estimates"]] == [row[:2] + row[3:4] for row in theirs["estimates"]]
     assert [values(birth) for birth in births] == 2 * [{"bdSeq": 1, "Node Control/Rebirth": False}]
     events = [values(payload) for payload in wire.of("Sealscope/DDATA/monitor/press 1")]
@@ -208,6 +215,56 @@ def test_samples_and_alarms_over_sparkplug(broker: Broker, settings_file: Path, 
     states = wire.until("STATE/sealscope", 2)
     assert [state["online"] for state in states] == [True, False]
     wire.close()
+
+
+def told_in_parts(node: EdgeNode, start: int, stop: int) -> None:
+    """Let the node tell samples of both devices, 150 at a time."""
+    for at in range(start, stop, 150):
+        for k, (device, recording) in enumerate((("press 1", WORN), ("press 2", SOUND))):
+            node.tell(k, device, recording.samples(slice(at, at + 150)))
+        time.sleep(0.02)  # of QoS 0 a broker keeps none
+
+
+@pytest.mark.skipif(NO_POSTGRESQL is not None, reason=NO_POSTGRESQL or "")
+def test_monitors_that_share_actuators_hear_sparkplug_and_go_on_for_each_other(
+    broker: Broker,  # noqa: F811
+    tmp_path: Path,
+    undisturbed: dict[str, list[tuple[Any, ...]]],
+):
+    """Of two monitors one ends halfway: no block is missing, none is stored twice, and one node states the alarm."""
+    folder = tempfile.mkdtemp(prefix="sealscope-pg-")
+    database = PostgreSQL(folder)
+    wire = Wire(broker.port)
+    node = EdgeNode(wire)
+    wire.on_message = lambda topic, payload: node.bear() if topic == "spBv1.0/plant/NCMD/edge" else None
+    running = []
+    for name in ("a", "b"):
+        file = tmp_path / f"{name}.toml"
+        shared = SETTINGS.replace('"monitor.db"', f'"{database.url}"').replace('host_id = "sealscope"\n', "")
+        file.write_text(shared.format(port=broker.port) + f'[share]\nname = "{name}"\nlease_s = 4.0\n')
+        running.append(Running(read_settings(file)))
+    stays, ends = running
+    try:
+        until(lambda: all(each.service.actuators.held for each in running))
+        wire.until("plant/NCMD/edge", 2)
+        wire.until("plant/DBIRTH/edge", 4)
+        half = len(WORN) // 300 * 150
+        told_in_parts(node, 0, half)
+        stays.until(2 * half // 150)
+        ends.end()
+        told_in_parts(node, half, len(WORN))
+        stays.until(2 * -(-len(WORN) // 150))
+        until(lambda: any("Alarm/Event" in values(each) for each in wire.of("Sealscope/DDATA/monitor/press 1")))
+    finally:
+        stays.end()
+        ends.end()
+        wire.close()
+    ours, theirs = rows_of(database.url), undisturbed
+    database.stop()
+    shutil.rmtree(folder, ignore_errors=True)
+    assert len(ours["blocks"]) == len(theirs["blocks"])
+    assert [row[:2] + row[3:4] for row in ours["estimates"]] == [row[:2] + row[3:4] for row in theirs["estimates"]]
+    assert [row[:3] for row in ours["alarms"]] == [row[:3] for row in theirs["alarms"]]
 
 
 def test_a_monitor_that_is_killed_dies_by_its_will_and_is_born_with_the_next_number(

@@ -245,3 +245,19 @@ def test_no_alarm_is_lost_by_searching_only_where_it_is_worth_it():
     assert np.mean(quiet) < 0.05
     quiet = [near_an_alarm(np.arange(60.0), 10.0 + random.standard_normal(60), 4e-7) for _ in range(50)]
     assert np.mean(quiet) < 0.05
+
+
+@pytest.mark.slow
+def test_a_leak_to_the_outside_is_within_its_interval_though_the_balance_shows_half_of_it():
+    fault = "rod seal A 0.0042 L/min from 110 s"  # at the charge pressure
+    valves = {"makeup.check_valves": "present", "p_charge": "0.3 MPa"}
+    recording = ss.simulate(command="3 sin(4t)", duration=160.0, seed=20, set=valves, fault=fault)
+    watch, estimates = run(recording, [500])
+    assert watch.leak is not None and watch.leak.cause == "external leak"
+    true = 0.0042 * float(recording.between(OPENS, 160.0)["p_A"].mean()) / 0.3e6
+    for stated, (low, high) in (
+        (watch.leak.leak_lpm, watch.leak.leak_interval_lpm),
+        (estimates[-1].leak_lpm, estimates[-1].leak_interval_lpm),
+    ):
+        assert low <= true <= high
+        assert stated == pytest.approx(true, rel=0.25)

@@ -6,6 +6,7 @@ import logging
 import math
 import threading
 import time
+import zlib
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -250,7 +251,8 @@ class WatchedActuators:
             self.store.keep_alarm(connection, alarm)
         actuator.pending += 1
         actuator.bytes += bytes_of(samples)
-        if actuator.pending >= PENDING_BLOCKS or actuator.bytes >= PENDING_BYTES:
+        turn = (actuator.taken + zlib.crc32(name.encode())) % PENDING_BLOCKS  # not all actuators at the same instant
+        if turn == 0 or actuator.bytes >= PENDING_BYTES:
             rows.checkpoint(name)
             self._checkpoint(connection, actuator, rows)
         else:
@@ -352,6 +354,11 @@ class WatchedActuators:
                 raise
         self._tell()
         return alarm
+
+    @property
+    def held(self) -> frozenset[str]:
+        """The actuators that this monitor watches: all of its settings, or its share of them."""
+        return frozenset(self._settings) & (frozenset(self._settings) if self._share is None else self._share.held)
 
     @property
     def rigs(self) -> dict[str, str]:

@@ -171,6 +171,8 @@ class MonitorSettings(_Part):
                 raise ValueError("the node of the alarms must be none of the actuators' nodes")
         if self.share is not None and "://" not in self.database:
             raise ValueError(f"monitors that share actuators need a database by URL, got the file {self.database!r}")
+        if self.share is not None and self.mqtt is not None and self.mqtt.host_id is not None:
+            raise ValueError("monitors that share actuators are no primary host of Sparkplug: leave mqtt.host_id out")
         local = self.page is None or self.page.host in ("127.0.0.1", "localhost", "::1")
         if self.page is not None and not local and self.page.token_file is None:
             raise ValueError(f"a page beyond this machine needs page.token_file, got host {self.page.host!r} without")

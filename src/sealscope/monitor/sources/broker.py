@@ -56,7 +56,9 @@ class _Connection:
     def __init__(self, settings: BrokerSettings, password: str | None, service: BlockReceiver) -> None:
         self._settings, self._service = settings, service
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
-        self._client = client_of(settings.client_id, settings.user, password, settings.tls, settings.ca_file)
+        share = service.settings.share
+        name = settings.client_id if share is None else f"{settings.client_id}-{share.name}"  # a session of its own
+        self._client = client_of(name, settings.user, password, settings.tls, settings.ca_file)
         self._host: SparkplugHost | None = None
         if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
             self._host = SparkplugHost(service.settings.actuator, self._send, service.count)

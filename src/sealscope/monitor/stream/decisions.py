@@ -55,6 +55,11 @@ _NEAR_THE_THRESHOLD, _GROWN, _SURELY_GROWN = 0.6, 0.75 * WARMEST, 3.0
 _EVEN = 0.02
 #: Logarithm by which the duty changes where a rise of the conductance is not compared across it.
 _OTHER_DUTY = 0.15
+#: What leaks to the outside over what the balance shows of it: least, usual, most. One chamber loses the oil, and the
+#: balance is half the difference of both. What the make-up gives the other chamber counts as a leak, too, so that all
+#: of it shows where one side carries the load, and about half where the load reverses (0.42 to 0.55 in simulations).
+OUTSIDE = (1.0, 2.0, 2.5)
+_HALF_SHOWN = "; of what leaves one chamber the balance of both shows about half"
 #: A rise that comes from these is an alarm, whichever of them it is.
 _CAUSES = ("piston leak", "piston or pump leak", "pump leak", "external leak")
 
@@ -185,7 +190,7 @@ def _rise(evidence: Evidence, blocks: BalanceBlocks, g: Array) -> ConductanceRis
         size,
         deviation,
         evidence.cause or "",
-        evidence.reason,
+        evidence.reason + (_HALF_SHOWN if evidence.cause == "external leak" else ""),
         float(evidence.score or 0.0),
         float(evidence.threshold or 0.0),
     )

@@ -18,6 +18,7 @@ from sealscope.errors import InputError
 from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, plain_dataclass
 from sealscope.monitor.stream.decisions import (
     GROUP,
+    OUTSIDE,
     WINDOW,
     ConductanceRise,
     level_rise_of,
@@ -285,14 +286,15 @@ class Watch:
     def _raise(self, rise: ConductanceRise, raised: float, before: float, flow: float) -> None:
         size = rise.size * flow
         half = 1.96 * math.hypot(rise.size_sd, self.estimator.size_error * rise.size) * flow
-        upper = self.estimator.orifice * (size + half)
-        lpm, interval = (size, (max(0.0, size - half), upper)) if self.estimator.litres else (None, None)
+        least, usual, most = _share_shown(rise.cause)
+        upper = most * self.estimator.orifice * (size + half)
+        lpm, interval = usual * size, (least * max(0.0, size - half), upper)
         self.leak = WatchedLeak(
             raised,
             rise.onset_s,
             rise.onset_interval_s,
-            lpm,
-            interval,
+            lpm if self.estimator.litres else None,
+            interval if self.estimator.litres else None,
             before,
             rise.size_sd,
             rise.test,
@@ -317,7 +319,9 @@ class Watch:
             spread = 1.96 * math.hypot(
                 sd / math.sqrt(recent.size), self.leak.before_sd, self.estimator.size_error * (now - self.leak.before)
             )
-            beyond = now - self.leak.before, now - before * warmed - spread, now - before / warmed + spread
+            least, usual, most = _share_shown(self.leak.cause)
+            low, high = now - before * warmed - spread, now - before / warmed + spread
+            beyond = usual * (now - self.leak.before), least * low, most * high
         elif self.baseline is not None:
             base = self.baseline
             beyond = total - base.level, total - base.high - 1.96 * sd, total - base.low + 1.96 * sd
@@ -398,6 +402,11 @@ class Watch:
 
 
 _NUMBERS = ("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "seconds")
+
+
+def _share_shown(cause: str) -> tuple[float, float, float]:
+    """Return what leaks over what the conductance shows of it: least, usual and most."""
+    return OUTSIDE if cause == "external leak" else (1.0, 1.0, 1.0)
 
 
 @checked_call
