@@ -19,9 +19,15 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.cylinder import opposing_force
 from sealscope.physics.fluid import kinematic_viscosity, thermal_density, thermal_stiffness
+from sealscope.physics.lanes import WIDTH
 from sealscope.physics.pump import friction_torque, loss_coefficients, turbulent_slip
 from sealscope.physics.rest import initial_state
 from sealscope.physics.restrictors import behind_shut_off, behind_valve, implicit_orifice_flow, orifice_flow
+from sealscope.physics.rig import NUMBERS, rig_numbers
+from sealscope.physics.solvers.imex import IMEX_NODES
+from sealscope.physics.vector.fixed import left_to_table
+from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAK_ROWS, advance_lanes_imex
+from sealscope.simulation.batch.run import in_lanes
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Circulation, ShutOff, parse_fault
 from sealscope.simulation.simulate import simulate_with_truth
@@ -307,6 +313,28 @@ def test_a_leak_passes_what_the_oil_s_viscosity_lets_it(warmer):
     thick = parse_fault(fault).viscosity(load_rig("thesis"))(np.zeros(1))[0]
     np.testing.assert_allclose(truth.outputs["q_leak"], G / thick * dp, rtol=1e-9, atol=1e-15)
     assert (thick < 1.0) == (warmer > 0.0)
+
+
+@pytest.mark.slow
+def test_lanes_run_all_parts_as_a_run_by_itself_does(drive):
+    """Two rigs side by side, each with numbers of its own, held still."""
+    rigs = [rig_with(**PARTS), rig_with(**{**PARTS, "R_A": 8e9, "T_f": 0.2, "C_opp": 2e-7, "open_A": 0.4})]
+    h, n = 2.5e-4, 1600
+    nodes = np.array(IMEX_NODES) * h
+    shape = np.sin(4.0 * (np.arange(n)[:, None] * h + nodes))
+    numbers = [[getattr(rig_numbers(rig), name) for name in NUMBERS] for rig in rigs]
+    states = in_lanes(np.array([initial_state(rig, 0.0) for rig in rigs]), WIDTH)
+    drive_rows = in_lanes(np.array([[3.0, 0.0], [3.0, 0.0]]), WIDTH)
+    pressures, account = np.zeros((1, n, CHANNELS, WIDTH)), np.full((1, ACCOUNTS, WIDTH), np.inf)
+    advance_lanes_imex(
+        (0, 1), states, h, 0, nodes, shape, drive_rows, np.zeros((1, LEAK_ROWS, WIDTH)),
+        in_lanes(np.array(numbers)[:, None], WIDTH), np.array([0, n]), left_to_table(rig_numbers(rigs[0]), NUMBERS), 1,
+        pressures, 0, account,
+    )  # fmt: skip
+    for lane, rig in enumerate(rigs):
+        alone = drive(rig, n * h, rate=4000.0, step=h)
+        np.testing.assert_allclose(pressures[0, :, 0, lane], alone["p_A"], rtol=0, atol=1e-3)
+    assert np.ptp(pressures[0, -1, 0, :2]) > 1e3
 
 
 @pytest.mark.parametrize(

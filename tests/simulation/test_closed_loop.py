@@ -147,6 +147,19 @@ def test_faults_and_leaks_meet_a_closed_loop():
     assert run.truth.outputs["x"].max() == pytest.approx(0.03, rel=0.02)
 
 
+def test_a_recorded_force_is_taken_as_it_was(tmp_path):
+    path = tmp_path / "force.csv"
+    path.write_text("t [min],F [kN],note\n1,0.5,a\n1.01,1.5,b\n1.03,-0.5,c\n")
+    force = Experiment.of(load=f"file {path}", duration=1.0).load
+    np.testing.assert_allclose(force.at(np.array([0.0, 0.3, 0.6, 1.2, 9.0])), [500.0, 1000.0, 1500.0, 500.0, -500.0])
+    for words, rule in (("t [s],p [Pa]\n0,1\n", "columns t [s] and F [N]"), ("t [s],F [bar]\n0,1\n1,1\n", "bar")):
+        path.write_text(words)
+        with pytest.raises(InputError) as refused:
+            parse_force(f"file {path}")
+        assert rule in str(refused.value)
+        assert "\n" not in str(refused.value)
+
+
 def test_words_of_targets_and_loads():
     t = np.array([0.0, 0.5, 2.0])
     np.testing.assert_allclose(parse_position("position 50 mm sin(2t) + 1 cm").at(t), 0.05 * np.sin(2 * t) + 0.01)

@@ -10,8 +10,8 @@ from sealscope.compiled import kernel
 from sealscope.errors import InputError
 from sealscope.physics.cylinder import hard_stop_force, load_force, opposing_force
 from sealscope.physics.fluid import P_ATM
-from sealscope.physics.pump import friction_torque, pump_torque
-from sealscope.physics.rig import RigNumbers, pump_delivery, rig_numbers, valve_rates
+from sealscope.physics.pump import friction_torque, pump_flow, pump_torque, turbulent_slip
+from sealscope.physics.rig import RigNumbers, rig_numbers, valve_rates
 from sealscope.physics.state import CURRENT, INTEGRAL, OMEGA, P_1, P_2, P_A, P_B, POSITION, STATES, state_of
 
 if TYPE_CHECKING:
@@ -83,7 +83,9 @@ def supply_at_rest(force: float, x: float, p: RigNumbers) -> tuple[float, float,
         middle = 0.5 * (low + high)
         p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
-        rises = valve_rates(state_of(y), pump_delivery(p.omega_P, middle - p.p_return, p), p)[2] > 0.0
+        over = middle - p.p_return
+        Q_1 = pump_flow(p.omega_P, over, p.q_b, p.G_pump) - turbulent_slip(over, p.c_slip, p.dp_0)
+        rises = valve_rates(state_of(y), Q_1, p)[2] > 0.0
         low, high = (middle, high) if rises else (low, middle)
     return low, p_A, p_B
 

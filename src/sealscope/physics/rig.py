@@ -302,24 +302,6 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 
 
 @contracted
-def pump_delivery(omega: float, dp: float, p: RigNumbers) -> float:
-    """Flow [m^3/s] that the pump delivers into port 1, by its ideal flow and its slip."""
-    Q_1 = pump_flow(omega, dp, p.q_b, p.G_pump)
-    if len(p.lossy) > 0:
-        Q_1 = Q_1 - turbulent_slip(dp, p.c_slip, p.dp_0)
-    return Q_1
-
-
-@contracted
-def shaft_load(omega: float, dp: float, p: RigNumbers) -> float:
-    """Torque [N m] that pressures and friction put on the shaft, but for viscous drag."""
-    torque = pump_torque(dp, p.q_b)
-    if len(p.lossy) > 0:
-        torque = torque + friction_torque(omega, dp, p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f)
-    return torque
-
-
-@contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
     """Friction [N] on the piston by the law that is in force, and the rate [m/s] of its bristles' deflection.
 
@@ -514,7 +496,12 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     error = speed_error(y, u, p)  # eq. (4.2) as a state
     voltage = controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
     current = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
-    spin = shaft_acceleration(y[CURRENT], y[OMEGA], shaft_load(y[OMEGA], dp_pump, p), p.C_m, p.B_M, p.J_M)
+    torque = pump_torque(dp_pump, p.q_b)
+    Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
+    if len(p.lossy) > 0:
+        torque = torque + friction_torque(y[OMEGA], dp_pump, p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f)
+        Q_1 = Q_1 - turbulent_slip(dp_pump, p.c_slip, p.dp_0)
+    spin = shaft_acceleration(y[CURRENT], y[OMEGA], torque, p.C_m, p.B_M, p.J_M)
     stop = hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
     load = load_force(x, p.F_l, p.k_load)
     if len(p.damped) > 0:
@@ -525,7 +512,6 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         load = load + F
     friction, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
     push = piston_acceleration(p_A, p_B, friction, load, stop, p.A_A, p.A_B, p.M_eq)
-    Q_1 = pump_delivery(y[OMEGA], dp_pump, p)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
     V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
@@ -574,7 +560,10 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     for m in range(len(y)):
         row[m] = y[m]
     n = len(y)
-    Q_1 = pump_delivery(y[OMEGA], pump_difference(y, p), p)
+    dp_pump = pump_difference(y, p)
+    Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
+    if len(p.lossy) > 0:
+        Q_1 = Q_1 - turbulent_slip(dp_pump, p.c_slip, p.dp_0)
     Q_A, Q_B = throttle_flows(y, p) if p.throttled else (Q_1, Q_1)
     if len(p.valved) > 0:
         Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)

@@ -6,9 +6,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Recorded, Sine, parse_command, plain_text
+from sealscope.storage.opening import open_regular
+from sealscope.units import to_si
 
 _LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _FORCES = {"N": 1.0, "kN": 1e3}
@@ -88,7 +92,33 @@ def command_or_target(text: str) -> Command | Position:
     return parse_position(text) or parse_command(text)
 
 
+def _recorded_force(path: str) -> Recorded:
+    """Return the force over time of a text table with the columns ``t [s]`` and ``F [N]``, each in any unit of its own.
+
+    The first row is at t = 0; linear between the rows, the last value afterwards.
+    """
+    with open_regular(path, "a recorded load") as file:
+        head = file.readline(4096).decode("utf-8-sig", "replace")
+        named = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in head.split(",")]
+        columns = {match[1]: (k, match[2]) for k, match in enumerate(named) if match}
+        if not {"t", "F"} <= columns.keys():
+            raise InputError(
+                f"a recorded load must have the columns t [s] and F [N], got {head.strip()[:80]!r} ({path})"
+            )
+        try:
+            table = np.loadtxt(file, delimiter=",", usecols=[columns["t"][0], columns["F"][0]], ndmin=2)
+        except ValueError as error:
+            raise InputError(f"a recorded load must hold numbers, got a table of which {error} ({path})") from None
+    t = to_si(table[:, 0], columns["t"][1], "s", name="t", place=path)
+    return Recorded(t - t[:1], to_si(table[:, 1], columns["F"][1], "N", name="F", place=path), path)
+
+
 def parse_force(text: str) -> Force:
-    """Read a load such as ``2 kN``, ``500 N sin(2t) + 100 N``, ``step 2 kN at 3 s`` in the words of `parse_command`."""
+    """Read a load such as ``2 kN``, ``500 N sin(2t) + 100 N``, ``step 2 kN at 3 s`` in the words of `parse_command`.
+
+    ``file LOAD.csv`` is a recorded one: columns ``t [s]`` and ``F [N]``.
+    """
     words = plain_text(text, "load")
+    if words.lower().startswith("file "):
+        return Force(_recorded_force(words[5:].strip()), words)
     return Force(_course(words, _FORCES, "load"), words)
