@@ -1,24 +1,24 @@
 """Actuators watched from pressures and command while their oil warms: false alarms per 1000 h, delays of leaks.
 
-    python benchmarks/monitor_pressures.py [--machines 8] [--hours 6] [--seed 0] [--stop-after 20]
+    python benchmarks/monitor_pressures.py [--machines 8] [--pieces 6] [--piece-minutes 60] [--learn-hours 2]
 
-Nothing is composed here: every sample is simulated, in pieces of an hour with pauses of 1 or 20 min between them (a
-short one the observer bridges, after a long one it begins anew). Each machine is the thesis's rig with a stiffness of
-550 to 750 MPa, friction within 10 %, pump leakage of 0.6e-13 to 4e-13 m^3/(s Pa) in cold oil, zeros of the pressures
-within 2 psi, and a command in turn from three; the watch assumes the rig as designed. Over a shift
+Nothing is composed here: every sample is simulated, in pieces of `--piece-minutes` with pauses of 1 or 20 min between
+them (a short one the observer bridges, after a long one it begins anew). Each machine is the thesis's rig with a
+stiffness of 550 to 750 MPa, friction within 10 %, pump leakage of 0.6e-13 to 4e-13 m^3/(s Pa) in cold oil, zeros of the
+pressures within 2 psi, and a command in turn from three; the watch assumes the rig as designed. Over a shift
 
     oil warms from 20 to 50 C with a time constant of 1 to 3 h: conductance x 4 (and an Ornstein-Uhlenbeck process of
     3 % and 40 min), viscous friction / 4, Coulomb friction -15 % (and a process of 10 % and 3 h), stiffness -15 %;
     charge pressure is another process (20 %, 6 h), and each pressure's zero (0.25 psi, 2 h), noise 1 or 1.6 times the
     rig's from one piece to the next.
 
-The baseline is learned over the first 2 h. Stated are 100 false alarms per 1000 h, as dozens of hours cannot tell 1
-from 0. An alarm is dismissed as a person would. After 4 h the state is copied, with 1 per 1000 h in place of 100, and
-the copies go on with leaks that begin 12 min later: steps of 0.0042, 0.015 and 0.05 L/min, and a growth from 0 to 0.05
-L/min in an hour.
+The baseline is learned over the first `--learn-hours`. Stated are 100 false alarms per 1000 h, as dozens of hours
+cannot tell 1 from 0. An alarm is dismissed as a person would. Before the last piece the state is copied, with 1 per
+1000 h in place of 100, and the copies go on with leaks that begin 12 min later: steps of 0.0042, 0.015 and 0.05 L/min,
+and a growth from 0 to 0.05 L/min in an hour.
 
 Each machine is a row, and each leak, of `results/monitor_pressures.csv`; a second call goes on with those that are
-missing, and the sums over all rows of the same hours are printed.
+missing, and the sums over all rows are printed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ import sealscope as ss
 from sealscope.simulation.changes import ParameterDrift, TabulatedDrift
 
 RESULTS = Path(__file__).parent / "results" / "monitor_pressures.csv"
-PIECE_S, LEARN_H, COPIED_H, ONSET_S = 3600.0, 2.0, 4, 720.0
+ONSET_S = 720.0
 COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)")
 #: Stated false alarms per 1000 h of the healthy machines, and of those that leak.
 HEALTHY_RATE, LEAKING_RATE = 100.0, 1.0
@@ -89,7 +89,7 @@ class Machine:
         self.clock, self.pieces = 1000.0, 0
         self._seeds = 100_000 * (seed + 1) + 1000 * number
 
-    def piece(self, leak: str | None = None, duration: float = PIECE_S) -> ss.Recording:
+    def piece(self, duration: float, leak: str | None = None) -> ss.Recording:
         """Return the next piece of its life."""
         t = np.linspace(0.0, duration, round(duration / 60.0) + 1)
         warm = 1.0 - (1.0 - self.warm) * np.exp(-t / self.tau)
@@ -143,23 +143,25 @@ def watched(watch: ss.Watch, recording: ss.Recording) -> tuple[int, list[str]]:
     return judged, alarms
 
 
-def healthy(machine: Machine, hours: int) -> tuple[dict[str, object], str, Machine]:
+def healthy(
+    machine: Machine, pieces: int, seconds: float, learn_hours: float
+) -> tuple[dict[str, object], str, Machine]:
     """Return the row, and the state after some hours with the machine as it was then."""
     import copy
 
-    watch = ss.watch("thesis", false_alarms_per_1000_h=HEALTHY_RATE, learn_hours=LEARN_H)
+    watch = ss.watch("thesis", false_alarms_per_1000_h=HEALTHY_RATE, learn_hours=learn_hours)
     judged, alarms, state, then = 0, list[str](), "", machine
-    for k in range(hours):
-        if k == COPIED_H:
+    for k in range(pieces):
+        if k == pieces - 1:
             state = json.dumps({**watch.state(), "false_alarms_per_1000_h": LEAKING_RATE})
             then = copy.deepcopy(machine)
-        blocks, tests = watched(watch, machine.piece())
+        blocks, tests = watched(watch, machine.piece(seconds))
         judged += blocks
         alarms += tests
     row = {
         "kind": "healthy",
         "rate": HEALTHY_RATE,
-        "hours": hours,
+        "hours": f"{pieces * seconds / 3600.0:g}",
         "judged_hours": f"{judged * watch.block_seconds / 3600.0:.2f}",
         "false_alarms": len(alarms),
         "by_test": " ".join(alarms),
@@ -168,11 +170,11 @@ def healthy(machine: Machine, hours: int) -> tuple[dict[str, object], str, Machi
     return row, state, then
 
 
-def leaking(state: str, machine: Machine, kind: str, hours: int) -> dict[str, object]:
+def leaking(state: str, machine: Machine, kind: str, hours: str) -> dict[str, object]:
     """Return the row of a leak."""
     watch = ss.Watch.from_state(json.loads(state))
     duration = ONSET_S + (1800.0 if kind in SIZES else 3600.0)
-    recording = machine.piece(LEAKS[kind], duration)
+    recording = machine.piece(duration, LEAKS[kind])
     row: dict[str, object] = {"kind": kind, "rate": LEAKING_RATE, "hours": hours, "false_alarms": 0}
     onset = float(recording.t[0]) + ONSET_S
     for first in range(0, len(recording), 500):
@@ -197,47 +199,55 @@ def rows_of_results() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def write(row: dict[str, object]) -> None:
+    """Write a row."""
+    with RESULTS.open("a", newline="") as file:
+        csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n").writerow(row)
+    print(row, flush=True)
+
+
 def main() -> None:
     """Watch, write rows, and print the sums."""
     import copy
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--machines", type=int, default=8)
-    parser.add_argument("--hours", type=int, default=6)
+    parser.add_argument("--pieces", type=int, default=6)
+    parser.add_argument("--piece-minutes", type=float, default=60.0)
+    parser.add_argument("--learn-hours", type=float, default=2.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--stop-after", type=float, default=20.0, help="no machine is begun after so many minutes")
     chosen = parser.parse_args()
     if not RESULTS.exists():
         RESULTS.write_text(",".join(COLUMNS) + "\n")
+    hours = f"{chosen.pieces * chosen.piece_minutes / 60.0:g}"
     began = time.monotonic()
     with threadpool_limits(limits=1):
         for number in range(chosen.machines):
-            same = (str(chosen.seed), str(number), str(chosen.hours))
+            same = (str(chosen.seed), str(number), hours)
             if any((row["seed"], row["machine"], row["hours"]) == same for row in rows_of_results()):
                 continue
             if time.monotonic() - began > 60.0 * chosen.stop_after:
                 break
             machine = Machine(chosen.seed, number)
-            row, state, then = healthy(machine, chosen.hours)
-            rows = [row] + [leaking(state, copy.deepcopy(then), kind, chosen.hours) for kind in LEAKS]
             place = {"seed": chosen.seed, "machine": number, "command": machine.command}
-            with RESULTS.open("a", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
-                for row in rows:
-                    writer.writerow({**place, **row})
-                    print({**place, **row}, flush=True)
-    told(chosen.hours)
+            row, state, then = healthy(machine, chosen.pieces, 60.0 * chosen.piece_minutes, chosen.learn_hours)
+            write({**place, **row})
+            for kind in LEAKS:
+                write({**place, **leaking(state, copy.deepcopy(then), kind, hours)})
+    told()
 
 
-def told(hours: int) -> None:
+def told() -> None:
     """Print the sums."""
-    rows = [row for row in rows_of_results() if row["hours"] == str(hours)]
+    rows = rows_of_results()
     mine = [row for row in rows if row["kind"] == "healthy"]
     judged, false = sum(float(row["judged_hours"]) for row in mine), sum(int(row["false_alarms"]) for row in mine)
     low = float(gammaincinv(false, 0.025)) if false else 0.0
     high = float(gammaincinv(false + 1, 0.975))
+    hours = sum(float(row["hours"]) for row in mine)
     print(
-        f"{len(mine)} machines, {hours * len(mine)} h, {judged:.0f} h judged: {false} false alarms, "
+        f"{len(mine)} machines, {hours:g} h, {judged:.1f} h judged: {false} false alarms, "
         f"{1000 * false / judged:.1f} per 1000 h (95 %: {1000 * low / judged:.1f} to {1000 * high / judged:.1f}), "
         f"stated {HEALTHY_RATE:g}"
     )

@@ -45,7 +45,8 @@ def settings_in(folder: Path, more: str = "", database: str = "monitor.db") -> M
 
 
 def message(actuator: str, samples: Recording) -> dict[str, Any]:
-    channels = {name: [float(f"{value:.9g}") for value in samples[name]] for name in CHANNELS}
+    names = [name for name in (*CHANNELS, "u") if name in samples]
+    channels = {name: [float(f"{value:.9g}") for value in samples[name]] for name in names}
     return {"actuator": actuator, "t": float(samples.t[0]), "rate": samples.rate, **channels}
 
 

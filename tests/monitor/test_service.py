@@ -14,9 +14,11 @@ from sqlalchemy.exc import DataError, OperationalError
 
 from sealscope.errors import InputError
 from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import TEMPLATE, read_settings
 from sealscope.monitor.sources.source_block import digest_of
+from sealscope.simulation.simulate import simulate
 
 from ..diagnosis.balance_machine import machine, step
 from .plant import kill_often, lines_of, message, rows_of, served, settings_in, write_files
@@ -66,6 +68,24 @@ def test_kills_at_random_instants_change_no_row(undisturbed, tmp_path):
     lines.write_bytes(LINES)
     assert kill_often(settings, lines, 2, seed=1) == 2
     assert rows_of(settings.database) == undisturbed[0]
+
+
+def test_an_actuator_without_a_position_is_stored_alike_whatever_the_restarts(tmp_path):
+    """The observer's state comes back with the same bits, before its search of the stiffness and after."""
+    pressed = simulate(command="5 sin(2t)", duration=75.0, seed=1).only(("p_A", "p_B", "u"))
+    lines = lines_of({"press 1": pressed}, 2500)
+    (tmp_path / "whole").mkdir()
+    whole = settings_in(tmp_path / "whole")
+    served(whole, lines)
+    settings = settings_in(tmp_path)
+    for share in (0.88, 0.97, 1.0):
+        service, _ = served(settings, lines[: round(share * len(lines))])
+    rows = rows_of(settings.database)
+    assert rows == rows_of(whole.database)
+    assert [row[3] for row in rows["estimates"]] == ["settling"] * 23
+    summaries = service.actuators.plain()
+    assert summaries["press 1"]["by"] == "pressures"
+    assert 'sealscope_watched{actuator="press 1",by="pressures"} 1.0' in metrics_text(summaries, {})
 
 
 @pytest.mark.slow

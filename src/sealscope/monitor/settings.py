@@ -289,9 +289,9 @@ port = 8765
 # token_file = "hook-token.txt"  # sent as Authorization: Bearer
 # timeout_s = 10.0
 
-# An actuator is watched by p_A, p_B, x and theta or omega (balance of volumes; from 0.001 L/min on), or without a
-# position by p_A, p_B and u, omega or theta at 250 Hz or more (observer; from 0.01 L/min on). The first minute of
-# samples settles it; other names stand in `map`.
+# An actuator is watched by p_A, p_B, x and theta or omega (balance of volumes: steps from 0.002 L/min on), or without
+# a position by p_A, p_B and u, omega or theta at 250 Hz or more (observer: steps from 0.005 L/min on). The first minute
+# of samples settles which; other names stand in `map`.
 [[actuator]]
 name = "press 1"
 folder = "press 1"               # recordings that appear here are read, in any format that `sealscope diagnose` reads
