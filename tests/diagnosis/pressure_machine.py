@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from sealscope.diagnosis.pressure_model.model import G
+from sealscope.diagnosis.pressure_model.model import ORIFICE, G
 from sealscope.diagnosis.pressure_model.track import Track, wander
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.changes import Linear, ParameterDrift
@@ -72,7 +72,7 @@ def recorded(
     seed: int = 1,
     *,
     command: str = "7 sin(4t)",
-    leak: str | None = None,
+    leak: str | tuple[str, ...] | None = None,
     fault: str | None = None,
     drift: tuple[str, float] | None = None,
     duration: float = 120.0,
@@ -125,5 +125,4 @@ def of_linear_model(
     for b in range(blocks):
         values, vectors = np.linalg.eigh(like.N[b])
         r[b] = like.N[b] @ path[b] + vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(size))
-    rise = replace(like.rises[G], right=r[:, G])
-    return replace(like, r=r, rises={**like.rises, G: rise})
+    return replace(like, r=r, r_all=np.insert(r, ORIFICE, like.r_all[:, ORIFICE], axis=1))

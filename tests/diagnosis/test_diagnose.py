@@ -152,3 +152,24 @@ def test_two_at_a_time_and_as_each_by_itself(recording: Recording, monkeypatch: 
     assert [one.detector for one in fused.parts] == ["second", "first"]
     assert len(seen) == 2
     assert whole.evidence("first").score == 0.05
+
+
+def test_quick_stops_at_the_detector_that_judges(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The most specific first; one that abstains does not judge; verdict and figures are those of all together."""
+
+    class Abstains(Looker):
+        name = "pressure model"
+
+        def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
+            return Evidence("cannot tell", "too little")
+
+    class Judges(Looker):
+        name = "observer"
+
+    monkeypatch.setattr(registry, "DETECTORS", {"looker": Looker, "observer": Judges, "pressure model": Abstains})
+    whole = Examination(recording, false_alarm_probability=0.05).fused()
+    seen.clear()
+    quick = Examination(recording, false_alarm_probability=0.05).fused(quick=True)
+    assert [part.detector for part in quick.parts] == ["observer", "pressure model"]
+    assert len(seen) == 1
+    assert (quick.verdict, quick.score, quick.detector) == (whole.verdict, whole.score, whole.detector)

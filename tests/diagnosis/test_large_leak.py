@@ -35,17 +35,22 @@ def spliced(first: Recording, second: Recording) -> Recording:
         pytest.param(0.4, "", "3 sin(4t)", marks=pytest.mark.slow),
         pytest.param(0.1, "orifice ", "7 sin(4t)", marks=pytest.mark.slow),
         pytest.param(1.0, "orifice ", "7 sin(4t)", marks=pytest.mark.slow),
+        pytest.param(0.4, "both", "5 sin(2t)", marks=pytest.mark.slow),
     ],
 )
 def test_a_large_leak_is_found_dated_sized_and_its_law_told(
     lpm: float, law: str, command: str, detector: PressureModel
 ) -> None:
-    evidence = detector.examine(recorded(1, command=command, leak=f"{lpm} L/min {law}from {ONSET:g} s"), [], P)
+    each = (f"{lpm} L/min {law}from {ONSET:g} s",)
+    if law == "both":
+        each = tuple(f"{0.5 * lpm} L/min {name}from {ONSET:g} s" for name in ("", "orifice "))
+    evidence = detector.examine(recorded(1, command=command, leak=each), [], P)
     assert evidence.verdict == "leak", evidence.reason
     assert evidence.onset_s == pytest.approx(ONSET, abs=1.0)
     low, high = evidence.onset_interval_s
     assert low <= ONSET <= high
-    assert ("as of an orifice" if law else "as of a worn seal") in evidence.reason
+    name = {"": "a worn seal", "orifice ": "an orifice"}.get(law, "a worn seal and an orifice")
+    assert f"as of {name} (" in evidence.reason
     low, high = evidence.leak_interval_lpm
     assert low <= lpm <= high
     assert evidence.leak_lpm == pytest.approx(lpm, rel=0.06)

@@ -218,6 +218,24 @@ def test_the_pressures_alone_bear_wrong_knowledge(values, thesis: Rig, machine) 
     assert 0.5 < found.leak_lpm / made.truth.mean_leak_lpm < 2.0
 
 
+def test_a_leak_that_opens_is_no_defect_of_the_model(thesis: Rig) -> None:
+    """0.05 L/min makes the innovations of its first block a hundred times too large; a slip, too, is no leak."""
+    made = simulate_with_truth(
+        Experiment.of(command="7 sin(4t)", leak="0.05 L/min from 60.4 s", duration=120.0, seed=5)
+    )
+    found = Observer(thesis).examine(made.recording.only(ALL), [], P)
+    assert found.verdict == "leak", found.reason
+    assert found.onset_s == pytest.approx(60.4, abs=0.5)
+    low, high = found.leak_interval_lpm
+    assert low <= 0.05 <= high
+
+
+def test_by_the_speed_no_flow_is_stated(thesis: Rig, machine) -> None:  # type: ignore[no-untyped-def]
+    found = Observer(thesis).examine(machine(True).recording.only(VIEWS["speed"]), [], P)
+    assert found.leak_lpm is None
+    assert found.verdict != "leak" or "overstated" in found.reason
+
+
 def test_a_machine_of_another_kind_is_not_judged(thesis: Rig, machine) -> None:  # type: ignore[no-untyped-def]
     """Pressures that do not come from the rig: innovations say so."""
     recording = machine(False).recording.only(PRESSURES)
@@ -299,7 +317,7 @@ def test_a_gap_in_the_position_leaves_the_pressures(thesis: Rig, machine) -> Non
     x[1000:1010] = np.nan
     holed = replace(recording, channels={**recording.channels, "x": x})
     assert formulation_of(recording) == "volume"
-    assert formulation_of(holed) == "speed"
+    assert formulation_of(holed) == "command"
     assert Observer(thesis).usable(holed) is None
 
 

@@ -10,35 +10,34 @@ from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth
 
-SIZES = (0.001, 0.0042, 0.02, 0.1, 0.2, 0.4)
+#: The larger sizes need a duty whose pump delivers as much; in that one the details hardly show a leak, and its blocks
+#: are too few for the observer.
+FAST, SLOW = "3 sin(4t)", "8 sin(t)"
+SIZES = {FAST: (0.0005, 0.0042, 0.02, 0.1, 0.2, 0.4), SLOW: (0.0005, 0.0042, 0.02, 0.1, 0.4, 1.0)}
+DUTY = {"volume balance": SLOW, "pressure model": SLOW}
 #: A score may be below the highest of all smaller leaks by this share: noise, and the saturation of a likelihood ratio.
 TOLERANCE = 0.2
-#: Largest leak [L/min] up to which a detector's score grows on this rig. Beyond, the observer does not follow; to the
-#: pressure model a leak of half of the pump's flow is less and less unlike another friction, and its score saturates.
-FOLLOWS = {"pressure model": 0.2, "observer": 0.02}
+#: Largest leak [L/min] up to which a detector's score grows on this rig. Beyond, the observer does not follow.
+FOLLOWS = {"observer": 0.02}
 THROTTLES = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"}
 
 
-def leaking(lpm: float) -> Recording:
+def leaking(lpm: float, command: str) -> Recording:
     leak = f"{lpm} L/min from 60 s"
-    experiment = Experiment.of(command="3 sin(4t)", duration=120.0, leak=leak, set=THROTTLES, seed=3)
+    experiment = Experiment.of(command=command, duration=120.0, leak=leak, set=THROTTLES, seed=3)
     return simulate_with_truth(experiment).recording
-
-
-@pytest.fixture(scope="module")
-def recordings() -> dict[float, Recording]:
-    return {lpm: leaking(lpm) for lpm in SIZES}
 
 
 @pytest.mark.parametrize(
     "detector",
     [name if name == "volume balance" else pytest.param(name, marks=pytest.mark.slow) for name in detectors()],
 )
-def test_score_does_not_fall_as_the_leak_grows(detector: str, recordings: dict[float, Recording]) -> None:
+def test_score_does_not_fall_as_the_leak_grows(detector: str) -> None:
+    command = DUTY.get(detector, FAST)
     highest, threshold_passed = 0.0, False
-    for lpm, recording in recordings.items():
-        evidence = Examination(recording, false_alarm_probability=0.01).evidence(detector)
-        if lpm > FOLLOWS.get(detector, max(SIZES)):
+    for lpm in SIZES[command]:
+        evidence = Examination(leaking(lpm, command), false_alarm_probability=0.01).evidence(detector)
+        if lpm > FOLLOWS.get(detector, 2.0):
             assert evidence.verdict in ("cannot tell", "leak")
             break
         assert evidence.score is not None

@@ -166,6 +166,7 @@ def _diagnoses(
     calibration: Path | None,
     rig: Rig | None,
     limit: str | None = None,
+    quick: bool = False,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
     """Yield recording and diagnosis of each file, None for one that cannot be read; no file is its own baseline."""
     from sealscope.diagnosis.diagnose import check_probability, diagnose
@@ -175,6 +176,8 @@ def _diagnoses(
     RepairLimit.of(limit)
     reading = _Reading.of(maps, rate, rig)
     if calibration is not None:
+        if quick:
+            raise InputError("--quick must stand without --calibration, which asks every method")
         yield from _calibrated(files, join_them, baseline, reading, calibration, rig, limit)
         return
     for file in files if baseline else ():
@@ -195,7 +198,14 @@ def _diagnoses(
             yield None
             continue
         work = partial(
-            diagnose, recording, others, false_alarm_probability=false_alarm, file=file, rig=rig, limit=limit
+            diagnose,
+            recording,
+            others,
+            false_alarm_probability=false_alarm,
+            rig=rig,
+            limit=limit,
+            quick=quick,
+            file=file,
         )
         diagnosis = attempt(file, work)
         yield None if diagnosis is None else (recording, diagnosis)
@@ -242,6 +252,9 @@ def diagnose(
     area: AreaOption = None,
     displacement: DisplacementOption = None,
     limit: LimitOption = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Stop at the first method that has a verdict, the most specific first.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
     fail_on: Annotated[
         list[FailOn] | None,
@@ -272,6 +285,7 @@ def diagnose(
         calibration=calibration,
         rig=assumed_rig(rig, area, displacement),
         limit=limit,
+        quick=quick,
     )
     jobs = min(cores(), len(files))
     piped = _check_standard_input([*files, *(baseline or ())])

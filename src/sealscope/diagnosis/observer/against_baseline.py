@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.baseline.level import DayToDay, Level, against_baseline, incomparable
-from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, misfit, states_flow, within
+from sealscope.diagnosis.observer.evidence import ConductanceSeries, course, misfit, no_flow, states_flow, within
 from sealscope.diagnosis.observer.model import G_UNIT
 from sealscope.diagnosis.observer.stream import Formulation, formulation_of
-from sealscope.diagnosis.verdict.evidence import NO_RIG, Evidence, without_flow
+from sealscope.diagnosis.verdict.evidence import Evidence, without_flow
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -65,7 +65,7 @@ def compare(
         course=course(series, step, expected),
     )
     from_level = evidence.verdict == "leak" and inner.verdict != "leak"
-    return without_flow(evidence, NO_RIG) if from_level and not states else evidence
+    return without_flow(evidence, no_flow(series.formulation)) if from_level and not states else evidence
 
 
 def day_to_day(formulation: Formulation, baseline: Sequence[Level]) -> DayToDay:

@@ -18,7 +18,14 @@ from sealscope.diagnosis.baseline.level import share_of_each
 from sealscope.diagnosis.changepoint.random_walk import FEWEST, WalkStep, find_leak_step
 from sealscope.diagnosis.observer.against_baseline import compare
 from sealscope.diagnosis.observer.estimates import Estimates
-from sealscope.diagnosis.observer.evidence import ConductanceSeries, misfit, orifice_over_laminar, states_flow, within
+from sealscope.diagnosis.observer.evidence import (
+    ConductanceSeries,
+    misfit,
+    orifice_over_laminar,
+    remains,
+    states_flow,
+    within,
+)
 from sealscope.diagnosis.observer.model import assume
 from sealscope.diagnosis.observer.stream import Formulation, ObserverStream, channels_of, formulation_of, whole
 from sealscope.diagnosis.verdict.evidence import Evidence
@@ -102,10 +109,15 @@ class Observer:
                 f"{FEWEST} are needed",
             )
         unfit = misfit(series.estimates, series.formulation, self.rig)
-        if unfit is not None:
+        if unfit is not None and not np.all(np.isfinite(series.G)):
             return Evidence("cannot tell", unfit)
         probability = share_of_each(false_alarm_probability, baseline)
         step = self._step(series, probability)
+        if unfit is not None and step.alarm and remains(series, step):  # a leak that opens is no defect of the model
+            opening = series.estimates.G.size - series.t.size + step.onset
+            unfit = misfit(series.estimates, series.formulation, self.rig, opening)
+        if unfit is not None:
+            return Evidence("cannot tell", unfit)
         if not baseline:
             states = states_flow(series.formulation, self.rig)
             return replace(within(series, step, states_flow=states), share=series.share)

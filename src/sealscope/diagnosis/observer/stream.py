@@ -44,13 +44,16 @@ def whole(recording: Recording, name: str) -> bool:
 
 
 def formulation_of(recording: Recording) -> Formulation | None:
-    """Return the formulation that a recording's channels allow; None where there is neither command nor speed."""
+    """Return the formulation that a recording's channels allow; None where there is neither command nor speed.
+
+    Without the position the command serves better than the speed, whose encoder's steps are noise in the flow.
+    """
     turned = whole(recording, "theta") or whole(recording, "omega")
     if turned and whole(recording, "x"):
         return "volume"
-    if turned:
-        return "speed"
-    return "command" if whole(recording, "u") else None
+    if whole(recording, "u"):
+        return "command"
+    return "speed" if turned else None
 
 
 def channels_of(formulation: Formulation, recording: Recording) -> tuple[str, ...]:

@@ -165,10 +165,9 @@ def is_followed(followed: Followed) -> bool:
     return followed.excess <= STEADY and abs(lead) <= _LARGEST_LEAD
 
 
-def _mean_drop(recording: Recording, since: float = -np.inf, power: float = 1.0) -> float:
-    """Return the mean of |p_A - p_B| to a power [Pa^power] from an instant on."""
-    late = recording.t >= since
-    return float(np.mean(np.abs(recording["p_A"][late] - recording["p_B"][late]) ** power))
+def _mean_drop(recording: Recording) -> float:
+    """Return the mean of |p_A - p_B| [Pa]."""
+    return float(np.mean(np.abs(recording["p_A"] - recording["p_B"])))
 
 
 def _flow(
@@ -176,25 +175,27 @@ def _flow(
 ) -> tuple[float, tuple[float, float], str]:
     """Return the mean flow [L/min] of a rise after a block, its 95 % interval, and the law in words where it is known.
 
-    Where both laws explain the record, the flow is the mean of theirs and the interval holds what either says.
+    Where several laws explain the record, the flow is the mean of theirs and the interval holds what any says.
     `scatter` of the blocks over their stated deviation.
     """
-    from sealscope.diagnosis.pressure_model.model import G
-    from sealscope.diagnosis.pressure_model.track import PossibleLeak
+    from sealscope.diagnosis.pressure_model.track import LAWS, WORN_SEAL, PossibleLeak
 
     steps = followed.steps
-    leaks = followed.leaks or (PossibleLeak(G, after, float(steps.size[after]), float(steps.deviation[after]), 0.0),)
+    leaks = followed.leaks or (
+        PossibleLeak(WORN_SEAL, after, float(steps.size[after]), float(steps.deviation[after]), 0.0),
+    )
     explained = float(np.max(steps.z)) ** 2 if followed.large is None else followed.large.better
     decisive = max(_DECISIVE, _DECISIVE_SHARE * explained)
     likely = [leak for leak in leaks if leak.cost <= leaks[0].cost + decisive]
     stated = []
+    late = recording.t >= onset
+    drop = recording["p_A"][late] - recording["p_B"][late]
     for leak in likely:
-        unit = _mean_drop(recording, onset, 1.0 if leak.rising == G else 0.5) / LITRE_PER_MINUTE
+        unit = leak.law.flow(drop) / LITRE_PER_MINUTE
         reach = 1.96 * float(np.hypot(scatter * leak.deviation, FLOW_SCALE * leak.size))
         stated.append((leak.size * unit, max(0.0, (leak.size - reach) * unit), (leak.size + reach) * unit))
-    law = ""
-    if len(likely) < len(leaks):
-        law = ", as of a worn seal" if likely[0].rising == G else ", as of an orifice"
+    pure = [leak.law for leak in likely if leak.law in LAWS]
+    law = "" if len(pure) > 1 or len(leaks) == 1 else f", as of {(pure or [likely[0].law])[0].name}"
     return (
         float(np.mean([lpm for lpm, *_ in stated])),
         (min(low for _, low, _ in stated), max(high for *_, high in stated)),

@@ -37,7 +37,7 @@ from sealscope.diagnosis.pressure_model.model import (
 )
 from sealscope.diagnosis.pressure_model.track import (
     DIVERGED,
-    RISES,
+    LAWS,
     ConductanceSteps,
     PossibleLeak,
     Track,
@@ -293,13 +293,13 @@ def _looked_again(
         return look
     speed = model.speed_amplitude(theta)
     start = followed.start
-    risen = [track(model, dp, edges, theta, start, skip, (rising, after), followed.path, seen=seen) for rising in RISES]
+    risen = [track(model, dp, edges, theta, start, skip, (law, after), followed.path, seen=seen) for law in LAWS]
     variance = min(fresh.variance for fresh in risen)
     leaks, excess = [], look.excess
-    for rising, fresh in zip(RISES, risen, strict=True):
-        again = steps_in(fresh, theta, speed, rising=rising)
+    for law, fresh in zip(LAWS, risen, strict=True):
+        again = steps_in(fresh, theta, speed, law=law)
         cost = fresh.misfit / variance + fresh.strain
-        leaks.append(PossibleLeak(rising, after, float(again.size[after]), float(again.deviation[after]), cost))
+        leaks.append(PossibleLeak(law, after, float(again.size[after]), float(again.deviation[after]), cost))
         excess = min(excess, excess_of(again))
     return _Look(followed, steps, tuple(sorted(leaks, key=lambda leak: leak.cost)), excess)
 

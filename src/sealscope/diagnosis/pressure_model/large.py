@@ -10,8 +10,9 @@ command is such another machine.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,10 @@ from sealscope.diagnosis.pressure_model.fit import (
 )
 from sealscope.diagnosis.pressure_model.model import GAIN, ORIFICE, SOUND, STATES, DrivenModel, G, K
 from sealscope.diagnosis.pressure_model.track import (
+    HOLE,
+    WORN_SEAL,
     ConductanceSteps,
+    Law,
     PossibleLeak,
     Track,
     excess_of,
@@ -68,8 +72,8 @@ _LIKELY, _TRANSIENT = 20.0, 0.5
 class LargeLeak:
     """A record with a leak, about which its blocks are linear.
 
-    `theta` (13,): the sound machine; `track`; `steps` beside the leak; `leaks` by either law, the likelier first;
-    `z` of the leak; `better`: cost of another machine less that of the leak; `onset`, its `limits` [samples];
+    `theta` (13,): the sound machine; `track`; `steps` beside the leak; `leaks` by either law and by both, the likelier
+    first; `z` of the leak; `better`: cost of another machine less that of the leak; `onset`, its `limits` [samples];
     `excess`: chi square a degree of freedom of what scatters beside the leak.
     """
 
@@ -113,37 +117,40 @@ def large_leak(
         return None
     block, best = tried
     after = _After.of(model, dp, int(edges[block + 1]), theta)
-    fitted = {law: after.leaking(law, size) for law, size in best.items()}
+    mixture = Law(1.0, best[HOLE] / best[WORN_SEAL]) if min(best.values()) > 0.0 else None
+    fitted = [after.leaking(law, size) for law, size in best.items()]
+    if mixture is not None:
+        fitted.append(after.leaking(mixture, 0.5 * best[WORN_SEAL], [each.theta for each in fitted]))
+    fitted = [each for each in fitted if each.size > 0.0]
     counted = seen & (np.arange(blocks) != block)
-    followed = {}
-    for law, (leaking, _) in fitted.items():
+    followed = []
+    for leaking in fitted:
         path = np.tile(theta, (blocks, 1))
-        path[block:] = leaking
-        path[block:, law] = theta[law]
-        size = float(leaking[law] - theta[law])
-        rise = law, block - 1
-        followed[law] = track(
-            model, dp, edges, theta, np.zeros(STATES), int(edges[0]), rise, path, seen=counted, size=size
+        path[block:] = leaking.sound
+        rise, start = (leaking.law, block - 1), np.zeros(STATES)
+        followed.append(
+            track(model, dp, edges, theta, start, int(edges[0]), rise, path, seen=counted, size=leaking.size)
         )
-    variance = min(each.variance for each in followed.values())
+    if not followed:
+        return None
+    variance = min(each.variance for each in followed)
     speed = model.speed_amplitude(theta)
-    leaks = []
-    for law, each in followed.items():
-        steps = steps_in(each, theta, speed, rising=law)
+    looks = []
+    for leaking, each in zip(fitted, followed, strict=True):
+        steps = steps_in(each, theta, speed, law=leaking.law)
         cost = each.misfit / variance + each.strain
         size, deviation = float(steps.size[block - 1]), float(steps.deviation[block - 1])
-        leaks.append(PossibleLeak(law, block - 1, size, deviation, cost))
-    leaks.sort(key=lambda leak: leak.cost)
-    likely = leaks[0]
-    there = followed[likely.rising]
-    steps = steps_in(there, theta, speed, rising=likely.rising, beside=likely)
-    cost, excess = fitted[likely.rising][1], excess_of(steps)
+        looks.append((PossibleLeak(leaking.law, block - 1, size, deviation, cost), each, leaking.cost))
+    looks.sort(key=lambda look: look[0].cost)
+    likely, there, cost = looks[0]
+    steps = steps_in(there, theta, speed, law=likely.law, beside=likely)
+    excess = excess_of(steps)
     z = float(np.sqrt(max(0.0, after.sound() - cost)))
     if not (z > _CLEAR and excess <= _LARGEST_EXCESS):
         return None
     better = after.another() - cost
     onset, limits = _onset(model, dp, edges, there, likely)
-    return LargeLeak(theta, there, steps, tuple(leaks), z, better, onset, limits, excess)
+    return LargeLeak(theta, there, steps, tuple(leak for leak, *_ in looks), z, better, onset, limits, excess)
 
 
 def _ladder(
@@ -152,17 +159,18 @@ def _ladder(
     edges: NDArray[np.int64],
     theta: Array,
     seen: NDArray[np.bool_],
-    tried: Mapping[int, Array],
-) -> tuple[int, dict[int, float]] | None:
+    tried: Mapping[Law, Array],
+) -> tuple[int, dict[Law, float]] | None:
     """Return the block in which a leak begins, and its size by either law; None where no leak explains the record.
 
     `tried`: sizes of each law, the first of them 0.
     """
-    best: dict[int, tuple[float, int, float]] = {}
+    best: dict[Law, tuple[float, int, float]] = {}
     sound = np.inf
     for law, sizes in tried.items():
         sets = np.tile(theta, (sizes.size, 1))
-        sets[:, law] += sizes
+        for k, share in law.parts:
+            sets[:, k] += share * sizes
         squares = np.minimum(np.nan_to_num((dp - model.run(sets)) ** 2, nan=_DIVERGED), _DIVERGED)
         misfit = np.add.reduceat(squares, edges[:-1], axis=1)
         misfit[:, -1] -= squares[:, edges[-1] :].sum(axis=1)
@@ -179,17 +187,30 @@ def _ladder(
     return block, {law: each[2] for law, each in best.items()}
 
 
-def _flows(model: DrivenModel, dp: Array, theta: Array) -> dict[int, float]:
+def _flows(model: DrivenModel, dp: Array, theta: Array) -> dict[Law, float]:
     """Return the leak of either law that passes the pump's rms flow at the rms pressure difference."""
     flow = float(model.piston_speed(model.speed_amplitude(theta))) * model.numbers.A_A / np.sqrt(2.0)
     drop = float(np.sqrt(np.mean(dp**2)))
-    return {G: flow / drop, ORIFICE: flow / np.sqrt(drop)}
+    return {WORN_SEAL: flow / drop, HOLE: flow / np.sqrt(drop)}
 
 
 def _refitted(model: DrivenModel, dp: Array, until: int, theta: Array, prior: Prior) -> Array:
     """Return the machine that is fitted to all that is sound, as far as the longest window reaches."""
     length = min(until, int(LONG_WINDOW[-1] * model.rate))
     return refit(window_at(model, dp, theta, until - length, length), theta, prior)[0]
+
+
+class _Leaking(NamedTuple):
+    """A leak fitted to what comes after: its size, 0 where it fits with none.
+
+    `theta` (13,): the machine with it, `sound` (13,): without; `cost` of the fit.
+    """
+
+    law: Law
+    size: float
+    sound: Array
+    theta: Array
+    cost: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,14 +241,25 @@ class _After:
             minimise(self.window, self.theta[None], Prior(self.theta, self.wander), range(SOUND), 10, 1.0)[1][0]
         )
 
-    def leaking(self, law: int, size: float) -> tuple[Array, float]:
-        """Return the machine from before with a leak of about that size, as free to wander, and its cost."""
+    def leaking(self, law: Law, size: float, also: Sequence[Array] = ()) -> _Leaking:
+        """Return the machine from before with a leak of about that size, as free to wander.
+
+        A leak of both laws may be more of either. `also`: other machines to begin with.
+        """
         start, deviation = self.theta.copy(), self.wander.copy()
-        start[law] += size
-        deviation[law] = max(size, deviation[law])
-        free = [*range(SOUND), *([ORIFICE] if law == ORIFICE else [])]
-        fitted, costs = minimise(self.window, start[None], Prior(start, deviation), free, 20, 1.0)
-        return fitted[0], float(costs[0])
+        for k, share in law.parts:
+            start[k] += share * size
+            deviation[k] = max(share * size, deviation[k])
+        free = [*range(SOUND), *([ORIFICE] if law.orifice else [])]
+        (theta, *_), costs = minimise(self.window, np.array([start, *also]), Prior(start, deviation), free, 20, 1.0)
+        risen = theta - self.theta
+        sound = theta.copy()
+        for k, _ in law.parts:
+            sound[k] = self.theta[k]
+        if law.laminar and law.orifice:
+            law = Law(1.0, float(risen[ORIFICE] / risen[G]))
+        size = float(risen[law.parts[0][0]]) if law.orifice >= 0.0 else 0.0
+        return _Leaking(law, size, sound, theta, float(costs[0]))
 
     def another(self) -> float:
         """Return the cost of another machine, which does not leak: all else is free within a prior about that before.
@@ -248,9 +280,11 @@ def _onset(
     blocks = edges.size - 1
     segment = np.clip(np.searchsorted(edges, np.arange(dp.size), side="right") - 1, 0, blocks - 1).astype(np.int64)
     sound = followed.path.copy()
-    sound[leak.after + 1 :, leak.rising] -= leak.size
+    for k, share in leak.law.parts:
+        sound[leak.after + 1 :, k] -= share * leak.size
     leaking = sound.copy()
-    leaking[leak.after :, leak.rising] += leak.size
+    for k, share in leak.law.parts:
+        leaking[leak.after :, k] += share * leak.size
     first, last = int(edges[leak.after]), int(edges[min(leak.after + 3, blocks)])
     apart = (dp - model.run(np.array([sound, leaking]), segment)) ** 2
     apart = apart[:, first:last]

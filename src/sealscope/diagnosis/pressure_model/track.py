@@ -14,7 +14,7 @@ Penzer, Diagnosing shocks in time series, JASA 93 (1998) 796-806.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,17 +64,46 @@ _ENOUGH = 4.0
 _LEASHES = (0.1, 0.3, 1.0)
 #: Wandering that is tried, times the usual one: the likelihood chooses.
 SCALES = (1.0, 2.0, 4.0)
-#: What wanders: the parameters of a sound machine and a constant of dp. What a leak makes rise, by its law.
+#: What wanders: the parameters of a sound machine and a constant of dp.
 SIZE = SOUND + 1
-RISES = (G, ORIFICE)
+
+
+@dataclass(frozen=True)
+class Law:
+    """What a leak of unit size adds: `laminar` to G [m^3/(s Pa)], `orifice` to its coefficient [m^3/(s Pa^0.5)]."""
+
+    laminar: float
+    orifice: float
+
+    @property
+    def parts(self) -> tuple[tuple[int, float], ...]:
+        """The parameters that rise, and by how much with the size."""
+        return tuple((k, each) for k, each in ((G, self.laminar), (ORIFICE, self.orifice)) if each != 0.0)
+
+    @property
+    def name(self) -> str:
+        """The law in words."""
+        return {(True, False): "a worn seal", (False, True): "an orifice"}.get(
+            (self.laminar != 0.0, self.orifice != 0.0), "a worn seal and an orifice"
+        )
+
+    def flow(self, drop: Array) -> float:
+        """Return the mean flow [m^3/s] of a leak of unit size at the pressure differences `drop` (n,) [Pa]."""
+        size = np.abs(drop)
+        return float(self.laminar * np.mean(size) + self.orifice * np.mean(np.sqrt(size)))
+
+
+#: A leak is a gap, or an orifice.
+WORN_SEAL, HOLE = Law(1.0, 0.0), Law(0.0, 1.0)
+LAWS = (WORN_SEAL, HOLE)
 
 
 @dataclass(frozen=True, eq=False)
 class Rise:
-    """What a rise of one parameter in a block does, in the model that is linear there.
+    """What a leak of a law does in a block, in the model that is linear there.
 
     `cross` (b, p): information shared with what wanders; `own` (b,), `right` (b,): its own information and right side;
-    `unit`: that of the parameter.
+    `unit`: of its size.
     """
 
     cross: Array
@@ -87,18 +116,18 @@ class Rise:
 class Track:
     """Parameters of a record, followed.
 
-    Blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 13) about which the model is
-    linear; `N` (b, p, p), `r` (b, p) information in units of `units` (p,), the last a constant of dp; `rises` by
-    parameter; `variance` [Pa^2] of the residual and of each block's (b,); `misfit` [Pa^2]: sum of squares of what is
-    left of dp; `strain`: chi square of the wandering; `start` (5,): the state at
-    the first sample.
+    Blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 13) about which the model is linear; `N` (b, p, p),
+    `r` (b, p) information in units of `units` (p,), the last a constant of dp; `N_all`, `r_all` with that on an
+    orifice; `variance` [Pa^2] of the residual and of each block's (b,); `misfit` [Pa^2]: sum of squares of what is left
+    of dp; `strain`: chi square of the wandering; `start` (5,): the state at the first sample.
     """
 
     edges: NDArray[np.int64]
     path: Array
     N: Array
     r: Array
-    rises: Mapping[int, Rise]
+    N_all: Array
+    r_all: Array
     units: Array
     variance: float
     block_variance: Array
@@ -107,6 +136,22 @@ class Track:
     misfit: float
     strain: float
     start: Array
+
+    def rise(self, law: Law) -> Rise:
+        """Return what a leak of a law does."""
+        at, unit = _in_units(law, self.path[0])
+        along = self.N_all @ at
+        return Rise(along[:, _WANDERING], along @ at, self.r_all @ at, unit)
+
+
+def _in_units(law: Law, theta: Array) -> tuple[Array, float]:
+    """Return what a leak raises (14,), in units of the parameters, and the size of the leak that raises so much."""
+    h = steps_of(theta)
+    at = np.zeros(SIZE + 1)
+    unit = float(h[law.parts[0][0]])
+    for k, share in law.parts:
+        at[k] = share * unit / h[k]
+    return at, unit
 
 
 def _deviations(theta: Array, shares: dict[int, float], rest: dict[int, float]) -> Array:
@@ -147,7 +192,7 @@ def track(
     theta: Array,
     start: Array,
     skip: int,
-    rise: tuple[int, int] | None = None,
+    rise: tuple[Law, int] | None = None,
     from_path: Array | None = None,
     *,
     seen: NDArray[np.bool_] | None = None,
@@ -155,10 +200,10 @@ def track(
 ) -> Track:
     """Follow the parameters from the first fit `theta` (13,) through blocks between `edges` of the whole record.
 
-    `start` (5,): the model's state at the first sample; `rise`: a parameter that rises by as much as suits, and after
-    which block; `from_path` (b, 13): where to begin, the first fit by default; `seen` (b,): blocks that count (default:
-    all), through the others the parameters wander unseen. Blocks are linearised about their own parameters, until these
-    stand still; the trend of the speed's bias within a block is eliminated.
+    `start` (5,): the model's state at the first sample; `rise`: the law of a leak of the size that suits, and after
+    which block it is open; `from_path` (b, 13): where to begin, the first fit by default; `seen` (b,): blocks that
+    count (default: all), through the others the parameters wander unseen. Blocks are linearised about their own
+    parameters, until these stand still; the trend of the speed's bias within a block is eliminated.
     """
     blocks = edges.size - 1
     seen = np.ones(blocks, dtype=bool) if seen is None else seen
@@ -174,11 +219,12 @@ def track(
     centre = np.append(theta[:SOUND] / h[:SOUND], 0.0)
     path = np.tile(theta, (blocks, 1)) if from_path is None else from_path
     limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
-    # where the rising parameter has risen, in its unit
-    risen = np.zeros(path.shape)
+    # where a leak is open, one of unit size
+    risen, unit = np.zeros(path.shape), 1.0
     if rise is not None:
-        risen[rise[1] + 1 :, rise[0]] = h[rise[0]]
-        size /= h[rise[0]]
+        at, unit = _in_units(rise[0], theta)
+        risen[rise[1] + 1 :] = at[:-1] * h
+        size /= unit
 
     def misfits(shown: Array) -> Array:
         rests = (dp[block] - shown[block] for block in limits)
@@ -221,10 +267,8 @@ def track(
             at,
             N[:, _WANDERING[:, None], _WANDERING] / variance,
             r[:, _WANDERING] / variance,
-            {
-                k: Rise(N[:, _WANDERING, k] / variance, N[:, k, k] / variance, r[:, k] / variance, float(h[k]))
-                for k in RISES
-            },
+            N / variance,
+            r / variance,
             units,
             variance,
             np.where(seen, squares / counts, variance),
@@ -238,7 +282,7 @@ def track(
         if rise is None:
             solved, fitted = chain.solve(right), 0.0
         else:
-            solved, fitted = _with_rise(chain, right, followed.rises[rise[0]], rise[1] + 1)
+            solved, fitted = _with_rise(chain, right, followed.rise(rise[0]), rise[1] + 1)
         fresh = np.column_stack([_held(solved.reshape(blocks, SIZE)[:, :SOUND] * h[:SOUND], theta), path[:, SOUND:]])
         further = max(0.0, fitted) - size
         tries = path + _SHARES[:, None, None] * (fresh - path)
@@ -337,11 +381,11 @@ def _held(path: Array, theta: Array) -> Array:
 class PossibleLeak:
     """A leak that would explain the record.
 
-    `rising`: its conductance G, or its coefficient as an orifice; `after` which block; `size`, `deviation`
-    [m^3/(s Pa)], of an orifice [m^3/(s Pa^0.5)]; `cost`: minus twice the log likelihood but for a constant.
+    `law`; `after` which block; `size`, `deviation`: of that law; `cost`: minus twice the log likelihood but for a
+    constant.
     """
 
-    rising: int
+    law: Law
     after: int
     size: float
     deviation: float
@@ -350,9 +394,9 @@ class PossibleLeak:
 
 @dataclass(frozen=True, eq=False)
 class ConductanceSteps:
-    """A step of what a leak makes rise, after each block.
+    """A step of a leak after each block.
 
-    `size`, `deviation` (b - 1,) [m^3/(s Pa)], of an orifice [m^3/(s Pa^0.5)]; `z` and their `correlation`; `level`
+    `size`, `deviation` (b - 1,) of its law; `z` and their `correlation`; `level`
     (b,) the wandering G with no step, and its `level_deviation`; `scale` of the wandering that was chosen; `excess`:
     chi square of the blocks against the wandering, and its degrees of freedom.
     """
@@ -378,17 +422,17 @@ def steps_in(
     theta: Array,
     speed: float,
     scales: Sequence[float] = SCALES,
-    rising: int = G,
+    law: Law = WORN_SEAL,
     beside: PossibleLeak | None = None,
 ) -> ConductanceSteps:
-    """Estimate a step of the `rising` parameter after each block.
+    """Estimate a step of a leak of a law after each block.
 
     Everything else is free to wander as far as the likelihood chooses. `beside` a leak of the same law, which is taken
     away first, the steps are further ones.
     """
     anchor, centre = np.split(followed.anchor, 2)
     walk = np.tile(wander(theta, followed.units, followed.seconds, speed), (len(followed.N) - 1, 1))
-    rise, r = followed.rises[rising], followed.r
+    rise, r = followed.rise(law), followed.r
     rise_right = rise.right
     if beside is not None:
         size = np.where(np.arange(len(r)) > beside.after, beside.size / rise.unit, 0.0)

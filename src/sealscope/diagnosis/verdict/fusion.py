@@ -27,9 +27,9 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     have shown. `detector` of the result is the
     judge, `parts` are the evidences, the judge's first.
     """
-    ranked = sorted(evidences, key=lambda own: ORDER.index(own.detector) if own.detector in ORDER else len(ORDER))
+    ranked = sorted(evidences, key=lambda own: rank(own.detector))
     usable = [own for own in ranked if own.usable]
-    judge = next((own for own in usable if not own.abstains), None)
+    judge = next((own for own in usable if judges(own)), None)
     if judge is None:
         return replace(_no_judge(ranked, usable), detector="", parts=tuple(ranked), usable=True)
     others = [own for own in usable if own is not judge]
@@ -52,6 +52,16 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     return replace(
         fused, reason="; ".join(reasons), parts=(judge, *(own for own in ranked if own is not judge)), usable=True
     )
+
+
+def rank(detector: str) -> int:
+    """Return how specific a detector is, 0 the most; a user's own are all alike."""
+    return ORDER.index(detector) if detector in ORDER else len(ORDER)
+
+
+def judges(evidence: Evidence) -> bool:
+    """Return whether evidence is a verdict, which less specific detectors cannot change."""
+    return evidence.usable and not evidence.abstains
 
 
 def _blind(evidence: Evidence) -> bool:
