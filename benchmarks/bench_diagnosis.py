@@ -100,6 +100,13 @@ def main() -> None:
         "against 1 recording, known": lambda: diagnose(leaky, sound[:1]),
         "against 6 recordings, known": lambda: diagnose(leaky, sound),
     }
+    pressures = [recording.only(["u", "p_A", "p_B"]) for recording in (sound[0], leaky)]
+    cases |= {
+        "the judge alone, no leak": lambda: diagnose(sound[0], quick=True),
+        "the judge alone, leak": lambda: diagnose(leaky, quick=True),
+        "pressures and command, no leak": lambda: diagnose(pressures[0]),
+        "pressures and command, leak": lambda: diagnose(pressures[1]),
+    }
     for command in COMMANDS:
         record = simulate(command=command, seed=1, leak="0.0042 L/min from 90 s")
         cases[f"leak under {command}, no throttles"] = partial(diagnose, record)
