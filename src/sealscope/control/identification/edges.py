@@ -23,7 +23,7 @@ EDGES = ("o_PA", "o_AT", "o_PB", "o_BT")
 #: errors may follow each other, fewest blocks of a side, and how often densities are taken anew.
 _HALF, _PARTS, _LAGS, _FEWEST, _TURNS = 0.01, 4, 12, 40, 2
 #: What the laws leave out of an overlap, as a share of the spool's stroke: how it moves between samples.
-_LEFT_OUT = 1e-5
+_LEFT_OUT = 6e-6
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ _VAGUE = 0.5
 _SURE, _UNLIKE = 6.0, 0.03
 #: What the regressions' laws leave out, as a share of a value: rows that do not resolve transients, averages of
 #: products. Found on simulated machines other than those by which the intervals were judged.
-_MODEL = {"cylinder": 2e-5, "fluid": 1e-3, "pump": 4e-4, "friction": 1e-2, "motor": 4e-4, "valve": 3e-5}
+_MODEL = {"cylinder": 2e-5, "fluid": 1e-3, "pump": 4e-4, "friction": 1e-2, "motor": 4e-4, "valve": 2e-5}
+_MODEL_OF_VALVE = {**_MODEL, "fluid": 4e-4}
 #: Parameters that may be zero: an interval around it is an estimate.
 _AROUND_ZERO = {"pump.G_pump", "cylinder.F_l", "valve.o_PA", "valve.o_AT", "valve.o_PB", "valve.o_BT"}
 #: What no recording of these channels tells, and why.
@@ -159,11 +160,13 @@ def _check_channels(recordings: Sequence[Recording], needed: Mapping[str, str], 
                 raise InputError(f"identification must have {name} in {unit}, got {recording.units[name]}")
 
 
-def _told(estimates: Sequence[Estimate], untold: list[tuple[str, str]]) -> list[Estimate]:
+def _told(
+    estimates: Sequence[Estimate], untold: list[tuple[str, str]], model: Mapping[str, float] = _MODEL
+) -> list[Estimate]:
     """Return the estimates that tell something, with what the laws leave out; add the vague ones to `untold`."""
     kept = []
     for scattered in estimates:
-        estimate = scattered.with_model_error(_MODEL[scattered.name.partition(".")[0]])
+        estimate = scattered.with_model_error(model[scattered.name.partition(".")[0]])
         vague = 1.96 * estimate.sd > _VAGUE * abs(estimate.value)
         if vague and estimate.name not in _AROUND_ZERO:
             low, high = estimate.interval
@@ -198,7 +201,7 @@ def _behind_valve(recordings: Sequence[Recording], rig: Rig) -> Identification:
     if isinstance(slid, str):
         untold.append(("friction", slid))
         slid = ()
-    return Identification(rig, tuple(_told([*edges.balance.estimates, *slid], untold)), tuple(untold))
+    return Identification(rig, tuple(_told([*edges.balance.estimates, *slid], untold, _MODEL_OF_VALVE)), tuple(untold))
 
 
 def _of_other_areas(ratio: float, stated: float) -> str:
