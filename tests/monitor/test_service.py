@@ -220,6 +220,24 @@ def test_marks_are_kept_and_act(tmp_path):
     assert after["watch"]["baseline_version"] == 2
 
 
+def test_a_state_of_another_version_begins_a_new_baseline(tmp_path, caplog):
+    """After an update estimates stay, their numbers go on, and the log says why the actuator learns anew."""
+    settings = settings_in(tmp_path)
+    service, _ = served(settings, LINES)
+    before = [row for row in rows_of(settings.database)["estimates"] if row[0] == "press 1"]
+    learned_with, state, _ = service.store.checkpoint("press 1")
+    state["watch"] = {"version": 1, "baseline_version": 3, "what it was": []}
+    with service.store.writing() as connection:
+        service.store.keep_checkpoint(connection, "press 1", learned_with, state, {})
+    again = Service(settings, once=True)
+    again._hold.close()
+    assert "press 1: its state has version 1, not 4, begins anew" in caplog.text
+    _, state, pending = again.store.checkpoint("press 1")
+    assert (state["watch"]["version"], state["watch"]["baseline_version"], pending) == (4, 4, [])
+    assert state["watch"]["blocks"] == max(row[1] for row in before)
+    assert [row for row in rows_of(settings.database)["estimates"] if row[0] == "press 1"] == before
+
+
 @pytest.mark.slow
 def test_other_settings_begin_a_new_baseline(tmp_path):
     settings = settings_in(tmp_path)

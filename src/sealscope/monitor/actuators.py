@@ -22,7 +22,8 @@ from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.stream.baseline import plain_dataclass
 from sealscope.monitor.stream.estimates import BlockEstimate
-from sealscope.monitor.stream.watch import Watch, watch
+from sealscope.monitor.stream.plain_state import part_of
+from sealscope.monitor.stream.watch import STATE_VERSION, Watch, watch
 from sealscope.recordings.recording import Recording
 
 _log = logging.getLogger(__name__)
@@ -85,12 +86,14 @@ class WatchedActuators:
             learn_hours=settings.learn_hours,
         )
         if saved is None:
-            actuator = _Actuator(settings, fresh, AlarmJudge(settings.name))
-            with self.store.writing() as connection:
-                self._checkpoint(connection, actuator, StoredRows())
-            return actuator
+            return self._begun_anew(_Actuator(settings, fresh, AlarmJudge(settings.name)))
         learned_with, state, pending = saved
         judge = AlarmJudge.from_state(state["judge"])
+        if (version := part_of(state["watch"], "version", int)) != STATE_VERSION:
+            _log.warning("%s: its state has version %s, not %d, begins anew", settings.name, version, STATE_VERSION)
+            learned = part_of(state["watch"], "baseline_version", int)
+            fresh.continue_from(self.store.estimates_kept(settings.name), learned)
+            return self._begun_anew(_Actuator(settings, fresh, judge))
         actuator = _Actuator(settings, Watch.from_state(state["watch"]), judge)
         actuator.taken = self.store.blocks_kept(settings.name)
         if state["last"] is not None:
@@ -101,10 +104,16 @@ class WatchedActuators:
             actuator.bytes += bytes_of(samples)
         if learned_with != settings.learned_with:
             _log.warning("%s: learned with %s, begins anew with other settings", settings.name, learned_with)
-            fresh.continue_from(actuator.watch)
+            fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
             actuator.watch = fresh
-            with self.store.writing() as connection:
-                self._checkpoint(connection, actuator, StoredRows())
+            return self._begun_anew(actuator)
+        return actuator
+
+    def _begun_anew(self, actuator: _Actuator) -> _Actuator:
+        """Return an actuator whose watch is fresh, its state stored."""
+        actuator.taken = self.store.blocks_kept(actuator.settings.name)
+        with self.store.writing() as connection:
+            self._checkpoint(connection, actuator, StoredRows())
         return actuator
 
     def count(self, reason: str, number: int = 1) -> None:

@@ -172,11 +172,17 @@ class MonitorStore:
 
     def blocks_kept(self, actuator: str) -> int:
         """Return the number of the last block of an actuator."""
+        return self._last(self.tables.blocks, actuator)
+
+    def estimates_kept(self, actuator: str) -> int:
+        """Return the number of the last estimate of an actuator."""
+        return self._last(self.tables.estimates, actuator)
+
+    def _last(self, table: Any, actuator: str) -> int:
         from sqlalchemy import func, select
 
-        blocks = self.tables.blocks
         with self.engine.connect() as connection:
-            query = select(func.max(blocks.c.number)).where(blocks.c.actuator == actuator)
+            query = select(func.max(table.c.number)).where(table.c.actuator == actuator)
             return int(connection.execute(query).scalar() or 0)
 
     def _forget(self, connection: Connection, actuator: str, block: int, estimate: int) -> None:

@@ -158,9 +158,14 @@ class Watch:
                     estimate = self._taken(self._samples.taken(length))
                 yield estimate, self.leak
 
-    def continue_from(self, before: Watch) -> None:
-        """Count blocks and baselines on from those of another watch, whose settings were others."""
-        self.blocks, self._version = before.blocks, before._version + 1
+    def continue_from(self, blocks: int, baseline_version: int) -> None:
+        """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
+        self.blocks, self._version = blocks, baseline_version + 1
+
+    @property
+    def baseline_version(self) -> int:
+        """Version of the baseline, or of that which is being learned."""
+        return self._version
 
     def relearn(self) -> None:
         """Learn a new baseline from now on: the machine was repaired, or is another."""
