@@ -108,7 +108,7 @@ class Watch:
 
     @property
     def by(self) -> str:
-        """What the actuator is watched by: "volumes" where its position is recorded, else "pressures"."""
+        """Way of watching, "volumes" where the position is recorded, else "pressures"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
     @property
