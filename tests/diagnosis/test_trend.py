@@ -265,6 +265,9 @@ def test_the_oil_s_temperature_is_taken_out_where_it_is_known() -> None:
 def test_the_temperature_is_read_beside_the_samples(name: str, text: str, expected: float | None) -> None:
     recording = ss.Recording(np.arange(4.0), {"p_A": np.ones(4)}, {"p_A": "Pa"}, 1.0, {"about": {name: text}})
     assert oil_temperature(recording) == (None if expected is None else pytest.approx(expected))
+    recorded = replace(recording, channels={"T_oil": np.array([np.nan, 300.0, 310.0, np.nan])}, units={"T_oil": "K"})
+    assert oil_temperature(recorded) == pytest.approx(305.0 - 273.15)
+    assert [finding.code for finding in ss.inspect(recorded)] == ["too_short"]
 
 
 def test_a_clock_set_back_and_a_gap_are_named() -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import ndtr
 
 from sealscope.monitor.alarms.alarm import status_word
 from sealscope.monitor.alarms.judging import AlarmJudge, Thresholds
@@ -42,6 +45,19 @@ def test_one_block_is_no_alarm_two_are():
     assert judge.alarm is not None
     assert (judge.alarm.level, judge.alarm.diagnostic_number) == ("warning", 4101)
     assert "case drain" in judge.alarm.next_check
+
+
+def test_stronger_evidence_is_rarer_by_chance():
+    """At the threshold it is the stated rate, then less, by the normal tail where the score is a level's."""
+    thresholds = Thresholds(false_alarms_per_1000_h=2.0)
+
+    def chance(test: str, score: float) -> float:
+        return thresholds.by_chance(replace(LEAK, test=test, score=score, threshold=4.0))
+
+    assert chance("step", 4.0) == chance("level", 4.0) == 2.0
+    assert chance("level", 5.0) == pytest.approx(2.0 * ndtr(-5.0) / ndtr(-4.0))
+    assert chance("rise", 7.0) == pytest.approx(2.0 * np.exp(-2.0))
+    assert chance("step", 1e4) == chance("level", 1e4) == pytest.approx(2e-9)
 
 
 def test_it_returns_well_below_its_threshold():

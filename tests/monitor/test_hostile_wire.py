@@ -77,6 +77,16 @@ def test_typed_arrays_are_lists_of_numbers(tag: int, kind: str):
     assert taken(cbor2.dumps({**GOOD, "x": cbor2.CBORTag(64, b"abcd")})) == "refused"  # of bytes: no samples
 
 
+def test_a_slow_channel_may_be_a_single_number():
+    for given in (41.5, [41.5], [41.5] * len(GOOD["p_A"])):
+        samples = decoded(json.dumps({**GOOD, "T_oil": given, "units": {"T_oil": "degC"}}).encode()).samples
+        assert samples is not None
+        assert samples["T_oil"] == pytest.approx(np.full(len(GOOD["p_A"]), 314.65))
+    for wrong in ([41.5, 42.0], "warm", True, {}, [None, "x"]):
+        assert taken(json.dumps({**GOOD, "T_oil": wrong}).encode()) == "refused"
+    assert taken(json.dumps({"actuator": "a", "t": 0.0, "rate": 1.0, "T_oil": 300.0}).encode()) == "refused"
+
+
 def mutated(random: np.random.Generator) -> bytes:
     data = bytearray(TEXTS[random.integers(2)])
     for _ in range(random.integers(1, 6)):

@@ -145,13 +145,16 @@ def test_prometheus_reads_the_metrics(page: TestClient):
     assert families["sealscope_blocks"].type == "counter"
 
 
-def test_the_order_is_error_warning_unseen_then_the_sure_leak():
+def test_the_order_is_error_warning_unseen_then_evidence_then_the_sure_leak():
     def row(word: int, low: float) -> dict[str, object]:
         return {"status_word": word, "leak_interval_lpm": [low, 1.0], "leak_lpm": 0.5}
 
     summaries = {"quiet": row(0, 0.0), "less": row(1, 0.1), "more": row(1, 0.2), "bad": row(2, 0.0), "gone": row(4, 0)}
     names = [each["name"] for each in ranked(summaries, [])]
     assert names == ["bad", "more", "less", "gone", "quiet"]
+    alarms = [{"actuator": "less", "by_chance_per_1000_h": 1e-6}, {"actuator": "more", "by_chance_per_1000_h": 1e-3}]
+    names = [each["name"] for each in ranked(summaries, alarms)]
+    assert names == ["bad", "less", "more", "gone", "quiet"]
 
 
 def test_a_port_in_use_is_one_line(service: Service):

@@ -200,6 +200,20 @@ def test_lines_without_a_block_are_counted(tmp_path, caplog):
     assert 4 <= len(caplog.records) < len(bad)
 
 
+def test_the_oil_s_temperature_stands_beside_the_estimates(tmp_path):
+    """The last one that was told, until the next; nothing where none is."""
+    service, _ = served(settings_in(tmp_path), LINES)
+    rows = list(service.store.estimates())
+    oil = [row["oil_celsius"] for row in rows if row["actuator"] == "press 2"]
+    assert {round(value, 9) for value in oil} == {41.0, 42.0, 43.0, 44.0}  # the first minute settles the duty
+    assert oil == sorted(oil)
+    assert {row["oil_celsius"] for row in rows if row["actuator"] == "press 1"} == {None}
+    shown = service.actuators.plain()
+    assert shown["press 2"]["oil_celsius"] == pytest.approx(44.0)
+    assert 'sealscope_oil_temperature_celsius{actuator="press 2"} 44' in metrics_text(shown, {})
+    assert [row["oil_celsius"] for row in service.store.course("press 2")] == pytest.approx(oil)
+
+
 def test_marks_are_kept_and_act(tmp_path):
     settings = settings_in(tmp_path)
     service, _ = served(settings, LINES)
@@ -249,6 +263,28 @@ def test_other_settings_begin_a_new_baseline(tmp_path):
     assert (state["watch"]["baseline_version"], state["watch"]["blocks"]) == (2, 41)
 
 
+def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
+    """Another rate, as where an actuator is added to a budget, moves thresholds only; old tables get their column."""
+    settings = settings_in(tmp_path)
+    service, _ = served(settings, LINES)
+    with service.store.writing() as connection:
+        connection.exec_driver_sql("ALTER TABLE estimates DROP COLUMN oil_celsius")
+        connection.exec_driver_sql("UPDATE facts SET value = '1' WHERE name = 'schema'")
+    before = service.actuators._actuators["press 1"].watch.baseline
+    assert before is not None
+    file = tmp_path / "monitor.toml"
+    file.write_text("fleet_false_alarms_per_1000_h = 0.002\n" + file.read_text())
+    again = Service(read_settings(file), once=True)
+    again._hold.close()
+    assert again.actuators.false_alarms_per_1000_h == pytest.approx(0.002)
+    kept = again.actuators._actuators["press 1"].watch
+    assert kept.false_alarms_per_1000_h == 0.001
+    assert kept.baseline == before
+    _, state, pending = again.store.checkpoint("press 1")
+    assert (state["watch"]["false_alarms_per_1000_h"], pending) == (0.001, [])
+    assert "oil_celsius" in next(again.store.estimates())
+
+
 def test_old_estimates_and_identities_are_forgotten(tmp_path, monkeypatch):
     monkeypatch.setattr("sealscope.monitor.actuators.KEPT_IDENTITIES", 20)
     settings = settings_in(tmp_path).model_copy(update={"keep_days": 60.0 / 86_400.0})
@@ -286,6 +322,10 @@ def test_the_commented_file_is_valid(tmp_path):
         (("lines = true", "lines = 3"), "lines: Input should be a valid boolean"),
         (("learn_hours = 0.02", "learn_hours = -1"), "learn_hours: Input should be greater than 0"),
         (("error_lpm", "eror_lpm"), "eror_lpm: Extra inputs are not permitted"),
+        (
+            ("[defaults]", "fleet_false_alarms_per_1000_h = 1\n[defaults]\nfalse_alarms_per_1000_h = 2"),
+            "state false_alarms_per_1000_h of actuators, or fleet_false_alarms_per_1000_h",
+        ),
         (('name = "press 2"', 'name = "press 1"'), "names of their own, got 'press 1' twice"),
         (('name = "press 2"', 'name = "press 2"\ntopic = "a"'), r"needs the table \[mqtt\]"),
         (("[defaults]", '[page]\nhost = "0.0.0.0"\n[defaults]'), "needs page.token_file"),

@@ -40,7 +40,7 @@ from sealscope.monitor.sources.sparkplug_host import GAPS, SparkplugHost
 from sealscope.monitor.sparkplug import SparkplugMetric, SparkplugPayload, decoded_payload, encoded
 from sealscope.recordings.recording import Recording
 
-from .plant import CHANNELS, rows_of, served, settings_in, until
+from .plant import CHANNELS, message, rows_of, served, settings_in, until
 from .test_service import LINES, SOUND, WORN
 
 DOUBLES = 31
@@ -178,8 +178,13 @@ def arrays(samples: Recording, at: int, **changed: Any) -> list[SparkplugMetric]
 
 
 def births(**changed: Any) -> list[SparkplugMetric]:
+    oil = SparkplugMetric("T_oil", None, sparkplug.DOUBLE, alias=len(CHANNELS), unit="degC")
     return [
-        SparkplugMetric(name, None, DOUBLES, alias=k, unit=UNITS[name], **changed) for k, name in enumerate(CHANNELS)
+        *(
+            SparkplugMetric(name, None, DOUBLES, alias=k, unit=UNITS[name], **changed)
+            for k, name in enumerate(CHANNELS)
+        ),
+        oil,
     ]
 
 
@@ -195,7 +200,11 @@ def as_source(samples: dict[str, Recording], size: int) -> Callable[[BlockReceiv
             for device, recording in samples.items():
                 part = recording.samples(slice(start, start + size))
                 if len(part):
-                    messages.append(("DDATA", device, arrays(part, round(1000.0 * float(part.t[0])))))
+                    metrics = arrays(part, round(1000.0 * float(part.t[0])))
+                    told = message(device, part)
+                    if "T_oil" in told:  # of a time of its own
+                        metrics.append(SparkplugMetric("T_oil", told["T_oil"], sparkplug.DOUBLE, timestamp=1))
+                    messages.append(("DDATA", device, metrics))
         for seq, (kind, device, metrics) in enumerate(messages):
             wire = encoded(SparkplugPayload(1, tuple(metrics), seq % 256))
             block = host.taken(sparkplug.topic_of("plant", kind, "edge", device), wire)

@@ -45,6 +45,16 @@ from sealscope.recordings.formats.headings.proposal import proposed_map
             "t;Pressure A [bar];Pressure A filtered [bar];Pressure B [bar];Position setpoint [mm];u cmd [V]",
             {"t": "t", "p_A": "Pressure A [bar]", "p_B": "Pressure B [bar]", "u": "u cmd [V]"},
         ),
+        (
+            "t [s];Druck A [bar];Druck B [bar];Weg [mm];Öltemperatur [°C];Temperatur Tank [°C]",
+            {
+                "t": "t [s]",
+                "p_A": "Druck A [bar]",
+                "p_B": "Druck B [bar]",
+                "x": "Weg [mm]",
+                "T_oil": "Öltemperatur [°C]",
+            },
+        ),
         ("t;PG_1;PG_2;PG_tank", {"p_A": "PG_1", "p_B": "PG_2", "t": "t"}),
         (
             "s;pump pressure 1 [psi];pump pressure 2 [psi];Pressure A (psi);Pressure B (psi)",

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from sealscope.errors import InputError
 from sealscope.monitor.alarms.alarm import Alarm, status_word
 from sealscope.monitor.alarms.judging import AlarmJudge
@@ -46,6 +48,14 @@ class _Actuator:
     taken: int = 0
     last: BlockEstimate | None = None
     shown: dict[str, Any] | None = None
+    oil_celsius: float | None = None
+
+    def warm(self, samples: Recording) -> None:
+        """Note the oil's temperature, where it is known and that of oil."""
+        if "T_oil" in samples and samples.units["T_oil"] == "K":
+            known = samples["T_oil"][np.abs(samples["T_oil"] - 373.15) < 200.0]
+            if known.size:
+                self.oil_celsius = float(known.mean()) - 273.15
 
 
 class _Repeated(Exception):  # noqa: N818 (says what happened)
@@ -98,6 +108,7 @@ class WatchedActuators:
         actuator.taken = self.store.blocks_kept(settings.name)
         if state["last"] is not None:
             actuator.last = plain_dataclass(BlockEstimate, state["last"], "last")
+        actuator.oil_celsius = state.get("oil_celsius")
         for samples, follows in pending:
             self._judged(actuator, samples, follows)
             actuator.pending += 1
@@ -107,10 +118,13 @@ class WatchedActuators:
             fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
             actuator.watch = fresh
             return self._begun_anew(actuator)
+        if actuator.watch.false_alarms_per_1000_h != settings.false_alarms_per_1000_h:
+            actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h
+            return self._begun_anew(actuator)  # with the same baseline
         return actuator
 
     def _begun_anew(self, actuator: _Actuator) -> _Actuator:
-        """Return an actuator whose watch is fresh, its state stored."""
+        """Return an actuator whose watch was changed by the settings, its state stored."""
         actuator.taken = self.store.blocks_kept(actuator.settings.name)
         with self.store.writing() as connection:
             self._checkpoint(connection, actuator, StoredRows())
@@ -252,7 +266,7 @@ class WatchedActuators:
     ) -> list[BlockEstimate]:
         name = block.actuator
         estimates, happened = self._judged(actuator, samples, block.follows)
-        rows.add_estimates(name, estimates)
+        rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
             if kind:
                 self.store.keep_event(connection, alarm, kind, t)
@@ -277,6 +291,7 @@ class WatchedActuators:
     ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
         """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
         estimates, happened = [], []
+        actuator.warm(samples)
         for estimate, leak in actuator.watch.each(samples, follows=follows):
             version = 0 if actuator.watch.baseline is None else actuator.watch.baseline.version
             change = actuator.judge.take(estimate, leak, version, actuator.settings.thresholds)
@@ -290,7 +305,8 @@ class WatchedActuators:
     def _checkpoint(self, connection: Any, actuator: _Actuator, rows: StoredRows) -> None:
         """Store the state; what is old then goes with the rows."""
         last = None if actuator.last is None else asdict(actuator.last)
-        state = {"watch": actuator.watch.state(), "judge": actuator.judge.state(), "last": last}
+        parts = {"watch": actuator.watch.state(), "judge": actuator.judge.state(), "last": last}
+        state: dict[str, Any] = {**parts, "oil_celsius": actuator.oil_celsius}
         settings = actuator.settings
         actuator.shown = self._summary(actuator)
         self.store.keep_checkpoint(connection, settings.name, settings.learned_with, state, actuator.shown)
@@ -310,6 +326,7 @@ class WatchedActuators:
             "total_lpm": None if last is None else last.total_lpm,
             "leak_lpm": None if last is None else last.leak_lpm,
             "leak_interval_lpm": None if last is None else last.leak_interval_lpm,
+            "oil_celsius": actuator.oil_celsius,
             "baseline": None
             if baseline is None
             else {"version": baseline.version, "hours": baseline.hours, "lpm": baseline.lpm},
@@ -373,6 +390,11 @@ class WatchedActuators:
     def rigs(self) -> dict[str, str]:
         """The rig of each actuator, by name or path."""
         return {name: settings.rig for name, settings in self._settings.items()}
+
+    @property
+    def false_alarms_per_1000_h(self) -> float:
+        """False alarms of all healthy actuators together per 1000 h in which all of them run, at most."""
+        return sum(settings.false_alarms_per_1000_h for settings in self._settings.values())
 
     def plain(self) -> dict[str, dict[str, Any]]:
         """Return what each actuator of the settings shows now, as its last transaction left it."""

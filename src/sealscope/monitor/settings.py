@@ -34,12 +34,13 @@ class WatchSettings(_Part):
     @property
     def thresholds(self) -> Thresholds:
         """What makes an alarm."""
-        return Thresholds(self.warning_lpm, self.error_lpm, self.debounce_blocks, self.return_share)
+        rate = self.false_alarms_per_1000_h
+        return Thresholds(self.warning_lpm, self.error_lpm, self.debounce_blocks, self.return_share, rate)
 
     @property
     def learned_with(self) -> str:
-        """The settings that a saved state depends on."""
-        return f"{self.rig}, {self.learn_hours:g} h, {self.false_alarms_per_1000_h:g} per 1000 h"
+        """The settings that a baseline depends on."""
+        return f"{self.rig}, {self.learn_hours:g} h"
 
 
 class ActuatorSettings(WatchSettings):
@@ -119,6 +120,7 @@ class MonitorSettings(_Part):
     lines: bool = False
     settle_s: float = Field(default=5.0, ge=0, le=3600)
     keep_days: float = Field(default=90.0, gt=0)
+    fleet_false_alarms_per_1000_h: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     defaults: WatchSettings = Field(default_factory=WatchSettings)
     page: PageSettings | None = None
     mqtt: BrokerSettings | None = None
@@ -136,6 +138,11 @@ class MonitorSettings(_Part):
         defaults, actuators = values.get("defaults", {}), values.get("actuator")
         if not (isinstance(defaults, dict) and isinstance(actuators, list)):
             return values
+        budget, rate = values.get("fleet_false_alarms_per_1000_h"), "false_alarms_per_1000_h"
+        if isinstance(budget, int | float) and actuators:
+            if any(isinstance(part, dict) and rate in part for part in (defaults, *actuators)):
+                raise ValueError(f"state {rate} of actuators, or fleet_{rate}, which they share in equal parts")
+            defaults = {**defaults, rate: budget / len(actuators)}
         spread = [{**defaults, **actuator} if isinstance(actuator, dict) else actuator for actuator in actuators]
         return {**values, "actuator": spread}
 
@@ -242,6 +249,7 @@ TEMPLATE = """\
 database = "monitor.db"          # a file of SQLite, or a URL such as postgresql+psycopg://user@host/name
 lines = false                    # take JSON lines from standard input
 keep_days = 90.0                 # estimates of so many days of operation are kept; alarms and marks stay
+# fleet_false_alarms_per_1000_h = 1.0 # of all healthy actuators together, in equal parts; in place of that below
 settle_s = 5.0                   # a file is read when it has not changed for so long [s]
 
 [defaults]                       # of every actuator

@@ -23,8 +23,11 @@ CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
         "p_B": "Pa",
         "q_leak": "m^3/s",
         "q_comp": "m^3/s",
+        "T_oil": "K",
     }
 )
+#: Channels that change over minutes: that such a channel is constant, or missing in most rows, is no defect.
+SLOW = frozenset({"T_oil"})
 #: What each channel, and the time, measures.
 LONG_NAMES: Mapping[str, str] = MappingProxyType(
     {
@@ -39,6 +42,7 @@ LONG_NAMES: Mapping[str, str] = MappingProxyType(
         "p_B": "pressure in chamber B",
         "q_leak": "leakage flow",
         "q_comp": "leakage flow that the controller makes good",
+        "T_oil": "oil temperature",
     }
 )
 #: Unit of a mapped channel that came without one: raw counts of a converter.

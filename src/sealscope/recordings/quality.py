@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
-from sealscope.recordings.channels import Array
+from sealscope.recordings.channels import SLOW, Array
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.motion import constant, runs_of, spacing, stuck
 from sealscope.recordings.recording import Recording
@@ -101,7 +101,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     with np.errstate(all="ignore"):
         findings = _time_findings(recording)
         for name, values in recording.channels.items():
-            findings += _channel_findings(recording, name, values)
+            findings += _channel_findings(recording, name, values) if name not in SLOW else []
         findings += _creep_findings(recording)
     return tuple(findings)
 
@@ -247,14 +247,15 @@ def _ordinal(number: int) -> str:
 
 
 def uniform_segments(recording: Recording, channels: Sequence[str] | None = None, *, shortest: int = 1) -> list[slice]:
-    """Return the maximal stretches, as slices, sampled uniformly with the named channels (default: all) finite.
+    """Return the maximal stretches, as slices, sampled uniformly with the named channels finite.
 
+    `channels`: by default all but those that change slowly.
     A stretch has at least `shortest` samples; each interval in it lies between half and one and a half steps of
     `recording.rate`. Raises InputError for a channel that the recording does not have.
     """
     count = len(recording)
     whole = np.isfinite(recording.t)
-    for name in recording.channels if channels is None else channels:
+    for name in (name for name in recording.channels if name not in SLOW) if channels is None else channels:
         whole = whole & np.isfinite(recording[name])
     joined = whole[1:] & whole[:-1] & even_steps(recording)
     starts = np.flatnonzero(whole & np.r_[True, ~joined][:count])

@@ -83,6 +83,19 @@ def test_drift_table_against_fresh_draws(n: int, number: int) -> None:
         assert abs(share - probability) < 0.15 * probability + 3.0 * deviation
 
 
+def test_beyond_the_table_a_threshold_is_exceeded_more_rarely_than_stated() -> None:
+    """Of one table's line, as far as weighted draws reach; nor is it twice as far out as they say."""
+    family = DriftFamily(np.arange(20.0), np.ones(20), np.zeros((20, 1)))
+    drift = family.drifts[12]
+    z, weights = rare_draws(drift.steps @ drift.root, 0.3 * 0.1 ** np.arange(11.0), 20_000, 3)
+    values = family.scores(drift.root @ z, 1)[0].max(axis=0)
+    for probability in (1e-8, 1e-9):
+        threshold = null_threshold("smooth_drift", probability, 20, 12)
+        share, deviation = obtained(threshold, values, weights)
+        assert share < probability + 3.0 * deviation
+        assert weighted_quantile(values, weights, probability) > 0.6 * threshold
+
+
 @pytest.mark.parametrize(("n", "number", "expected"), [(16, 0, 3.0), (30, 4, 0.03), (50, 8, 0.05), (50, 3, 4.0)])
 def test_walk_table_against_fresh_draws(n: int, number: int, expected: float) -> None:
     scan = WalkScan(np.ones(n), expected)

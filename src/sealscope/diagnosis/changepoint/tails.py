@@ -20,6 +20,9 @@ ONSET_CUT = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 _PLAIN = 0.2
 _LEVELS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])
 _LARGEST_LEVEL = 0.3
+#: Beyond the least probability of a table its thresholds grow by so much for each factor e: weighted draws of
+#: `smooth_drift` down to 1e-10 have 0.7 to 1.4.
+RARER = 1.5
 
 
 def near_best(profile: Array, scale: float = 1.0) -> NDArray[np.intp]:
@@ -134,12 +137,14 @@ def null_threshold(scan: str, probability: float, *place: float) -> float:
     """Return what the largest score of a scan exceeds with `probability` in series without a step.
 
     Interpolated in the table `scan`.csv beside this file, which `benchmarks/null_tables.py` makes and whose accuracy
-    stands there. `place`: what the null distribution depends on, in the order of the table's columns.
+    stands there; rarer ones exceed `RARER` more for each factor e. `place`: what the null distribution depends on, in
+    the order of the table's columns.
     """
     axes, values = _null_table(scan)
+    beyond = RARER * max(0.0, float(axes[-1][0] - np.log(probability)))
     for axis, wanted in zip(axes, (*place, probability), strict=True):
         at = np.log(wanted) if axis[0] != 0 else wanted
         k = int(np.clip(np.searchsorted(axis, at) - 1, 0, axis.size - 2))
         share = float(np.clip((at - axis[k]) / (axis[k + 1] - axis[k]), 0.0, 1.0))
         values = (1.0 - share) * values[k] + share * values[k + 1]
-    return float(values)
+    return float(values) + beyond

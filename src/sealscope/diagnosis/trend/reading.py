@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,7 +26,7 @@ from sealscope.diagnosis.volume_balance.evidence import level as balance_level
 from sealscope.diagnosis.volume_balance.evidence import states_flow
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.formats.headings.preamble import remarks_of
+from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
 from sealscope.recordings.recording import Recording
 
 #: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
@@ -39,11 +38,6 @@ BASES: tuple[Basis, ...] = ("volume balance", "pressure model", "observer", "rin
 _SHARE, _BY_RINGING, _RINGING, _FREEDOM = 0.1, 0.6 * G_UNIT, 0.11, 4.0
 #: Error of a ringing's logarithm that a recording states of itself.
 _RINGING_ERROR = 0.01
-_TEMPERATURE = re.compile(
-    r"(?P<value>[-+]?\d{1,3}(?:[.,]\d{1,3})?)\s*(?P<unit>°\s?[CF]|deg\s?[CF]|[CFK]\b|℃)", re.IGNORECASE
-)
-_UNIT_OF_NAME = re.compile(r"[\[(]\s*([^\])]{1,6}?)\s*[\])]")
-_OIL = re.compile(r"temp|oil|öl|oel|fluid|huile|olio|aceite", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,19 +147,10 @@ def _reasons(part: Recording, rig: Rig) -> str:
 
 
 def oil_temperature(recording: Recording) -> float | None:
-    """Return the oil's temperature [deg C] by what the file says beside its samples, None where it does not."""
-    for name, text in remarks_of(recording.provenance).items():
-        if not _OIL.search(name):
-            continue
-        unit_of_name = _UNIT_OF_NAME.search(name)
-        match = _TEMPERATURE.search(text if unit_of_name is None else f"{text} {unit_of_name[1]}")
-        if match is None:
-            continue
-        value, unit = float(match["value"].replace(",", ".")), match["unit"].upper().replace("℃", "C")[-1]
-        celsius = (value - 32.0) / 1.8 if unit == "F" else value - 273.15 if unit == "K" else value
-        if -60.0 < celsius < 200.0:
-            return celsius
-    return None
+    """Return the oil's mean temperature [deg C], else what the file says beside its samples; None where neither is."""
+    if "T_oil" in recording and np.any(known := np.isfinite(recording["T_oil"])):
+        return float(recording["T_oil"][known].mean()) - 273.15
+    return stated_oil_temperature(recording.provenance)
 
 
 def scatter_of(basis: Basis, usual: float) -> DayToDay:

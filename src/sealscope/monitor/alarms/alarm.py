@@ -52,6 +52,8 @@ class Alarm:
         "false" or "repaired", as a person said; "" before.
     shelved_until_s : float
         It is not announced before this clock [s].
+    by_chance_per_1000_h : float, optional
+        Alarms as strong as this that a healthy actuator raises per 1000 operating hours, at most.
     """
 
     id: str
@@ -70,6 +72,7 @@ class Alarm:
     baseline: int
     mark: str = ""
     shelved_until_s: float = 0.0
+    by_chance_per_1000_h: float | None = None
 
     @property
     def active(self) -> bool:

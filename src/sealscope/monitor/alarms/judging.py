@@ -9,6 +9,7 @@ from typing import Any
 from sealscope.errors import InputError
 from sealscope.monitor.alarms.alarm import NEXT_CHECKS, Alarm, AlarmState, Level
 from sealscope.monitor.stream.baseline import plain_dataclass
+from sealscope.monitor.stream.decisions import rarity
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 
 
@@ -18,13 +19,18 @@ class Thresholds:
 
     `warning_lpm`, `error_lpm`: leak from which it is one [L/min], None for no error level; `debounce`: successive
     blocks that must say so; `return_share`: it returns, or an error becomes a warning, below this share of the
-    threshold.
+    threshold; `false_alarms_per_1000_h`: the rate that the tests are set for.
     """
 
     warning_lpm: float = 0.0
     error_lpm: float | None = None
     debounce: int = 2
     return_share: float = 0.7
+    false_alarms_per_1000_h: float = 1.0
+
+    def by_chance(self, leak: WatchedLeak) -> float:
+        """Return how many alarms as strong as a leak's a healthy machine raises per 1000 h, at most."""
+        return self.false_alarms_per_1000_h * rarity(leak.test, leak.score, leak.threshold)
 
 
 @dataclass
@@ -74,7 +80,9 @@ class AlarmJudge:
             happened = "error"
         now = replace(self.alarm, updated_s=estimate.t)
         if leak is not None:
-            now = replace(now, leak_lpm=estimate.leak_lpm, leak_interval_lpm=estimate.leak_interval_lpm)
+            leak_lpm, interval = estimate.leak_lpm, estimate.leak_interval_lpm
+            chance = thresholds.by_chance(leak)
+            now = replace(now, leak_lpm=leak_lpm, leak_interval_lpm=interval, by_chance_per_1000_h=chance)
         self.alarm = None if now.state == "normal" else now
         return now, happened
 
@@ -109,6 +117,7 @@ class AlarmJudge:
             leak.reason,
             NEXT_CHECKS.get(leak.cause, NEXT_CHECKS["piston or pump leak"]),
             baseline,
+            by_chance_per_1000_h=thresholds.by_chance(leak),
         )
         return self.alarm, "raised"
 

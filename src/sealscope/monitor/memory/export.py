@@ -15,10 +15,11 @@ Label = Literal["healthy", "leak", ""]
 ALARM_COLUMNS = (
     *("id", "actuator", "level", "state", "mark", "marked_by", "marked_s", "comments", "raised_s", "onset_s"),
     *("onset_low_s", "onset_high_s", "leak_lpm", "leak_low_lpm", "leak_high_lpm", "cause", "evidence", "baseline"),
+    "by_chance_per_1000_h",
 )
 ESTIMATE_COLUMNS = (
     *("actuator", "t", "status", "total_lpm", "total_low_lpm", "total_high_lpm"),
-    *("leak_lpm", "leak_low_lpm", "leak_high_lpm", "label", "alarm"),
+    *("leak_lpm", "leak_low_lpm", "leak_high_lpm", "oil_celsius", "label", "alarm"),
 )
 
 

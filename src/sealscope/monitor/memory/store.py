@@ -36,6 +36,7 @@ _ESTIMATES = (
     "leak_lpm",
     "leak_low_lpm",
     "leak_high_lpm",
+    "oil_celsius",
 )
 
 
@@ -51,14 +52,15 @@ class StoredRows:
     summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
     old: dict[str, tuple[int, int]] = field(default_factory=dict)
 
-    def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate]) -> None:
-        """Add the estimates of a block."""
+    def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
+        """Add the estimates of a block, and the oil's temperature then."""
         for estimate in estimates:
             values = (
                 estimate.total_lpm,
                 *(estimate.total_interval_lpm or (None, None)),
                 estimate.leak_lpm,
                 *(estimate.leak_interval_lpm or (None, None)),
+                oil_celsius,
             )
             place = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": estimate.status[:160]}
             self.estimates.append({**place, **dict(zip(_ESTIMATES, values, strict=True))})
@@ -107,8 +109,8 @@ class MonitorStore:
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {known} ({database})")
 
     def _prepared(self) -> str | None:
-        """Make the tables that are missing, and return the version of those that were there."""
-        from sqlalchemy import select
+        """Make the tables and columns that are missing, and return the version of those that were there."""
+        from sqlalchemy import select, text
 
         with self.engine.begin() as connection:
             self.tables.metadata.create_all(connection)
@@ -116,6 +118,10 @@ class MonitorStore:
             known = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
             if known is None:
                 connection.execute(facts.insert().values(name="schema", value=str(self.tables.SCHEMA)))
+            if known == "1":
+                connection.execute(text("ALTER TABLE estimates ADD COLUMN oil_celsius DOUBLE PRECISION"))
+                known = str(self.tables.SCHEMA)
+                connection.execute(facts.update().where(facts.c.name == "schema").values(value=known))
         return None if known is None else str(known)
 
     @contextmanager

@@ -6,7 +6,7 @@ from sqlalchemy import Column, Float, Index, Integer, LargeBinary, MetaData, Str
 
 metadata = MetaData()
 #: Version of the tables, kept in `facts`.
-SCHEMA = 1
+SCHEMA = 2
 
 facts = Table("facts", metadata, Column("name", String(40), primary_key=True), Column("value", Text, nullable=False))
 #: Blocks that are stored, by identity.
@@ -48,6 +48,7 @@ estimates = Table(
     Column("leak_lpm", Float(53)),
     Column("leak_low_lpm", Float(53)),
     Column("leak_high_lpm", Float(53)),
+    Column("oil_celsius", Float(53)),
 )
 alarms = Table(
     "alarms",

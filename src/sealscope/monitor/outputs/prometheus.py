@@ -12,6 +12,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _METRICS = (
     ("leak_lpm", "sealscope_leak_lpm", "gauge", "Leak beyond the healthy machine [L/min]"),
     ("total_lpm", "sealscope_total_lpm", "gauge", "Flow past pump and piston together [L/min]"),
+    ("oil_celsius", "sealscope_oil_temperature_celsius", "gauge", "Oil temperature as recorded [deg C]"),
     ("status_word", "sealscope_status_word", "gauge", "Bits: 1 warning, 2 error, 4 not acknowledged"),
     ("blocks", "sealscope_blocks_total", "counter", "Blocks since the beginning"),
     ("t", "sealscope_block_time_seconds", "gauge", "Clock at the end of the last block"),

@@ -54,12 +54,27 @@ function showOutages(values) {
   place.hidden = !lines.length;
 }
 
+// a rate per 1000 h in the words of a plant: how long until the next one
+function onceIn(rate) {
+  const hours = 1000 / rate;
+  const [length, unit] = hours < 48 ? [hours, "hours"] : hours < 8760 ? [hours / 24, "days"] : [hours / 8760, "years"];
+  return length >= 1e4 ? `10 000 ${unit}` : `${Number(length.toPrecision(2))} ${unit}`;
+}
+
+// healthy actuators of the whole fleet raise alarms as strong as this one so seldom
+let fleetCount = 1;
+const byChance = (alarm) =>
+  alarm.by_chance_per_1000_h === null || alarm.by_chance_per_1000_h === undefined
+    ? ""
+    : `healthy, the fleet would raise such an alarm once in ${onceIn(alarm.by_chance_per_1000_h * fleetCount)} or less often`;
+
 function stateOf(row) {
   if (!row.alarm) return row.status;
   return `${row.alarm.level}, ${row.alarm.state}, since ${clock(row.alarm.onset_s)}`;
 }
 
 function showFleet(fleet) {
+  fleetCount = fleet.actuators.length;
   const list = byId("fleet");
   const focused = document.activeElement && document.activeElement.dataset.name;
   list.replaceChildren();
@@ -83,6 +98,8 @@ function showFleet(fleet) {
     if (row.name === focused) button.focus();
   }
   const count = fleet.actuators.length;
+  byId("budget").textContent =
+    `While all run, at most one false alarm in ${onceIn(fleet.false_alarms_per_1000_h)} is stated for all of them together.`;
   byId("overall").textContent =
     `${count} actuator${count === 1 ? "" : "s"}, ${alarms === 0 ? "no alarm" : alarms === 1 ? "1 alarm" : alarms + " alarms"}`;
   const dropped = Object.entries(fleet.counters).map(([reason, number]) => `${number} ${reason}`);
@@ -98,10 +115,11 @@ function facts(alarm) {
     ["Raised", clock(alarm.raised_s)],
     ["Cause", alarm.cause],
     ["Evidence", alarm.evidence],
+    ["By chance", byChance(alarm)],
     ["Next check", alarm.next_check],
     ["Number", `${alarm.diagnostic_number}, baseline ${alarm.baseline}`],
   ];
-  for (const [name, value] of rows) list.append(element("dt", "", name), element("dd", "", value));
+  for (const [name, value] of rows.filter((row) => row[1])) list.append(element("dt", "", name), element("dd", "", value));
 }
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -110,6 +128,9 @@ function draw(course, events) {
   const place = byId("chart");
   const column = (name) => course.map((row) => row[name]);
   const data = [column("t"), column("leak_low_lpm"), column("leak_high_lpm"), column("leak_lpm"), column("total_lpm")];
+  const warmth = column("oil_celsius");
+  const warm = warmth.some((value) => value !== null);
+  if (warm) data.push(warmth);
   if (chart) chart.destroy();
   place.replaceChildren();
   if (!course.length) {
@@ -119,6 +140,7 @@ function draw(course, events) {
   const dated = course[0].t > 1e8;
   const grid = { stroke: colour("--line"), width: 1 };
   const flowText = (plot, value) => (value === null || value === undefined ? "–" : `${litres(value)} L/min`);
+  const degrees = (plot, value) => (value === null || value === undefined ? "–" : `${value.toFixed(1)} °C`);
   const edge = { stroke: colour("--band"), width: 1, points: { show: false }, value: flowText };
   const marks = events.filter((event) => event.event !== "comment");
   chart = new uPlot(
@@ -130,6 +152,7 @@ function draw(course, events) {
       axes: [
         { stroke: colour("--quiet"), grid, space: 80, ...(dated ? {} : { values: (plot, at) => at.map(clock) }) },
         { stroke: colour("--quiet"), grid, size: 70, label: "L/min", values: (plot, at) => at.map(litres) },
+        ...(warm ? [{ scale: "oil", side: 1, stroke: colour("--quiet"), grid: { show: false }, label: "oil, °C" }] : []),
       ],
       series: [
         { value: (plot, at) => (at === null ? "–" : clock(at)), label: "clock" },
@@ -137,6 +160,7 @@ function draw(course, events) {
         { ...edge, label: "to" },
         { label: "leak", stroke: colour("--leak"), width: 2, value: flowText },
         { label: "pump and piston", stroke: colour("--total"), width: 1, value: flowText },
+        ...(warm ? [{ label: "oil", scale: "oil", stroke: colour("--oil"), width: 1, value: degrees }] : []),
       ],
       hooks: {
         draw: [
@@ -178,8 +202,9 @@ function showLife(life) {
   const base = now.baseline;
   const learned = base ? `; baseline ${base.version}, ${base.hours.toPrecision(2)} h` +
     (base.lpm === null ? "" : `, ${litres(Math.max(base.lpm, 0))} L/min`) : "; the baseline is being learned";
+  const oil = now.oil_celsius === null || now.oil_celsius === undefined ? "" : `, oil ${now.oil_celsius.toFixed(0)} °C`;
   byId("now").textContent =
-    `${clock(now.t)}: ${now.status}; pump and piston pass ${flow(now.total_lpm)}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${learned}`;
+    `${clock(now.t)}: ${now.status}; pump and piston pass ${flow(now.total_lpm)}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${oil}${learned}`;
   const alarm = life.alarms.find((each) => each.state !== "normal");
   byId("alarm").hidden = !alarm;
   if (alarm) {

@@ -99,7 +99,8 @@ def site(
     def fleet(request: Request) -> Response:
         rows = ranked(actuators.plain(), store.alarms(open_only=True))
         shown = {"actuators": rows, "counters": actuators.counters, "waiting": waits()[0]}
-        return JSONResponse({**shown, "outages": actuators.outages.plain()})
+        budget = actuators.false_alarms_per_1000_h
+        return JSONResponse({**shown, "outages": actuators.outages.plain(), "false_alarms_per_1000_h": budget})
 
     def actuator(request: Request) -> Response:
         name = request.path_params["name"]

@@ -14,6 +14,7 @@ from sealscope.errors import InputError
 from sealscope.monitor.sources.source_block import SourceBlock
 from sealscope.recordings import Recording, read
 from sealscope.recordings.formats.columns import ChannelMap
+from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
 
 _log = logging.getLogger(__name__)
 #: Names of files that are still being written.
@@ -94,7 +95,17 @@ class WatchedFolder:
 
 
 def _on_the_clock(recording: Recording, written: float) -> Recording:
-    """Return a recording whose last sample was taken at the clock `written` [s]."""
+    """Return a recording whose last sample was taken at the clock `written` [s].
+
+    The oil's temperature that the file states beside its samples becomes a channel.
+    """
     last = recording.t[np.isfinite(recording.t)]
     shift = written - float(last[-1]) if last.size else 0.0
-    return Recording(recording.t + shift, recording.channels, recording.units, recording.rate)
+    channels, units, celsius = (
+        dict(recording.channels),
+        dict(recording.units),
+        stated_oil_temperature(recording.provenance),
+    )
+    if "T_oil" not in channels and celsius is not None:
+        channels["T_oil"], units["T_oil"] = np.full(len(recording), celsius + 273.15), "K"
+    return Recording(recording.t + shift, channels, units, recording.rate)

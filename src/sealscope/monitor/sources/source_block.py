@@ -16,7 +16,8 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.monitor.stream.joining import CHANNELS
-from sealscope.recordings.recording import CHANNEL_UNITS, Recording
+from sealscope.recordings.channels import CHANNEL_UNITS, SLOW
+from sealscope.recordings.recording import Recording
 from sealscope.units import to_si
 
 if TYPE_CHECKING:
@@ -93,8 +94,9 @@ def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None
     """Return the block of a message, JSON where it begins with ``{``, else CBOR.
 
     Its mapping has ``t``, the clock of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers,
-    null where one is missing, or in CBOR a typed array of floats (RFC 8746), NaN where one is missing; ``units`` names
-    those that are not SI; ``actuator`` where the source does not say; ``id`` where the contents are not the identity.
+    null where one is missing, or in CBOR a typed array of floats (RFC 8746), NaN where one is missing; a channel that
+    changes slowly (``T_oil``) may be a single number; ``units`` names those that are not SI; ``actuator`` where the
+    source does not say; ``id`` where the contents are not the identity.
     Raises RefusedMessage for anything else.
     """
     if len(payload) > LARGEST:
@@ -113,13 +115,19 @@ def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None
     if not rate > 0.0:
         raise RefusedMessage(NO_CLOCK, f"rate must be > 0 Hz, got {rate:g}")
     channels = {channel: _channel(values[channel], channel, units) for channel in CHANNELS if channel in values}
-    sizes = {values.size for values in channels.values()}
+    sizes = {values.size for channel, values in channels.items() if channel not in SLOW}
     if sizes and max(sizes) > MOST_SAMPLES:
         raise RefusedMessage(OVERSIZED, f"a channel must have at most {MOST_SAMPLES} samples, got {max(sizes)}")
     if len(sizes) != 1 or not min(sizes):
         raise RefusedMessage(NO_SAMPLES, f"channels must have equally many samples, 1 to {MOST_SAMPLES}")
+    count = sizes.pop()
+    for channel in SLOW & channels.keys():
+        if channels[channel].size == 1:
+            channels[channel] = np.full(count, channels[channel][0])
+        elif channels[channel].size != count:
+            raise RefusedMessage(NO_SAMPLES, f"channel {channel} must have 1 or {count} samples")
     with np.errstate(over="ignore"):  # times beyond floating point are dropped by the stream
-        clock = t + np.arange(sizes.pop()) / rate
+        clock = t + np.arange(count) / rate
     samples = Recording(clock, channels, {channel: CHANNEL_UNITS[channel] for channel in channels}, rate)
     return SourceBlock(name, _identity(values.get("id")) or digest_of(payload), samples, done=done)
 
@@ -179,6 +187,8 @@ def _number(values: Mapping[str, Any], name: str) -> float:
 
 
 def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
+    if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
+        values = [values]
     kind = _TYPED.get(getattr(values, "tag", None) or 0)
     if kind is not None:
         if not isinstance(values.value, bytes) or len(values.value) % np.dtype(kind).itemsize:

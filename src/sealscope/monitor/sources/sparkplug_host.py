@@ -55,6 +55,7 @@ from sealscope.monitor.sparkplug import (
     typed,
 )
 from sealscope.monitor.stream.joining import CHANNELS
+from sealscope.recordings.channels import SLOW
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.units import to_si
 
@@ -264,6 +265,9 @@ class SparkplugHost:
         groups: dict[int, dict[str, SparkplugMetric]] = {}
         for metric in metrics:
             if metric.name is not None and metric.name in by_name:
+                if by_name[metric.name] in SLOW and not isinstance(metric.value, np.ndarray):
+                    birth.metrics[metric.name] = metric
+                    continue
                 at = metric.timestamp if metric.timestamp is not None else sent
                 if at is None:
                     raise RefusedMessage(NO_CLOCK, f"the metric {metric.name[:40]!r} must have a time, got none")
@@ -290,6 +294,9 @@ class SparkplugHost:
             )
             for name in names
         }
+        for name, channel in by_name.items():
+            if channel in SLOW and isinstance(known := birth.metrics[name].value, (int, float)):
+                values[channel] = np.full(t.size, float(known))
         return _in_si(t, values, rate, {channel: birth.metrics[name].unit for name, channel in by_name.items()})
 
     def _clock(self, actuator: str, at: float, size: int, rate: float) -> Array:
@@ -336,7 +343,7 @@ def _piece(group: Mapping[str, SparkplugMetric], birth: _Birth, by_name: Mapping
         return {
             channel: np.array([number_of(birth.metrics[name].value)])
             for name, channel in by_name.items()
-            if not isinstance(birth.metrics[name].value, np.ndarray)
+            if channel not in SLOW and not isinstance(birth.metrics[name].value, np.ndarray)
         }
     except ValueError as error:
         raise RefusedMessage(NO_SAMPLES, error) from None

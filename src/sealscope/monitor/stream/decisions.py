@@ -22,6 +22,7 @@ from functools import cache
 import numpy as np
 
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, find_step, share_of_threshold
+from sealscope.diagnosis.changepoint.tails import RARER
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import BalanceBlocks, Geometry
 from sealscope.diagnosis.volume_balance.evidence import judge, trouble
@@ -38,8 +39,10 @@ GROUP = 16
 WINDOW = 60
 #: Share of the rate of false alarms that each test takes.
 _SHARES = {"step": 0.45, "rise": 0.45, "level": 0.1}
-#: Probabilities of a look for which a threshold is tabled.
-_PROBABILITIES = (1e-7, 0.05)
+#: Probabilities of a look for which a threshold is known.
+_PROBABILITIES = (1e-12, 0.05)
+#: A rise as rare as this share of the stated rate, or rarer, is said to be so rare: tails are not known further out.
+_RAREST = 1e-9
 #: A search is worth its time where the contrast of a step is this many deviations. An alarm has more: a score over 26,
 #: the least threshold, is a contrast of 5.8, of which the deviation's own error takes a fifth.
 _WORTH_A_SEARCH = 4.5
@@ -86,7 +89,7 @@ class ConductanceRise:
 def probability_of(test: str, false_alarms_per_1000_h: float, seconds: float) -> float:
     """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
 
-    Raises InputError where no threshold is tabled for it.
+    Raises InputError where no threshold is known for it.
     """
     probability = _SHARES[test] * false_alarms_per_1000_h / 1000.0 * seconds / 3600.0
     low, high = _PROBABILITIES
@@ -96,6 +99,18 @@ def probability_of(test: str, false_alarms_per_1000_h: float, seconds: float) ->
             f"false_alarms_per_1000_h must be {low * scale:.2g} to {high * scale:.2g}, got {false_alarms_per_1000_h:g}"
         )
     return probability
+
+
+def rarity(test: str, score: float, threshold: float) -> float:
+    """Return how much rarer than at the stated rate a healthy machine shows such a score, as a share <= 1.
+
+    By the tail of the test: normal for a level, else exp(-(score - threshold) / `tails.RARER`), which overstates.
+    """
+    from scipy.special import log_ndtr
+
+    normal = test == "level"
+    exponent = float(log_ndtr(-score) - log_ndtr(-threshold)) if normal else (threshold - score) / RARER
+    return min(1.0, max(_RAREST, math.exp(max(exponent, math.log(_RAREST)))))
 
 
 @cache

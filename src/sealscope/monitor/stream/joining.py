@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 
-#: Channels that a stream knows.
-CHANNELS = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u")
+#: Channels by which an actuator is watched, and with those that are kept beside the estimates.
+_WATCHED = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u")
+CHANNELS = (*_WATCHED, "T_oil")
 #: Rates that differ by less than this share are one rate.
 _SAME_RATE = 0.01
 #: Two samples follow each other where their times differ by so many steps.
@@ -31,13 +32,13 @@ def channels_to_watch(samples: Recording) -> tuple[str, ...]:
     The balance of volumes reads position, angle or speed, and all pressures; without a position the chamber pressures
     and what moves the machine suffice.
     """
-    there = {name for name in CHANNELS if name in samples}
+    there = {name for name in _WATCHED if name in samples}
     if not {"p_A", "p_B"} <= there:
         return ()
     if "x" in there and {"theta", "omega"} & there:
-        return tuple(name for name in CHANNELS if name in there - {"u"})
+        return tuple(name for name in _WATCHED if name in there - {"u"})
     if {"u", "theta", "omega"} & there:
-        return tuple(name for name in CHANNELS if name in there - {"x", "p_1", "p_2"})
+        return tuple(name for name in _WATCHED if name in there - {"x", "p_1", "p_2"})
     return ()
 
 

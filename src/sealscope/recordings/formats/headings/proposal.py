@@ -66,6 +66,10 @@ _OTHERS = _words(
     "tank supply versorgung system charge speisedruck speise accumulator speicher oil oel temp temperature temperatur "
     "force kraft current strom flow"
 )
+_OIL = _words(
+    "oil oel ol huile aceite olio oleo olie olej olja yag oiltemp oiltemperature oeltemp oeltemperatur масло масла "
+    "油 油温 油溫 オイル"
+)
 #: Of what is wanted and not measured, unless it is a command; and of what is made from other columns.
 _WANTED = _words("soll sollwert setpoint set target demand reference ref cmd command consigne")
 _MADE = _words("filtered filt gefiltert filtre smoothed mean mittel avg average min max rms error fehler")
@@ -74,8 +78,16 @@ _UNSPACED = frozenset(word for words in (*_WORDS.values(), _A, _B, _PUMP) for wo
 #: How loggers write revolutions a minute, which as a unit of its own is a frequency.
 TURNS = ("1/min", "min-1", "min^-1", "min\u207b\u00b9", "/min", "U/min")
 _MEASURED = ("pressure", "position", "speed", "angle")
-_UNITS = {"position": "m", "command": "V", "speed": "rad/s", "angle": "rad", "leak": "m^3/s", "time": "s"}
-_CHANNELS = {"position": "x", "command": "u", "speed": "omega", "angle": "theta", "leak": "q_leak", "time": "t"}
+_UNITS = {"oil": "K", "position": "m", "command": "V", "speed": "rad/s", "angle": "rad", "leak": "m^3/s", "time": "s"}
+_CHANNELS = {
+    "oil": "T_oil",
+    "position": "x",
+    "command": "u",
+    "speed": "omega",
+    "angle": "theta",
+    "leak": "q_leak",
+    "time": "t",
+}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
 _LONGEST_NAME = 80
 
@@ -174,6 +186,8 @@ def _guess(label: Label, head: str) -> _Guess | None:
     side = head if _HEAD in words and head else _side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_OTHERS | _WANTED) else _Guess("pressure", side, unit)
+    if unit is not None and words & _OIL and same_dimension(unit, "K"):
+        return _Guess("oil", "", unit)
     if words & _OTHERS or (words & _WANTED and any(words & _WORDS[kind] for kind in _MEASURED)):
         return None
     if unit in TURNS and words & _WORDS["speed"]:
