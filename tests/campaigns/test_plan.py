@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.case import cases_of, interleaved
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan, plan_names
 from sealscope.errors import InputError
@@ -48,6 +48,17 @@ def test_a_plan_is_read_with_its_units(tiny):
     assert (plan.duration_s, plan.onset_s, plan.size) == (6.0, 3.0, 26)
     assert [one.leak_lpm for one in plan.records] == pytest.approx([0.0, 0.0, 0.015, 0.03])
     assert plan.factors["closed"] == ("0 %", "50 %")
+
+
+def test_kinds_of_records_take_turns(tiny):
+    """However early a campaign ends, each kind has its share, within one record."""
+    cases = cases_of(load_plan(tiny))
+    order = interleaved(cases)
+    assert sorted(order, key=cases.index) == cases
+    kinds = [(case.use, case.leak_lpm) for case in order]
+    for done in range(len(cases)):
+        for kind in set(kinds):
+            assert abs(kinds[:done].count(kind) - done * kinds.count(kind) / len(kinds)) <= 1.0
 
 
 @pytest.mark.parametrize(

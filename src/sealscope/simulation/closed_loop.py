@@ -10,6 +10,7 @@ import numpy as np
 from sealscope.control.controller import Controller, Measured
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig
+from sealscope.physics.state import P_A, P_B, POSITION, THETA
 from sealscope.recordings.recording import Array
 from sealscope.simulation.courses import Position
 
@@ -44,59 +45,67 @@ class Feedback:
     ) -> None:
         """Begin a run; `outputs`: duration [s] of it, and rate [Hz] of the solver's outputs."""
         duration, rate = outputs
-        self._controller, self._rig = controller, rig
+        self._controller = controller
         self.apart = round(rate / controller.rate)
         samples = round(duration * rate) // self.apart + 1
         t = np.arange(samples + 1) / controller.rate
-        self._t = t
-        self._target = np.broadcast_to(target.at(t), t.shape)
+        # plain numbers: a run asks for them one by one, and from lists that takes a tenth of the time
+        self._t = t.tolist()
+        self._target = np.broadcast_to(target.at(t), t.shape).tolist()
         # the voltage of a sample acts from `delay` to `delay + 1` samples later
         ahead = target.at(t + controller.delay / controller.rate)
-        self._speed = np.diff(np.broadcast_to(ahead, t.shape)) * controller.rate
+        self._speed = (np.diff(np.broadcast_to(ahead, t.shape)) * controller.rate).tolist()
         random = np.random.default_rng([seed, 2])
         sensors = rig.sensors
-        self._noise = random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)
+        self._noise = (random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)).tolist()
+        self._counts = sensors.x.resolution, 2.0 * math.pi / sensors.theta.counts
+        self._limit = rig.daq.u_max
         self._voltage: Callable[[Measured], float]
         self.restart()
 
     def restart(self) -> None:
         """Begin the run anew."""
         self._voltage = self._controller.start()
-        self._volts = np.zeros(self._t.size + self._controller.delay)
+        self._volts = [0.0] * (len(self._t) + self._controller.delay)
         self._compensated: Array | None = None
         self._sampled = 0
 
     def sample(self, output: int, y: Array) -> None:
         """Let the controller see the state `y` at an output of the solver, unless it has."""
-        from sealscope.physics.state import P_A, P_B, POSITION, THETA
-
         k = output // self.apart
         if k < self._sampled:
             return
-        sensors, (noise_A, noise_B) = self._rig.sensors, self._noise[k]
-        seen = _counted(float(y[POSITION]), sensors.x.resolution)
-        angle = _counted(float(y[THETA]), 2.0 * np.pi / sensors.theta.counts)
-        aim = float(self._target[k]), float(self._speed[k])
-        pressures = float(y[P_A] + noise_A), float(y[P_B] + noise_B)
-        volts = float(self._voltage(Measured(float(self._t[k]), *aim, seen, *pressures, angle)))
+        (noise_A, noise_B), (x_count, angle_count) = self._noise[k], self._counts
+        volts = float(
+            self._voltage(
+                Measured(
+                    self._t[k],
+                    self._target[k],
+                    self._speed[k],
+                    _counted(y.item(POSITION), x_count),
+                    y.item(P_A) + noise_A,
+                    y.item(P_B) + noise_B,
+                    _counted(y.item(THETA), angle_count),
+                )
+            )
+        )
         flow = getattr(self._voltage, "compensated", None)
         if flow is not None:
             if self._compensated is None:
-                self._compensated = np.zeros(self._t.size)
+                self._compensated = np.zeros(len(self._t))
             self._compensated[k] = flow
-        if not np.isfinite(volts):
+        if not math.isfinite(volts):
             raise SimulationFailed(f"the controller must give a finite voltage, got {volts} at t = {self._t[k]:.4g} s")
-        limit = self._rig.daq.u_max
-        self._volts[k + self._controller.delay] = min(max(volts, -limit), limit)
+        self._volts[k + self._controller.delay] = min(max(volts, -self._limit), self._limit)
         self._sampled = k + 1
 
     def held(self, output: int) -> float:
         """Return the voltage [V] that acts from an output of the solver to the controller's next sample."""
-        return float(self._volts[output // self.apart])
+        return self._volts[output // self.apart]
 
     def volts(self, outputs: int) -> Array:
         """Return the voltages [V], (n,), at the first outputs of the solver."""
-        return np.asarray(self._volts[np.arange(outputs) // self.apart])
+        return np.asarray(self._volts)[np.arange(outputs) // self.apart]
 
     def compensated(self, outputs: int) -> Array | None:
         """Return the leakage flow [m^3/s] that is made good, at the first outputs; None where none is reported."""

@@ -334,11 +334,11 @@ class _Run:
     def advance(self, y: Array, start: int, stop: int, every: int, rows: Array, origin: int = 0) -> None:
         """Advance the state `y` in place from output `start` to `stop`, `every` steps each; write rows k - origin."""
         from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
-        from sealscope.physics.solvers.limits import longest_step, longest_step_on_stop
+        from sealscope.physics.solvers.limits import longest_step
         from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
         from sealscope.physics.state import survey
 
-        feedback, unloaded = self.feedback, np.zeros((0, 0))
+        unloaded = np.zeros((0, 0))
         h = 1.0 / (self.rate * every)
         nodes = np.array(IMEX_NODES if self.method == "imex" else RK4_NODES)
         nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
@@ -346,15 +346,9 @@ class _Run:
         last = start
         while last < stop:
             first, last = last, min(last + block, stop)
-            if feedback is not None:  # up to the controller's next sample
-                last = min((first // feedback.apart + 1) * feedback.apart, stop)
-                if first % feedback.apart == 0:
-                    feedback.sample(first, y)
             steps = np.arange(first * every, last * every, dtype=np.float64)
             # writable, so that a run with a leak takes the kernel that one without (zeros shared by all) has compiled
             u, G, C = (np.require(a, requirements=("C", "W")) for a in self.inputs.at_nodes(steps * h, nodes * h))
-            if feedback is not None:
-                u = np.full(u.shape, feedback.held(first))
             F = unloaded if self.load is None else np.ascontiguousarray(self.load.at(steps[:, None] * h + nodes * h))
             worst = float(G.max()), float(C.max())
             for k, end, p in self.schedule.within(first, last):
@@ -362,19 +356,65 @@ class _Run:
                     refuse_long(h, longest_step(p, *worst), "the leak")
                 part = slice((k - first) * every, (end - first) * every)
                 out = rows[k - origin : end - origin]
-                if self.method == "imex":
+                if self.feedback is not None:
+                    self._follow(self.feedback, y, h, (G[part], C[part], F[part]), p, every, out, k)
+                elif self.method == "imex":
                     advance_imex(y, h, u[part], G[part], C[part], F[part], p, every, out)
                 else:
                     advance_rk4(y, h, u[part], G[part], C[part], F[part], p, self.euler, every, out)
-            done = rows[first - origin : last - origin]
-            finite, reach, least = survey(done)
-            if not (self.allow_unresolved or reach <= 0.5 * p.L):
-                refuse_long(h, longest_step_on_stop(p), "the hard stop (cylinder.k_stop, d_stop)")
-            if not finite or (not self.allow_unresolved and least < VACUUM):
-                _refuse_rows(done, first, self.rate, self.allow_unresolved)
+            if self.feedback is None:
+                done = rows[first - origin : last - origin]
+                self._refuse(survey(done), p, h, done, first)
             if self.progress is not None and last / self.rate > self.reached:
                 self.reached = last / self.rate
                 self.progress(self.reached)
+
+    def _follow(
+        self,
+        feedback: Feedback,
+        y: Array,
+        h: float,
+        inputs: tuple[Array, Array, Array],
+        p: RigNumbers,
+        every: int,
+        out: Array,
+        start: int,
+    ) -> None:
+        """Advance the state over the outputs `out` from `start` on, under a controller; `inputs`: G, C and load."""
+        from sealscope.physics.solvers.imex import sampled_imex
+        from sealscope.physics.solvers.rk4 import sampled_rk4
+
+        apart = feedback.apart
+        u = np.empty((apart * every, inputs[0].shape[1]))
+
+        def hold(output: int) -> None:
+            if output % apart == 0:
+                feedback.sample(output, y)
+            u.fill(feedback.held(output))
+
+        ahead = apart - start % apart
+        parts = (
+            sampled_imex(y, h, u, *inputs, p, every, ahead, apart, out)
+            if self.method == "imex"
+            else sampled_rk4(y, h, u, *inputs, p, self.euler, every, ahead, apart, out)
+        )
+        first = 0
+        hold(start)
+        for last, surveyed in parts:
+            self._refuse(surveyed, p, h, out[first:last], start + first)
+            first = last
+            if last < len(out):
+                hold(start + last)
+
+    def _refuse(self, surveyed: tuple[bool, float, float], p: RigNumbers, h: float, rows: Array, first: int) -> None:
+        """Raise SimulationFailed where rows from the output `first` on, as surveyed, are beyond what the rig allows."""
+        from sealscope.physics.solvers.limits import longest_step_on_stop
+
+        finite, reach, least = surveyed
+        if not (self.allow_unresolved or reach <= 0.5 * p.L):
+            refuse_long(h, longest_step_on_stop(p), "the hard stop (cylinder.k_stop, d_stop)")
+        if not finite or (not self.allow_unresolved and least < VACUUM):
+            _refuse_rows(rows, first, self.rate, self.allow_unresolved)
 
 
 def refuse_long(h: float, limit: float, what: str) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -117,6 +118,20 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
             machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
             cases.append(CampaignCase(name[:16], int(machine >> np.uint64(1)), int(noise >> np.uint64(1)), **content))
     return cases
+
+
+def interleaved(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
+    """Return the cases so that each kind (use, leak, law, fault) is spread evenly over the order.
+
+    A campaign that is ended early then has every kind in its proportion, each with its cells in turn.
+    """
+    kinds = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
+    counts, before = Counter(kinds), Counter[Any]()
+    shares = []
+    for kind in kinds:
+        shares.append((before[kind] + 0.5) / counts[kind])
+        before[kind] += 1
+    return [cases[k] for k in sorted(range(len(cases)), key=shares.__getitem__)]
 
 
 def sources() -> Iterator[Path]:

@@ -21,7 +21,8 @@ def stated(look: Look, names: Sequence[str], views: Views) -> tuple[Scores, dict
         seen = looks[detector.view]
         if detector.detector and detector.key not in statements:
             examination = seen.examination
-            evidence = examination.fused() if detector.of == DIAGNOSE else examination.evidence(detector.of)
+            fused = detector.of == DIAGNOSE
+            evidence = examination.fused(detector.quick) if fused else examination.evidence(detector.of)
             statements[detector.key] = stated_evidence({name: getattr(evidence, name) for name in STATED})
         if detector.own:
             statement = statements[detector.key]

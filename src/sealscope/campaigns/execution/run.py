@@ -9,7 +9,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-from sealscope.campaigns.cases.case import CampaignCase, cases_of
+from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleaved
 from sealscope.campaigns.cases.recordings import ProgressCallback
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import work
@@ -42,8 +42,9 @@ def run(
     `jobs`: processes of this machine, one a core by default and two a core at most, 1 for this process alone;
     `cluster`: address of a Dask scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side
     by side (`batches`) on the `device`, cpu (with `jobs` threads) or gpu, which implies `batch`. The rows are the same
-    whoever makes them and in whatever order, those of batches in any batch. Raises InputError where the folder holds
-    another campaign, another run is at work in it, or a batch cannot do what the plan asks for.
+    whoever makes them and in whatever order, those of batches in any batch; kinds of records take turns
+    (`interleaved`). Raises InputError where the folder holds another campaign, another run is at work in it, or a batch
+    cannot do what the plan asks for.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be >= 1, got {jobs}")
@@ -62,7 +63,7 @@ def run(
         rows = store.rows_of(plan, place)
         if retry:
             rows = {name: row for name, row in rows.items() if row.error is None}
-        waiting = [case for case in cases if case.id not in rows]
+        waiting = [case for case in interleaved(cases) if case.id not in rows]
         failures = sum(row.error is not None for row in rows.values())
         done = len(rows)
         if progress is not None:

@@ -5,6 +5,7 @@
 "volume balance, calibrated"    its score, the threshold from the plan's leak-free records
 "diagnose"                      the fused verdict of all registered detectors
 "diagnose @ pressures"          the same, given the channels of the view `pressures` alone
+"diagnose, quick"               the same verdict, by the detectors down to the one that judges
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
 
 DIAGNOSE = "diagnose"
-_OWN = ", own threshold"
+_OWN, _QUICK = ", own threshold", ", quick"
 #: name -> channels; the name "" stands for what detectors see that name no view.
 Views = Mapping[str, tuple[str, ...]]
 #: Channels that detectors see by default: all but the flow meter of the bypass, which is no part of the machine.
@@ -32,7 +33,8 @@ class PlanDetector:
     """One name of a plan's `detectors`, parsed.
 
     `of`: the scorer, the detector or `diagnose`; `own`: whether its verdict is by its own threshold; `detector`:
-    whether it is a registered detector or `diagnose`; `view`: the set of channels it sees, "" where none is named.
+    whether it is a registered detector or `diagnose`; `view`: the set of channels it sees, "" where none is named;
+    `quick`: whether it ends at the detector that judges (`diagnose(..., quick=True)`).
     """
 
     name: str
@@ -40,11 +42,13 @@ class PlanDetector:
     own: bool
     detector: bool
     view: str
+    quick: bool = False
 
     @property
     def key(self) -> str:
         """The name under which its statement is stored: the same for its own and for a calibrated threshold."""
-        return f"{self.of}{VIEW}{self.view}" if self.view else self.of
+        of = f"{self.of}{_QUICK}" if self.quick else self.of
+        return f"{of}{VIEW}{self.view}" if self.view else of
 
     @property
     def needs_calibration(self) -> bool:
@@ -60,7 +64,8 @@ def plan_detector(name: str) -> PlanDetector:
         return PlanDetector(name, base, False, False, view)
     if base.endswith(CALIBRATED):
         return PlanDetector(name, base.removesuffix(CALIBRATED), False, True, view)
-    return PlanDetector(name, base.removesuffix(_OWN), True, True, view)
+    quick = base == f"{DIAGNOSE}{_QUICK}"
+    return PlanDetector(name, base.removesuffix(_QUICK if quick else _OWN), True, True, view, quick)
 
 
 def check_detector(name: str, views: Views) -> None:

@@ -11,6 +11,8 @@ work-precision table that chose it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
@@ -27,7 +29,19 @@ from sealscope.physics.rig import (
     volumes_at,
     within_limits,
 )
-from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, Pressures, State, moved, pressures_moved, state_of
+from sealscope.physics.state import (
+    P_1,
+    P_2,
+    P_A,
+    P_B,
+    POSITION,
+    Pressures,
+    State,
+    moved,
+    pressures_moved,
+    state_of,
+    survey,
+)
 
 #: Nodes of the step at which the inputs are needed.
 IMEX_NODES = (0.0, 1 / 2, 83 / 250, 31 / 50, 17 / 20, 1.0)
@@ -160,3 +174,28 @@ def advance_imex(
         z = imex_step(z, h, volts, laminar, orifice, load, p)
     for m in range(len(z)):
         y[m] = z[m]
+
+
+@kernel
+def sampled_imex(
+    y: np.ndarray,
+    h: float,
+    u: np.ndarray,
+    G: np.ndarray,
+    C: np.ndarray,
+    F: np.ndarray,
+    p: RigNumbers,
+    every: int,
+    ahead: int,
+    apart: int,
+    rows: np.ndarray,
+) -> Iterator[tuple[int, tuple[bool, float, float]]]:
+    """Advance as `advance_imex`, and stop at each sample of a controller, as `rk4.sampled_rk4` does."""
+    first, last, n = 0, ahead, rows.shape[0]
+    while first < n:
+        last = min(last, n)
+        begin, end = first * every, last * every
+        load = F[begin:end] if F.shape[0] > 0 else F
+        advance_imex(y, h, u[: end - begin], G[begin:end], C[begin:end], load, p, every, rows[first:last])
+        yield last, survey(rows[first:last])
+        first, last = last, last + apart

@@ -5,11 +5,13 @@ Exact enough without throttles, unstable with them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.rig import RigNumbers, observe, rates, within_limits
-from sealscope.physics.state import State, moved, state_of
+from sealscope.physics.state import State, moved, state_of, survey
 
 #: Nodes of the step at which the inputs are needed.
 RK4_NODES = (0.0, 0.5, 1.0)
@@ -67,3 +69,36 @@ def advance_rk4(
         z = rk4_step(z, h, volts, laminar, orifice, load, p, euler_integral)
     for m in range(len(z)):
         y[m] = z[m]
+
+
+@kernel
+def sampled_rk4(
+    y: np.ndarray,
+    h: float,
+    u: np.ndarray,
+    G: np.ndarray,
+    C: np.ndarray,
+    F: np.ndarray,
+    p: RigNumbers,
+    euler_integral: bool,
+    every: int,
+    ahead: int,
+    apart: int,
+    rows: np.ndarray,
+) -> Iterator[tuple[int, tuple[bool, float, float]]]:
+    """Advance as `advance_rk4`, and stop at each sample of a controller: `ahead` outputs on, then every `apart`.
+
+    `u`: (apart every, 3) command, which the caller may change wherever this stops. Yields how many outputs there are,
+    and the `survey` of those since the stop before. One call for many samples: unpacking `p` takes longer than the
+    steps between two.
+    """
+    first, last, n = 0, ahead, rows.shape[0]
+    while first < n:
+        last = min(last, n)
+        begin, end = first * every, last * every
+        load = F[begin:end] if F.shape[0] > 0 else F
+        advance_rk4(
+            y, h, u[: end - begin], G[begin:end], C[begin:end], load, p, euler_integral, every, rows[first:last]
+        )
+        yield last, survey(rows[first:last])
+        first, last = last, last + apart
