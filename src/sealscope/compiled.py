@@ -28,9 +28,14 @@ from threading import Lock
 from typing import Any, TypeVar
 
 import numba
-from numba.core import config
+from numba.core import config, ir
 from numba.core.caching import FunctionCache
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import FunctionPass, register_pass
+from numba.core.ir_utils import get_definition, guard
 from numba.core.registry import CPUDispatcher
+from numba.core.types import BaseNamedTuple, BaseTuple
+from numba.core.untyped_passes import RewriteSemanticConstants
 from numba.extending import intrinsic
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -150,10 +155,66 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             _log.debug("cannot save compiled code in %s: %s", self.cache_path, error)
 
 
+@register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[untyped-decorator]
+class _SettledLaws(FunctionPass):  # type: ignore[misc]
+    """Replace len(p.law) by its number, `p` an argument that is a named tuple and `law` a field that is a tuple.
+
+    Branches on it are then settled before types are inferred, and a law that is absent is not even compiled.
+    """
+
+    _name = "sealscope_settled_laws"
+
+    def __init__(self) -> None:
+        FunctionPass.__init__(self)
+
+    def run_pass(self, state: Any) -> bool:
+        """Run the pass; True where it changed something."""
+        code, changed = state.func_ir, False
+
+        def definition(variable: Any) -> Any:
+            return guard(get_definition, code, variable)
+
+        def length(value: Any) -> int | None:
+            if getattr(value, "op", None) != "call" or len(value.args) != 1:
+                return None
+            field = definition(value.args[0])
+            if getattr(definition(value.func), "value", None) is not len or getattr(field, "op", None) != "getattr":
+                return None
+            numbers = definition(field.value)
+            kind = state.args[numbers.index] if isinstance(numbers, ir.Arg) else None
+            if not isinstance(kind, BaseNamedTuple) or field.attr not in kind.fields:
+                return None
+            law = kind.types[kind.fields.index(field.attr)]
+            return law.count if isinstance(law, BaseTuple) else None
+
+        for block in code.blocks.values():
+            for statement in block.body:
+                value = statement.value if isinstance(statement, ir.Assign) else None
+                count = length(value)
+                if count is not None:
+                    statement.value = ir.Const(count, statement.loc)
+                    known = code._definitions[statement.target.name]
+                    known[known.index(value)] = statement.value
+                    changed = True
+        return changed
+
+
+class _Compiler(CompilerBase):  # type: ignore[misc]
+    """numba's compiler, with `_SettledLaws`."""
+
+    def define_pipelines(self) -> list[Any]:
+        """Return the one pipeline."""
+        pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        pipeline.add_pass_after(_SettledLaws, RewriteSemanticConstants)
+        pipeline.finalize()
+        return [pipeline]
+
+
 def kernel(function: _F, fastmath: Any = False) -> _F:
     """Compile `function` (no Python objects, GIL released) with the safe cache; errors in floats follow IEEE 754."""
     directory = cache_directory()
-    dispatcher = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=fastmath)(function)
+    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "fastmath": fastmath}
+    dispatcher = numba.njit(pipeline_class=_Compiler, **options)(function)
     if directory is None:
         return dispatcher  # type: ignore[no-any-return]
     # numba reads the folder when the decorator runs; other users of numba in this process keep theirs. Two threads that
@@ -195,7 +256,7 @@ def _law(function: _F, fastmath: Any) -> _F:
         return function
     options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": True}
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return _Law(function, targetoptions=options)  # type: ignore[return-value]
+    return _Law(function, targetoptions=options, pipeline_class=_Compiler)  # type: ignore[return-value]
 
 
 def law(function: _F) -> _F:

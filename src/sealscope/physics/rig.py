@@ -104,7 +104,6 @@ PARAMETERS = {
 #: Choices that the laws take as truth values, each with the parameter and the value that stand for True; `made_up` is
 #: True with check valves of either kind.
 _CHOICES = {
-    "throttled": ("line.orifices", "present"),
     "position_dependent": ("cylinder.volumes", "position"),
     "coulomb_of_difference": ("friction.coulomb_pressure", "difference"),
     "literal_bracket": ("friction.bracket", "literal"),
@@ -120,13 +119,13 @@ DERIVED_FROM = (
 )
 #: The numbers of `RigNumbers`.
 NUMBERS = (*PARAMETERS, *DERIVED)
-#: Laws that most rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out. Air
-#: in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has bristles, that differs
-#: between the directions; check valves with pilots, relief valves, an accumulator that exchanges little heat; a damper,
-#: a load that changes with time (of a run, not of a rig); a servo valve between a supply and the cylinder; filters in
-#: the lines; losses of motor and pump beyond the linear ones; an opposing cylinder.
+#: Laws that some rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out.
+#: Throttles in the lines; air in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has
+#: bristles, that differs between the directions; check valves with pilots, relief valves, an accumulator that exchanges
+#: little heat; a damper, a load that changes with time (of a run, not of a rig); a servo valve between a supply and the
+#: cylinder; filters in the lines; losses of motor and pump beyond the linear ones; an opposing cylinder.
 LAWS = (
-    *("aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
+    *("throttled", "aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
     *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
     *("filtered", "lossy", "opposed"),
 )
@@ -139,11 +138,11 @@ if TYPE_CHECKING:
         """A rig's parameters as the compiled laws take them: SI floats, choices as truth values."""
 
         _fields: tuple[str, ...]
-        throttled: bool
         position_dependent: bool
         coulomb_of_difference: bool
         literal_bracket: bool
         made_up: bool
+        throttled: tuple[bool, ...]
         aerated: tuple[bool, ...]
         open_circuit: tuple[bool, ...]
         conserving: tuple[bool, ...]
@@ -243,6 +242,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
     choices["made_up"] = rig.makeup.check_valves != "absent"
     laws = {
+        "throttled": rig.line.orifices == "present",
         "aerated": rig.fluid.air > 0,
         "open_circuit": choices["made_up"] or rig.cylinder.G_ext_A > 0 or rig.cylinder.G_ext_B > 0,
         "conserving": rig.cylinder.volumes == "position" and rig.cylinder.balance == "mass",
@@ -277,7 +277,7 @@ def within_limits(y: State, p: RigNumbers) -> State:
     fed = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     z = y[BRISTLE] if len(p.bristled) > 0 else 0.0
     current = min(max(y[CURRENT], -p.i_max), p.i_max)
-    p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
+    p_1, p_2 = (y[P_1], y[P_2]) if len(p.throttled) > 0 else (y[P_A], y[P_B])
     x_s, v_s = 0.0, 0.0
     if len(p.valved) > 0:
         p_1, p_2 = y[P_1], p.p_return
@@ -296,7 +296,7 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 @contracted
 def pump_difference(y: State, p: RigNumbers) -> float:
     """Pressure difference [Pa] between the ports of the pump."""
-    if p.throttled or len(p.valved) > 0:
+    if len(p.throttled) > 0 or len(p.valved) > 0:
         return y[P_1] - y[P_2]
     return y[P_A] - y[P_B]
 
@@ -402,7 +402,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     At the pump's ports, or at the chambers without lines. The pilot of a side's check valve is the other side.
     """
     supply = supply_pressure(y, p)
-    p_1, p_2 = (y[P_1], y[P_2]) if p.throttled else (y[P_A], y[P_B])
+    p_1, p_2 = (y[P_1], y[P_2]) if len(p.throttled) > 0 else (y[P_A], y[P_B])
     if len(p.piloted) > 0:
         up_1 = pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
         up_2 = pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
@@ -427,10 +427,10 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     up_1, up_2 = make_up_flows(y, p)
     out_A, out_B = external_leakage(y[P_A], p.G_ext_A), external_leakage(y[P_B], p.G_ext_B)
     supply = supply_pressure(y, p)
-    given_1, up_1 = volumes_exchanged(up_1, supply, y[P_1] if p.throttled else y[P_A], p)
-    given_2, up_2 = volumes_exchanged(up_2, supply, y[P_2] if p.throttled else y[P_B], p)
+    given_1, up_1 = volumes_exchanged(up_1, supply, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
+    given_2, up_2 = volumes_exchanged(up_2, supply, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
     fed = given_1 + given_2
-    if p.throttled:
+    if len(p.throttled) > 0:
         rate_1 = pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
         return (-pressure_rate(out_A, V_A, K_A), -pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
@@ -516,7 +516,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
     from_A, to_B = volumes_exchanged(Q_L, p_A, p_B, p)
-    if p.throttled:
+    if len(p.throttled) > 0:
         from_2, to_1 = volumes_exchanged(Q_1, y[P_2], y[P_1], p)
         rate_A = pressure_rate(-p.A_A * v - from_A, V_A, K_A)
         rate_B = pressure_rate(p.A_B * v + to_B, V_B, K_B)
@@ -548,7 +548,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
 def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
     """dy/dt of the whole rig."""
     dy = rates_without_throttles(y, u, G, C, F, p)
-    if p.throttled:
+    if len(p.throttled) > 0:
         Q_A, Q_B = throttle_flows(y, p)
         dy = pressures_moved(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))
     return dy
@@ -564,7 +564,7 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     if len(p.lossy) > 0:
         Q_1 = Q_1 - turbulent_slip(dp_pump, p.c_slip, p.dp_0)
-    Q_A, Q_B = throttle_flows(y, p) if p.throttled else (Q_1, Q_1)
+    Q_A, Q_B = throttle_flows(y, p) if len(p.throttled) > 0 else (Q_1, Q_1)
     if len(p.valved) > 0:
         Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
         Q_A, Q_B = Q_PA - Q_AT, Q_BT - Q_PB

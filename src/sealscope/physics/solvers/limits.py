@@ -52,7 +52,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     """
     ends = _end_volumes(p)
     chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
-    ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if p.throttled else chambers
+    ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if len(p.throttled) > 0 else chambers
     B_M, G_pump = p.B_M, p.G_pump
     if len(p.lossy) > 0:  # friction at standstill, under the largest torque of the motor; slip at no pressure
         B_M += (p.T_f + p.C_f * p.C_m * p.i_max) / p.omega_f

@@ -119,7 +119,7 @@ def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> A
     flow = flow + abs(piston_leakage(z[P_A] - z[P_B], leak[4] * share, leak[5] * share, q.dp_0))
     least = min(least, z[P_A])
     least = min(least, z[P_B])
-    if q.throttled:
+    if len(q.throttled) > 0:
         least = min(least, z[P_1])
         least = min(least, z[P_2])
     total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]
