@@ -1,10 +1,11 @@
 """Intervals of `sealscope identify` on simulated rigs that it does not know: how often they hold the truth.
 
-    python benchmarks/identification.py [--rigs 30] [--seed 28] [--base thesis-closed-loop]
+    python benchmarks/identification.py [--rigs 30] [--seed 28] [--base thesis-closed-loop] [-o FILE]
 
 Each rig is the base with areas, bulk modulus, pump leakage, friction, load and speed loop of its own (behind a servo
 valve: rated flow and overlaps in place of areas and speed loop), recorded twice for 60 s: a closed loop over a
-multi-sine whose controller knows the base, with and without a load that swings.
+multi-sine whose controller knows the base, with and without a load that swings. With `-o FILE` each rig is a line of
+JSON there, and rigs that the file has are not run again. A rig that cannot be run (a pressure below vacuum) is counted.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from sealscope.control.identification import identify
+from sealscope.errors import SimulationFailed
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth
@@ -93,10 +95,22 @@ def main() -> None:
     parser.add_argument("--base", default="thesis-closed-loop")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
-    rows = [judged((options.base, number, options.seed)) for number in range(options.rigs)]
+    lines = (
+        options.output.read_text(encoding="utf-8").splitlines() if options.output and options.output.exists() else []
+    )
+    results = [json.loads(line) for line in lines]
+    for number in range(len(results), options.rigs):
+        try:
+            results.append(judged((options.base, number, options.seed)))
+        except SimulationFailed as failure:
+            results.append(str(failure))
+        if options.output:
+            with options.output.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(results[-1]) + "\n")
+    rows = [result for result in results if isinstance(result, dict)]
     names = sorted({name for row in rows for name in row})
     total = held = 0
-    print(f"{options.base}, {options.rigs} rigs")
+    print(f"{options.base}, {len(rows)} rigs, {len(results) - len(rows)} that could not be run")
     for name in names:
         of = [row[name] for row in rows if name in row]
         inside = sum(r["low"] <= r["truth"] <= r["high"] for r in of)
@@ -106,8 +120,6 @@ def main() -> None:
         bias = np.mean([(r["value"] - r["truth"]) / max(0.25 * (r["high"] - r["low"]), 1e-300) for r in of])
         print(f"{name:22} {inside:3}/{len(of):<3} +-{width:.3g} (median error {error:.3g}, mean z {bias:.2f})")
     print(f"all: {held}/{total} = {100 * held / max(1, total):.1f} %")
-    if options.output:
-        options.output.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

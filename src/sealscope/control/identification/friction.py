@@ -21,6 +21,8 @@ _ROW, _LAGS, _FEWEST, _SLIDES = 0.1, 20, 60, 2.0
 _LOADED = 0.5
 #: Least ratio of the highest to the lowest speed.
 _SPREAD = 2.0
+#: Rows ring whose forces scatter by so many times that of the calmest tenth of them.
+_RINGS = 1.5
 
 
 def friction(recordings: Sequence[Recording], rig: Rig, area_A: float, area_B: float) -> tuple[Estimate, ...] | str:
@@ -28,6 +30,8 @@ def friction(recordings: Sequence[Recording], rig: Rig, area_A: float, area_B: f
 
     A_A p_A - A_B p_B - M a = F_l + sign(v) (F_pr + F_cfr (p_A + p_B)) (1 + (K_brk - 1) exp(-C_c |v|)) + F_v v
     (eqs. (4.20), (4.21)) over rows in which the piston slides; F_cfr, C_c, M_eq are the rig's as stated. Areas in m^2.
+    Where friction falls with speed a piston rings, and the mean of its friction is not that of its mean speed: rows in
+    which the forces scatter by more than their noise are left out.
     """
     if rig.cylinder.A_opp > 0:
         return "friction is not told from the force of an opposing cylinder (cylinder.A_opp > 0)"
@@ -76,9 +80,20 @@ def _rows(recording: Recording, rig: Rig, area_A: float, area_B: float) -> Array
     at = np.arange(n + 1) * step
     v = np.diff(smooth[at]) * rate / step
     a = np.gradient(v) * rate / step
-    p_A, p_B = (recording[name][: n * step].reshape(n, step).mean(axis=1) for name in ("p_A", "p_B"))
+    sides = [recording[name][: n * step].reshape(n, step) for name in ("p_A", "p_B")]
+    p_A, p_B = (side.mean(axis=1) for side in sides)
     force = area_A * p_A - area_B * p_B - rig.cylinder.M_eq * a
+    scatter = _scatter(area_A * sides[0] - area_B * sides[1])
     rows = np.stack([force, v, p_A + p_B], axis=1)[1:-1]
     steady = (np.sign(v[:-2]) == np.sign(v[1:-1])) & (np.sign(v[2:]) == np.sign(v[1:-1]))
     calm = np.abs(a[1:-1]) < 0.5 * np.abs(v[1:-1]) / _ROW
-    return np.asarray(rows[steady & calm & np.isfinite(rows).all(axis=1)])
+    even = (scatter <= _RINGS * np.nanquantile(scatter, 0.1))[1:-1]
+    return np.asarray(rows[steady & calm & even & np.isfinite(rows).all(axis=1)])
+
+
+def _scatter(rows: Array) -> Array:
+    """Return the standard deviation of each row's samples (n, m) from a straight line of its own: (n,)."""
+    line = np.linspace(-1.0, 1.0, rows.shape[1])
+    rest = rows - rows.mean(axis=1, keepdims=True)
+    rest = rest - (rest @ line)[:, None] / (line @ line) * line
+    return np.asarray(rest.std(axis=1))
