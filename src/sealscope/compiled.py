@@ -28,13 +28,13 @@ from threading import Lock
 from typing import Any, TypeVar
 
 import numba
+from numba import types
 from numba.core import config, ir
 from numba.core.caching import FunctionCache
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.ir_utils import get_definition, guard
 from numba.core.registry import CPUDispatcher
-from numba.core.types import BaseNamedTuple, BaseTuple
 from numba.core.untyped_passes import RewriteSemanticConstants
 from numba.extending import intrinsic
 
@@ -182,10 +182,10 @@ class _SettledLaws(FunctionPass):  # type: ignore[misc]
                 return None
             numbers = definition(field.value)
             kind = state.args[numbers.index] if isinstance(numbers, ir.Arg) else None
-            if not isinstance(kind, BaseNamedTuple) or field.attr not in kind.fields:
+            if not isinstance(kind, types.BaseNamedTuple) or field.attr not in kind.fields:
                 return None
             law = kind.types[kind.fields.index(field.attr)]
-            return law.count if isinstance(law, BaseTuple) else None
+            return law.count if isinstance(law, types.BaseTuple) else None
 
         for block in code.blocks.values():
             for statement in block.body:

@@ -1,4 +1,4 @@
-"""Oil and energy: nothing appears, nothing is lost."""
+"""Oil of the closed circuit: nothing appears, nothing is lost (energy: `test_variants.py`)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import simpson
-
-PUMP_LEAK = 4e-13
 
 
 def oil(rig, run) -> np.ndarray:
@@ -125,67 +123,3 @@ def test_the_mass_of_oil_with_air_is_kept(check_rig, drive):
     volumes = {"p_A": c.V + c.A_A * run["x"], "p_B": c.V - c.A_B * run["x"], "p_1": rig.line.V_1, "p_2": rig.line.V_2}
     held = sum(volume * np.exp(np.interp(run[name], p, log_density)) for name, volume in volumes.items())
     assert np.abs(held - held[0]).max() <= 1e-6 * held[0]
-
-
-def energy_terms(rig, run, G: float, C: float) -> dict[str, float]:
-    """Energies [J] of a run: what came in through the wires, what each place lost, what is stored more than before."""
-    m, c, f, K = rig.motor, rig.cylinder, rig.friction, rig.fluid.K_oil
-    i, w, v = run["i"], run["omega"], run["v"]
-    p_A, p_B, p_1, p_2 = (run[name] for name in ("p_A", "p_B", "p_1", "p_2"))
-
-    def total(power: np.ndarray) -> float:
-        return float(simpson(power, x=run.t))
-
-    def gained(energy: np.ndarray) -> float:
-        return float(energy[-1] - energy[0])
-
-    speed = np.abs(v)
-    F_C = f.F_pr + f.F_cfr * (p_A + p_B)
-    running = F_C * (1 + (f.K_brk - 1) * np.exp(-f.C_c * speed)) + f.F_v * speed
-    standing = speed / f.v_th * (F_C * (1 + (f.K_brk - 1) * np.exp(-f.C_c * f.v_th)) + f.F_v * f.v_th)
-    dp = p_A - p_B
-    stored = 0.5 * c.V * (p_A**2 + p_B**2) / K
-    terms = {
-        "wires": total(run["V"] * i),
-        "copper": total(m.R_c * i**2),
-        "motor and pump, viscous": total(m.B_M * w**2),
-        "pump leakage": total(rig.pump.G_pump * (p_1 - p_2) ** 2),
-        "piston leakage": total(dp * (G * dp + C * dp / (dp**2 + rig.line.dp_0**2) ** 0.25)),
-        "friction": total(np.where(speed > f.v_th, running, standing) * speed),
-        "load": total(c.F_l * v),
-        "winding": gained(0.5 * m.L_c * i**2),
-        "rotor": gained(0.5 * m.J_M * w**2),
-        "piston": gained(0.5 * c.M_eq * v**2),
-    }
-    if rig.line.orifices == "present":
-        stored = stored + 0.5 * (rig.line.V_1 * p_1**2 + rig.line.V_2 * p_2**2) / K
-        terms["throttles"] = total(run["Q_A"] * (p_1 - p_A) + run["Q_B"] * (p_B - p_2))
-    return {**terms, "oil": gained(stored)}
-
-
-@pytest.mark.parametrize(
-    ("throttled", "values", "G", "C"),
-    [
-        (False, {}, 0.0, 0.0),
-        (False, {"G_pump": PUMP_LEAK, "F_l": 20.0}, 6e-13, 2e-10),
-        (True, {}, 0.0, 0.0),
-        (True, {"G_pump": PUMP_LEAK, "closed_A": 0.75, "metering": "literal"}, 6e-13, 2e-10),
-    ],
-    ids=["free", "free, leaks and load", "throttled", "throttled, literal, leaks"],
-)
-def test_what_the_wires_bring_is_found_again(check_rig, drive, throttled, values, G, C):
-    rig = check_rig(throttled, **values)
-    assert rig.motor.C_e == rig.motor.C_m  # else the motor itself makes or eats energy
-    step = 1e-5
-    run = drive(rig, 2.0 + step, G=G, C=C, rate=1 / step, step=step)
-    terms = energy_terms(rig, run, G, C)
-    came = terms.pop("wires")
-    assert came > 0.5
-    assert sum(terms.values()) == pytest.approx(came, rel=1e-6), terms
-    for name in ("copper", "friction", "motor and pump, viscous"):
-        assert terms[name] > 1e-3 * came
-    if G:
-        assert terms["pump leakage"] > 1e-4 * came
-        assert terms["piston leakage"] > 1e-4 * came
-    if throttled:
-        assert terms["throttles"] > 1e-5 * came  # seen by the tolerance
