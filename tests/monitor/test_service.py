@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy.exc import DataError, OperationalError
 
 from sealscope.errors import InputError
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.memory.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import TEMPLATE, read_settings
@@ -241,8 +241,10 @@ def test_a_state_of_another_version_begins_a_new_baseline(tmp_path, caplog):
     before = [row for row in rows_of(settings.database)["estimates"] if row[0] == "press 1"]
     learned_with, state, _ = service.store.checkpoint("press 1")
     state["watch"] = {"version": 1, "baseline_version": 3, "what it was": []}
+    rows = StoredRows()
+    rows.add_checkpoint("press 1", learned_with, state)
     with service.store.writing() as connection:
-        service.store.keep_checkpoint(connection, "press 1", learned_with, state, {})
+        service.store.keep_rows(connection, rows)
     again = Service(settings, once=True)
     again._hold.close()
     assert "press 1: its state has version 1, not 4, begins anew" in caplog.text
@@ -264,11 +266,16 @@ def test_other_settings_begin_a_new_baseline(tmp_path):
 
 
 def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
-    """Another rate, as where an actuator is added to a budget, moves thresholds only; old tables get their column."""
+    """Another rate, as where an actuator is added to a budget, moves thresholds only; old tables are taken over."""
     settings = settings_in(tmp_path)
     service, _ = served(settings, LINES)
+    shown = service.actuators.plain()
     with service.store.writing() as connection:
         connection.exec_driver_sql("ALTER TABLE estimates DROP COLUMN oil_celsius")
+        connection.exec_driver_sql("ALTER TABLE actuators ADD COLUMN summary TEXT NOT NULL DEFAULT ''")
+        of = "SELECT summary FROM summaries WHERE summaries.actuator = actuators.actuator"
+        connection.exec_driver_sql(f"UPDATE actuators SET summary = ({of})")
+        connection.exec_driver_sql("DELETE FROM summaries")
         connection.exec_driver_sql("UPDATE facts SET value = '1' WHERE name = 'schema'")
     before = service.actuators._actuators["press 1"].watch.baseline
     assert before is not None
@@ -283,6 +290,8 @@ def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
     _, state, pending = again.store.checkpoint("press 1")
     assert (state["watch"]["false_alarms_per_1000_h"], pending) == (0.001, [])
     assert "oil_celsius" in next(again.store.estimates())
+    assert len(shown) == 2
+    assert again.actuators.plain() == shown
 
 
 def test_old_estimates_and_identities_are_forgotten(tmp_path, monkeypatch):

@@ -126,8 +126,10 @@ class WatchedActuators:
     def _begun_anew(self, actuator: _Actuator) -> _Actuator:
         """Return an actuator whose watch was changed by the settings, its state stored."""
         actuator.taken = self.store.blocks_kept(actuator.settings.name)
+        rows = StoredRows()
+        self._checkpoint(actuator, rows)
         with self.store.writing() as connection:
-            self._checkpoint(connection, actuator, StoredRows())
+            self.store.keep_rows(connection, rows)
         return actuator
 
     def count(self, reason: str, number: int = 1) -> None:
@@ -276,13 +278,10 @@ class WatchedActuators:
         actuator.bytes += bytes_of(samples)
         turn = (actuator.taken + zlib.crc32(name.encode())) % PENDING_BLOCKS  # not all actuators at the same instant
         if turn == 0 or actuator.bytes >= PENDING_BYTES:
-            rows.checkpoint(name)
-            self._checkpoint(connection, actuator, rows)
+            self._checkpoint(actuator, rows)
         else:
             rows.add_pending(name, actuator.pending, samples, block.follows)
-            summary = self._summary(actuator)
-            if summary != actuator.shown:
-                rows.summaries[name] = actuator.shown = summary
+            self._show(actuator, rows)
         return estimates
 
     @staticmethod
@@ -302,17 +301,23 @@ class WatchedActuators:
             actuator.last = estimates[-1]
         return estimates, happened
 
-    def _checkpoint(self, connection: Any, actuator: _Actuator, rows: StoredRows) -> None:
-        """Store the state; what is old then goes with the rows."""
+    def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
+        """Add the state to the rows, and what is old then."""
         last = None if actuator.last is None else asdict(actuator.last)
         parts = {"watch": actuator.watch.state(), "judge": actuator.judge.state(), "last": last}
         state: dict[str, Any] = {**parts, "oil_celsius": actuator.oil_celsius}
         settings = actuator.settings
-        actuator.shown = self._summary(actuator)
-        self.store.keep_checkpoint(connection, settings.name, settings.learned_with, state, actuator.shown)
+        rows.add_checkpoint(settings.name, settings.learned_with, state)
+        self._show(actuator, rows)
         kept = self._keep_s / actuator.watch.block_seconds
         rows.old[settings.name] = actuator.taken - KEPT_IDENTITIES, math.floor(actuator.watch.blocks - kept)
         actuator.pending = actuator.bytes = 0
+
+    def _show(self, actuator: _Actuator, rows: StoredRows) -> None:
+        """Add what an actuator shows to the rows, where it has changed."""
+        summary = self._summary(actuator)
+        if summary != actuator.shown:
+            rows.summaries[actuator.settings.name] = actuator.shown = summary
 
     @staticmethod
     def _summary(actuator: _Actuator) -> dict[str, Any]:
@@ -371,7 +376,7 @@ class WatchedActuators:
                     self.store.keep_alarm(connection, alarm)
                     self.store.keep_event(connection, alarm, mark, at, by_whom, text)
                     rows = StoredRows()
-                    self._checkpoint(connection, actuator, rows)
+                    self._checkpoint(actuator, rows)
                     self.store.keep_rows(connection, rows)
             except InputError:
                 raise

@@ -17,6 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.volume_balance.rests import in_motion
+from sealscope.diagnosis.volume_balance.sums import (
+    ABS_DP,
+    ABS_FLOW,
+    FILLED,
+    LIFT,
+    MOTION,
+    NOISE,
+    ROOT_DP,
+    SWINGING,
+    WALK,
+    beyond_pressure,
+    block_means,
+    volume_columns,
+)
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
@@ -84,8 +98,8 @@ class BalanceBlocks:
     def __len__(self) -> int:
         return int(self.t.size)
 
-    def chosen(self, which: Array | np.ndarray) -> BalanceBlocks:
-        """Return the blocks of an index or mask."""
+    def chosen(self, which: Array | np.ndarray | slice) -> BalanceBlocks:
+        """Return the blocks of an index, mask or slice."""
         arrays = {name: getattr(self, name)[which] for name in _ARRAYS}
         return BalanceBlocks(**arrays, samples=self.samples, seconds=self.seconds)
 
@@ -166,7 +180,7 @@ def _information(dp: Array, length: int) -> float:
     count = dp.size // length
     rows = np.nan_to_num(dp[: count * length]).reshape(count, length)
     columns = np.stack([rows, _integral(rows, 1.0)], axis=1)
-    return float(np.sum(_beyond(columns[:, 1:], columns[:, 0], 1.0).rest ** 2))
+    return float(np.sum(beyond_pressure(_plain(columns[:, 1:]), _plain(columns[:, 0]), 1.0)[0] ** 2))
 
 
 def _integral(rows: Array, step: float) -> Array:
@@ -189,22 +203,14 @@ class _Beyond(NamedTuple):
     along: Array
 
 
-def _beyond(columns: Array, dp: Array, step: float) -> _Beyond:
-    """Return what offset, slope and dp leave of columns (n, c, L)."""
-    length = dp.shape[1]
-    tau = (np.arange(length) - 0.5 * (length - 1)) * step
-    tau2 = float(tau @ tau)
-    tiny = np.finfo(float).tiny
-    dp = dp - dp.mean(axis=1, keepdims=True)
-    tilt = dp @ tau / tau2
-    along = tilt * tau2 / np.maximum(np.sum(dp**2, axis=1), tiny)
-    dp = dp - tilt[:, None] * tau
-    rest = columns - columns.mean(axis=2, keepdims=True)
-    slope = rest @ tau / tau2
-    rest -= slope[:, :, None] * tau
-    stored = np.einsum("ncl,nl->nc", rest, dp) / np.maximum(np.sum(dp**2, axis=1), tiny)[:, None]
-    rest -= stored[:, :, None] * dp[:, None, :]
-    return _Beyond(rest, slope - stored * tilt[:, None], stored, tau2 * (1.0 - tilt * along), along)
+def _plain(values: Array) -> Array:
+    """Return values as compiled functions take them: in one piece, and not read-only."""
+    return np.require(values, np.float64, ("C", "W"))
+
+
+def _half(size: int, rate: float) -> int:
+    """Return the samples to either side over which dp and flow of rows of `size` samples are smoothed."""
+    return min(2 * round(0.5 * SMOOTH_SECONDS * rate) + 1, size - 1) // 2
 
 
 def _smooth(rows: Array, samples: int) -> Array:
@@ -219,17 +225,6 @@ def _smooth(rows: Array, samples: int) -> Array:
 def _noise(rows: Array) -> Array:
     """Return the variance (n,) of white noise in rows of slow signals (n, L): that of the second differences over 6."""
     return np.asarray(np.mean(np.diff(rows, 2, axis=1) ** 2, axis=1) / 6.0)
-
-
-def _walk(integral: Array, step: float) -> Array:
-    """Return the relative variance (n,) of a conductance from noise of dp of unit variance.
-
-    The integral sums the noise up to a random walk: sum_t I_t sum_{j <= t} noise_j step / sum_t I_t^2 has the variance
-    step^2 sum_j (sum_{t >= j} I_t)^2 / (sum_t I_t^2)^2.
-    """
-    reach = np.cumsum(integral[:, ::-1], axis=1)
-    own = np.maximum(np.sum(integral**2, axis=1), np.finfo(float).tiny)
-    return np.asarray(step**2 * np.sum(reach**2, axis=1) / own**2)
 
 
 @dataclass(frozen=True)
@@ -261,29 +256,21 @@ class Geometry:
 def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple[Array, Array, Array]:
     """Return the columns (n, c, L) of samples `rows` (n, L) of the `balance_channels`, dp, and dp smoothed (n, L)."""
     step = 1.0 / rate
-    if "theta" in rows:
-        theta = rows["theta"] * geometry.displacement
-        flow = np.gradient(theta, step, axis=1)
-    else:
-        flow = rows["omega"] * geometry.displacement
-        theta = _integral(flow, step)
-    dp = rows["p_A"] - rows["p_B"]
+    by_angle = "theta" in rows
+    turned = rows["theta" if by_angle else "omega"] * geometry.displacement
+    dp = _plain(rows["p_A"] - rows["p_B"])
     # the mean of a root is not the root of the mean: noise would pass for a smaller root near zero
-    width = 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1
-    smooth = _smooth(dp, width)
-    root = np.sign(smooth) * np.sqrt(np.abs(smooth))
-    y = rows["x"] * geometry.area
-    moved = np.diff(y, axis=1, prepend=y[:, :1])
-    by_pump, by_side = (np.cumsum(np.sign(of) * moved, axis=1) for of in (_smooth(flow, width), smooth))
-    columns = [y, theta, flow, _integral(dp, step), _integral(root, step), by_pump, by_side]
+    half = _half(dp.shape[1], rate)
+    common, smooth = volume_columns(_plain(rows["x"] * geometry.area), _plain(turned), by_angle, dp, step, half)
+    more: list[Array] = []
     if "p_1" in rows:
         dp_12 = rows["p_1"] - rows["p_2"]
-        columns += [dp_12, _integral(dp_12, step)]
+        more += [dp_12, _integral(dp_12, step)]
     if geometry.unequal:
-        columns += [] if "p_1" in rows else [np.zeros_like(dp)] * 2
-        columns += _stored(rows, smooth > 0.0)
-        return _under_load(np.stack(columns, axis=1), dp, smooth)
-    return np.stack(columns, axis=1), dp, smooth
+        more += [] if "p_1" in rows else [np.zeros_like(dp)] * 2
+        more += _stored(rows, smooth > 0.0)
+    columns = np.concatenate([common, np.stack(more, axis=1)], axis=1) if more else common
+    return _under_load(columns, dp, smooth) if geometry.unequal else (columns, dp, smooth)
 
 
 def _under_load(columns: Array, dp: Array, smooth: Array) -> tuple[Array, Array, Array]:
@@ -328,17 +315,6 @@ def _shown(columns: Array, beyond: _Beyond) -> _Beyond:
         hidden = np.var(rest[:, column], axis=1) <= _MORE_THAN_NOISE * _noise(columns[:, column])
         rest[hidden, column], slope[hidden, column], stored[hidden, column] = 0.0, 0.0, 0.0
     return beyond._replace(rest=rest, slope=slope, stored=stored)
-
-
-def _swinging(x: Array, dp: Array, smooth: Array) -> Array:
-    """Return the share (n,) of the way x (n, L) gone while dp has another sign than its means over `SMOOTH_SECONDS`.
-
-    On a single rod the higher pressure says whose area moves oil. Noise changes the sign near zero, and is passed
-    quickly; a circuit that swings between its valves changes it faster than the samples, or their means, can tell.
-    """
-    way = np.abs(np.gradient(x, axis=1))
-    other = np.sum(way * (np.sign(dp) != np.sign(smooth)), axis=1)
-    return np.asarray(other / np.maximum(way.sum(axis=1), np.finfo(float).tiny))
 
 
 def _passed_over(
@@ -409,17 +385,17 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
     usable &= np.all(np.isfinite(times), axis=1) & np.all((spacing > 0.5) & (spacing < 1.5), axis=1)
     cut = {name: values[usable] for name, values in cut.items()}
     columns, dp, smooth = volumes(cut, rate, geometry)
-    beyond = _beyond(columns, dp, step)
+    columns, dp = _plain(columns), _plain(dp)
+    beyond = _Beyond(*beyond_pressure(columns, dp, step))
     if columns.shape[1] > STORED_B:
         beyond = _shown(columns, beyond)
     rest = beyond.rest
-    noise, root = _noise(dp), np.sqrt(np.abs(smooth)).mean(axis=1)
-    abs_dp, root_dp = np.abs(smooth).mean(axis=1), root
-    abs_flow = np.abs(_smooth(columns[:, FLOW], 2 * round(0.5 * SMOOTH_SECONDS * rate) + 1)).mean(axis=1)
+    y, flow, integral = (_plain(values) for values in (columns[:, Y], columns[:, FLOW], rest[:, I_AB]))
+    means = block_means(y, flow, integral, dp, _plain(smooth), cut["p_A"] + cut["p_B"], step, _half(length, rate))
+    abs_dp, root_dp, abs_flow = means[ABS_DP], means[ROOT_DP], means[ABS_FLOW]
     if motion is not None:
         abs_flow = abs_flow * float(np.mean(motion[0]))
         abs_dp, root_dp = _over_rests(everything, *motion, length, rate)[:, :count][:, usable]
-    x, both, tenth = columns[:, Y], cut["p_A"] + cut["p_B"], max(1, length // 10)
     return BalanceBlocks(
         t=times[usable].mean(axis=1),
         gram=rest @ rest.transpose(0, 2, 1),
@@ -428,13 +404,13 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
         abs_dp=abs_dp,
         root_dp=root_dp,
         abs_flow=abs_flow,
-        lift=np.sqrt(np.abs(dp)).mean(axis=1) / np.maximum(root, np.finfo(float).tiny) - 1.0,
-        motion=np.sum(0.5 * (dp[:, 1:] + dp[:, :-1]) * np.diff(x, axis=1), axis=1) / (length * step),
-        walk=noise * _walk(rest[:, I_AB], step),
-        swinging=_swinging(x, dp, smooth),
-        filled=both[:, -tenth:].mean(axis=1) - both[:, :tenth].mean(axis=1),
-        noise=noise,
-        noise_12=_noise(columns[:, DP_12]) if "p_1" in cut else np.zeros_like(noise),
+        lift=means[LIFT],
+        motion=means[MOTION],
+        walk=means[WALK],
+        swinging=means[SWINGING],
+        filled=means[FILLED],
+        noise=means[NOISE],
+        noise_12=_noise(columns[:, DP_12]) if "p_1" in cut else np.zeros_like(abs_dp),
         steady=beyond.steady,
         along=beyond.along,
         samples=length,

@@ -29,6 +29,14 @@ PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 KEPT_IDENTITIES = 100_000
 #: How often the tables are tried to be made where several monitors begin at once.
 _ATTEMPTS = 10
+#: What makes tables of a version those of the next.
+_CHANGES = {
+    "1": ("alter table estimates add column oil_celsius double precision",),
+    "2": (
+        "insert into summaries select actuator, summary from actuators",
+        "alter table actuators drop column summary",
+    ),
+}
 _ESTIMATES = (
     "total_lpm",
     "total_low_lpm",
@@ -44,11 +52,13 @@ _ESTIMATES = (
 class StoredRows:
     """Rows that blocks add to the tables beside themselves, gathered to be stored at once.
 
-    By actuator: `summaries`, and `old`, the numbers up to which blocks and estimates are deleted.
+    By actuator: `checkpoints`, settings and state; `summaries`; and `old`, the numbers up to which blocks and estimates
+    are deleted.
     """
 
     estimates: list[dict[str, Any]] = field(default_factory=list)
     pending: list[dict[str, Any]] = field(default_factory=list)
+    checkpoints: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)
     summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
     old: dict[str, tuple[int, int]] = field(default_factory=dict)
 
@@ -69,10 +79,10 @@ class StoredRows:
         """Add samples that a restart goes through once more after the checkpoint."""
         self.pending.append({"actuator": actuator, "number": number, "samples": packed(samples, follows)})
 
-    def checkpoint(self, actuator: str) -> None:
-        """Leave out what a checkpoint of an actuator makes needless."""
+    def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
+        """Add the state of an actuator, which takes the place of the samples since the last one."""
         self.pending = [row for row in self.pending if row["actuator"] != actuator]
-        self.summaries.pop(actuator, None)
+        self.checkpoints[actuator] = settings, state
 
 
 class MonitorStore:
@@ -115,13 +125,15 @@ class MonitorStore:
         with self.engine.begin() as connection:
             self.tables.metadata.create_all(connection)
             facts = self.tables.facts
-            known = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
+            version = facts.c.name == "schema"
+            known = connection.execute(select(facts.c.value).where(version)).scalar()
             if known is None:
                 connection.execute(facts.insert().values(name="schema", value=str(self.tables.SCHEMA)))
-            if known == "1":
-                connection.execute(text("ALTER TABLE estimates ADD COLUMN oil_celsius DOUBLE PRECISION"))
-                known = str(self.tables.SCHEMA)
-                connection.execute(facts.update().where(facts.c.name == "schema").values(value=known))
+            while known in _CHANGES:
+                for change in _CHANGES[known]:
+                    connection.execute(text(change))
+                known = str(int(known) + 1)
+                connection.execute(facts.update().where(version).values(value=known))
         return None if known is None else str(known)
 
     @contextmanager
@@ -160,21 +172,42 @@ class MonitorStore:
 
     def keep_rows(self, connection: Connection, rows: StoredRows) -> None:
         """Store the rows of blocks, each table's at once."""
-        from sqlalchemy import bindparam
+        from sqlalchemy import String, bindparam
 
-        tables = self.tables
+        tables, of = self.tables, bindparam("of", type_=String)
+        states = {
+            name: {"settings": settings, "checkpoint": json.dumps(state, allow_nan=False)}
+            for name, (settings, state) in rows.checkpoints.items()
+        }
+        if states:
+            before = tables.pending.delete().where(tables.pending.c.actuator == of)
+            connection.execute(before, [{"of": name} for name in states])
         for table, values in (
             (tables.estimates, rows.estimates),
             (tables.pending, rows.pending),
         ):
             if values:
                 connection.execute(table.insert(), values)
-        if rows.summaries:
-            statement = tables.actuators.update().where(tables.actuators.c.actuator == bindparam("of"))
-            shown = [{"of": name, "summary": json.dumps(summary)} for name, summary in rows.summaries.items()]
-            connection.execute(statement.values(summary=bindparam("summary")), shown)
-        for name, (block, estimate) in rows.old.items():
-            self._forget(connection, name, block, estimate)
+        self._put_all(connection, tables.actuators, states)
+        shown = {name: {"summary": json.dumps(summary)} for name, summary in rows.summaries.items()}
+        self._put_all(connection, tables.summaries, shown)
+        for table, place in ((tables.blocks, 0), (tables.estimates, 1)):
+            old = [{"of": name, "last": numbers[place]} for name, numbers in rows.old.items() if numbers[place] > 0]
+            if old:
+                chosen = (table.c.actuator == of) & (table.c.number <= bindparam("last"))
+                connection.execute(table.delete().where(chosen), old)
+
+    def _put_all(self, connection: Connection, table: Table, values: dict[str, dict[str, Any]]) -> None:
+        """Change the rows of actuators, or insert those that are missing."""
+        from sqlalchemy import bindparam
+
+        if not values:
+            return
+        statement = table.update().where(table.c.actuator == bindparam("of"))
+        changed = connection.execute(statement, [{"of": name, **row} for name, row in values.items()])
+        if changed.rowcount != len(values):
+            for name, row in values.items():
+                self.put(connection, table, {"actuator": name}, row)
 
     def blocks_kept(self, actuator: str) -> int:
         """Return the number of the last block of an actuator."""
@@ -190,15 +223,6 @@ class MonitorStore:
         with self.engine.connect() as connection:
             query = select(func.max(table.c.number)).where(table.c.actuator == actuator)
             return int(connection.execute(query).scalar() or 0)
-
-    def _forget(self, connection: Connection, actuator: str, block: int, estimate: int) -> None:
-        """Delete the identities up to the number `block`, and the estimates up to the number `estimate`."""
-        blocks, estimates = self.tables.blocks, self.tables.estimates
-        if block > 0:
-            connection.execute(blocks.delete().where(blocks.c.actuator == actuator, blocks.c.number <= block))
-        if estimate > 0:
-            old = (estimates.c.actuator == actuator) & (estimates.c.number <= estimate)
-            connection.execute(estimates.delete().where(old))
 
     def keep_alarm(self, connection: Connection, alarm: Alarm) -> None:
         """Store an alarm as it is now."""
@@ -219,19 +243,6 @@ class MonitorStore:
             "alarm": json.dumps(alarm.plain()),
         }
         connection.execute(self.tables.events.insert().values(**values))
-
-    def keep_checkpoint(
-        self, connection: Connection, actuator: str, settings: str, checkpoint: dict[str, Any], summary: dict[str, Any]
-    ) -> None:
-        """Store the state of an actuator, which takes the place of the samples since the last checkpoint."""
-        pending = self.tables.pending
-        connection.execute(pending.delete().where(pending.c.actuator == actuator))
-        values = {
-            "settings": settings,
-            "checkpoint": json.dumps(checkpoint, allow_nan=False),
-            "summary": json.dumps(summary),
-        }
-        self.put(connection, self.tables.actuators, {"actuator": actuator}, values)
 
     def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
         """Return settings and state as of the checkpoint, and the samples since then; None where there is none."""
@@ -259,9 +270,8 @@ class MonitorStore:
         """Return what each actuator showed last."""
         from sqlalchemy import select
 
-        actuators = self.tables.actuators
         with self.engine.connect() as connection:
-            rows = connection.execute(select(actuators.c.actuator, actuators.c.summary))
+            rows = connection.execute(select(self.tables.summaries))
             return {name: json.loads(summary) for name, summary in rows}
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ from sqlalchemy import Column, Float, Index, Integer, LargeBinary, MetaData, Str
 
 metadata = MetaData()
 #: Version of the tables, kept in `facts`.
-SCHEMA = 2
+SCHEMA = 3
 
 facts = Table("facts", metadata, Column("name", String(40), primary_key=True), Column("value", Text, nullable=False))
 #: Blocks that are stored, by identity.
@@ -26,13 +26,19 @@ pending = Table(
     Column("number", Integer, primary_key=True, autoincrement=False),
     Column("samples", LargeBinary, nullable=False),
 )
-#: State of the detector and of the alarm, as of the checkpoint, in JSON; and what an actuator shows now.
+#: State of the detector and of the alarm, as of the checkpoint, in JSON.
 actuators = Table(
     "actuators",
     metadata,
     Column("actuator", String(120), primary_key=True),
     Column("settings", Text, nullable=False),
     Column("checkpoint", Text, nullable=False),
+)
+#: What each actuator shows now: a row of its own, for one is written whole, and a state is large.
+summaries = Table(
+    "summaries",
+    metadata,
+    Column("actuator", String(120), primary_key=True),
     Column("summary", Text, nullable=False),
 )
 estimates = Table(

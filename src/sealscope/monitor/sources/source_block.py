@@ -127,7 +127,7 @@ def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None
         elif channels[channel].size != count:
             raise RefusedMessage(NO_SAMPLES, f"channel {channel} must have 1 or {count} samples")
     with np.errstate(over="ignore"):  # times beyond floating point are dropped by the stream
-        clock = t + np.arange(count) / rate
+        clock = _kept(t + np.arange(count) / rate)
     samples = Recording(clock, channels, {channel: CHANNEL_UNITS[channel] for channel in channels}, rate)
     return SourceBlock(name, _identity(values.get("id")) or digest_of(payload), samples, done=done)
 
@@ -206,6 +206,13 @@ def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any
         raise RefusedMessage(NO_SAMPLES, f"channel {name} must have finite numbers, got infinity")
     unit = units.get(name)
     try:
-        return array if unit is None else np.asarray(to_si(array, str(unit)[:40], CHANNEL_UNITS[name], name=name))
+        return _kept(array if unit is None else to_si(array, str(unit)[:40], CHANNEL_UNITS[name], name=name))
     except InputError as error:
         raise RefusedMessage(WRONG_UNITS, error) from None
+
+
+def _kept(values: Any) -> np.ndarray[Any, Any]:
+    """Return an array that nobody else has, read-only, which a Recording takes without a copy."""
+    array = np.asarray(values)
+    array.setflags(write=False)
+    return array

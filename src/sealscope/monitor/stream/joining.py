@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ CHANNELS = (*_WATCHED, "T_oil")
 _SAME_RATE = 0.01
 #: Two samples follow each other where their times differ by so many steps.
 _FOLLOWS = (0.5, 1.5)
+#: Pieces of samples that are kept apart, at most: joined only when a block is whole, or they are many.
+_PIECES = 16
 #: Rates taken [Hz]: below, a reversal is not resolved; above, a block would hold more samples than it is worth.
 _RATES = (10.0, 100_000.0)
 
@@ -32,7 +35,12 @@ def channels_to_watch(samples: Recording) -> tuple[str, ...]:
     The balance of volumes reads position, angle or speed, and all pressures; without a position the chamber pressures
     and what moves the machine suffice.
     """
-    there = {name for name in _WATCHED if name in samples}
+    return _channels_to_watch(tuple(name for name in _WATCHED if name in samples.channels))
+
+
+@cache
+def _channels_to_watch(names: tuple[str, ...]) -> tuple[str, ...]:
+    there = {*names}
     if not {"p_A", "p_B"} <= there:
         return ()
     if "x" in there and {"theta", "omega"} & there:
@@ -48,7 +56,7 @@ class SampleJoiner:
 
     `late_s`: samples up to this much older than the newest are late or repeated, and dropped; older ones show that the
     clock was set back. `settled`: a position that is recorded later is left out. `counters`: samples that were dropped
-    and interruptions, by reason.
+    and interruptions, by reason. `pieces`: the samples as they came, of each piece the times and the channels.
     """
 
     late_s: float = 60.0
@@ -56,12 +64,11 @@ class SampleJoiner:
     names: tuple[str, ...] = ()
     rate: float = 0.0
     newest: float = float("-inf")
-    t: Array = field(default_factory=lambda: np.empty(0))
-    channels: dict[str, Array] = field(default_factory=dict)
+    pieces: list[list[Array]] = field(default_factory=list)
     counters: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return int(self.t.size)
+        return sum(piece[0].size for piece in self.pieces)
 
     def count(self, reason: str, number: int = 1) -> None:
         """Add to a counter."""
@@ -70,7 +77,7 @@ class SampleJoiner:
     def interrupt(self, reason: str) -> None:
         """Drop the samples since the last whole block, and count why."""
         self.count(reason)
-        self.t, self.channels = np.empty(0), {name: np.empty(0) for name in self.names}
+        self.pieces = []
 
     def restart(self, reason: str) -> None:
         """Take the next sample whatever its time is: the recorder or its clock was set anew."""
@@ -84,17 +91,13 @@ class SampleJoiner:
         if abs(samples.rate / self.rate - 1.0) > _SAME_RATE:
             self.interrupt("rate changed")
             self.rate = samples.rate
-        known = np.isfinite(samples.t)
-        if not known.all():
-            self.count("samples without a time", int(np.count_nonzero(~known)))
-        for first, last in self._in_order(samples.t, np.flatnonzero(known)):
+        for first, last in self._in_order(samples.t):
             if np.isfinite(self.newest) and not self._follows(samples.t[first] - self.newest):
                 self.interrupt("gap")
-            self.t = np.concatenate([self.t, samples.t[first:last]])
-            self.channels = {
-                name: np.concatenate([self.channels[name], samples[name][first:last]]) for name in self.names
-            }
-            self.newest = float(self.t[-1])
+            self.pieces.append([samples.t[first:last], *(samples[name][first:last] for name in self.names)])
+            if len(self.pieces) > _PIECES:
+                self.pieces = [self._joined(len(self))]
+            self.newest = float(samples.t[last - 1])
             yield
 
     def _follows(self, step: Any) -> Any:
@@ -122,12 +125,21 @@ class SampleJoiner:
         if names != self.names:
             if self.names:
                 self.count("began anew: a position is recorded, too")
-            self.names, self.rate, self.t = names, samples.rate, np.empty(0)
-            self.channels = {name: np.empty(0) for name in names}
+            self.names, self.rate, self.pieces = names, samples.rate, []
         return True
 
-    def _in_order(self, t: Array, known: NDArray[np.intp]) -> Iterator[tuple[int, int]]:
+    def _in_order(self, t: Array) -> Iterator[tuple[int, int]]:
         """Yield first and one past the last index of runs of samples that follow each other."""
+        with np.errstate(all="ignore"):  # NaN and infinity follow nothing
+            steps = np.diff(t)
+            whole = t.size > 1 and t[0] > self.newest and self._follows(steps.min()) and self._follows(steps.max())
+        if whole:  # as nearly always
+            yield 0, t.size
+            return
+        finite = np.isfinite(t)
+        if not finite.all():
+            self.count("samples without a time", int(np.count_nonzero(~finite)))
+        known: NDArray[np.intp] = np.flatnonzero(finite)
         at = 0
         while at < known.size:
             first = int(known[at])
@@ -149,25 +161,43 @@ class SampleJoiner:
     def taken(self, length: int) -> Recording:
         """Return the first `length` samples, and drop them here."""
         block = self.first(length)
-        self.t = self.t[length:].copy()
-        self.channels = {name: values[length:].copy() for name, values in self.channels.items()}
+        while self.pieces and length >= self.pieces[0][0].size:
+            length -= self.pieces.pop(0)[0].size
+        if length:
+            self.pieces[0] = [_rest(values, length) for values in self.pieces[0]]
         return block
 
     def first(self, length: int) -> Recording:
         """Return the first `length` samples, which stay."""
+        t, *channels = self._joined(length)
         units = {name: CHANNEL_UNITS[name] for name in self.names}
-        return Recording(self.t[:length], {name: self.channels[name][:length] for name in self.names}, units, self.rate)
+        return Recording(t, dict(zip(self.names, channels, strict=True)), units, self.rate)
+
+    def _joined(self, length: int) -> list[Array]:
+        """Return the times and the channels of the first `length` samples, read-only and nobody else's."""
+        parts = []
+        for piece in self.pieces:
+            parts.append(piece if piece[0].size <= length else [values[:length] for values in piece])
+            length -= parts[-1][0].size
+            if not length:
+                break
+        whole = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        whole = whole or [np.empty(0) for _ in ("t", *self.names)]
+        for values in whole:
+            values.setflags(write=False)
+        return whole
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
+        t, *channels = self._joined(len(self))
         return {
             "late_s": self.late_s,
             "settled": self.settled,
             "names": list(self.names),
             "rate": self.rate,
             "newest": None if self.newest == float("-inf") else self.newest,
-            "t": plain_array(self.t),
-            "channels": {name: plain_array(values) for name, values in self.channels.items()},
+            "t": plain_array(t),
+            "channels": {name: plain_array(values) for name, values in zip(self.names, channels, strict=True)},
             "counters": dict(self.counters),
         }
 
@@ -177,13 +207,21 @@ class SampleJoiner:
         newest = part_of(state, "newest", (float, int, type(None)))
         names = tuple(name for name in part_of(state, "names", list) if name in CHANNELS)
         channels = part_of(state, "channels", Mapping)
+        piece = [array_of(part_of(state, "t", Mapping), "t")]
+        piece += [array_of(part_of(channels, name, Mapping), name) for name in names]
         return cls(
             float(part_of(state, "late_s", (float, int))),
             bool(part_of(state, "settled", bool)),
             names,
             float(part_of(state, "rate", (float, int))),
             float("-inf") if newest is None else float(newest),
-            array_of(part_of(state, "t", Mapping), "t"),
-            {name: array_of(part_of(channels, name, Mapping), name) for name in names},
+            [piece] if piece[0].size else [],
             {str(reason): int(number) for reason, number in part_of(state, "counters", Mapping).items()},
         )
+
+
+def _rest(values: Array, first: int) -> Array:
+    """Return values from the index `first` on; a copy where they are the lesser part of what they were cut from."""
+    rest = values[first:]
+    whole = values if values.base is None else values.base
+    return rest.copy() if 2 * rest.size < getattr(whole, "size", 0) else rest

@@ -42,6 +42,7 @@ class VolumeEstimator:
         self._used: tuple[str, ...] = ()
         self._balance: FrozenBalance | None = None
         self._window: BalanceBlocks | None = None
+        self._shown: RecentBlocks | None = None  # what the window shows, once somebody has asked
 
     @classmethod
     def of(cls, rig: Rig) -> VolumeEstimator:
@@ -85,9 +86,10 @@ class VolumeEstimator:
         problem = trouble(fit)
         if problem is not None:
             half = len(window) // 2
-            self._window = window.chosen(np.arange(half, len(window)))
+            self._keep(window.chosen(slice(half, None)))
             return NotJudged(problem, "blocks: no balance can be fitted", half)
-        self._balance, self._window = FrozenBalance.of(fit), None
+        self._balance = FrozenBalance.of(fit)
+        self._keep(None)
         shown = [self._reading(window.chosen(np.array([k]))) for k in range(len(window))]
         return [block for blocks in shown if not isinstance(blocks, NotJudged) for block in blocks] or shown[-1]
 
@@ -110,9 +112,12 @@ class VolumeEstimator:
             before = None  # a pause, or the clock was set back
         if before is not None and (before.samples, before.gram.shape[1]) != (cut.samples, cut.gram.shape[1]):
             before = None
-        window = cut if before is None else BalanceBlocks.joined([before, cut])
-        self._window = window.chosen(np.arange(max(0, len(window) - WINDOW), len(window)))
-        return self._window
+        window = cut if before is None else BalanceBlocks.joined([before.chosen(slice(1 - WINDOW, None)), cut])
+        self._keep(window)
+        return window
+
+    def _keep(self, window: BalanceBlocks | None) -> None:
+        self._window, self._shown = window, None
 
     def append(self, block: BlockConductance) -> RecentBlocks:
         """Keep a block that is judged; return the last ones, up to a pause."""
@@ -124,7 +129,9 @@ class VolumeEstimator:
         window, balance = self._window, self._balance
         if window is None or balance is None:
             return RecentBlocks(np.empty(0), np.empty(0), np.empty(0))
-        return RecentBlocks(window.t, balance.conductances(window)[0], balance.flow(window))
+        if self._shown is None:
+            self._shown = RecentBlocks(window.t, balance.conductances(window)[0], balance.flow(window))
+        return self._shown
 
     def step(self, probability: float, *, again: bool) -> tuple[ConductanceRise | None, str | None]:
         """Return the rise that the last blocks show, and what forbids to compare them."""
@@ -134,7 +141,7 @@ class VolumeEstimator:
     def forget(self, keep: int = 0) -> None:
         """Compare with nothing before the last `keep` blocks."""
         window = self._window
-        self._window = None if window is None or not keep else window.chosen(np.arange(len(window))[-keep:])
+        self._keep(None if window is None or not keep else window.chosen(slice(-keep, None)))
 
     def relearn(self) -> None:
         """Fit the balance again."""
