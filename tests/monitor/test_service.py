@@ -320,9 +320,11 @@ def test_the_commented_file_is_valid(tmp_path):
     file.write_text(TEMPLATE, encoding="utf-8")
     settings = read_settings(file)
     assert settings.actuator[0].folder == tmp_path / "press 1"
-    for line in TEMPLATE.splitlines():
-        if line.startswith("# ") and "=" in line and not line.startswith("# ["):
-            assert len(line.split("#")) >= 2
+    uncommented = "\n".join(line[2:] if line.startswith("# simulate") else line for line in TEMPLATE.splitlines())
+    file.write_text(uncommented, encoding="utf-8")
+    (actuator,) = read_settings(file).actuator
+    assert actuator.simulate is not None
+    assert actuator.simulate.speed == 20.0
 
 
 @pytest.mark.parametrize(

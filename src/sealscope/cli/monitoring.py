@@ -6,12 +6,9 @@ import logging
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from sealscope.monitor.service import Service
 
 #: Words after `monitor` that are no file of settings.
 COMMANDS = ("init", "run", "demo", "export", "dashboard", "-h", "--help")
@@ -48,12 +45,9 @@ def run(
     ] = False,
 ) -> None:
     """Watch the actuators of FILE: blocks in, alarms as JSON lines on standard output."""
-    from sealscope.monitor.service import Service
-    from sealscope.monitor.settings import read_settings
-
     if not logging.getLogger("sealscope").handlers:
         logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
-    _serve(Service(read_settings(file), once=once))
+    _serve(file, once=once)
 
 
 @monitor.command()
@@ -67,16 +61,17 @@ def demo(
     """Watch three simulated actuators at 20 times real time; one begins to leak after two minutes of theirs."""
     import tempfile
 
-    from sealscope.live_demo import live_demo
+    from sealscope.live_simulation import DEMO
+    from sealscope.storage.atomic import atomic_write
     from sealscope.storage.folders import make_folder
-
-    def say(text: str) -> None:
-        typer.echo(text, err=True)
 
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(temporary) if folder is None else folder
         make_folder(place)
-        _serve(live_demo(place, port, speed, say))
+        file = place / "demo.toml"
+        with atomic_write(file) as written:
+            written.write_text(DEMO.format(port=port, speed=speed), encoding="utf-8")
+        _serve(file)
 
 
 @monitor.command()
@@ -113,8 +108,17 @@ def dashboard(
     typer.echo(f"{file}: written")
 
 
-def _serve(service: Service) -> None:
-    """Run a service until it ends, or a signal ends it."""
+def _serve(file: Path, *, once: bool = False) -> None:
+    """Run the service of a file of settings until it ends, or a signal ends it."""
+    from sealscope.monitor.service import Service
+    from sealscope.monitor.settings import read_settings
+
+    settings, sources = read_settings(file), []
+    if any(actuator.simulate is not None for actuator in settings.actuator):
+        from sealscope.live_simulation import simulated_sources
+
+        sources = simulated_sources(settings, lambda text: typer.echo(text, err=True))
+    service = Service(settings, once=once, sources=sources)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
     if service.page is not None:

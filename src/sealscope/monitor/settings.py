@@ -14,6 +14,7 @@ from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.storage.toml_file import read_toml
 
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
+_Words = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class _Part(BaseModel):
@@ -43,6 +44,22 @@ class WatchSettings(_Part):
         return f"{self.rig}, {self.learn_hours:g} h"
 
 
+class SimulateSettings(_Part):
+    """The simulated rig in the place of an actuator's samples, in the words of ``sealscope simulate``.
+
+    `speed`: as a multiple of real time.
+    """
+
+    command: _Words = "3 sin(4t)"
+    load: _Words | None = None
+    leak: _Words | list[_Words] = Field(default_factory=list)
+    fault: _Words | list[_Words] = Field(default_factory=list)
+    duration: _Words = "20 min"
+    rate: _Words | None = None
+    seed: int = Field(default=0, ge=0)
+    speed: float = Field(default=1.0, gt=0, allow_inf_nan=False)
+
+
 class ActuatorSettings(WatchSettings):
     """An actuator: its name, where its samples come from, and what differs from the defaults."""
 
@@ -55,6 +72,7 @@ class ActuatorSettings(WatchSettings):
     rate: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     nodes: dict[str, str] = Field(default_factory=dict)
     units: dict[str, str] = Field(default_factory=dict)
+    simulate: SimulateSettings | None = None
 
 
 class PageSettings(_Part):
@@ -310,5 +328,7 @@ pattern = "*"
 # nodes = { p_A = "ns=2;s=press1.p_A", p_B = "ns=2;s=press1.p_B" } # or nodes of the OPC UA server, by channel
 # units = { p_A = "bar" }        # theirs, where they are not SI
 # rate = 500.0                   # its sampling rate [Hz], where no metric `rate` states it
+# simulate = { command = "3 sin(4t)", leak = "0.0042 L/min from 120 s", seed = 1, speed = 20.0 } # or the simulated rig,
+#                                # in the words of `sealscope simulate`, at `speed` times real time
 # error_lpm = 0.02               # what differs from the defaults
 """
