@@ -26,6 +26,7 @@ ODD = (
     b'{"t": 1e999, "rate": 50, "x": [1]}',
     b'{"t": 1, "rate": 1e308, "x": [1], "actuator": "a"}',
     b'{"t": 9007199254740993, "rate": 50, "x": [1]}',
+    b'{"t": 1' + b"0" * 320 + b', "rate": 50, "x": [1], "actuator": "a"}',
     b'{"t": 0, "rate": 50, "x": [1, [2]], "actuator": "a"}',
     b'{"t": 0, "rate": 50, "x": [1, 1e999], "actuator": "a"}',
     b'{"t": 0, "rate": 50, "x": [1, -Infinity], "actuator": "a"}',
@@ -40,6 +41,8 @@ ODD = (
     b"\xd8\x1c\x81\xd8\x1d\x00",  # CBOR: a list that holds itself
     b"\xc2" + b"\x59\x27\x10" + b"\xff" * 10_000,  # CBOR: a number of 10 000 bytes
     b"\x81" * 50_000,
+    *(cbor2.dumps({**GOOD, name: 7**6000}) for name in ("t", "rate", "id", "actuator", "x")),
+    cbor2.dumps({**GOOD, 7**6000: 0}),
     b"",
     b"\x00",
 )

@@ -183,7 +183,7 @@ def test_a_full_queue_makes_its_source_wait_and_says_so(tmp_path, monkeypatch, c
 def test_a_source_is_no_longer_than_the_service(tmp_path):
     """A source that waits for room ends with the service."""
     service = Service(settings_in(tmp_path), once=True, stdin=io.BytesIO(), stdout=io.StringIO())
-    thread = threading.Thread(target=lambda: [service.hand(SourceBlock("press 1", str(k), None)) for k in range(200)])
+    thread = threading.Thread(target=lambda: [service.hand(SourceBlock("press 1", str(k), None)) for k in range(600)])
     thread.start()
     thread.join(0.3)
     assert thread.is_alive()

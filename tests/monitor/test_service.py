@@ -188,9 +188,9 @@ def test_lines_without_a_block_are_counted(tmp_path, caplog):
     other = good.replace("press 1", "<script>alert(1)</script>").encode()
     service, _ = served(settings_in(tmp_path), b"\n".join([*bad, other, b"", good.encode()]))
     assert service.actuators.counters == {
-        "messages that are no JSON or CBOR": 4,
+        "messages that are no JSON or CBOR": 5,
         "messages that are no mapping of known names": 1,
-        "messages without a clock, a rate or a sound identity": 3,
+        "messages without a clock, a rate or a sound identity": 2,
         "messages whose channels are no lists of numbers of one length": 2,
         "messages with units of another dimension": 1,
         "messages without an actuator, or with another one than their topic": 1,

@@ -32,12 +32,12 @@ from sealscope.storage.folders import locked
 
 _log = logging.getLogger(__name__)
 #: Blocks that wait to be stored and their bytes, at most; sources wait beyond.
-_WAITING, _WAITING_BYTES = 128, 256_000_000
+_WAITING, _WAITING_BYTES = 512, 256_000_000
 #: How often folders are looked at [s], the longest pause after an error of the database, and how long a post that is
 #: under way at the end is waited for.
 _LOOK_S, _LONGEST_PAUSE_S, _POST_S = 0.5, 5.0, 30.0
 #: Blocks that are stored in one transaction, at most, and how long the first one waits for others [s].
-_TOGETHER, _GATHER_S = 64, 0.02
+_TOGETHER, _GATHER_S = 256, 0.02
 #: What a block is counted under that raised an error.
 _DROPPED = "blocks that raised an error"
 #: A source that waits for longer [s] is a line in the log.

@@ -5,7 +5,7 @@ A message that holds no block is a RefusedMessage, whose reason is one of few: m
 
 from __future__ import annotations
 
-import json
+import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -102,12 +102,12 @@ def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None
     if len(payload) > LARGEST:
         raise RefusedMessage(OVERSIZED, f"a message must have at most {LARGEST} bytes, got {len(payload)}")
     values = _mapping(payload)
-    unknown = sorted(str(name)[:40] for name in values if name not in _KNOWN)
+    unknown = sorted(_brief(name) for name in values if name not in _KNOWN)
     if unknown:
         raise RefusedMessage(NO_MAPPING, f"a message must hold {', '.join(sorted(_KNOWN))}, got {unknown[0]!r}")
     name = values.get("actuator", actuator)
     if not isinstance(name, str) or (actuator is not None and name != actuator):
-        raise RefusedMessage(WRONG_ACTUATOR, f"a message must name its actuator, got {str(name)[:40]!r}")
+        raise RefusedMessage(WRONG_ACTUATOR, f"a message must name its actuator, got {_brief(name)!r}")
     units = values.get("units", {})
     if not isinstance(units, Mapping):
         raise RefusedMessage(WRONG_UNITS, "a message's units must be a mapping")
@@ -148,28 +148,35 @@ def _identity(given: Any) -> str:
         return ""
     if isinstance(given, bool) or not isinstance(given, (str, int)):
         raise RefusedMessage(NO_CLOCK, f"id must be a text or a whole number, got {type(given).__name__}")
+    if isinstance(given, int) and given.bit_length() > 64:
+        raise RefusedMessage(NO_CLOCK, "a whole number as id must have at most 64 bits")
     identity = str(given)
     if len(identity) > 100 or not identity.isprintable():
         raise RefusedMessage(NO_CLOCK, f"id must have at most 100 letters that can be printed, got {identity[:40]!r}")
     return identity
 
 
-def _no_number(text: str) -> float:
-    raise ValueError(f"a number must be finite, got {text}")
+def _brief(value: Any) -> str:
+    """Return the beginning of a value as text; CBOR has whole numbers of more digits than Python writes."""
+    try:
+        return str(value)[:40]
+    except ValueError:
+        return type(value).__name__
 
 
 def _mapping(payload: bytes) -> Mapping[str, Any]:
     try:
         if payload.lstrip()[:1] == b"{":
-            values = json.loads(payload, parse_constant=_no_number)
+            import orjson
+
+            values = orjson.loads(payload)
         else:
             import cbor2
 
             values = cbor2.loads(payload)
-    except ImportError:
-        raise RefusedMessage(
-            UNREADABLE, "a message must be JSON, or cbor2 installed: pip install 'sealscope[mqtt]'"
-        ) from None
+    except ImportError as error:
+        needed = f"a message needs {error.name}: pip install 'sealscope[serve,mqtt]'"
+        raise RefusedMessage(UNREADABLE, needed) from None
     except Exception as error:  # a damaged message makes the libraries raise whatever they like
         raise RefusedMessage(
             UNREADABLE, f"a message must be JSON or CBOR: {' '.join(str(error).split())[:80]}"
@@ -181,9 +188,13 @@ def _mapping(payload: bytes) -> Mapping[str, Any]:
 
 def _number(values: Mapping[str, Any], name: str) -> float:
     value = values.get(name)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise RefusedMessage(NO_CLOCK, f"{name} must be a number, got {str(value)[:40]!r}")
-    return float(value)
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
+    except OverflowError:  # CBOR has whole numbers of any size
+        number = math.inf
+    if not math.isfinite(number):
+        raise RefusedMessage(NO_CLOCK, f"{name} must be a number, got {_brief(value)!r}")
+    return number
 
 
 def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
@@ -206,7 +217,7 @@ def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any
         raise RefusedMessage(NO_SAMPLES, f"channel {name} must have finite numbers, got infinity")
     unit = units.get(name)
     try:
-        return _kept(array if unit is None else to_si(array, str(unit)[:40], CHANNEL_UNITS[name], name=name))
+        return _kept(array if unit is None else to_si(array, _brief(unit), CHANNEL_UNITS[name], name=name))
     except InputError as error:
         raise RefusedMessage(WRONG_UNITS, error) from None
 
