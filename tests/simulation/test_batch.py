@@ -126,6 +126,31 @@ def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself():
     assert np.abs(found[0, 1] / found[0, 0] - 1.0).max() > 0.05
 
 
+def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig):
+    rig = check_rig(True, volumes="position", p_charge="2 MPa", G_circ=2e-10, **QUIET)
+    moves = [f"{what} from 2 s to 3.1 s within 0.2 s" for what in ("shut-off A to 0 %", "circulation")]
+    options = {"rig": rig, "command": "3 sin(4t)", "duration": 5.0, "step": 2.5e-4, "allow_unresolved": True}
+    experiments = [Experiment.of(**options, fault=moves), Experiment.of(**options, fault="shut-off B to 5 % from 3 s")]
+    bounds = [0.0, 2.2, 3.2, 5.0]
+    batch = simulate_batch(experiments, bounds=bounds)
+    for k, one in enumerate(experiments):  # cells are those of all runs of a set
+        np.testing.assert_allclose(batch.rms[k], rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-4)
+    assert np.abs(batch.rms[0, :, 1] / batch.rms[1, :, 1] - 1.0).min() > 0.05
+    with pytest.raises(SimulationFailed, match="step must be"):  # where the pump's oil circulates
+        stiff = rig.with_overrides({"G_circ": 2e-9})
+        simulate_batch([Experiment.of(**options | {"rig": stiff, "allow_unresolved": False}, fault=moves)])
+
+
+@pytest.mark.slow
+def test_oil_boils_side_by_side_as_it_does_by_itself(check_rig):
+    values = {"p_vap": "2 kPa", "p_charge": "0 Pa", "F_v": 6000.0, **QUIET, "sensors.p_A.range_lo": -2e5}
+    rig, bounds = check_rig(**values, **{"sensors.p_B.range_lo": -2e5}), [0.0, 6.0]
+    one = Experiment.of(rig=rig, command="9 sin(4t)", duration=6.0, **COMMON)
+    alone = simulate_with_truth(one)
+    assert alone.truth.outputs["p_B"].min() == 2e3 - 101325
+    np.testing.assert_allclose(simulate_batch([one], bounds=bounds).rms[0], rms_of(alone.recording, bounds), rtol=1e-6)
+
+
 def test_neither_order_nor_number_nor_threads_change_a_run(check_rig):
     experiments = [
         Experiment.of(

@@ -87,6 +87,31 @@ def jumps_of(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
     return outputs[(outputs > 0) & (outputs < n_out)]
 
 
+def refined(bounds: np.ndarray, effects: Sequence[Effect], rate: float) -> np.ndarray:
+    """Return the bounds with each block cut so that no effect moves further than its resolution in one."""
+    starts, stops = bounds[:-1], bounds[1:]
+    parts = np.ones(starts.size)
+    for effect in effects:
+        least = max(1, round(effect.shortest * rate))
+        most = np.maximum(1, (stops - starts) // least)
+        parts = np.maximum(parts, np.minimum(moved_per_block(effect, bounds, rate), most))
+    cuts = [
+        np.linspace(a, b, n, endpoint=False)
+        for a, b, n in zip(starts, stops, parts.astype(np.int64), strict=True)
+        if n > 1
+    ]
+    return np.unique(np.r_[bounds, np.rint(np.concatenate([*cuts, bounds[:0]])).astype(np.int64)])
+
+
+def extremes(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
+    """Return `base`, and the numbers at either side of each bend of the effects that have no shortest block."""
+    quick = [effect for effect in effects if effect.shortest < SHORTEST_BLOCK]
+    bends = np.array(sorted({jump for effect in quick for jump in effect.jumps if math.isfinite(jump)}))
+    values = values_of(quick, base, np.concatenate([bends - 1e-9, bends + 1e-9])) if bends.size else {}
+    rows = np.unique(np.array(list(values.values())).T, axis=0) if values else ()
+    return base, *(base._replace(**dict(zip(values, row.tolist(), strict=True))) for row in rows)
+
+
 class Schedule:
     """The rig's numbers over a run, constant within blocks: `bounds` (n + 1,) output indices, one number set a block.
 
@@ -101,8 +126,8 @@ class Schedule:
         self.numbers = [base]
         if not effects:
             return
-        self.bounds = np.unique(np.r_[np.arange(0, n_out, cell), n_out, jumps_of(effects, n_out, rate)])
-        self.bounds = self._refined(effects, rate)
+        coarse = np.unique(np.r_[np.arange(0, n_out, cell), n_out, jumps_of(effects, n_out, rate)])
+        self.bounds = refined(coarse, effects, rate)
         middles: Array = np.asarray(0.5 * (self.bounds[:-1] + self.bounds[1:]) / rate, dtype=np.float64)
         values = values_of(effects, base, middles)
         table = np.array(list(values.values()))
@@ -117,21 +142,6 @@ class Schedule:
         whole = base._replace(**kinds)
         rows = table[:, new].T.tolist()
         self.numbers = [whole._replace(**dict(zip(values, row, strict=True))) for row in rows]
-
-    def _refined(self, effects: Sequence[Effect], rate: float) -> np.ndarray:
-        """Return the bounds with each block cut so that no effect moves further than its resolution in one."""
-        starts, stops = self.bounds[:-1], self.bounds[1:]
-        parts = np.ones(starts.size)
-        for effect in effects:
-            least = max(1, round(effect.shortest * rate))
-            most = np.maximum(1, (stops - starts) // least)
-            parts = np.maximum(parts, np.minimum(moved_per_block(effect, self.bounds, rate), most))
-        cuts = [
-            np.linspace(a, b, n, endpoint=False)
-            for a, b, n in zip(starts, stops, parts.astype(np.int64), strict=True)
-            if n > 1
-        ]
-        return np.unique(np.r_[self.bounds, np.rint(np.concatenate([*cuts, self.bounds[:0]])).astype(np.int64)])
 
     def within(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
         """Yield the parts (start, stop, numbers) of the outputs first <= k < last."""

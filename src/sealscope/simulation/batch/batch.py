@@ -285,7 +285,8 @@ def allowed_step(part: LaneSet, sizes: Array) -> float:
     limits = []
     for member, size in zip(part.members, sizes, strict=True):
         laminar = member.leak.law == "laminar"
-        limits.append(longest_step(member.numbers, size if laminar else 0.0, 0.0 if laminar else size))
+        leak = (size if laminar else 0.0, 0.0 if laminar else size)
+        limits += [longest_step(numbers, *leak) for numbers in member.extremes]
     return max(min(limits), LONGEST_STEP / FINEST)
 
 

@@ -21,8 +21,10 @@ from sealscope.simulation.changes import (
     SHORTEST_BLOCK,
     Effect,
     Readings,
+    extremes,
     jumps_of,
     moved_per_block,
+    refined,
     values_of,
 )
 from sealscope.simulation.commands import Command, Sine
@@ -66,6 +68,11 @@ class Member:
         leaks = self.experiment.leaks
         return leaks[0] if leaks else Leak("laminar", 0.0)
 
+    @cached_property
+    def extremes(self) -> tuple[RigNumbers, ...]:
+        """The run's numbers, and those between which valves move (`changes.extremes`)."""
+        return extremes(self.effects, self.numbers)
+
 
 @dataclass(frozen=True)
 class LaneSet:
@@ -100,9 +107,6 @@ def refuse(experiment: Experiment, place: int) -> None:
         raise no(f"no fault of a sensor, got {', '.join(str(fault) for fault in experiment.faults)}")
     if experiment.rig.daq.jitter != 0:
         raise no(f"daq.jitter = 0, got {experiment.rig.daq.jitter}")
-    if any(effect.shortest < SHORTEST_BLOCK for effect in experiment.effects()):
-        moving = [str(fault) for fault in experiment.faults if fault.kind in ("shut-off valve", "circulation valve")]
-        raise no(f"valves in the lines that stand still, got {', '.join(moving)}")
     if experiment.leaks and experiment.thins:
         raise no("no leak while the oil's temperature changes")
     for name in CHAMBERS:
@@ -209,6 +213,7 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     """Cells for a set at `rate` [Hz] of outputs.
 
     0.5 s long, or so short (down to 0.05 s) that no effect moves by more than its resolution; a jump begins a cell.
+    While a valve moves, a cell is as short as an output.
     """
     from sealscope.physics.rig import NUMBERS
 
@@ -219,10 +224,12 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     if not effects:
         return Cells(np.array([0, n_out]), base, (), np.empty((len(members), 0, 1)))
     coarse = np.arange(0, n_out + 1, max(1, round(LONGEST_BLOCK * rate)))
-    parts = max(float(moved_per_block(effect, coarse, rate).max(initial=1.0)) for effect in effects)
+    slow = [effect for effect in effects if effect.shortest >= SHORTEST_BLOCK]
+    parts = max((float(moved_per_block(effect, coarse, rate).max(initial=1.0)) for effect in slow), default=1.0)
     length = max(LONGEST_BLOCK / parts, SHORTEST_BLOCK)
     grid = np.arange(0, n_out, max(1, round(length * rate)))
     bounds = np.unique(np.r_[grid, n_out, jumps_of(effects, n_out, rate)])
+    bounds = refined(bounds, [effect for effect in effects if effect.shortest < SHORTEST_BLOCK], rate)
     middles = 0.5 * (bounds[:-1] + bounds[1:]) / rate
     fields = tuple(sorted({NUMBERS.index(effect.field) for effect in effects}))
     values = np.repeat(base[:, list(fields), None], middles.size, axis=2)
@@ -339,11 +346,12 @@ class SetRun:
         leaks = leak_rows(members, sizes, measured)
         checked = set()
         for member, (G, C) in zip(members, leaks[:, :2].tolist(), strict=True):
-            what = id(member.numbers), G, C
-            if not (member.experiment.allow_unresolved or what in checked):
-                checked.add(what)
-                refuse_unresolved(member.numbers, self.h, self.method)
-                refuse_long(self.h, longest_step(member.numbers, G, C), f"the leak of run {member.place}")
+            for numbers in member.extremes:
+                what = id(numbers), G, C
+                if not (member.experiment.allow_unresolved or what in checked):
+                    checked.add(what)
+                    refuse_unresolved(numbers, self.h, self.method)
+                    refuse_long(self.h, longest_step(numbers, G, C), f"the leak of run {member.place}")
         self.state = in_lanes(
             np.array([initial_state(m.experiment.rig, m.experiment.x_0) for m in members]), self.width
         )
