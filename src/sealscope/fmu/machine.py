@@ -33,6 +33,7 @@ from sealscope.physics.rig import (
     RigNumbers,
     derived_numbers,
     observe,
+    pressures_of,
     rig_numbers,
     throttle_readings,
 )
@@ -169,8 +170,8 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
         p, z = numbers(v, given), state_of(state)
         observe(z, given[_U], given[_G], given[_C], p, out)
         out[_N_OUTPUTS] = _electric(out[_VOLTAGE], z[CURRENT])
-        out[_N_OUTPUTS + 1] = _hydraulic(out[_Q_1], (z[P_1] - z[P_2]) if throttled else (z[P_A] - z[P_B]))
-        out[_N_OUTPUTS + 2] = _mechanical(z[P_A], z[P_B], z[VELOCITY], p.A_A, p.A_B)
+        out[_N_OUTPUTS + 1] = _hydraulic(out[_Q_1], (out[P_1] - out[P_2]) if throttled else (out[P_A] - out[P_B]))
+        out[_N_OUTPUTS + 2] = _mechanical(out[P_A], out[P_B], z[VELOCITY], p.A_A, p.A_B)
         return 0
 
     if implicit:
@@ -201,7 +202,8 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
             total += 0.0 * z[m]  # NaN from any value that is not finite
         if total != 0.0:
             return 1
-        return 2 if min(z[P_A], z[P_B], z[P_1], z[P_2]) < -P_ATM else 0
+        p_A, p_B, p_1, p_2 = pressures_of(z, p)
+        return 2 if min(p_A, p_B, p_1, p_2) < -P_ATM else 0
 
     return {"start": start, "advance": advance, "report": report}
 

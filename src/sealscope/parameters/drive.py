@@ -84,6 +84,10 @@ class Fluid(Part):
     p_charge: Annotated[float, quantity("charge pressure: all pressures at the start", "Pa", ge=0, le=1e8)]
     air: Annotated[float, quantity("free air in the oil, by volume of oil at atmospheric pressure", "1", ge=0, le=0.5)]
     n_air: Annotated[float, quantity("polytropic exponent of the air in the oil", "1", ge=1, le=1.4)]
+    p_vap: Annotated[
+        float,
+        quantity("vapour pressure of the oil, absolute; 0: it does not boil", "Pa", absent=0.0, ge=0, le=1e5),
+    ]
     T_oil: Annotated[
         float, quantity("temperature of the oil at which the rig's values hold", "K", absent=313.15, gt=200, lt=500)
     ]

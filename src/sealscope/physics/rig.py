@@ -39,7 +39,7 @@ from sealscope.physics.external import (
     pilot_valve_flow,
     polytropic_pressure,
 )
-from sealscope.physics.fluid import effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
+from sealscope.physics.fluid import P_ATM, effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
 from sealscope.physics.friction import (
     bristle_rate,
     coulomb_friction,
@@ -123,11 +123,12 @@ NUMBERS = (*PARAMETERS, *DERIVED)
 #: Throttles in the lines; air in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has
 #: bristles, that differs between the directions; check valves with pilots, relief valves, an accumulator that exchanges
 #: little heat; a damper, a load that changes with time (of a run, not of a rig); a servo valve between a supply and the
-#: cylinder; filters in the lines; losses of motor and pump beyond the linear ones; an opposing cylinder.
+#: cylinder; filters in the lines; losses of motor and pump beyond the linear ones; an opposing cylinder; oil
+#: that boils.
 LAWS = (
     *("throttled", "aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
     *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
-    *("filtered", "lossy", "opposed"),
+    *("filtered", "lossy", "opposed", "boiling"),
 )
 #: The choices: truth values, and the laws.
 CHOICES = (*_CHOICES, "made_up", *LAWS)
@@ -158,6 +159,7 @@ if TYPE_CHECKING:
         filtered: tuple[bool, ...]
         lossy: tuple[bool, ...]
         opposed: tuple[bool, ...]
+        boiling: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> float: ...
@@ -258,6 +260,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "filtered": rig.line.R_A > 0 or rig.line.R_B > 0,
         "lossy": rig.motor.T_f > 0 or rig.pump.C_st > 0 or rig.pump.C_f > 0 or rig.pump.C_h > 0,
         "opposed": rig.cylinder.A_opp > 0,
+        "boiling": rig.fluid.p_vap > 0,
     }
     return RigNumbers(
         *(attrgetter(name)(rig) for name in PARAMETERS.values()),
@@ -286,6 +289,26 @@ def within_limits(y: State, p: RigNumbers) -> State:
 
 
 @contracted
+def vapour_floor(q: float, p: RigNumbers) -> float:
+    """Pressure [Pa] of a volume whose state is q [Pa]: no lower than the oil's vapour pressure `p_vap` [Pa absolute].
+
+    Below it the oil boils: a cavity opens, and q goes on by the oil's own bulk modulus, so that rho(q) V is the mass
+    that is there and V (1 - rho(q)/rho(p_vap)) the cavity. Nothing of the balances of oil changes.
+
+    Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
+    """
+    if len(p.boiling) == 0:
+        return q
+    return max(q, p.p_vap - P_ATM)
+
+
+@contracted
+def pressures_of(y: State, p: RigNumbers) -> Pressures:
+    """Pressures p_A, p_B, p_1, p_2 [Pa] of a state, no lower than the vapour pressure (`vapour_floor`)."""
+    return vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), vapour_floor(y[P_1], p), vapour_floor(y[P_2], p)
+
+
+@contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
     """Commanded less actual motor speed [rad/s]; the pump of a servo valve's supply has one speed."""
     if len(p.valved) > 0:
@@ -296,9 +319,10 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 @contracted
 def pump_difference(y: State, p: RigNumbers) -> float:
     """Pressure difference [Pa] between the ports of the pump."""
+    p_A, p_B, p_1, p_2 = pressures_of(y, p)
     if len(p.throttled) > 0 or len(p.valved) > 0:
-        return y[P_1] - y[P_2]
-    return y[P_A] - y[P_B]
+        return p_1 - p_2
+    return p_A - p_B
 
 
 @contracted
@@ -308,7 +332,7 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
     `applied` [N]: all other forces on the piston. Eqs. (4.20)-(4.22), unless the rig has another law.
     """
     v = y[VELOCITY]
-    F_C = coulomb_friction(y[P_A], y[P_B], p.F_pr, p.F_cfr, p.coulomb_of_difference)
+    F_C = coulomb_friction(vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), p.F_pr, p.F_cfr, p.coulomb_of_difference)
     F_v, breakaway = p.F_v, p.K_brk * F_C
     if len(p.one_sided) > 0:
         breakaway = select(applied < 0.0, p.backward * breakaway, breakaway)
@@ -329,7 +353,8 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     Q_A runs from line 1 into chamber A, eqs. (4.9)-(4.10), and Q_B from chamber B into line 2, eqs. (4.11)-(4.12). A
     filter in series takes R Q of the pressure difference (Darcy's law).
     """
-    dp_A, dp_B = y[P_1] - y[P_A], y[P_B] - y[P_2]
+    p_A, p_B, p_1, p_2 = pressures_of(y, p)
+    dp_A, dp_B = p_1 - p_A, p_B - p_2
     if len(p.filtered) > 0:
         Q_A = implicit_orifice_flow(dp_A, p.R_A, p.c_A_in, p.c_A_out, p.dp_0)
         return Q_A, implicit_orifice_flow(dp_B, p.R_B, p.c_B_out, p.c_B_in, p.dp_0)
@@ -348,7 +373,7 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     """Bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
     if len(p.aerated) == 0:
         return p.K_oil
-    return effective_bulk_modulus(pressure, p.K_oil, p.air, p.n_air)
+    return effective_bulk_modulus(vapour_floor(pressure, p), p.K_oil, p.air, p.n_air)
 
 
 @contracted
@@ -356,7 +381,12 @@ def density_ratio(pressure: float, other: float, p: RigNumbers) -> float:
     """Density of the oil at `pressure` over that at the `other` pressure [Pa]."""
     if len(p.aerated) == 0:
         return oil_density_ratio(pressure - other, p.K_oil)
-    return mixture_density_ratio(pressure, other, p.K_oil, p.air, p.n_air)
+    p_a, p_b = vapour_floor(pressure, p), vapour_floor(other, p)
+    ratio = mixture_density_ratio(p_a, p_b, p.K_oil, p.air, p.n_air)
+    if len(p.boiling) == 0:
+        return ratio
+    softest = effective_bulk_modulus(p.p_vap - P_ATM, p.K_oil, p.air, p.n_air)
+    return ratio * oil_density_ratio((pressure - p_a) - (other - p_b), softest)
 
 
 @contracted
@@ -402,7 +432,9 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     At the pump's ports, or at the chambers without lines. The pilot of a side's check valve is the other side.
     """
     supply = supply_pressure(y, p)
-    p_1, p_2 = (y[P_1], y[P_2]) if len(p.throttled) > 0 else (y[P_A], y[P_B])
+    p_A, p_B, p_1, p_2 = pressures_of(y, p)
+    if len(p.throttled) == 0:
+        p_1, p_2 = p_A, p_B
     if len(p.piloted) > 0:
         up_1 = pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
         up_2 = pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
@@ -444,12 +476,12 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
     """Return the flows [m^3/s] of a servo valve's edges: P to A, A to T, P to B, B to T; x_s > 0 opens P-A and B-T."""
     x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
-    p_P, p_T = y[P_1], y[P_2]
+    p_A, p_B, p_P, p_T = pressures_of(y, p)
     return (
-        edge_flow(p_P - y[P_A], x_s, p.o_PA, Q_N, dp_N, x_max, dp_lam),
-        edge_flow(y[P_A] - p_T, -x_s, p.o_AT, Q_N, dp_N, x_max, dp_lam),
-        edge_flow(p_P - y[P_B], -x_s, p.o_PB, Q_N, dp_N, x_max, dp_lam),
-        edge_flow(y[P_B] - p_T, x_s, p.o_BT, Q_N, dp_N, x_max, dp_lam),
+        edge_flow(p_P - p_A, x_s, p.o_PA, Q_N, dp_N, x_max, dp_lam),
+        edge_flow(p_A - p_T, -x_s, p.o_AT, Q_N, dp_N, x_max, dp_lam),
+        edge_flow(p_P - p_B, -x_s, p.o_PB, Q_N, dp_N, x_max, dp_lam),
+        edge_flow(p_B - p_T, x_s, p.o_BT, Q_N, dp_N, x_max, dp_lam),
     )
 
 
@@ -477,7 +509,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
     from_A, _ = volumes_exchanged(Q_AT, p_A, p_T, p)
     from_B, _ = volumes_exchanged(Q_BT, p_B, p_T, p)
     _, fed = volumes_exchanged(Q_1, p_T, p_P, p)
-    relief = check_valve_flow(p_P - p_T, p.p_set, p.G_set)
+    relief = check_valve_flow(pump_difference(y, p), p.p_set, p.G_set)
     return (
         pressure_rate(to_A - from_A, V_A, bulk_modulus(p_A, p)),  # eq. (4.18)
         pressure_rate(to_B - from_B, V_B, bulk_modulus(p_B, p)),  # eq. (4.19)
@@ -489,7 +521,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
 @contracted
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
     """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients, `F` [N] load."""
-    p_A, p_B, x, v = y[P_A], y[P_B], y[POSITION], y[VELOCITY]
+    p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
         v = stuck_velocity(v, p.v_th)
     dp_pump = pump_difference(y, p)
@@ -515,7 +547,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
     V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
-    from_A, to_B = volumes_exchanged(Q_L, p_A, p_B, p)
+    from_A, to_B = volumes_exchanged(Q_L, y[P_A], y[P_B], p)
     if len(p.throttled) > 0:
         from_2, to_1 = volumes_exchanged(Q_1, y[P_2], y[P_1], p)
         rate_A = pressure_rate(-p.A_A * v - from_A, V_A, K_A)
@@ -528,7 +560,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_B = by_valve[1] + pressure_rate(p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = by_valve[2], by_valve[3]
     else:
-        from_2, to_1 = volumes_exchanged(Q_1, p_B, p_A, p)
+        from_2, to_1 = volumes_exchanged(Q_1, y[P_B], y[P_A], p)
         rate_A = pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
         rate_B = pressure_rate(-from_2 + p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = rate_A, rate_B
@@ -559,6 +591,7 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     """Write the states and the derived quantities of `OUTPUTS` into `row`."""
     for m in range(len(y)):
         row[m] = y[m]
+    row[P_A], row[P_B], row[P_1], row[P_2] = pressures_of(y, p)
     n = len(y)
     dp_pump = pump_difference(y, p)
     Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
@@ -571,7 +604,7 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     row[n] = Q_1
     row[n + 1] = Q_A
     row[n + 2] = Q_B
-    row[n + 3] = piston_leakage(y[P_A] - y[P_B], G, C, p.dp_0)
+    row[n + 3] = piston_leakage(row[P_A] - row[P_B], G, C, p.dp_0)
     row[n + 4] = controller_voltage(speed_error(y, u, p), y[INTEGRAL], p.k_p, p.K_i, p.V_max)
     row[n + 5] = row[n + 6] = 0.0
     if len(p.open_circuit) > 0:

@@ -10,6 +10,7 @@ import numpy as np
 from sealscope.control.controller import Controller, Measured
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig
+from sealscope.physics.fluid import P_ATM
 from sealscope.physics.state import P_A, P_B, POSITION, THETA
 from sealscope.recordings.recording import Array
 from sealscope.simulation.courses import Position
@@ -60,6 +61,7 @@ class Feedback:
         self._noise = (random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)).tolist()
         self._counts = sensors.x.resolution, 2.0 * math.pi / sensors.theta.counts
         self._limit = rig.daq.u_max
+        self._floor = rig.fluid.p_vap - P_ATM if rig.fluid.p_vap > 0 else -math.inf
         self._voltage: Callable[[Measured], float]
         self.restart()
 
@@ -83,8 +85,8 @@ class Feedback:
                     self._target[k],
                     self._speed[k],
                     _counted(y.item(POSITION), x_count),
-                    y.item(P_A) + noise_A,
-                    y.item(P_B) + noise_B,
+                    max(y.item(P_A), self._floor) + noise_A,
+                    max(y.item(P_B), self._floor) + noise_B,
                     _counted(y.item(THETA), angle_count),
                 )
             )

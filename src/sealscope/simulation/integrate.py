@@ -35,7 +35,7 @@ Progress = Callable[[float], None]
 DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
 #: How many times finer than `LONGEST_STEP` a step that is chosen by error may become.
 FINEST = 20
-#: Lowest gauge pressure [Pa] the model is valid for: there is no cavitation in it, and oil holds no tension.
+#: Lowest gauge pressure [Pa] the model is valid for where the oil does not boil (`fluid.p_vap`): it holds no tension.
 VACUUM = -101325.0
 #: The share by which a detail's RMS in a recording (truth and noise together) may be off.
 DETAIL_TOLERANCE = 1e-3
@@ -450,10 +450,10 @@ def _refuse_rows(rows: Array, first: int, rate: float, allow_unresolved: bool) -
     if not allow_unresolved and pressures.min() < VACUUM:
         k, column = np.unravel_index(int(np.argmax(pressures < VACUUM)), pressures.shape)
         raise SimulationFailed(
-            f"{OUTPUTS[P_A + column]} must stay above vacuum ({VACUUM:g} Pa gauge: the model has no cavitation), got "
+            f"{OUTPUTS[P_A + column]} must stay above vacuum ({VACUUM:g} Pa gauge: the rig's oil does not boil), got "
             f"{pressures[k, column]:.4g} Pa at t = {(first + k) / rate:.4g} s (x = {rows[k, 4]:.3f} m); "
-            "raise fluid.p_charge, take a smaller command, start further from the cap, or replace what leaks out "
-            "(makeup.check_valves = present)"
+            "raise fluid.p_charge, take a smaller command, start further from the cap, let the oil boil (fluid.p_vap), "
+            "or replace what leaks out (makeup.check_valves = present)"
         )
 
 

@@ -17,12 +17,14 @@ import numpy as np
 
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.cylinder import pressure_rate
-from sealscope.physics.lanes import anywhere
+from sealscope.physics.fluid import P_ATM
+from sealscope.physics.lanes import anywhere, select
 from sealscope.physics.restrictors import implicit_orifice_flow
 from sealscope.physics.rig import (
     RigNumbers,
     bulk_modulus,
     observe,
+    pressures_of,
     rates_without_throttles,
     throttle_flows,
     throttle_rates,
@@ -89,19 +91,30 @@ def _after(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> St
 def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     """Solve an implicit stage.
 
-    Return the state with the pressures that the throttles' flows leave, and what these flows add to the rates.
+    Return the state with the pressures that the throttles' flows leave, and what these flows add to the rates. Where
+    oil boils, the pressure stays whatever flows: such a volume adds nothing to g.
     """
     V_A, V_B = volumes_at(z[POSITION], p)
     step = GAMMA * h
-    total_A, total_B = z[P_1] - z[P_A], z[P_B] - z[P_2]
+    p_A, p_B, p_1, p_2 = pressures_of(z, p)
+    total_A, total_B = p_1 - p_A, p_B - p_2
     moved = z
     s = (z[P_A], z[P_B], z[P_1], z[P_2])
-    turns = AIR_TURNS if len(p.aerated) + len(p.conserving) > 0 else 1
+    turns = AIR_TURNS if len(p.aerated) + len(p.conserving) + len(p.boiling) > 0 else 1
     for _ in range(turns):
         K_A, K_B = bulk_modulus(moved[P_A], p), bulk_modulus(moved[P_B], p)
         K_1, K_2 = bulk_modulus(moved[P_1], p), bulk_modulus(moved[P_2], p)
-        g_A = step * (pressure_rate(1.0, V_A, K_A) + pressure_rate(1.0, p.V_1, K_1))
-        g_B = step * (pressure_rate(1.0, V_B, K_B) + pressure_rate(1.0, p.V_2, K_2))
+        r_A, r_B = pressure_rate(1.0, V_A, K_A), pressure_rate(1.0, V_B, K_B)
+        r_1, r_2 = pressure_rate(1.0, p.V_1, K_1), pressure_rate(1.0, p.V_2, K_2)
+        if len(p.boiling) > 0:
+            least = p.p_vap - P_ATM
+            boils_A, boils_B = moved[P_A] < least, moved[P_B] < least
+            boils_1, boils_2 = moved[P_1] < least, moved[P_2] < least
+            total_A = select(boils_1, least, z[P_1]) - select(boils_A, least, z[P_A])
+            total_B = select(boils_B, least, z[P_B]) - select(boils_2, least, z[P_2])
+            r_A, r_B = select(boils_A, 0.0 * r_A, r_A), select(boils_B, 0.0 * r_B, r_B)
+            r_1, r_2 = select(boils_1, 0.0 * r_1, r_1), select(boils_2, 0.0 * r_2, r_2)
+        g_A, g_B = step * (r_A + r_1), step * (r_B + r_2)
         if len(p.filtered) > 0:  # p_1 - p_A = d + R Q once the flow has passed: the filter adds to g
             g_A, g_B = g_A + p.R_A, g_B + p.R_B
         Q_A = implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)

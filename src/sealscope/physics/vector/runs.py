@@ -13,10 +13,10 @@ import numpy as np
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.lanes import load, store
 from sealscope.physics.leakage import piston_leakage
-from sealscope.physics.rig import CHOICES, LAWS, NUMBERS, RigNumbers
+from sealscope.physics.rig import CHOICES, LAWS, NUMBERS, RigNumbers, pressures_of, vapour_floor
 from sealscope.physics.solvers.imex import imex_step
 from sealscope.physics.solvers.rk4 import rk4_step
-from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, State
+from sealscope.physics.state import P_A, P_B, POSITION, State
 from sealscope.physics.vector.fixed import settled, taken
 
 #: Rows that describe a leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
@@ -116,12 +116,13 @@ def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> A
     """Return the account with an output more in it."""
     flow, opened, reach, least, diverged = account
     share = opening(leak, t)
-    flow = flow + abs(piston_leakage(z[P_A] - z[P_B], leak[4] * share, leak[5] * share, q.dp_0))
-    least = min(least, z[P_A])
-    least = min(least, z[P_B])
+    p_A, p_B, p_1, p_2 = pressures_of(z, q)
+    flow = flow + abs(piston_leakage(p_A - p_B, leak[4] * share, leak[5] * share, q.dp_0))
+    least = min(least, p_A)
+    least = min(least, p_B)
     if len(q.throttled) > 0:
-        least = min(least, z[P_1])
-        least = min(least, z[P_2])
+        least = min(least, p_1)
+        least = min(least, p_2)
     total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]
     return flow, opened + share, max(abs(z[POSITION]), reach), least, diverged + 0.0 * total
 
@@ -183,8 +184,8 @@ def advance(
                 t = (start + step) * h
                 if due == 0:
                     due = every
-                    store(pressures, out, z[P_A])
-                    store(pressures, out + 1, z[P_B])
+                    store(pressures, out, vapour_floor(z[P_A], q))
+                    store(pressures, out + 1, vapour_floor(z[P_B], q))
                     out += CHANNELS
                     noted = _noted(z, leak, t + nodes[0], noted, q)
                 due -= 1
