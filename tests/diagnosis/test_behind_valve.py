@@ -21,6 +21,7 @@ from sealscope.diagnosis.pressure_model.model import (
     assumed_numbers,
     nominal,
 )
+from sealscope.diagnosis.volume_balance import behind_valve as balance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
@@ -95,6 +96,42 @@ def test_a_supply_that_drifts_is_no_other_cause() -> None:
     assert behind_pump is not None
     assert behind_pump.cause == "external leak"
     assert other_cause(signatures(other, behind_valve=True), 30.0) is None
+
+
+#: A machine of another rated flow, with edges ground unevenly and a spool that is slower than the rig says.
+OTHER = {"Q_N": "10.6 L/min", "o_PA": "4 um", "o_BT": "-3 um", "o_AT": "2 um", "omega_s": 880.0}
+
+
+def balanced(**options: str) -> Recording:
+    return simulate_with_truth(
+        Experiment.of(rig=RIG, command="5 sin(2t)", duration=60.0, rate=RATE, seed=5, set=OTHER, **options)
+    ).recording
+
+
+def test_the_balance_behind_a_valve_finds_leaks_from_position_and_supply() -> None:
+    """On a machine whose valve differs from the rig's: its edges are found beside the leak, in the same fit."""
+    sound, leaking = balanced(), balanced(leak="0.02 L/min from 30 s")
+    healthy = diagnose(sound, rig=RIG, quick=True)
+    assert (healthy.verdict, healthy.methods[0].detector) == ("no leak", "volume balance")
+    found = diagnose(leaking, rig=RIG, quick=True)
+    assert (found.verdict, found.cause, found.methods[0].detector) == ("leak", "piston leak", "volume balance")
+    assert found.onset_s == pytest.approx(30.0, abs=3.2)  # a window of one cycle
+    low, high = found.leak_interval_lpm
+    assert 0.015 < low < 0.02 < high < 0.025
+    few = sound.only([name for name in sound.channels if name != "p_1"])
+    assert "p_1" in diagnose(few, rig=RIG).methods[0].reason
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param("rod seal A 0.003 L/min from 30 s", marks=pytest.mark.slow),  # compiles a solver of its own
+        "sensor p_A offset 2 psi from 30 s",
+    ],
+)
+def test_what_else_changes_is_no_leak_to_the_balance_behind_a_valve(fault: str) -> None:
+    """Oil that leaves one chamber alone, and the zero of a transducer, which makes the edges' gains step."""
+    assert balance.examined(balanced(fault=fault), RIG, 0.01).verdict != "leak"
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sealscope.control.identification.balance import BLOCK, Balanced
 from sealscope.control.identification.estimate import Estimate, least_squares
+from sealscope.physics.valve import spool_series
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def _chambers(recording: Recording, rig: Rig, K: float) -> tuple[_Chamber, _Cham
     offsets = np.arange(-half, half + 1)
     ends = np.arange(half, len(recording) - half, length)
     x_ends = x[ends[:, None] + offsets].mean(axis=1)
-    way = _spool(recording["u"], rig, rate)
+    way = spool_series(recording["u"], v, rate, _PARTS)
     over = np.array([0.5 * (p_A - p_B)[a : b + 1][1:].sum() + 0.5 * (p_A - p_B)[a:b].sum() for a, b in _pairs(ends)])
 
     def law(dp: Array) -> Array:
@@ -158,15 +159,3 @@ def _between(values: Array) -> Array:
     """Return values evenly between the samples, in the middles of the parts of each."""
     shares = (np.arange(_PARTS) + 0.5) / _PARTS
     return np.asarray((values[:-1, None] + np.diff(values)[:, None] * shares).ravel())
-
-
-def _spool(u: Array, rig: Rig, rate: float) -> Array:
-    """Return the spool's place [m] in the middles of the parts of each sample, from rest."""
-    from scipy.signal import cont2discrete, lfilter
-
-    v = rig.valve
-    target = v.x_max * np.clip(u / v.u_N, -1.0, 1.0)
-    lag = (np.array([v.omega_s**2]), np.array([1.0, 2.0 * v.zeta_s * v.omega_s, v.omega_s**2]))
-    numerator, denominator, _ = cont2discrete(lag, 1.0 / (rate * _PARTS))
-    place = lfilter(numerator.ravel(), denominator, np.repeat(target, _PARTS))
-    return np.asarray(np.clip(0.5 * (place[1:] + place[:-1])[: (u.size - 1) * _PARTS], -v.x_max, v.x_max))

@@ -18,6 +18,7 @@ import numpy as np
 from sealscope.diagnosis.baseline.level import share_of_each
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, DriftStep
 from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.volume_balance.behind_valve import examined, unusable_behind_valve
 from sealscope.diagnosis.volume_balance.blocks import (
     BalanceBlocks,
     Geometry,
@@ -56,6 +57,7 @@ class VolumeBalance:
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
+        self._valved = rig.valve.spool == "present"
         areas = rig.cylinder.A_A, rig.cylinder.A_B
         self.geometry = Geometry(
             0.5 * sum(areas),
@@ -68,6 +70,8 @@ class VolumeBalance:
 
     def usable(self, recording: Recording) -> str | None:
         """Return None where the recording has what the balance needs, else the reason why not."""
+        if self._valved:
+            return unusable_behind_valve(recording)
         missing = channels_needed(recording)
         if missing is not None:
             return missing
@@ -81,6 +85,8 @@ class VolumeBalance:
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a rise of the conductance, and of its level against the baseline's."""
+        if self._valved:  # the level of G is not known there, so that a baseline tells nothing
+            return examined(recording, self.rig, false_alarm_probability)
         fit, problem = self.fit(recording)
         if fit is None:
             return Evidence("cannot tell", problem)
