@@ -37,8 +37,8 @@ SHARES = {
 VALVE_SHARES = {name: share for name, share in SHARES.items() if name.startswith(("fluid", "friction"))} | {
     "valve.Q_N": 0.2
 }
-#: Overlaps of its edges, either way [m].
-LAP = 10e-6
+#: Overlaps of its edges, either way [m], and vapour pressure [Pa]: a load pulls some pistons faster than oil comes.
+LAP, P_VAP = 10e-6, 1e3
 
 
 def drawn_rig(base: str, number: int, seed: int = 15) -> dict[str, float]:
@@ -54,6 +54,8 @@ def drawn_rig(base: str, number: int, seed: int = 15) -> dict[str, float]:
     for edge in ("PA", "AT", "PB", "BT") if valved else ():
         values[f"valve.o_{edge}"] = random.uniform(-LAP, LAP)
     values["cylinder.F_l"] = random.uniform(-200.0, 200.0)
+    if valved:
+        values["fluid.p_vap"] = P_VAP
     return values
 
 

@@ -204,7 +204,7 @@ def examples(default: int, slow: int):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@examples(3, 15)
+@examples(3, 8)
 def test_nothing_is_lost(drive, variant, count):
     """Oil to 1e-9 of what the pump moves, energy to 1e-6 of what is turned over."""
     name, fixed, drawn = VARIANTS[variant]
