@@ -9,7 +9,7 @@ import time
 import zlib
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.stream.baseline import plain_dataclass
 from sealscope.monitor.stream.estimates import BlockEstimate
-from sealscope.monitor.stream.plain_state import part_of
+from sealscope.monitor.stream.plain_state import part_of, plain_fields
 from sealscope.monitor.stream.watch import STATE_VERSION, Watch, watch
 from sealscope.recordings.recording import Recording
 
@@ -303,7 +303,7 @@ class WatchedActuators:
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add the state to the rows, and what is old then."""
-        last = None if actuator.last is None else asdict(actuator.last)
+        last = None if actuator.last is None else plain_fields(actuator.last)
         parts = {"watch": actuator.watch.state(), "judge": actuator.judge.state(), "last": last}
         state: dict[str, Any] = {**parts, "oil_celsius": actuator.oil_celsius}
         settings = actuator.settings

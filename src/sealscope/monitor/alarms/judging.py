@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sealscope.errors import InputError
@@ -11,6 +11,7 @@ from sealscope.monitor.alarms.alarm import NEXT_CHECKS, Alarm, AlarmState, Level
 from sealscope.monitor.stream.baseline import plain_dataclass
 from sealscope.monitor.stream.decisions import rarity
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
+from sealscope.monitor.stream.plain_state import plain_fields
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ class AlarmJudge:
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
-        return asdict(self)
+        return {**vars(self), "alarm": None if self.alarm is None else plain_fields(self.alarm)}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> AlarmJudge:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.monitor.stream.plain_state import plain_fields
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_values import as_type
 
@@ -95,7 +96,7 @@ class BaselineLearning:
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values; infinite ones are None."""
-        values = asdict(self)
+        values = plain_fields(self)
         for name in ("low", "high"):
             values[name] = values[name] if math.isfinite(values[name]) else None
         for name in ("duty_low", "duty_high"):

@@ -122,6 +122,14 @@ def _contrasts(n: int) -> Array:
     return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
 
 
+def _median(values: Array) -> float:
+    """Return the median of a few values, in a third of the time of NumPy's."""
+    ordered, half = np.sort(values), values.size // 2
+    if math.isnan(ordered[-1]):  # which comes last
+        return math.nan
+    return float(ordered[half]) if values.size % 2 else 0.5 * float(ordered[half - 1] + ordered[half])
+
+
 def worth_a_search(g: Array) -> bool:
     """Return whether any step in a series (n,) is so large that a search for a rise could end in an alarm.
 
@@ -129,12 +137,12 @@ def worth_a_search(g: Array) -> bool:
     of the noise is that of the second differences, that of the walk of differences over `_LAG` blocks, by their
     medians, which one step does not move. Means of m values on either side differ by 2 s^2/m + 2 q m/3 (variance).
     """
-    noise = float(np.median(np.abs(np.diff(g, 2)))) / (0.6745 * np.sqrt(6.0))
+    noise = _median(np.abs(np.diff(g, 2))) / (0.6745 * math.sqrt(6.0))
     if not np.max(_contrasts(g.size) @ g) > _WORTH_A_SEARCH * noise:
         return False
     if g.size < _FEW:
         return True
-    moved = float(np.median(np.abs(g[_LAG:] - g[:-_LAG]))) / 0.6745
+    moved = _median(np.abs(g[_LAG:] - g[:-_LAG])) / 0.6745
     walk = max(0.0, moved**2 - 2.0 * noise**2) / _LAG
     sums = np.concatenate([[0.0], np.cumsum(g)])
     for m in _NEIGHBOURS:

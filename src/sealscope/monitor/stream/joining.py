@@ -5,6 +5,7 @@ The result depends on the samples and their order alone, never on how they were 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -68,7 +69,7 @@ class SampleJoiner:
     counters: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return sum(piece[0].size for piece in self.pieces)
+        return sum([piece[0].size for piece in self.pieces])
 
     def count(self, reason: str, number: int = 1) -> None:
         """Add to a counter."""
@@ -92,7 +93,8 @@ class SampleJoiner:
             self.interrupt("rate changed")
             self.rate = samples.rate
         for first, last in self._in_order(samples.t):
-            if np.isfinite(self.newest) and not self._follows(samples.t[first] - self.newest):
+            step = float(samples.t[first]) - self.newest
+            if math.isfinite(self.newest) and not self._follows(step, step):
                 self.interrupt("gap")
             self.pieces.append([samples.t[first:last], *(samples[name][first:last] for name in self.names)])
             if len(self.pieces) > _PIECES:
@@ -100,9 +102,10 @@ class SampleJoiner:
             self.newest = float(samples.t[last - 1])
             yield
 
-    def _follows(self, step: Any) -> Any:
+    def _follows(self, least: float, most: float) -> bool:
+        """Return whether samples follow each other that are so far apart, at least and at most [s]."""
         low, high = _FOLLOWS
-        return (step * self.rate > low) & (step * self.rate < high)
+        return least * self.rate > low and most * self.rate < high
 
     def _fits(self, samples: Recording) -> bool:
         """Return whether the samples have the stream's channels and SI units; count them where they do not."""
@@ -132,7 +135,7 @@ class SampleJoiner:
         """Yield first and one past the last index of runs of samples that follow each other."""
         with np.errstate(all="ignore"):  # NaN and infinity follow nothing
             steps = np.diff(t)
-            whole = t.size > 1 and t[0] > self.newest and self._follows(steps.min()) and self._follows(steps.max())
+            whole = t.size > 1 and t[0] > self.newest and self._follows(float(steps.min()), float(steps.max()))
         if whole:  # as nearly always
             yield 0, t.size
             return
@@ -153,7 +156,9 @@ class SampleJoiner:
                 at += run
                 continue
             rest = known[at:]
-            breaks = ~self._follows(np.diff(t[rest])) | (np.diff(rest) != 1)
+            low, high = _FOLLOWS
+            steps = np.diff(t[rest]) * self.rate
+            breaks = ~((steps > low) & (steps < high)) | (np.diff(rest) != 1)
             run = int(np.argmax(breaks)) + 1 if breaks.any() else rest.size
             yield first, first + run
             at += run

@@ -21,6 +21,11 @@ def plain_array(values: Array) -> dict[str, Any]:
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
 
 
+def plain_fields(values: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass whose values are plain already; lists are copied, for they may grow."""
+    return {name: list(value) if isinstance(value, list) else value for name, value in vars(values).items()}
+
+
 def array_of(value: Any, name: str) -> Array:
     """Return the array that `plain_array` made a mapping of; `name` stands in the error.
 

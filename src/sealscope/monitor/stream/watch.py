@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from sealscope.monitor.stream.decisions import (
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 from sealscope.monitor.stream.estimator import PAUSE_S, BlockConductance, ConductanceEstimator, NotJudged, RecentBlocks
 from sealscope.monitor.stream.joining import SampleJoiner
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
+from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array, plain_fields
 from sealscope.monitor.stream.pressures import PressureEstimator
 from sealscope.monitor.stream.volumes import VolumeEstimator
 from sealscope.recordings.recording import Array, Recording
@@ -357,8 +356,8 @@ class Watch:
             "samples": self._samples.state(),
             "estimators": {by: estimator.state() for by, estimator in self._estimators.items()},
             "learning": self._learning.state(),
-            "baseline": None if self.baseline is None else asdict(self.baseline),
-            "leak": None if self.leak is None else asdict(self.leak),
+            "baseline": None if self.baseline is None else plain_fields(self.baseline),
+            "leak": None if self.leak is None else plain_fields(self.leak),
             "means": plain_array(self._means),
             "group": plain_array(self._group),
         }
