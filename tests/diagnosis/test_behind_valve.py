@@ -118,6 +118,12 @@ def test_the_balance_behind_a_valve_finds_leaks_from_position_and_supply() -> No
     assert found.onset_s == pytest.approx(30.0, abs=3.2)  # a window of one cycle
     low, high = found.leak_interval_lpm
     assert 0.015 < low < 0.02 < high < 0.025
+    stopped = dict(sound.channels)
+    stopped["p_A"] = np.where(np.abs(sound.t - 24.05) < 0.04, stopped["p_1"], stopped["p_A"])
+    stopped["p_B"] = np.where(np.abs(sound.t - 24.05) < 0.04, stopped["p_2"], stopped["p_B"])
+    evidence = balance.examined(replace(sound, channels=stopped), RIG, 0.01)
+    assert evidence.verdict == "no leak"
+    assert "the piston is at an end of its stroke, or a load holds it, at 24.0 s" in evidence.reason
     few = sound.only([name for name in sound.channels if name != "p_1"])
     assert "p_1" in diagnose(few, rig=RIG).methods[0].reason
 

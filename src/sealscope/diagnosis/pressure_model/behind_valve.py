@@ -24,7 +24,7 @@ from sealscope.recordings.recording import Array
 
 State = tuple[float, float, float, float, float]
 #: |p_A - p_B| as a share of the supply at which the piston does not move, and for how long [s] it must stay there.
-_STALLED, _STALLED_S = 0.7, 0.02
+STALLED, _STALLED_S = 0.7, 0.02
 
 
 def flow_per_volt(rig: Rig) -> float:
@@ -43,7 +43,7 @@ def stalled(dp: Array, supply: Array, rate: float) -> int | None:
 
     Then the piston is at an end of its stroke, or a load holds it: no law of its motion describes that.
     """
-    held: NDArray[np.bool_] = np.abs(dp) > _STALLED * float(np.median(supply))
+    held: NDArray[np.bool_] = np.abs(dp) > STALLED * float(np.median(supply))
     length = max(1, int(_STALLED_S * rate))
     runs = np.convolve(held, np.ones(length), "valid") > length - 0.5
     return int(np.argmax(runs)) if np.any(runs) else None

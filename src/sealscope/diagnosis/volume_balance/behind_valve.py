@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, DriftStep, find_step, findable_step
+from sealscope.diagnosis.pressure_model.behind_valve import STALLED, stalled
 from sealscope.diagnosis.verdict.evidence import (
     LEAK_WORTH_FINDING,
     NO_RIG,
@@ -45,9 +46,6 @@ CHANNELS = ("x", "u", "p_A", "p_B", "p_1", "p_2")
 #: Length of a block, least length of a window of whole cycles, half length of the averages at a block's ends [s]; parts
 #: of a sample in which the spool is followed; most windows of a recording.
 _BLOCK, _WINDOW, _HALF, _PARTS, _MOST = 0.25, 3.0, 0.01, 4, 60
-#: A block counts where p_A - p_B stays below this share of the supply: beyond, the piston is at an end of its stroke,
-#: and the edges pass what nobody can tell.
-_STALLED = 0.7
 #: Least share of a window's blocks that counts, and of a recording's windows.
 _MOST_OF_A_WINDOW, _MOST_WINDOWS = 0.6, 0.7
 #: How well is known, before the recording: overlaps as a share of the spool's stroke, its lateness [s], the oil's
@@ -68,7 +66,8 @@ class ValveWindows:
     """Conductance past the piston over n windows.
 
     `t` (n,) middles [s]; `seconds` of a window; `G` (n,) [m^3/(s Pa)] beyond an unknown level, `sd` (n,) its deviation;
-    `flow` [m^3/s]: mean flow of the valve; `share` of the recording's windows that count.
+    `flow` [m^3/s]: mean flow of the valve; `share` of the recording's windows that count; `stopped` [s]: since when the
+    piston is at an end of its stroke now and then, None where it never is.
     """
 
     t: Array
@@ -77,6 +76,16 @@ class ValveWindows:
     sd: Array
     flow: float
     share: float
+    stopped: float | None
+
+    @property
+    def left_out(self) -> str:
+        """What the windows leave out, in words."""
+        if self.stopped is None:
+            return ""
+        return (
+            f"; the piston is at an end of its stroke, or a load holds it, at {self.stopped:.1f} s, which is left out"
+        )
 
 
 def unusable_behind_valve(recording: Recording) -> str | None:
@@ -115,7 +124,9 @@ def examined(recording: Recording, rig: Rig, probability: float) -> Evidence:
     lpm = 0.5 * (laminar + other) * step.size
     limits = max(0.0, step.size - half) * min(laminar, other), (step.size + half) * max(laminar, other)
     open_ = windows.t > step.onset
-    reason = f"what passes between the chambers rose by {lpm:.4f} L/min at {step.onset:.1f} s ({figures})"
+    reason = (
+        f"what passes between the chambers rose by {lpm:.4f} L/min at {step.onset:.1f} s ({figures}){windows.left_out}"
+    )
     lines = [np.where(open_, value, 0.0) for value in (lpm, *limits)]
     course = LeakCourse(windows.t, lines[0], lines[1], lines[2])
     leak = Evidence(
@@ -145,6 +156,7 @@ def _no_step(windows: ValveWindows, step: DriftStep, probability: float, dp: flo
     known = share <= LEAK_WORTH_FINDING
     if not known:
         reason += f", more than {LEAK_WORTH_FINDING:.0%} of the valve's flow, the smallest leak worth finding"
+    reason += windows.left_out
     passage = Passage(None, None, dp, smallest / LITRE_PER_MINUTE, None, None, share)
     return Evidence(
         "no leak" if known else "cannot tell",
@@ -176,7 +188,8 @@ def conductances(recording: Recording, rig: Rig) -> ValveWindows | str:
     ends = half + np.round(np.arange(count * per + 1) * (window * rate / per)).astype(np.int64)
     chambers = [_ValveChamber.of(recording, rig, sign, ends, half) for sign in (1.0, -1.0)]
     dp = recording["p_A"] - recording["p_B"]
-    held = np.abs(dp) > _STALLED * float(np.median(recording["p_1"] - recording["p_2"]))
+    supply = recording["p_1"] - recording["p_2"]
+    held, at = np.abs(dp) > STALLED * float(np.median(supply)), stalled(dp, supply, rate)
     used = ~(np.logical_or.reduceat(held, ends[:-1]) | touched(recording, ends))
     filled = used.reshape(count, per).mean(axis=1) >= _MOST_OF_A_WINDOW
     share = float(filled.mean())
@@ -193,7 +206,8 @@ def conductances(recording: Recording, rig: Rig) -> ValveWindows | str:
         return fit
     middles = (np.arange(count) + 0.5) * window + half / rate
     flow = float(np.mean([np.abs(chamber.swept[used]).mean() for chamber in chambers])) * per / window
-    return ValveWindows(float(recording.t[0]) + middles[filled], window, *fit, flow, share)
+    stopped = None if at is None else float(recording.t[at])
+    return ValveWindows(float(recording.t[0]) + middles[filled], window, *fit, flow, share, stopped)
 
 
 @dataclass(frozen=True, eq=False)
