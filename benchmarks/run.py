@@ -2,8 +2,8 @@
 
     python benchmarks/run.py [--quick] [--into FOLDER]
 
-Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib), batch.json and streams.json into
-`benchmarks/results` or the folder that is given.
+Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib), batch.json, variants.json and streams.json
+into `benchmarks/results` or the folder that is given.
 """
 
 from __future__ import annotations
@@ -35,6 +35,9 @@ def main() -> None:
         solvers += ["--rounds", "2", "--duration", "20", "--case", "no throttles, 3 sin 4t"]
         solvers += ["--case", "50 % closed, 3 sin 4t"]
         batch += ["--rounds", "2", "--runs", "32", "--duration", "20"]
+    variants = ["bench_variants.py", "--json", str(results / "variants.json")]
+    if chosen.quick:
+        variants += ["--rounds", "1", "--runs", "8", "--duration", "20"]
     streams = ["bench_streams.py", "--json", str(results / "streams.json")]
     if chosen.quick:
         streams += ["--rounds", "3"]
@@ -42,7 +45,7 @@ def main() -> None:
     if chosen.quick:
         gpu += ["--runs", "2000", "--rounds", "2"]
     print(f"{platform.machine()}, {platform.python_implementation()} {platform.python_version()}", flush=True)
-    for words in (solvers, batch, streams, gpu):
+    for words in (solvers, batch, variants, streams, gpu):
         subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=True)
 
 

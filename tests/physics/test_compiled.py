@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import namedtuple
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import numba
 import numpy as np
 import pytest
 from numba.core import config
+from numba.core.errors import TypingError
 
 import sealscope
 from sealscope import compiled
@@ -243,3 +245,29 @@ def test_a_law_is_the_same_from_python_as_within_compiled_code():
 
     assert within(3.0) == doubled(3.0) + 1.0 == doubled(x=3.0) + 1.0 == 7.0
     assert doubled(np.float32(0.25)) == 0.5  # of another type than within
+
+
+def test_a_law_that_a_rig_leaves_out_is_not_compiled():
+    """What is behind len(p.law) > 0 is not even looked at where the tuple is empty: here it cannot be compiled."""
+    numbers = namedtuple("numbers", ("x", "law"))
+
+    @compiled.law
+    def broken(x):
+        return x.nothing_of_this_name
+
+    @compiled.kernel
+    def chosen(p):
+        if len(p.law) > 0 or p.x < 0.0:
+            return broken(p.x)
+        return 2.0 * p.x
+
+    @compiled.kernel
+    def guarded(p):
+        more = broken(p.x) if len(p.law) > 0 else 0.0
+        return p.x + more
+
+    assert guarded(numbers(1.5, ())) == 1.5
+    with pytest.raises(TypingError, match="nothing_of_this_name"):
+        guarded(numbers(1.5, (True,)))
+    with pytest.raises(TypingError, match="nothing_of_this_name"):  # a branch that is not settled is compiled
+        chosen(numbers(1.5, ()))
