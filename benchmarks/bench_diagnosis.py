@@ -1,10 +1,12 @@
 """Time `diagnose` on 180 s of all channels at 500 Hz, and the import of what it needs in a fresh interpreter.
 
-    python benchmarks/bench_diagnosis.py [--rounds 15] [--imports 7] [--files 12] [--json FILE]
+    python benchmarks/bench_diagnosis.py [--rounds 3] [--imports 3] [--files 4] [--only TEXT ...] [--json FILE]
 
-Prints the median and the middle half (25 % to 75 %) of each [s]. `first call` is the first diagnosis of a fresh
-interpreter, imports apart. Recordings of a baseline are `known`: their own fits were made by an earlier call.
-At last, `sealscope diagnose` on several files on one core and on all.
+Prints the median and the middle half (25 % to 75 %) of each [s], and the least processor time [s], which other work on
+the machine changes little: figures of two versions are compared by it. Ends within two minutes on two cores that are
+free. `--only`: the cases whose names hold one of these, and neither imports nor files. `first call` is the first
+diagnosis of a fresh interpreter, imports apart. Recordings of a baseline are `known`: their own fits were made by an
+earlier call. At last, `sealscope diagnose` on several files on one core and on all.
 """
 
 from __future__ import annotations
@@ -49,9 +51,14 @@ diagnose(prepared)
 
 def seconds(call: Callable[[], object]) -> float:
     """Wall time of one call [s]."""
-    start = time.perf_counter()
+    return timed(call)[0]
+
+
+def timed(call: Callable[[], object]) -> tuple[float, float]:
+    """Wall time and processor time of one call [s]."""
+    start, spent = time.perf_counter(), time.process_time()
     call()
-    return time.perf_counter() - start
+    return time.perf_counter() - start, time.process_time() - spent
 
 
 def fresh(imported: str, then: str = "") -> tuple[float, float]:
@@ -83,9 +90,10 @@ def of_many(count: int, duration: float, cores: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--imports", type=int, default=7)
-    parser.add_argument("--files", type=int, default=12, help="files that `sealscope diagnose` is given at once")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--imports", type=int, default=3)
+    parser.add_argument("--files", type=int, default=4, help="files that `sealscope diagnose` is given at once")
+    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="cases whose names hold one of these")
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     if min(chosen.rounds, chosen.imports) < 1:
@@ -106,24 +114,33 @@ def main() -> None:
         "the judge alone, leak": lambda: diagnose(leaky, quick=True),
         "pressures and command, no leak": lambda: diagnose(pressures[0]),
         "pressures and command, leak": lambda: diagnose(pressures[1]),
+        "the judge alone, from pressures": lambda: diagnose(pressures[0], quick=True),
     }
     for command in COMMANDS:
         record = simulate(command=command, seed=1, leak="0.0042 L/min from 90 s")
         cases[f"leak under {command}, no throttles"] = partial(diagnose, record)
     figures: dict[str, list[float]] = {}
     for name, call in cases.items():
+        if chosen.only and not any(text in name for text in chosen.only):
+            continue
         call()
-        figures[name] = quartiles([seconds(call) for _ in range(chosen.rounds)])
-    fresh(_IMPORT, _FIRST_CALL)
-    figures["import sealscope"] = quartiles([fresh("import sealscope")[0] for _ in range(chosen.imports)])
-    both = [fresh(_IMPORT, _FIRST_CALL) for _ in range(chosen.imports)]
-    figures["import of diagnose"] = quartiles([one[0] for one in both])
-    figures["first call in a fresh interpreter"] = quartiles([one[1] for one in both])
-    alone, beside = (of_many(chosen.files, 180.0, cores) for cores in (1, len(os.sched_getaffinity(0))))
-    print("180 s at 500 Hz, all channels; median (25 % .. 75 %) [s]")
-    for name, (middle, low, high) in figures.items():
-        print(f"{name:<40}{middle:8.3f} ({low:.3f} .. {high:.3f})")
-    print(f"{chosen.files} files: {alone:.1f} s on one core, {beside:.1f} s on all: {alone / beside:.2f} times as fast")
+        times = [timed(call) for _ in range(chosen.rounds)]
+        figures[name] = [*quartiles([wall for wall, _ in times]), min(spent for _, spent in times)]
+    if not chosen.only:
+        fresh(_IMPORT, _FIRST_CALL)
+        figures["import sealscope"] = quartiles([fresh("import sealscope")[0] for _ in range(chosen.imports)])
+        both = [fresh(_IMPORT, _FIRST_CALL) for _ in range(chosen.imports)]
+        figures["import of diagnose"] = quartiles([one[0] for one in both])
+        figures["first call in a fresh interpreter"] = quartiles([one[1] for one in both])
+    print("180 s at 500 Hz, all channels unless said; median (25 % .. 75 %), processor time [s]")
+    for name, (middle, low, high, *spent) in figures.items():
+        print(f"{name:<40}{middle:8.3f} ({low:.3f} .. {high:.3f}){''.join(f'{least:9.3f}' for least in spent)}")
+    if not chosen.only:
+        alone, beside = (of_many(chosen.files, 180.0, cores) for cores in (1, len(os.sched_getaffinity(0))))
+        times_as_fast = alone / beside
+        print(
+            f"{chosen.files} files: {alone:.1f} s on one core, {beside:.1f} s on all: {times_as_fast:.2f} times as fast"
+        )
     if chosen.json:
         unfinished = chosen.json.with_name(chosen.json.name + ".partial")
         unfinished.write_text(json.dumps(figures, indent=2) + "\n")

@@ -135,7 +135,7 @@ def window_at(model: DrivenModel, dp: Array, theta: Array, first: int, length: i
     """Return the window of `length` samples from `first` on; the model comes to it with parameters `theta` (13,)."""
     state = np.zeros((1, STATES))
     if first > 0:
-        model.part(0, first).run(theta[None], start=state)
+        model.coarse(theta).part(0, first).run(theta[None], start=state)
     integral = float(state[0, _INTEGRAL] / theta[GAIN])
     settle = int(SETTLE * model.rate)
     here = dp[first + settle : first + length]
@@ -169,7 +169,8 @@ def minimise(
 ) -> tuple[Array, Array]:
     """Minimise the cost over the free parameters by Levenberg-Marquardt from several starts (m, 13) side by side.
 
-    Returns the sets that are reached, cheapest first, and their costs (m,); `enough`: gain of cost to continue for.
+    Returns the sets that are reached, cheapest first, and their costs (m,). A start is left where the linear model
+    promises less than `enough` of cost, or a step gains less.
     """
     free = list(free)
     data = window.slow(window.dp)
@@ -181,26 +182,34 @@ def minimise(
         return misfit if np.isfinite(misfit) else np.inf
 
     costs = np.array([cost_of(here, at) for here, at in zip(shown, thetas, strict=True)])
-    active = list(np.flatnonzero(np.isfinite(costs)))
+    active = [int(start) for start in np.flatnonzero(np.isfinite(costs))]
     for _ in range(most):
         if not active:
             break
         # slopes of all starts, and then all their tries, fill the vector registers together
-        dampings = _DAMPINGS if len(active) == 1 else _FEWER_DAMPINGS
         h = np.array([steps_of(thetas[start]) for start in active])[:, free]
         sets = np.repeat(thetas[active], len(free), axis=0).reshape(len(active), len(free), -1)
         sets[:, range(len(free)), free] += h
         moved = window.runs(sets.reshape(-1, thetas.shape[1])).reshape(len(active), len(free), -1)
-        tries = np.repeat(thetas[active], len(dampings), axis=0).reshape(len(active), len(dampings), -1)
+        systems: dict[int, tuple[Array, Array, Array]] = {}
         for row, start in enumerate(active):
             slopes = moved[row] - shown[start]
             scale = h[row] / prior.deviation[free]
             off = (thetas[start] - prior.centre)[free] / prior.deviation[free]
             H = window.weight * (slopes @ slopes.T) + np.diag(scale**2)
             g = window.weight * (slopes @ (data - shown[start])) - off * scale
+            promised = float(g @ np.linalg.solve(H, g)) if np.all(np.isfinite(H)) else 0.0
+            if promised >= enough:
+                systems[start] = H, g, h[row]
+        active = list(systems)
+        if not active:
+            break
+        dampings = _DAMPINGS if len(active) == 1 else _FEWER_DAMPINGS
+        tries = np.repeat(thetas[active], len(dampings), axis=0).reshape(len(active), len(dampings), -1)
+        for row, start in enumerate(active):
+            H, g, scale = systems[start]
             for k, factor in enumerate(dampings):
-                if np.all(np.isfinite(H)):
-                    tries[row, k, free] += np.linalg.solve(H + factor * np.diag(np.diag(H)), g) * h[row]
+                tries[row, k, free] += np.linalg.solve(H + factor * np.diag(np.diag(H)), g) * scale
                 if not _valid(tries[row, k]):
                     tries[row, k] = thetas[start]
         tried = window.runs(tries.reshape(-1, thetas.shape[1])).reshape(len(active), len(dampings), -1)
@@ -260,7 +269,7 @@ def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Arra
     tried, _ = minimise(short, starts[costs <= costs[0] + _NEAR], prior, everything, 8, 1.0)
     other = next((k for k in range(1, len(tried)) if abs(tried[k, K] / tried[0, K] - 1.0) > _SAME), None)
     finalists, _ = minimise(window, tried[[0] if other is None else [0, other]], prior, everything, 4, 1.0)
-    (theta, *_), costs = minimise(window, finalists[:1], prior, everything, 20, 0.1)
+    (theta, *_), costs = minimise(window, finalists[:1], prior, everything, 20, 1.0)
     plain = theta.copy()
     plain[[LEAD, BIAS]] = 0.0
     plain[[G, F_C, F_V, K_BRK, C_C, F_CFR]] = centre[[G, F_C, F_V, K_BRK, C_C, F_CFR]]
@@ -270,5 +279,5 @@ def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Arra
 def refit(window: Window, start: Array, prior: Prior) -> tuple[Array, float]:
     """Return the best fit that is reached from another start, and its cost per sample."""
     fitted, _ = minimise(window, start[None], prior, (GAIN, K), 6, 1.0)
-    fitted, costs = minimise(window, fitted, prior, range(SOUND), 20, 0.1)
+    fitted, costs = minimise(window, fitted, prior, range(SOUND), 20, 1.0)
     return fitted[0], float(costs[0]) / window.dp.size

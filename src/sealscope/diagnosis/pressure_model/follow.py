@@ -149,8 +149,10 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
     theta, cost, anew = fit(long, short, prior, guess)
     if not np.isfinite(cost):
         return "the model of the rig cannot be fitted to the pressures"
-    hum = lines_in(dp - model.run(theta[None])[0], rate, cycle)
-    if np.any(hum):
+    shown = model.run(theta[None])[0]
+    hum = lines_in(dp - shown, rate, cycle)
+    humming = bool(np.any(hum))
+    if humming:
         dp = dp - hum
         long, short = _windows(model, dp, theta, span)
         theta, cost = refit(long, theta, prior)
@@ -163,7 +165,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
         return f"too short: {counted.size} whole blocks of {length:.3g} s, {FEWEST_BLOCKS} are needed"
     edges, seen = edges[counted[0] : counted[-1] + 2], seen[counted[0] : counted[-1] + 1]
     skip = int(FIRST * rate)
-    look, large = _tracked(model, dp, edges, theta, skip, seen), None
+    look, large = _tracked(model, dp, edges, theta, skip, seen, None if humming else shown), None
     if isinstance(look, str) or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
         large = _large(plain, raw, edges, seen, prior)
         if large is not None and large.better > BETTER:
@@ -253,11 +255,18 @@ def _tracked(
     theta: Array,
     skip: int,
     seen: NDArray[np.bool_],
+    shown: Array | None = None,
 ) -> _Look | str:
-    """Follow the record from a first fit, and estimate the steps of G in it."""
+    """Follow the record from a first fit, and estimate the steps of G in it.
+
+    `shown` (n,): what the model shows with that fit from rest.
+    """
     try:
         followed = min(
-            (track(model, dp, edges, theta, start, skip, seen=seen) for start in _starts(model, theta)),
+            (
+                track(model, dp, edges, theta, start, skip, seen=seen, shown=None if np.any(start) else shown)
+                for start in _starts(model, theta)
+            ),
             key=lambda each: float(each.block_variance[:_EARLY].mean()),
         )
     except FloatingPointError:
@@ -293,7 +302,7 @@ def _looked_again(
         return look
     speed = model.speed_amplitude(theta)
     start = followed.start
-    risen = [track(model, dp, edges, theta, start, skip, (law, after), followed.path, seen=seen) for law in LAWS]
+    risen = [track(model, dp, edges, theta, start, skip, (law, after), followed, seen=seen) for law in LAWS]
     variance = min(fresh.variance for fresh in risen)
     leaks, excess = [], look.excess
     for law, fresh in zip(LAWS, risen, strict=True):

@@ -7,6 +7,8 @@ chambers ring against each other, so the phase between p_A and -p_B grows with f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,16 +34,15 @@ _QUIET = 0.35
 _COHERENT, _OUTLYING, _SURE, _FEWEST = 0.1, 1e-3, 1e-4, 5.0
 
 
-def _spectrum(first: Array, second: Array, rate: float, seconds: float) -> tuple[Array, NDArray[np.complex128]]:
-    """Return frequencies [Hz] and cross spectrum of two channels (n,), averaged over half overlapping segments."""
-    length = min(round(seconds * rate), first.size)
-    window = np.hanning(length)
-    sums = np.zeros(length // 2 + 1, dtype=np.complex128)
-    for begin in range(0, first.size - length + 1, max(1, length // 2)):
-        parts = (channel[begin : begin + length] for channel in (first, second))
-        a, b = (np.fft.rfft(window * (part - part.mean())) for part in parts)
-        sums += a * np.conj(b)
-    return np.asarray(np.fft.rfftfreq(length, 1.0 / rate), dtype=np.float64), sums
+def _spectra(channels: Sequence[Array], rate: float, seconds: float) -> tuple[Array, NDArray[np.complex128]]:
+    """Return frequencies [Hz] and spectra (channels, segments, frequencies) of half overlapping segments."""
+    length = min(round(seconds * rate), channels[0].size)
+    parts = np.array(
+        [np.lib.stride_tricks.sliding_window_view(each, length)[:: max(1, length // 2)] for each in channels]
+    )
+    parts -= parts.mean(axis=-1, keepdims=True)
+    parts *= np.hanning(length)
+    return np.asarray(np.fft.rfftfreq(length, 1.0 / rate), dtype=np.float64), np.fft.rfft(parts)
 
 
 def line_frequencies(residual: Array, rate: float, cycle: float | None = None) -> Array:
@@ -50,8 +51,8 @@ def line_frequencies(residual: Array, rate: float, cycle: float | None = None) -
     `cycle` [s] of the duty, None where it does not repeat: what a model misses of the motion, a leak above all, lies at
     its harmonics.
     """
-    frequency, cross = _spectrum(residual, residual, rate, SEGMENT)
-    power = np.abs(cross)
+    frequency, spectra = _spectra([residual], rate, SEGMENT)
+    power = np.sum(np.abs(spectra[0]) ** 2, axis=0)
     reach = round(_NEAR / frequency[1])
     candidates = np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])) + 1
     candidates = candidates[frequency[candidates] >= _LOWEST]
@@ -103,13 +104,13 @@ def skew(p_A: Array, p_B: Array, rate: float) -> float:
     c / (1 - c) of coherence c; lines of hum, where the phase is anything, weigh as their neighbours do. 0 where the
     scatter leaves it uncertain by more than 0.1 ms, or it is beyond `LARGEST_SKEW`.
     """
-    frequency, cross = _spectrum(p_A, p_B, rate, _COMPARED)
-    _, own_A = _spectrum(p_A, p_A, rate, _COMPARED)
-    _, own_B = _spectrum(p_B, p_B, rate, _COMPARED)
+    frequency, (of_A, of_B) = _spectra([p_A, p_B], rate, _COMPARED)
+    cross = np.sum(of_A * np.conj(of_B), axis=0)
+    own_A, own_B = (np.sum(np.abs(each) ** 2, axis=0) for each in (of_A, of_B))
     # noise that both channels share is in phase and white: what is left of it where nothing rings any more
     cross = cross - max(0.0, float(np.median(np.real(cross[frequency > _QUIET * rate]))))
     here = (frequency >= _LOW) & (frequency <= min(_HIGH, 0.4 * rate))
-    coherence = np.clip(np.abs(cross[here]) ** 2 / np.maximum(np.abs(own_A[here] * own_B[here]), 1e-300), 0.0, 0.8)
+    coherence = np.clip(np.abs(cross[here]) ** 2 / np.maximum(own_A[here] * own_B[here], 1e-300), 0.0, 0.8)
     late = np.angle(-cross[here]) / (2.0 * np.pi * frequency[here])
     odds = np.where(coherence > _COHERENT, coherence / (1.0 - coherence), 0.0)
     neighbours = np.lib.stride_tricks.sliding_window_view(np.pad(odds, 5, mode="reflect"), 11)

@@ -256,9 +256,10 @@ class _After:
         sound = theta.copy()
         for k, _ in law.parts:
             sound[k] = self.theta[k]
+        size = float(risen[law.parts[0][0]])
         if law.laminar and law.orifice:
             law = Law(1.0, float(risen[ORIFICE] / risen[G]))
-        size = float(risen[law.parts[0][0]]) if law.orifice >= 0.0 else 0.0
+            size = size if law.orifice > 0.0 else 0.0
         return _Leaking(law, size, sound, theta, float(costs[0]))
 
     def another(self) -> float:

@@ -15,7 +15,7 @@ Penzer, Diagnosing shocks in time series, JASA 93 (1998) 796-806.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,8 @@ _STUCK, _LEAPS, _BIASES = 3.0, 1.7, np.array([0.0, -0.25, 0.25, -0.5, 0.5, -1.0,
 #: Shares of a Gauss-Newton step that are tried side by side, and the fall of the cost to go on for.
 _SHARES = np.array([1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 1.4])
 _ENOUGH = 4.0
+#: Slopes of coarse steps do as long as a step gains this share of what they promise.
+_KEPT = 0.5
 #: How far the parameters may wander in the first passes, times the usual: the record's mean comes first, so that what
 #: is left in a block is small and the model is linear over it.
 _LEASHES = (0.1, 0.3, 1.0)
@@ -137,6 +139,17 @@ class Track:
     strain: float
     start: Array
 
+    def fall(self, at: Array, further: Array) -> float:
+        """Return by how much the misfit [its variance] falls from parameters `at` (b, 13) [units] to `further` ones.
+
+        `further` (b, 14): the steps to those [units], and of the constant of dp.
+        """
+        slope = self.r_all - np.einsum("bij,bj->bi", self.N_all[:, :, :-1], at)
+        fallen = 2.0 * further * slope - further * np.einsum("bij,bj->bi", self.N_all, further)
+        # the misfit is that beside a constant of its own
+        counted = self.N_all[:, -1, -1] > 0.0
+        return float(fallen.sum() - np.sum(slope[counted, -1] ** 2 / self.N_all[counted, -1, -1]))
+
     def rise(self, law: Law) -> Rise:
         """Return what a leak of a law does."""
         at, unit = _in_units(law, self.path[0])
@@ -193,17 +206,20 @@ def track(
     start: Array,
     skip: int,
     rise: tuple[Law, int] | None = None,
-    from_path: Array | None = None,
+    begin: Track | Array | None = None,
     *,
     seen: NDArray[np.bool_] | None = None,
     size: float = 0.0,
+    shown: Array | None = None,
 ) -> Track:
     """Follow the parameters from the first fit `theta` (13,) through blocks between `edges` of the whole record.
 
     `start` (5,): the model's state at the first sample; `rise`: the law of a leak of the size that suits, and after
-    which block it is open; `from_path` (b, 13): where to begin, the first fit by default; `seen` (b,): blocks that
-    count (default: all), through the others the parameters wander unseen. Blocks are linearised about their own
-    parameters, until these stand still; the trend of the speed's bias within a block is eliminated.
+    which block it is open; `begin`: a path (b, 13) to begin at, or a track of the same blocks that is linear about its
+    own, the first fit by default; `seen` (b,): blocks that count (default: all), through the others the parameters
+    wander unseen; `shown` (n,): what the model shows where it begins. Blocks are linearised about their own parameters,
+    until these stand still, by slopes of coarse steps until the last time. The trend of the speed's bias within a block
+    is eliminated.
     """
     blocks = edges.size - 1
     seen = np.ones(blocks, dtype=bool) if seen is None else seen
@@ -215,10 +231,12 @@ def track(
     speed = model.speed_amplitude(theta)
     walk = np.tile(wander(theta, units, seconds, speed), (blocks - 1, 1))
     anchor = _anchor(theta, units)
-    leashes = _LEASHES if from_path is None else _LEASHES[-1:]
+    leashes = _LEASHES if begin is None else _LEASHES[-1:]
     centre = np.append(theta[:SOUND] / h[:SOUND], 0.0)
-    path = np.tile(theta, (blocks, 1)) if from_path is None else from_path
+    known = begin if isinstance(begin, Track) else None
+    path = np.tile(theta, (blocks, 1)) if begin is None else known.path if known is not None else np.asarray(begin)
     limits = [slice(max(int(edges[b]), skip), int(edges[b + 1])) for b in range(blocks)]
+    counts = np.array([here.stop - here.start - SIZE - 1 for here in limits])
     # where a leak is open, one of unit size
     risen, unit = np.zeros(path.shape), 1.0
     if rise is not None:
@@ -226,9 +244,12 @@ def track(
         risen[rise[1] + 1 :] = at[:-1] * h
         size /= unit
 
+    begins, end = np.array([here.start for here in limits]), limits[-1].stop
+
     def misfits(shown: Array) -> Array:
-        rests = (dp[block] - shown[block] for block in limits)
-        return np.array([rest.size * np.var(rest) for rest in rests]) * seen
+        rest = dp[begins[0] : end] - shown[..., begins[0] : end]
+        sums, squares = (np.add.reduceat(each, begins - begins[0], axis=-1) for each in (rest, rest**2))
+        return np.asarray((squares - sums**2 / (counts + SIZE + 1)) * seen)
 
     def strain(at: Array, walk: Array) -> float:
         at = at[:, :SOUND] / h[:SOUND]
@@ -243,26 +264,28 @@ def track(
         tries = np.tile(between, (_BIASES.size, 1, 1))
         tries[:, :, BIAS] += _BIASES[:, None] * _WANDER_BIAS * speed
         runs = model.run(tries + size * risen, segment, np.tile(start, (_BIASES.size, 1)))
-        best = np.argmin([misfits(shown) for shown in runs], axis=0)
+        best = np.argmin(misfits(runs), axis=0)
         return np.where(stuck[:, None], tries[best, at], path)
 
-    before: tuple[float, float, Track] | None = None
-    last = _PASSES
-    number = 0
-    while True:
-        at = path + size * risen
-        sets = np.tile(at, (h.size + 1, 1, 1))
-        for k in range(h.size):
-            sets[k + 1, :, k] += h[k]
-        shown = model.run(sets, segment, np.tile(start, (h.size + 1, 1)))
-        N, r, squares, counts = _normal(dp, shown, limits, at / h)
+    rows, trend = np.ones((SIZE + 3, n)), np.zeros(n)
+    for here in limits:
+        trend[here] = np.linspace(-1.0, 1.0, here.stop - here.start)
+
+    def linear(shown: Array, moved: Array, at: Array, strained: float) -> Track:
+        """Return the blocks, linear about the path `at` (b, 13), where the model shows (n,) [Pa].
+
+        `moved` (14, n): what it shows there, in steps of slopes, and for a unit more of each parameter; `strained`: chi
+        square of the wandering.
+        """
+        np.subtract(moved[1:], moved[0], out=rows[: h.size])
+        np.multiply(rows[BIAS], trend, out=rows[-2])
+        np.subtract(dp, shown, out=rows[-1])
+        N, r, squares = _normal(rows, limits, at / h)
         variance = float(squares[seen].sum() / counts[seen].sum())
         N, r = N * seen[:, None, None], r * seen[:, None]
         if not (np.all(np.isfinite(N)) and np.all(np.isfinite(r)) and np.isfinite(variance)):
             raise FloatingPointError(DIVERGED)
-        allowed = leashes[min(number, len(leashes) - 1)] * walk
-        misfit = float(misfits(shown[0]).sum())
-        followed = Track(
+        return Track(
             edges,
             at,
             N[:, _WANDERING[:, None], _WANDERING] / variance,
@@ -274,38 +297,68 @@ def track(
             np.where(seen, squares / counts, variance),
             np.concatenate([anchor, centre]),
             seconds,
-            misfit,
-            strain(path, allowed),
+            float(misfits(shown).sum()),
+            strained,
             start,
         )
+
+    before: tuple[float, float, Track] | None = None
+    last, number = _PASSES, 0
+    coarse = model.coarse(theta)
+    fine = coarse is model
+    while True:
+        allowed = leashes[min(number, len(leashes) - 1)] * walk
+        at = path + size * risen
+        if known is not None:
+            followed, known, fine = replace(known, strain=strain(path, allowed)), None, True
+            shown = None
+        else:
+            sets = np.tile(at, (h.size + 1, 1, 1))
+            for k in range(h.size):
+                sets[k + 1, :, k] += h[k]
+            runs = (model if fine else coarse).run(sets, segment, np.tile(start, (h.size + 1, 1)))
+            if fine:
+                shown = runs[0]
+            elif shown is None:
+                shown = model.run(at[None], segment, start[None].copy())[0]
+            followed = linear(shown, runs, at, strain(path, allowed))
         chain, right = Chain(followed.N, allowed, anchor), right_sides(followed.r, anchor, centre).reshape(-1, 1)
         if rise is None:
             solved, fitted = chain.solve(right), 0.0
         else:
             solved, fitted = _with_rise(chain, right, followed.rise(rise[0]), rise[1] + 1)
-        fresh = np.column_stack([_held(solved.reshape(blocks, SIZE)[:, :SOUND] * h[:SOUND], theta), path[:, SOUND:]])
-        further = max(0.0, fitted) - size
-        tries = path + _SHARES[:, None, None] * (fresh - path)
-        sizes = size + _SHARES * further
-        runs = model.run(tries + sizes[:, None, None] * risen, segment, np.tile(start, (_SHARES.size, 1)))
-        apart = np.array([misfits(each).sum() for each in runs])
-        costs = apart / variance + np.array([strain(each, allowed) for each in tries])
-        if np.all(np.isnan(costs)):
-            raise FloatingPointError(DIVERGED)
-        best = int(np.nanargmin(costs))
-        gained = misfit / variance + followed.strain - costs[best]
-        if gained > 0.0:
-            path, size = tries[best], float(sizes[best])
-        number += 1
-        if number < len(leashes) or (gained > _ENOUGH and number < last):
+        solved, fitted = solved.reshape(blocks, SIZE), max(0.0, fitted)
+        fresh = np.column_stack([_held(solved[:, :SOUND] * h[:SOUND], theta), path[:, SOUND:]])
+        further = np.column_stack([(fresh + fitted * risen - at) / h, solved[:, -1]])
+        promised = followed.strain - strain(fresh, allowed) + followed.fall(at / h, further)
+        apart, strained = followed.misfit, followed.strain
+        if number + 1 < len(leashes) or promised > _ENOUGH:
+            tries = path + _SHARES[:, None, None] * (fresh - path)
+            sizes = size + _SHARES * (fitted - size)
+            runs = model.run(tries + sizes[:, None, None] * risen, segment, np.tile(start, (_SHARES.size, 1)))
+            reached = misfits(runs).sum(axis=1)
+            costs = reached / followed.variance + np.array([strain(each, allowed) for each in tries])
+            if np.all(np.isnan(costs)):
+                raise FloatingPointError(DIVERGED)
+            best = int(np.nanargmin(costs))
+            gained = apart / followed.variance + strained - costs[best]
+            if gained > 0.0:
+                path, size, shown = tries[best], float(sizes[best]), runs[best]
+            apart, strained = float(reached[best]), strain(tries[best], allowed)
+            number += 1
+            if number < len(leashes) or (gained > _ENOUGH and number < last):
+                fine = fine or gained < _KEPT * promised
+                continue
+        if not fine:
+            fine = True
             continue
         if before is not None:
-            return before[2] if before[0] / variance + before[1] < costs[best] else followed
+            return before[2] if (before[0] - apart) / followed.variance + before[1] < strained else followed
         stuck = _stuck(followed, counts, walk if rise is None else None)
         if not np.any(stuck) or np.all(stuck):
             return followed
-        before = float(apart[best]), strain(tries[best], allowed), followed
-        path = freed(path, stuck)
+        before = apart, strained, followed
+        path, shown, fine = freed(path, stuck), None, coarse is model
         last = number + _PASSES
 
 
@@ -324,33 +377,24 @@ def _with_rise(chain: Chain, right: Array, rise: Rise, first: int) -> tuple[Arra
     return without - size * shared, float(size)
 
 
-def _normal(dp: Array, shown: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Array, Array, Array]:
+def _normal(rows: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Array, Array]:
     """Return the normal equations of each block between `limits`.
 
     They are N (b, 14, 14) and r (b, 14) of the model that is linear about `at` (b, 13) [units], the last a constant
-    of dp, the sum of squares (b,) that nothing which wanders explains, and its degrees of freedom (b,). `shown`
-    (14, n): the model there, and a unit more of each parameter. The trend of the speed's bias is eliminated.
+    of dp, and the sum of squares (b,) that nothing which wanders explains. `rows` (16, n): what a unit more of each
+    parameter adds to dp, the constant, the trend of the speed's bias, which is eliminated, and dp less the model's.
     """
-    blocks, size = len(limits), len(shown)
-    N, r = np.empty((blocks, size, size)), np.empty((blocks, size))
-    squares, counts = np.empty(blocks), np.empty(blocks)
-    for b, here in enumerate(limits):
-        slopes = shown[1:, here] - shown[0, here]
-        count = slopes.shape[1]
-        ramp = slopes[BIAS] * np.linspace(-1.0, 1.0, count)
-        X = np.vstack([slopes, np.ones(count), ramp])
-        rest = dp[here] - shown[0, here]
-        H, g = X @ X.T, X @ rest
-        lost = H[:-1, -1] / H[-1, -1]
-        if not np.all(np.isfinite(H)) or not np.all(np.isfinite(g)):
-            raise FloatingPointError(DIVERGED)
-        H, g, gone = H[:-1, :-1] - np.outer(lost, H[:-1, -1]), g[:-1] - lost * g[-1], g[-1] ** 2 / H[-1, -1]
-        own = g[_WANDERING]
-        explained = own @ np.linalg.lstsq(H[_WANDERING[:, None], _WANDERING], own, rcond=1e-12)[0]
-        squares[b] = float(rest @ rest - gone - explained)
-        counts[b] = count - SIZE - 1
-        N[b], r[b] = H, g + H @ np.append(at[b], 0.0)
-    return N, r, squares, counts
+    size = len(rows) - 2
+    products = np.array([rows[:, here] @ rows[:, here].T for here in limits])
+    if not np.all(np.isfinite(products)):
+        raise FloatingPointError(DIVERGED)
+    trend = products[:, size]
+    products -= trend[:, :, None] * trend[:, None, :] / trend[:, size, None, None]
+    H, g = products[:, :size, :size], products[:, :size, -1]
+    own = g[:, _WANDERING]
+    inverse = np.linalg.pinv(H[:, _WANDERING[:, None], _WANDERING], rcond=1e-12, hermitian=True)
+    squares = products[:, -1, -1] - np.einsum("bi,bij,bj->b", own, inverse, own)
+    return H, g + np.einsum("bij,bj->bi", H[:, :, :-1], at), squares
 
 
 def _stuck(followed: Track, counts: Array, walk: Array | None) -> NDArray[np.bool_]:
