@@ -102,7 +102,7 @@ def test_tls_user_and_password_open_the_broker_and_nothing_less(guarded: Broker,
         return Running(read_settings(file))
 
     for folder, options, reason in (
-        ("ca", {"ca": "another"}, "no connection to 127.0.0.1"),
+        ("ca", {"ca": "another"}, f"no connection to 127.0.0.1:{guarded.port}: its certificate is not trusted"),
         ("password", {"password": "wrong"}, "127.0.0.1 refuses the connection: Not authorized"),
     ):
         refused = running(folder, **options)

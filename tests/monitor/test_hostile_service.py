@@ -49,7 +49,7 @@ FORGED: list[tuple[str, dict[str, object]]] = [
     (NO_CLOCK, {"rate": -500.0}),
     (NO_CLOCK, {"rate": 0}),
     (NO_CLOCK, {"id": "a\0b"}),
-    (NO_CLOCK, {"id": "\ud800"}),
+    (UNREADABLE, {"id": "\ud800"}),
     (NO_CLOCK, {"id": {"a": 1}}),
     (NO_CLOCK, {"id": "x" * 101}),
     (NO_SAMPLES, {"x": []}),
@@ -68,7 +68,7 @@ FORGED: list[tuple[str, dict[str, object]]] = [
     (UNKNOWN, {"actuator": "press 9"}),
     (UNKNOWN, {"actuator": "<script>alert(1)</script>"}),
     (UNKNOWN, {"actuator": "press 1\0"}),
-    (UNKNOWN, {"actuator": "\ud800"}),
+    (UNREADABLE, {"actuator": "\ud800"}),
     (UNKNOWN, {"actuator": "'; drop table blocks; --"}),
     (UNKNOWN, {"actuator": "x" * 50_000}),
 ]

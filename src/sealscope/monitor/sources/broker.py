@@ -16,6 +16,8 @@ from __future__ import annotations
 import json
 import logging
 import socket
+import ssl
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -137,7 +139,8 @@ class _Connection:
             self._service.outages.lost(BROKER, f"the connection to {self._settings.host} is lost: {reason}")
 
     def _unreached(self, client: Any, userdata: Any) -> None:
-        self._service.outages.lost(BROKER, f"no connection to {self._settings.host}:{self._settings.port}")
+        place = f"no connection to {self._settings.host}:{self._settings.port}"
+        self._service.outages.lost(BROKER, place + _why(sys.exc_info()[1]))  # paho calls while it handles the error
 
     def _message(self, client: Any, userdata: Any, message: Any) -> None:
         """Take a message in; must not wait, for the connection would be lost meanwhile."""
@@ -211,3 +214,11 @@ class _Connection:
             if (lost := away(error)) is None:
                 raise
             self._service.outages.lost(DATABASE, lost)
+
+
+def _why(error: BaseException | None) -> str:
+    """Return the reason of an error in a few words after a colon, "" where there is none."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f": its certificate is not trusted ({error.verify_message})"
+    reason = " ".join(str(getattr(error, "strerror", None) or error or "").split())[:120]
+    return f": {reason}" if reason else ""
