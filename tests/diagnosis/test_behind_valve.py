@@ -152,5 +152,4 @@ def test_leaks_behind_a_valve_are_found_dated_and_sized() -> None:
         assert evidence.leak_interval_lpm is not None
         low, high = evidence.leak_interval_lpm
         assert low < lpm < high
-        assert 0.4 * lpm < low
-        assert high < 2.0 * lpm
+        assert high - low < 0.016 + 0.8 * lpm  # what edges and spool give way, and the scale of flows
