@@ -14,8 +14,8 @@ pressures within 2 psi, and a command in turn from three; the watch assumes the 
 
 The baseline is learned over the first `--learn-hours`. Stated are 100 false alarms per 1000 h, as dozens of hours
 cannot tell 1 from 0. An alarm is dismissed as a person would. Before the last piece the state is copied, with 1 per
-1000 h in place of 100, and the copies go on with leaks that begin 12 min later: steps of 0.0042, 0.015 and 0.05 L/min,
-and a growth from 0 to 0.05 L/min in an hour.
+1000 h in place of 100, and the copies go on with leaks that begin 12 min later: steps of 0.002, 0.0042, 0.015 and 0.05
+L/min, 0.0042 L/min past a rod seal to the outside, and a growth from 0 to 0.05 L/min in an hour.
 
 Each machine is a row, and each leak, of `results/monitor_pressures.csv`; a second call goes on with those that are
 missing, and the sums over all rows are printed.
@@ -42,13 +42,13 @@ ONSET_S = 720.0
 COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)")
 #: Stated false alarms per 1000 h of the healthy machines, and of those that leak.
 HEALTHY_RATE, LEAKING_RATE = 100.0, 1.0
+GROWTH = "growth to 0.05 in an hour"
+SIZES = {"step 0.002": 0.002, "step 0.0042": 0.0042, "step 0.015": 0.015, "step 0.05": 0.05, "rod seal 0.0042": 0.0042}
 LEAKS = {
-    "step 0.0042": f"0.0042 L/min from {ONSET_S} s",
-    "step 0.015": f"0.015 L/min from {ONSET_S} s",
-    "step 0.05": f"0.05 L/min from {ONSET_S} s",
-    "growth to 0.05 in an hour": f"0.05 L/min growing from {ONSET_S} s to {ONSET_S + 3600.0} s",
+    **{kind: {"leak": f"{lpm} L/min from {ONSET_S} s"} for kind, lpm in SIZES.items() if kind.startswith("step")},
+    "rod seal 0.0042": {"fault": f"rod seal A 0.0042 L/min from {ONSET_S} s"},
+    GROWTH: {"leak": f"0.05 L/min growing from {ONSET_S} s to {ONSET_S + 3600.0} s"},
 }
-SIZES = {"step 0.0042": 0.0042, "step 0.015": 0.015, "step 0.05": 0.05}
 COLUMNS = (
     *("seed", "machine", "command", "kind", "rate", "hours", "judged_hours", "false_alarms", "by_test", "delay_s"),
     *("test", "true_lpm", "stated_lpm", "stated_low_lpm", "stated_high_lpm", "counters"),
@@ -89,8 +89,8 @@ class Machine:
         self.clock, self.pieces = 1000.0, 0
         self._seeds = 100_000 * (seed + 1) + 1000 * number
 
-    def piece(self, duration: float, leak: str | None = None) -> ss.Recording:
-        """Return the next piece of its life."""
+    def piece(self, duration: float, **fails: str) -> ss.Recording:
+        """Return the next piece of its life; `fails`: the leak or fault that begins in it."""
         t = np.linspace(0.0, duration, round(duration / 60.0) + 1)
         warm = 1.0 - (1.0 - self.warm) * np.exp(-t / self.tau)
         rubs = self.friction * np.exp(self.rubs.course(t.size, 60.0)) * (1.0 - 0.15 * warm)
@@ -108,8 +108,8 @@ class Machine:
         recording = ss.simulate(
             command=self.command,
             duration=duration,
-            seed=self._seeds + self.pieces + (500 if leak else 0),
-            leak=leak,
+            seed=self._seeds + self.pieces + (500 if fails else 0),
+            **fails,
             drifts=[
                 *(ParameterDrift(name, TabulatedDrift(t, course / course[0] - 1)) for name, course in courses.items()),
                 *(
@@ -174,7 +174,7 @@ def leaking(state: str, machine: Machine, kind: str, hours: str) -> dict[str, ob
     """Return the row of a leak."""
     watch = ss.Watch.from_state(json.loads(state))
     duration = ONSET_S + (1800.0 if kind in SIZES else 3600.0)
-    recording = machine.piece(duration, LEAKS[kind])
+    recording = machine.piece(duration, **LEAKS[kind])
     row: dict[str, object] = {"kind": kind, "rate": LEAKING_RATE, "hours": hours, "false_alarms": 0}
     onset = float(recording.t[0]) + ONSET_S
     for first in range(0, len(recording), 500):

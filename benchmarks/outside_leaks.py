@@ -1,10 +1,11 @@
 """Leaks past a rod seal to the outside, as a watch states them: L/min against what left the chamber.
 
-    python benchmarks/outside_leaks.py [--development]
+    python benchmarks/outside_leaks.py [--development] [--pressures]
 
 The factors of `monitor.stream.decisions.OUTSIDE` were chosen on the records of `--development`; the others judge them.
 The flow of a rod seal is stated at the charge pressure; what leaves is that flow times the chamber's mean pressure over
-it. The circuit has a make-up, without which it would run empty.
+it. The circuit has a make-up, without which it would run empty. With `--pressures` the watch gets the chamber pressures
+and the command alone, and longer records.
 """
 
 from __future__ import annotations
@@ -43,27 +44,29 @@ def main() -> None:
     """Print a line a record."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--development", action="store_true", help="the records on which the factors were chosen")
-    development = parser.parse_args().development
+    parser.add_argument("--pressures", action="store_true", help="watched from pressures and command")
+    chosen = parser.parse_args()
     with threadpool_limits(limits=1):
-        for number, record in enumerate(DEVELOPMENT if development else JUDGED):
-            stated(*record, seed=number + (1 if development else 11))
+        for number, record in enumerate(DEVELOPMENT if chosen.development else JUDGED):
+            stated(*record, seed=number + (1 if chosen.development else 11), pressures=chosen.pressures)
 
 
-def stated(command: str, side: str, lpm: float, charge: float, load: float, seed: int) -> None:
+def stated(command: str, side: str, lpm: float, charge: float, load: float, *, seed: int, pressures: bool) -> None:
     """Simulate a record, watch it, and print what is stated of its leak."""
+    onset, duration, learned = (900.0, 1500.0, 300.0) if pressures else (ONSET_S, DURATION_S, 100.0)
     recording = ss.simulate(
         command=command,
-        duration=DURATION_S,
+        duration=duration,
         seed=seed,
         set={"makeup.check_valves": "present", "p_charge": f"{charge} MPa", "cylinder.F_l": f"{load} N"},
-        fault=f"rod seal {side} {lpm} L/min from {ONSET_S} s",
+        fault=f"rod seal {side} {lpm} L/min from {onset} s",
     )
-    watch = ss.watch("thesis", learn_hours=100.0 / 3600.0)
-    estimate = watch.update(recording)[-1]
-    true = lpm * float(recording.between(ONSET_S, DURATION_S)[f"p_{side}"].mean()) / (1e6 * charge)
+    watch = ss.watch("thesis", learn_hours=learned / 3600.0)
+    estimate = watch.update(recording.only(("p_A", "p_B", "u")) if pressures else recording)[-1]
+    true = lpm * float(recording.between(onset, duration)[f"p_{side}"].mean()) / (1e6 * charge)
     print(f"{command}, rod seal {side}, {charge:g} MPa, {load:g} N: {true:.5f} L/min leave", end="; ")
     if watch.leak is None or estimate.leak_lpm is None or estimate.leak_interval_lpm is None:
-        print("no leak")
+        print("no leak", watch.counters)
         return
     low, high = estimate.leak_interval_lpm
     print(f"{watch.leak.cause}, {estimate.leak_lpm:.5f} ({low:.5f} to {high:.5f}),", end=" ")

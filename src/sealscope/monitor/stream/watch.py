@@ -43,6 +43,8 @@ _LEARN_SECONDS = 60.0
 _LONGEST_PAUSE_S = 3600.0
 #: Oil warms by 30 K in a shift of so many hours, at most.
 _SHIFT_HOURS = 8.0
+#: What pressures do not tell.
+_PRESSURES_ALONE = "; from pressures alone a leak to the outside can look like this, and is then stated too large"
 #: Blocks whose mean is the leak after an alarm.
 _RECENT = 8
 
@@ -303,7 +305,7 @@ class Watch:
             rise.size_sd,
             rise.test,
             rise.cause,
-            rise.reason,
+            rise.reason + ("" if self.by == "volumes" else _PRESSURES_ALONE),
             rise.score,
             rise.threshold,
         )
