@@ -23,6 +23,8 @@ NEXT_CHECKS = {
     "piston or pump leak": "hold a load with the pump stopped: a piston that creeps has a worn seal; else measure the "
     "flow of the pump's case drain",
     "pump leak": "measure the flow of the pump's case drain",
+    "leak inside or outside": "look for oil outside: rod seal, fittings, hoses; if there is none, hold a load with the "
+    "pump stopped: a piston that creeps has a worn seal, else measure the flow of the pump's case drain",
     "external leak": "look for oil outside: fittings, rod seal, hoses; read the accumulator's level",
 }
 

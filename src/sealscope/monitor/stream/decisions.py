@@ -58,10 +58,13 @@ _NEAR_THE_THRESHOLD, _GROWN, _SURELY_GROWN = 0.6, 0.75 * WARMEST, 3.0
 _EVEN = 0.02
 #: Logarithm by which the duty changes where a rise of the conductance is not compared across it.
 _OTHER_DUTY = 0.15
-#: What leaks to the outside over what the balance shows of it: least, usual, most. One chamber loses the oil, and the
-#: balance is half the difference of both. What the make-up gives the other chamber counts as a leak, too, so that all
-#: of it shows where one side carries the load, and about half where the load reverses (0.42 to 0.55 in simulations).
-OUTSIDE = (1.0, 2.0, 2.5)
+#: What pressures alone show: an external leak raises alarms as one inside does.
+INSIDE_OR_OUTSIDE = "leak inside or outside"
+#: What leaks over what shows of it, by cause: least, usual, most. By volumes one chamber loses the oil of an external
+#: leak, and the balance is half the difference of both. What the make-up gives the other chamber counts as a leak, too,
+#: so that all of it shows where one side carries the load, and about half where the load reverses (0.42 to 0.55 in
+#: simulations). By pressures an external leak shows as 2.6 to 4.1 times what it is.
+SHOWN = {"external leak": (1.0, 2.0, 2.5), INSIDE_OR_OUTSIDE: (0.2, 1.0, 1.0)}
 _HALF_SHOWN = "; of what leaves one chamber the balance of both shows about half"
 #: A rise that comes from these is an alarm, whichever of them it is.
 _CAUSES = ("piston leak", "piston or pump leak", "pump leak", "external leak")

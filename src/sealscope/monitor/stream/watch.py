@@ -17,7 +17,8 @@ from sealscope.errors import InputError
 from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, plain_dataclass
 from sealscope.monitor.stream.decisions import (
     GROUP,
-    OUTSIDE,
+    INSIDE_OR_OUTSIDE,
+    SHOWN,
     WINDOW,
     ConductanceRise,
     level_rise_of,
@@ -43,8 +44,6 @@ _LEARN_SECONDS = 60.0
 _LONGEST_PAUSE_S = 3600.0
 #: Oil warms by 30 K in a shift of so many hours, at most.
 _SHIFT_HOURS = 8.0
-#: What pressures do not tell.
-_PRESSURES_ALONE = "; from pressures alone a leak to the outside can look like this, and is then stated too large"
 #: Blocks whose mean is the leak after an alarm.
 _RECENT = 8
 
@@ -292,7 +291,8 @@ class Watch:
     def _raise(self, rise: ConductanceRise, raised: float, before: float, flow: float) -> None:
         size = rise.size * flow
         half = 1.96 * math.hypot(rise.size_sd, self.estimator.size_error * rise.size) * flow
-        least, usual, most = _share_shown(rise.cause)
+        cause = rise.cause if self.by == "volumes" else INSIDE_OR_OUTSIDE
+        least, usual, most = _share_shown(cause)
         upper = most * self.estimator.orifice * (size + half)
         lpm, interval = usual * size, (least * max(0.0, size - half), upper)
         self.leak = WatchedLeak(
@@ -304,8 +304,8 @@ class Watch:
             before,
             rise.size_sd,
             rise.test,
-            rise.cause,
-            rise.reason + ("" if self.by == "volumes" else _PRESSURES_ALONE),
+            cause,
+            rise.reason,
             rise.score,
             rise.threshold,
         )
@@ -412,7 +412,7 @@ _NUMBERS = ("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_versio
 
 def _share_shown(cause: str) -> tuple[float, float, float]:
     """Return what leaks over what the conductance shows of it: least, usual and most."""
-    return OUTSIDE if cause == "external leak" else (1.0, 1.0, 1.0)
+    return SHOWN.get(cause, (1.0, 1.0, 1.0))
 
 
 @checked_call
