@@ -247,9 +247,9 @@ def test_a_state_of_another_version_begins_a_new_baseline(tmp_path, caplog):
         service.store.keep_rows(connection, rows)
     again = Service(settings, once=True)
     again._hold.close()
-    assert "press 1: its state has version 1, not 4, begins anew" in caplog.text
+    assert "press 1: its state has version 1, not 5, begins anew" in caplog.text
     _, state, pending = again.store.checkpoint("press 1")
-    assert (state["watch"]["version"], state["watch"]["baseline_version"], pending) == (4, 4, [])
+    assert (state["watch"]["version"], state["watch"]["baseline_version"], pending) == (5, 4, [])
     assert state["watch"]["blocks"] == max(row[1] for row in before)
     assert [row for row in rows_of(settings.database)["estimates"] if row[0] == "press 1"] == before
 

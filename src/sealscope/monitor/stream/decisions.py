@@ -58,6 +58,8 @@ _NEAR_THE_THRESHOLD, _GROWN, _SURELY_GROWN = 0.6, 0.75 * WARMEST, 3.0
 _EVEN = 0.02
 #: Logarithm by which the duty changes where a rise of the conductance is not compared across it.
 _OTHER_DUTY = 0.15
+#: ... and by which a leak may lower the pressure difference, since the chambers ring less: 0.015 L/min by 0.24.
+_DAMPED = 0.7
 #: What pressures alone show: an external leak raises alarms as one inside does.
 INSIDE_OR_OUTSIDE = "leak inside or outside"
 #: What leaks over what shows of it, by cause: least, usual, most. By volumes one chamber loses the oil of an external
@@ -222,13 +224,17 @@ def _rise(evidence: Evidence, blocks: BalanceBlocks, g: Array) -> ConductanceRis
     )
 
 
-def other_duty(t: Array, duty: Array, onset: float) -> str | None:
-    """Return that the duty (n, 2) of blocks with the middles `t` (n,) changed with the rise, or None."""
+def other_duty(t: Array, duty: Array, onset: float, *, damped: bool = False) -> str | None:
+    """Return that the duty (n, 2) of blocks with the middles `t` (n,) changed with the rise, or None.
+
+    `damped`: the first of it is a pressure difference that rings, which a leak lowers.
+    """
     after = t >= onset
     if min(after.sum(), (~after).sum()) < 3:
         return None
-    moved = np.abs(np.median(duty[after], axis=0) - np.median(duty[~after], axis=0))
-    return "changed duty" if float(moved.max()) > _OTHER_DUTY else None
+    moved = np.median(duty[after], axis=0) - np.median(duty[~after], axis=0)
+    fall = np.array([_DAMPED if damped else _OTHER_DUTY, _OTHER_DUTY])
+    return "changed duty" if np.any((moved > _OTHER_DUTY) | (moved < -fall)) else None
 
 
 def rise_of(

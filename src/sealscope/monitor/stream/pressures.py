@@ -190,7 +190,7 @@ class PressureEstimator:
         rise = rise_of("step", t, g, _evened(sd), probability, again=again)
         if rise is None:
             return None, None
-        other = other_duty(t, duty, rise.onset_s)
+        other = other_duty(t, duty, rise.onset_s, damped=True)
         return (None, other) if other is not None else (rise, None)
 
     def forget(self, keep: int = 0) -> None:
