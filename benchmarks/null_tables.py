@@ -2,6 +2,7 @@
 
     python benchmarks/null_tables.py {smooth_drift,random_walk} [--draws N] [--blocks N ...]
     python benchmarks/null_tables.py check [--draws N] [--blocks N ...]
+    python benchmarks/null_tables.py beyond [--draws N] [--blocks N ...]
 
 Each line of a table gives what the largest score of series without a step exceeds with the probabilities of the head
 line. Seeds are the blocks' and the strength's numbers. It takes 20 to 60 minutes on one core.
@@ -12,6 +13,7 @@ deviation), at 1e-6 and less within a factor of two or more for strong drifts.
 random_walk: blocks, number of the walk, expected walk. From 200 000 plain draws a line, and beyond a probability of
 0.01 by a generalised Pareto tail fitted to that share of them (probability-weighted moments: Hosking & Wallis,
 Technometrics 29 (1987) 339-349): within 3 % at 0.01, 6 % at 0.001, 12 % at 0.0001.
+beyond: thresholds of `smooth_drift` at 1e-10 by weighted draws, beside the table's with `tails.RARER` beyond 1e-7.
 check: shares of fresh series without a step that `find_step` and `find_leak_step` call one, with 95 % intervals.
 """
 
@@ -39,21 +41,21 @@ TAIL = 0.01
 CHUNK = 2000
 
 
-def drift_lines(draws: int, blocks: tuple[int, ...]) -> Iterator[tuple[float, ...]]:
-    """Yield the lines of the table of `smooth_drift`."""
-    levels = 0.3 * 10.0 ** (-0.5 * np.arange(18))
+def drift_lines(
+    draws: int, blocks: tuple[int, ...], probabilities: tuple[float, ...] = DRIFT_PROBABILITIES, levels: int = 18
+) -> Iterator[tuple[float, ...]]:
+    """Yield the lines of the table of `smooth_drift`; so many `levels` of draws, each half a decade rarer."""
+    rare = 0.3 * 10.0 ** (-0.5 * np.arange(levels))
     for n in blocks:
         family = smooth_drift.DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)))
         for number, drift in enumerate(family.drifts):
             scores, weights = [], []
             for chunk in range((draws if n < DRIFT_BLOCKS[-1] else draws * 3 // 10) // CHUNK):
-                z, weight = tails.rare_draws(
-                    drift.steps @ drift.root, levels, CHUNK, 10**6 * n + 10**4 * number + chunk
-                )
+                z, weight = tails.rare_draws(drift.steps @ drift.root, rare, CHUNK, 10**6 * n + 10**4 * number + chunk)
                 scores.append(family.scores(drift.root @ z, 1)[0].max(axis=0))
                 weights.append(weight)
             values, weight = np.concatenate(scores), np.concatenate(weights)
-            yield (n, number, *(tails.weighted_quantile(values, weight, p) for p in DRIFT_PROBABILITIES))
+            yield (n, number, *(tails.weighted_quantile(values, weight, p) for p in probabilities))
 
 
 @kernel
@@ -134,6 +136,19 @@ def check(series: int, blocks: tuple[int, ...]) -> None:
                 print(f"{f'{scan}, {n}, {name}':<42}{series:>9}{shares}", flush=True)
 
 
+def beyond(draws: int, blocks: tuple[int, ...]) -> None:
+    """Print thresholds at 1e-10, drawn and extended, and how fast the drawn ones grow from 1e-7 on."""
+    rarest = 1e-10
+    growths, ratios = [], []
+    for n, number, edge, drawn in drift_lines(draws, blocks, (DRIFT_PROBABILITIES[-1], rarest), levels=24):
+        extended = tails.null_threshold("smooth_drift", rarest, n, number)
+        growths.append((drawn - edge) / math.log(DRIFT_PROBABILITIES[-1] / rarest))
+        ratios.append(drawn / extended)
+        print(f"{n:g} blocks, strength {number:g}: drawn {drawn:.1f}, extended {extended:.1f}", flush=True)
+    print(f"growth for each factor e: median {np.median(growths):.2f}, {min(growths):.2f} to {max(growths):.2f}")
+    print(f"drawn over extended: median {np.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")
+
+
 def share(alarms: int, series: int) -> str:
     """Return a share and its 95 % Clopper-Pearson interval."""
     low = betaincinv(alarms, series - alarms + 1, 0.025) if alarms else 0.0
@@ -173,12 +188,15 @@ def walk_alarms(g: np.ndarray, expected: float) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scan", choices=("smooth_drift", "random_walk", "check"))
+    parser.add_argument("scan", choices=("smooth_drift", "random_walk", "check", "beyond"))
     parser.add_argument("--draws", type=int)
     parser.add_argument("--blocks", type=int, nargs="+")
     chosen = parser.parse_args()
     if chosen.scan == "check":
         check(chosen.draws or 100_000, tuple(chosen.blocks or (40,)))
+        return
+    if chosen.scan == "beyond":
+        beyond(chosen.draws or 24_000, tuple(chosen.blocks or (20,)))
         return
     if chosen.scan == "smooth_drift":
         lines, names = drift_lines(chosen.draws or 80_000, tuple(chosen.blocks or DRIFT_BLOCKS)), "blocks,strength"

@@ -20,8 +20,8 @@ ONSET_CUT = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 _PLAIN = 0.2
 _LEVELS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])
 _LARGEST_LEVEL = 0.3
-#: Beyond the least probability of a table its thresholds grow by so much for each factor e: weighted draws of
-#: `smooth_drift` down to 1e-10 have 0.7 to 1.4.
+#: Beyond the least probability of a table its thresholds grow by so much for each factor e: about twice what weighted
+#: draws of `smooth_drift` grow by down to 1e-10 (`benchmarks/null_tables.py beyond`; single draws scatter).
 RARER = 1.5
 
 
