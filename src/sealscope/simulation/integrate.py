@@ -258,8 +258,8 @@ def integrate(
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
-    base = rig_numbers(rig) if load is None else rig_numbers(rig)._replace(pushed=(True,))
-    start_state = initial_state(rig, x_0, 0.0 if load is None else float(load.at(np.zeros(()))))
+    base = rig_numbers(rig) if load is None else rig_numbers(rig)._replace(pushed=load.tables() or (True,))
+    start_state = initial_state(rig, x_0, 0.0 if load is None else load.at_rest(x_0))
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
     if error is not None and not (math.isfinite(error) and error > 0):
@@ -427,7 +427,9 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed where a step h [s] cannot resolve the rig."""
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
-    refuse_long(h, longest_step(p), "speed loop, oil columns and friction of this rig")
+    refuse_long(
+        h, longest_step(p), "speed loop, oil columns and friction of this rig" + " under its load" * (len(p.pushed) > 1)
+    )
     rate = stiffest_rate(p)
     if method == "rk4" and p.throttled and h * rate > DECAY_LIMIT:
         raise SimulationFailed(

@@ -96,7 +96,7 @@ def refuse(experiment: Experiment, place: int) -> None:
     if experiment.controlled is not None:
         raise no(f"a command, got a target for a controller ({experiment.command})")
     if experiment.load is not None:
-        raise no(f"no load that changes with time, got {experiment.load}")
+        raise no(f"no load beside the rig's own, got {experiment.load}")
     if len(experiment.leaks) > 1:
         raise no(f"at most one leak, got {len(experiment.leaks)}")
     if experiment.leaks and not isinstance(experiment.leaks[0].opening, From | Growing):
