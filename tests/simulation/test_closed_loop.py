@@ -244,3 +244,11 @@ def test_rates_and_voltages_that_cannot_be():
 
     with pytest.raises(SimulationFailed, match="the controller must give a finite voltage, got nan at t = 0 s"):
         trajectory(replace(target, controller=Broken()), ())
+
+    @dataclass(frozen=True)
+    class Raising(Broken):
+        def start(self):
+            return lambda measured: 1.0 if measured.t < 0.1 else 1.0 / 0.0
+
+    with pytest.raises(ZeroDivisionError):
+        trajectory(replace(target, controller=Raising()), ())

@@ -381,32 +381,19 @@ class _Run:
         start: int,
     ) -> None:
         """Advance the state over the outputs `out` from `start` on, under a controller; `inputs`: G, C and load."""
-        from sealscope.physics.solvers.imex import sampled_imex
-        from sealscope.physics.solvers.rk4 import sampled_rk4
+        from sealscope.physics.solvers.imex import closed_imex
+        from sealscope.physics.solvers.rk4 import closed_rk4
 
-        apart = feedback.apart
-        u = np.empty((apart * every, inputs[0].shape[1]))
-
-        def hold(output: int) -> None:
-            if output % apart == 0:
-                feedback.sample(output, y)
-            u.fill(feedback.held(output))
-
-        ahead = apart - start % apart
-        parts = (
-            sampled_imex(y, h, u, *inputs, p, every, ahead, apart, out)
+        outputs, *surveyed = (
+            closed_imex(y, h, *inputs, p, every, start, out, feedback.loop)
             if self.method == "imex"
-            else sampled_rk4(y, h, u, *inputs, p, self.euler, every, ahead, apart, out)
+            else closed_rk4(y, h, *inputs, p, self.euler, every, start, out, feedback.loop)
         )
-        first = 0
-        hold(start)
-        for last, surveyed in parts:
-            self._refuse(surveyed, p, h, out[first:last], start + first)
-            first = last
-            if last < len(out):
-                hold(start + last)
+        self._refuse(surveyed, p, h, out[:outputs], start)
+        if outputs < len(out):
+            feedback.refuse()
 
-    def _refuse(self, surveyed: tuple[bool, float, float], p: RigNumbers, h: float, rows: Array, first: int) -> None:
+    def _refuse(self, surveyed: Sequence[float], p: RigNumbers, h: float, rows: Array, first: int) -> None:
         """Raise SimulationFailed where rows from the output `first` on, as surveyed, are beyond what the rig allows."""
         from sealscope.physics.solvers.limits import longest_step_on_stop
 
