@@ -231,8 +231,6 @@ def test_rates_and_voltages_that_cannot_be():
     target = Experiment.of(rig="thesis-closed-loop", command="position 10 mm sin(t)", duration=1.0)
     with pytest.raises(InputError, match="a run of a batch must have a command, got a target"):
         simulate_batch([target])
-    with pytest.raises(InputError, match="a run of a batch must have no load beside the rig's own"):
-        simulate_batch([Experiment.of(load="10 N", duration=1.0)])
 
     @dataclass(frozen=True)
     class Broken:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -14,6 +14,10 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Recorded, Sine, parse_command, plain_text
 from sealscope.storage.opening import open_regular
 from sealscope.units import to_si
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+    from sealscope.physics.rig import RigNumbers
 
 _LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _FORCES = {"N": 1.0, "kN": 1e3}
@@ -71,6 +75,14 @@ class Force:
 
     def __str__(self) -> str:
         return f"load {self.words}"
+
+
+def numbers_under(rig: Rig, load: Force | None) -> RigNumbers:
+    """Return the numbers of a rig with the laws of a load beside its own."""
+    from sealscope.physics.rig import rig_numbers
+
+    numbers = rig_numbers(rig)
+    return numbers if load is None else numbers._replace(pushed=load.tables() or (True,))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Effect, Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
-from sealscope.simulation.courses import Force
+from sealscope.simulation.courses import Force, numbers_under
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, Method, choose_method
 from sealscope.simulation.faults import Leak
 from sealscope.simulation.instruments import FILTER_REACH
@@ -254,11 +254,10 @@ def integrate(
     a pressure falls below vacuum; `allow_unresolved` lets all but a state that is not finite pass.
     """
     from sealscope.physics.rest import initial_state
-    from sealscope.physics.rig import rig_numbers
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
-    base = rig_numbers(rig) if load is None else rig_numbers(rig)._replace(pushed=load.tables() or (True,))
+    base = numbers_under(rig, load)
     start_state = initial_state(rig, x_0, 0.0 if load is None else load.at_rest(x_0))
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
