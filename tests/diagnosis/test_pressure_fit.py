@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.pressure_model.fit import steps_of
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.model import (
     F_C,
@@ -20,6 +21,7 @@ from sealscope.diagnosis.pressure_model.model import (
     K,
     assumed_numbers,
     nominal,
+    pressure_differences,
     stiffening,
 )
 from sealscope.parameters import Rig, load_rig
@@ -136,7 +138,7 @@ def test_the_solver_is_of_fourth_order(thesis: Rig) -> None:
 
 
 def test_lanes_are_runs_of_their_own(thesis: Rig) -> None:
-    """Eleven sets in two calls of eight lanes are what each gives alone, whatever stands in the lanes beside it."""
+    """Sets in two calls of all lanes are what each gives alone, whatever stands in the lanes beside it."""
     u, _ = true_difference()
     model = DrivenModel.of(u[:3000], 500.0, assumed_numbers(thesis))
     random = np.random.default_rng(4)
@@ -145,6 +147,26 @@ def test_lanes_are_runs_of_their_own(thesis: Rig) -> None:
     for one, theta in zip(together, sets, strict=True):
         np.testing.assert_array_equal(one, model.run(theta[None])[0])
     assert np.ptp(together, axis=0).max() > 1e4
+
+
+@pytest.mark.slow
+def test_single_precision_is_within_a_pascal_of_doubles(thesis: Rig) -> None:
+    """What the model shows, and its slopes: the transducers' noise is 12 kPa, a step of G moves dp by 60 Pa rms."""
+    u, _ = true_difference()
+    theta = truth_of(thesis)
+    model = DrivenModel.of(u[:10000], 500.0, assumed_numbers(thesis)).with_travel(theta)
+    sets = np.tile(theta, (RUNS // 2, 1))
+    stepped = [GAIN, K, G, F_C, F_V]
+    sets[range(1, 6), stepped] += steps_of(theta)[stepped]
+    table = np.ascontiguousarray(sets.T[None])
+    shown, state = np.empty((model.samples, RUNS // 2)), np.zeros((STATES, RUNS // 2))
+    segment = np.zeros(model.samples, dtype=np.int64)
+    pressure_differences(model.inputs, model.h, model.every, table, segment, model.numbers, state, shown, False)
+    apart = model.run(sets) - shown.T
+    assert 0.0 < np.sqrt(np.mean(apart**2)) < 0.3
+    assert np.abs(apart).max() < 2.0
+    slopes = np.sqrt(np.mean((shown.T[1:6] - shown.T[0]) ** 2, axis=1))
+    assert np.all(np.sqrt(np.mean((apart[1:6] - apart[0]) ** 2, axis=1)) < 0.01 * slopes)
 
 
 def test_a_run_goes_on_where_it_stopped(thesis: Rig) -> None:

@@ -12,7 +12,17 @@ import pytest
 
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.friction import stribeck_friction
-from sealscope.physics.lanes import WIDTH, anywhere, exponential, load, power_of_two, select, spread, store
+from sealscope.physics.lanes import (
+    SINGLE_WIDTH,
+    WIDTH,
+    anywhere,
+    exponential,
+    load,
+    power_of_two,
+    select,
+    spread,
+    store,
+)
 from sealscope.physics.motor import winding_current_rate
 from sealscope.physics.rest import initial_state
 from sealscope.physics.restrictors import implicit_orifice_flow, orifice_flow
@@ -59,6 +69,20 @@ def test_every_operation_does_on_lanes_what_it_does_on_numbers():
     in_numbers(x, y, numbers)
     np.testing.assert_allclose(lanes, numbers, rtol=1e-13, atol=1e-13)
     assert np.ptp(lanes) > 10.0
+
+
+def test_lanes_of_single_precision_do_the_same_to_six_digits():
+    x, y = np.random.default_rng(2).normal(0.0, 1.5, (2, 200, SINGLE_WIDTH)).astype(np.float32)
+    y = np.where(np.any(y >= 2.5, axis=1, keepdims=True), np.maximum(y, np.float32(2.5)), y)
+    x[0, :4] = -60.0, -200.0, 60.0, 200.0  # far ends of the exponential: 0 and the largest power of two
+    singles, numbers = np.empty_like(x), np.empty(x.shape)
+    in_lanes(x, y, singles)
+    in_numbers(x.astype(np.float64), y.astype(np.float64), numbers)
+    assert 1e38 < singles[0, 3] < np.inf
+    numbers[0, 3] = singles[0, 3]
+    # a difference of terms is as exact as its largest term
+    np.testing.assert_allclose(singles, numbers, rtol=4e-6, atol=4e-5)
+    assert np.ptp(singles[1:]) > 10.0
 
 
 @kernel

@@ -6,7 +6,6 @@
 "diagnose"                      the fused verdict of all registered detectors
 "diagnose @ pressures"          the same, given the channels of the view `pressures` alone
 "diagnose, quick"               the same verdict, by the detectors down to the one that judges
-"volume balance, online"        what its stream has raised by the record's end, samples coming second by second
 """
 
 from __future__ import annotations
@@ -22,9 +21,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
 
 DIAGNOSE = "diagnose"
-_OWN, _QUICK, _ONLINE = ", own threshold", ", quick", ", online"
-#: Detectors that have a stream which raises alarms at a stated rate.
-_STREAMED = ("volume balance",)
+_OWN, _QUICK = ", own threshold", ", quick"
 #: name -> channels; the name "" stands for what detectors see that name no view.
 Views = Mapping[str, tuple[str, ...]]
 #: Channels that detectors see by default: all but the flow meter of the bypass, which is no part of the machine.
@@ -37,8 +34,7 @@ class PlanDetector:
 
     `of`: the scorer, the detector or `diagnose`; `own`: whether its verdict is by its own threshold; `detector`:
     whether it is a registered detector or `diagnose`; `view`: the set of channels it sees, "" where none is named;
-    `quick`: whether it ends at the detector that judges (`diagnose(..., quick=True)`); `online`: whether it is the
-    detector's stream.
+    `quick`: whether it ends at the detector that judges (`diagnose(..., quick=True)`).
     """
 
     name: str
@@ -47,12 +43,11 @@ class PlanDetector:
     detector: bool
     view: str
     quick: bool = False
-    online: bool = False
 
     @property
     def key(self) -> str:
         """The name under which its statement is stored: the same for its own and for a calibrated threshold."""
-        of = f"{self.of}{_QUICK if self.quick else ''}{_ONLINE if self.online else ''}"
+        of = f"{self.of}{_QUICK}" if self.quick else self.of
         return f"{of}{VIEW}{self.view}" if self.view else of
 
     @property
@@ -69,9 +64,8 @@ def plan_detector(name: str) -> PlanDetector:
         return PlanDetector(name, base, False, False, view)
     if base.endswith(CALIBRATED):
         return PlanDetector(name, base.removesuffix(CALIBRATED), False, True, view)
-    quick, online = base == f"{DIAGNOSE}{_QUICK}", base.endswith(_ONLINE)
-    of = base.removesuffix(_QUICK if quick else _ONLINE if online else _OWN)
-    return PlanDetector(name, of, True, True, view, quick, online)
+    quick = base == f"{DIAGNOSE}{_QUICK}"
+    return PlanDetector(name, base.removesuffix(_QUICK if quick else _OWN), True, True, view, quick)
 
 
 def check_detector(name: str, views: Views) -> None:
@@ -85,8 +79,6 @@ def check_detector(name: str, views: Views) -> None:
     known = [DIAGNOSE, *detectors()]
     if parsed.of == DIAGNOSE and not parsed.own:
         raise InputError(f"{DIAGNOSE!r} has no score of its own and cannot be calibrated, got {name!r}")
-    if parsed.online and parsed.of not in _STREAMED:
-        raise InputError(f"online must be one of {', '.join(_STREAMED)}, got {name!r}")
     if parsed.of in known:
         return
     choices = [*SCORERS, *known, *(f"{detector}{CALIBRATED}" for detector in known[1:])]

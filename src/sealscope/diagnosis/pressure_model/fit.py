@@ -53,7 +53,7 @@ _INTEGRAL = 4
 #: Weight of the slow part: its samples hang together over some 30.
 _SLOW_WEIGHT = 1.0 / 30.0
 #: Dampings tried from one start, and from each of several.
-_DAMPINGS = (0.0, 1e-3, 1e-2, 0.03, 0.1, 1.0, 10.0, 100.0)
+_DAMPINGS = (0.0, 1e-4, 1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _FEWER_DAMPINGS = (0.0, 1e-2, 0.3, 10.0)
 #: A stroke is long that takes away this share of V.
 _LONG_STROKE = 0.25
@@ -65,21 +65,24 @@ _NEAR, _SAME = 50.0, 0.01
 
 
 def steps_of(theta: Array) -> Array:
-    """Return the steps (13,) of the forward differences, small against the data's errors and large against rounding."""
+    """Return the steps (13,) of the forward differences, small against the data's errors and large against rounding.
+
+    Single precision leaves 0.1 Pa; of 10^5 Pa most steps move 10 to 100 Pa.
+    """
     return np.array(
         [
             1e-3 * theta[GAIN],
             2e-5,
-            1e-3 * abs(theta[GAIN]),
+            1e-3 * abs(theta[GAIN]) + 1e-4 * abs(theta[BIAS]),
             5e-4 * theta[K],
             2e-14,
             1e-3 * theta[F_C] + 0.01,
             1e-3 * abs(theta[F_V]) + 0.1,
             1e-3 * theta[K_BRK],
             3e-3 * theta[C_C] + 1e-3,
-            2e-8,
+            2e-7,
+            2e-2,
             2e-3,
-            1e-3,
             5e-12,
         ]
     )
@@ -183,43 +186,70 @@ def minimise(
 
     costs = np.array([cost_of(here, at) for here, at in zip(shown, thetas, strict=True)])
     active = [int(start) for start in np.flatnonzero(np.isfinite(costs))]
-    for _ in range(most):
-        if not active:
-            break
-        # slopes of all starts, and then all their tries, fill the vector registers together
-        h = np.array([steps_of(thetas[start]) for start in active])[:, free]
-        sets = np.repeat(thetas[active], len(free), axis=0).reshape(len(active), len(free), -1)
-        sets[:, range(len(free)), free] += h
-        moved = window.runs(sets.reshape(-1, thetas.shape[1])).reshape(len(active), len(free), -1)
+    known: dict[int, Array] = {}  # what starts show for a step of each free parameter
+
+    def run(parts: Sequence[Array]) -> list[Array]:
+        """Run sets of several starts, which fill the vector registers together."""
+        shown = window.runs(np.concatenate(parts))
+        return np.split(shown, np.cumsum([len(part) for part in parts])[:-1])
+
+    def stepped(theta: Array) -> Array:
+        """Return a set for a step of each free parameter."""
+        sets = np.tile(theta, (len(free), 1))
+        sets[range(len(free)), free] += steps_of(theta)[free]
+        return sets
+
+    def damped(theta: Array, system: tuple[Array, Array, Array], dampings: Sequence[float]) -> Array:
+        """Return the sets that a linear system leads to from a start, one a damping."""
+        H, g, h = system
+        tries = np.tile(theta, (len(dampings), 1))
+        for row, factor in zip(tries, dampings, strict=True):
+            row[free] += np.linalg.solve(H + factor * np.diag(np.diag(H)), g) * h
+            if not _valid(row):
+                row[:] = theta
+        return tries
+
+    for turn in range(most):
+        unknown = [start for start in active if start not in known]
+        if unknown:
+            known.update(zip(unknown, run([stepped(thetas[start]) for start in unknown]), strict=True))
         systems: dict[int, tuple[Array, Array, Array]] = {}
-        for row, start in enumerate(active):
-            slopes = moved[row] - shown[start]
-            scale = h[row] / prior.deviation[free]
+        for start in active:
+            h = steps_of(thetas[start])[free]
+            slopes = known.pop(start) - shown[start]
+            scale = h / prior.deviation[free]
             off = (thetas[start] - prior.centre)[free] / prior.deviation[free]
             H = window.weight * (slopes @ slopes.T) + np.diag(scale**2)
             g = window.weight * (slopes @ (data - shown[start])) - off * scale
             promised = float(g @ np.linalg.solve(H, g)) if np.all(np.isfinite(H)) else 0.0
             if promised >= enough:
-                systems[start] = H, g, h[row]
+                systems[start] = H, g, h
         active = list(systems)
         if not active:
             break
-        dampings = _DAMPINGS if len(active) == 1 else _FEWER_DAMPINGS
-        tries = np.repeat(thetas[active], len(dampings), axis=0).reshape(len(active), len(dampings), -1)
-        for row, start in enumerate(active):
-            H, g, scale = systems[start]
-            for k, factor in enumerate(dampings):
-                tries[row, k, free] += np.linalg.solve(H + factor * np.diag(np.diag(H)), g) * scale
-                if not _valid(tries[row, k]):
-                    tries[row, k] = thetas[start]
-        tried = window.runs(tries.reshape(-1, thetas.shape[1])).reshape(len(active), len(dampings), -1)
+
+        # a whole step is looked at with its slopes, as it is taken nearly always; the last one needs none
+        tries = {start: damped(thetas[start], systems[start], _FEWER_DAMPINGS) for start in active}
+        final = turn + 1 == most
+        parts = [tries[start] if final else np.vstack([tries[start], stepped(tries[start][0])]) for start in active]
+        tried = dict(zip(active, run(parts), strict=True))
+        reached = {
+            start: [cost_of(here, at) for here, at in zip(tried[start], tries[start], strict=False)] for start in active
+        }
+        again = [start for start in active if int(np.argmin(reached[start])) != 0] if len(active) == 1 else []
+        for start in again:
+            tries[start] = damped(thetas[start], systems[start], _DAMPINGS)
+            tried[start] = window.runs(tries[start])
+            reached[start] = [cost_of(here, at) for here, at in zip(tried[start], tries[start], strict=True)]
         going = []
-        for row, start in enumerate(active):
-            reached = [cost_of(here, at) for here, at in zip(tried[row], tries[row], strict=True)]
-            best = int(np.argmin(reached))
-            gained = costs[start] - reached[best]
+        for start in active:
+            best = int(np.argmin(reached[start]))
+            gained = costs[start] - reached[start][best]
             if gained > 0.0:
-                thetas[start], costs[start], shown[start] = tries[row, best], reached[best], tried[row, best]
+                thetas[start], costs[start] = tries[start][best], reached[start][best]
+                shown[start] = tried[start][best]
+                if best == 0 and len(tried[start]) > len(tries[start]):
+                    known[start] = tried[start][len(tries[start]) :]
             if gained >= enough:
                 going.append(start)
         active = going
@@ -245,6 +275,11 @@ def first_guess(short: Window, prior: Prior) -> Array:
     return np.asarray(fitted[0])
 
 
+def long_strokes(model: DrivenModel) -> bool:
+    """Return whether the piston's place changes the chambers' volumes much."""
+    return float(np.max(np.abs(model.travel))) > _LONG_STROKE
+
+
 def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Array, float, list[Array]]:
     """Return the parameters (13,) of the best fit, its cost per sample, and other starts.
 
@@ -252,7 +287,7 @@ def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Arra
     the many starts about the first `guess`.
     """
     centre = prior.centre
-    long = float(np.max(np.abs(short.model.travel))) > _LONG_STROKE
+    long = long_strokes(short.model)
     starts = np.tile(guess, (_STIFFNESSES.size, 1))
     starts[:, K] = centre[K] * _STIFFNESSES
     if long:

@@ -19,6 +19,7 @@ from sealscope.diagnosis.pressure_model.fit import (
     Window,
     first_guess,
     fit,
+    long_strokes,
     prior_of,
     refit,
     window_at,
@@ -109,7 +110,7 @@ class Followed:
 
 
 def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple[Window, Window]:
-    """Return the long window of the fit and its beginning, the short one."""
+    """Return the long window of the fit and its beginning, the short one, in steps twice as long where these do."""
     n = dp.size
     long, short = (
         min(n, int(np.clip(cycles * cycle, least, most) * model.rate))
@@ -118,7 +119,9 @@ def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple
     first = max(0, min(int(_WINDOW_AT * n), n - long))
     whole = window_at(model, dp, theta, first, long)
     length = min(short, long)
-    return whole, replace(whole, model=model.part(first, length), dp=whole.dp[: length - whole.settle])
+    # of long strokes, whose stiffness follows the place, coarse steps find another place
+    starts = model if long_strokes(model) else model.coarse(theta)
+    return whole, replace(whole, model=starts.part(first, length), dp=whole.dp[: length - whole.settle])
 
 
 def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | str:

@@ -22,7 +22,7 @@ from sealscope.diagnosis.pressure_model.behind_valve import flow_per_volt, rates
 from sealscope.parameters import Rig
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
-from sealscope.physics.lanes import WIDTH, load, spread, store
+from sealscope.physics.lanes import SINGLE_WIDTH, load, store
 from sealscope.physics.leakage import piston_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
@@ -39,11 +39,13 @@ PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c", "F
 GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C, F_CFR, STROKE, OFFSET, ORIFICE = range(len(PARAMETERS))
 #: The parameters that a machine without an orifice past the piston has.
 SOUND = ORIFICE
-#: Runs that one call makes side by side.
-RUNS = WIDTH
+#: Runs that one call makes side by side: in single precision, which is within some Pa of doubles.
+RUNS = SINGLE_WIDTH
 STATES = 5
 State = tuple[float, float, float, float, float]
 Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
+#: Samples that are turned from lanes into runs at a time.
+_TURNED = 1024
 #: Largest share of V that a stroke takes away, squared.
 _LARGEST_SHARE = 0.75
 #: Largest share of V by which a chamber behind a valve is smaller or larger.
@@ -141,6 +143,18 @@ def _moved(y: State, h: float, k: State) -> State:
     return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4]
 
 
+@contracted
+def _weighed(a: State, b: State, c: State, d: State) -> State:
+    """Return a + 2 b + 2 c + d: summed before they are added to a state, which in single precision rounds once."""
+    return (
+        (a[0] + d[0]) + 2.0 * (b[0] + c[0]),
+        (a[1] + d[1]) + 2.0 * (b[1] + c[1]),
+        (a[2] + d[2]) + 2.0 * (b[2] + c[2]),
+        (a[3] + d[3]) + 2.0 * (b[3] + c[3]),
+        (a[4] + d[4]) + 2.0 * (b[4] + c[4]),
+    )
+
+
 @kernel
 def pressure_differences(
     inputs: np.ndarray,
@@ -153,12 +167,13 @@ def pressure_differences(
     out: np.ndarray,
     speeds: bool,
 ) -> None:
-    """Write dp [Pa], or v [m/s] if `speeds`, of RUNS runs at each sample into `out` (n, RUNS).
+    """Write dp [Pa], or v [m/s] if `speeds`, of all lanes at each sample into `out` (n, lanes).
 
-    The method is RK4 in steps of h [s], `every` to a sample. `inputs`: (2 every n + 1, 5) at every half step: command
-    [V], its derivative [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa], a servo valve's supply
-    [Pa]; `theta`: (segments, 13,
-    RUNS) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, RUNS) at the first sample, in place.
+    `theta`, `state` and `out` are in single precision for RUNS lanes, or doubles for half as many. The method is RK4 in
+    steps of h [s], `every` to a sample. `inputs`: (2 every n + 1, 5) at every half step: command [V], its derivative
+    [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa], a servo valve's supply [Pa]; `theta`:
+    (segments, 13, lanes) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, lanes) at the first
+    sample, in place.
     """
     y = (load(state, 0), load(state, 1), load(state, 2), load(state, 3), load(state, 4))
     for sample in range(segment.size):
@@ -194,9 +209,12 @@ def pressure_differences(
             k_2 = reduced_rates(_moved(y, 0.5 * h, k_1), u_1, stiff, aside, coulomb, supply, now, m)
             k_3 = reduced_rates(_moved(y, 0.5 * h, k_2), u_1, stiff, aside, coulomb, supply, now, m)
             k_4 = reduced_rates(_moved(y, h, k_3), u_2, stiff, aside, coulomb, supply, now, m)
-            y = _moved(_moved(_moved(_moved(y, h / 6.0, k_1), h / 3.0, k_2), h / 3.0, k_3), h / 6.0, k_4)
-    for state_row in range(5):
-        store(state, state_row, y[state_row] + spread(0.0))
+            y = _moved(y, h / 6.0, _weighed(k_1, k_2, k_3, k_4))
+    store(state, 0, y[0])
+    store(state, 1, y[1])
+    store(state, 2, y[2])
+    store(state, 3, y[3])
+    store(state, 4, y[4])
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,14 +338,15 @@ class DrivenModel:
         shown = np.empty((runs, n))
         for first in range(0, runs, RUNS):
             lanes = np.minimum(np.arange(first, first + RUNS), runs - 1)
-            table = np.ascontiguousarray(np.moveaxis(sets[lanes], 0, -1))
-            state = np.zeros((STATES, RUNS))
+            table = np.ascontiguousarray(np.moveaxis(sets[lanes], 0, -1), dtype=np.float32)
+            state = np.zeros((STATES, RUNS), dtype=np.float32)
             if start is not None:
                 state[:] = start[lanes].T
-            out = np.empty((n, RUNS))
+            out = np.empty((n, RUNS), dtype=np.float32)
             pressure_differences(self.inputs, self.h, self.every, table, which, self.numbers, state, out, speeds)
             here = lanes[: min(RUNS, runs - first)]
-            shown[here] = out.T[: here.size]
+            for part in range(0, n, _TURNED):  # parts that stay in the processor's cache
+                shown[first : first + here.size, part : part + _TURNED] = out[part : part + _TURNED].T[: here.size]
             if start is not None:
                 start[here] = state.T[: here.size]
         return shown

@@ -56,8 +56,10 @@ _PASSES = 10
 #: the stiffness leaps by so many deviations of its walk: they are set between their neighbours, at one of these biases
 #: of the speed, in units of the bias's own wandering, and followed once more.
 _STUCK, _LEAPS, _BIASES = 3.0, 1.7, np.array([0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, 2.0])
-#: Shares of a Gauss-Newton step that are tried side by side, and the fall of the cost to go on for.
-_SHARES = np.array([1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 1.4])
+#: Shares of a Gauss-Newton step that are looked at first, those that are tried side by side where the whole one is not
+#: the best of these, and the fall of the cost to go on for.
+_FIRST_SHARES = (1.0, 0.7, 0.4)
+_SHARES = np.array([1.0, 0.85, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 1.2, 1.4])
 _ENOUGH = 4.0
 #: Slopes of coarse steps do as long as a step gains this share of what they promise.
 _KEPT = 0.5
@@ -302,26 +304,51 @@ def track(
             start,
         )
 
+    now = model if known is not None else model.coarse(theta)
+    lack: Array | float = 0.0
+
+    def sets(shares: Sequence[float] | Array, move: Array, grown: float) -> Array:
+        """Return the parameters (runs, b, 13) at those shares of a move and of what the leak grows with it."""
+        each = np.asarray(shares)[:, None, None]
+        return np.asarray(path + each * move + (size + each * grown) * risen)
+
+    def looked(at: Array, others: Array) -> tuple[Array, Array]:
+        """Return what the model shows at `at` (b, 13) and for a step of each parameter, and at `others`."""
+        slopes = np.tile(at, (h.size + 1, 1, 1))
+        for k in range(h.size):
+            slopes[k + 1, :, k] += h[k]
+        every = np.concatenate([slopes, others])
+        runs = now.run(every, segment, np.tile(start, (len(every), 1)))
+        return runs[: h.size + 1], runs[h.size + 1 :]
+
     before: tuple[float, float, Track] | None = None
     last, number = _PASSES, 0
-    coarse = model.coarse(theta)
-    fine = coarse is model
+    runs: Array | None = None
+    good: Track | None = None
+    nothing = np.zeros(path.shape)
     while True:
         allowed = leashes[min(number, len(leashes) - 1)] * walk
         at = path + size * risen
         if known is not None:
-            followed, known, fine = replace(known, strain=strain(path, allowed)), None, True
-            shown = None
+            followed, known = replace(known, strain=strain(path, allowed)), None
         else:
-            sets = np.tile(at, (h.size + 1, 1, 1))
-            for k in range(h.size):
-                sets[k + 1, :, k] += h[k]
-            runs = (model if fine else coarse).run(sets, segment, np.tile(start, (h.size + 1, 1)))
-            if fine:
-                shown = runs[0]
-            elif shown is None:
-                shown = model.run(at[None], segment, start[None].copy())[0]
-            followed = linear(shown, runs, at, strain(path, allowed))
+            if runs is None:
+                runs, _ = looked(at, sets([], nothing, 0.0))
+                if now is not model:
+                    exact = model.run(at[None], segment, start[None].copy())[0] if shown is None else shown
+                    lack = exact - runs[0]
+            try:
+                followed = linear(runs[0] + lack, runs, at, strain(path, allowed))
+            except FloatingPointError:
+                # beside where it shows something finite the model diverges: what was there before is all there is
+                if now is model and good is None:
+                    raise
+                if now is model and good is not None:
+                    return good
+                now, lack, runs, shown = model, 0.0, None, None
+                continue
+        runs = shown = None
+        good = followed
         chain, right = Chain(followed.N, allowed, anchor), right_sides(followed.r, anchor, centre).reshape(-1, 1)
         if rise is None:
             solved, fitted = chain.solve(right), 0.0
@@ -333,24 +360,33 @@ def track(
         promised = followed.strain - strain(fresh, allowed) + followed.fall(at / h, further)
         apart, strained = followed.misfit, followed.strain
         if number + 1 < len(leashes) or promised > _ENOUGH:
-            tries = path + _SHARES[:, None, None] * (fresh - path)
-            sizes = size + _SHARES * (fitted - size)
-            runs = model.run(tries + sizes[:, None, None] * risen, segment, np.tile(start, (_SHARES.size, 1)))
-            reached = misfits(runs).sum(axis=1)
-            costs = reached / followed.variance + np.array([strain(each, allowed) for each in tries])
+            # the whole step is looked at with its slopes, as it is taken nearly always, beside two shorter ones
+            move, grown, before_it = fresh - path, fitted - size, apart / followed.variance + strained
+            shares = np.array(_FIRST_SHARES)
+            there, others = looked(sets(shares[:1], move, grown)[0], sets(shares[1:], move, grown))
+            reached = misfits(np.concatenate([there[:1], others]) + lack).sum(axis=1)
+            costs = reached / followed.variance + np.array([strain(path + each * move, allowed) for each in shares])
+            whole = bool(before_it - costs[0] > _KEPT * promised)
+            if not (whole or before_it - np.nanmin(costs) > _KEPT * promised):
+                shares = _SHARES
+                tries = now.run(sets(shares, move, grown), segment, np.tile(start, (shares.size, 1)))
+                reached = misfits(tries + lack).sum(axis=1)
+                costs = reached / followed.variance + np.array([strain(path + each * move, allowed) for each in shares])
             if np.all(np.isnan(costs)):
                 raise FloatingPointError(DIVERGED)
-            best = int(np.nanargmin(costs))
-            gained = apart / followed.variance + strained - costs[best]
+            best = 0 if whole else int(np.nanargmin(costs))
+            gained = before_it - costs[best]
+            apart, strained = float(reached[best]), strain(path + shares[best] * move, allowed)
             if gained > 0.0:
-                path, size, shown = tries[best], float(sizes[best]), runs[best]
-            apart, strained = float(reached[best]), strain(tries[best], allowed)
+                path, size = path + shares[best] * move, float(size + shares[best] * grown)
+                runs = there if whole else None
             number += 1
             if number < len(leashes) or (gained > _ENOUGH and number < last):
-                fine = fine or gained < _KEPT * promised
+                if now is not model and gained < _KEPT * promised:
+                    now, lack, runs = model, 0.0, None
                 continue
-        if not fine:
-            fine = True
+        if now is not model:
+            now, lack, runs = model, 0.0, None
             continue
         if before is not None:
             return before[2] if (before[0] - apart) / followed.variance + before[1] < strained else followed
@@ -358,7 +394,7 @@ def track(
         if not np.any(stuck) or np.all(stuck):
             return followed
         before = apart, strained, followed
-        path, shown, fine = freed(path, stuck), None, coarse is model
+        path, now, runs = freed(path, stuck), model.coarse(theta), None
         last = number + _PASSES
 
 
@@ -392,7 +428,10 @@ def _normal(rows: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Arr
     products -= trend[:, :, None] * trend[:, None, :] / trend[:, size, None, None]
     H, g = products[:, :size, :size], products[:, :size, -1]
     own = g[:, _WANDERING]
-    inverse = np.linalg.pinv(H[:, _WANDERING[:, None], _WANDERING], rcond=1e-12, hermitian=True)
+    try:
+        inverse = np.linalg.pinv(H[:, _WANDERING[:, None], _WANDERING], rcond=1e-12, hermitian=True)
+    except np.linalg.LinAlgError:  # numbers that are nearly too large
+        raise FloatingPointError(DIVERGED) from None
     squares = products[:, -1, -1] - np.einsum("bi,bij,bj->b", own, inverse, own)
     return H, g + np.einsum("bij,bj->bi", H[:, :, :-1], at), squares
 

@@ -5,13 +5,12 @@ Exact enough without throttles, unstable with them.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.rig import RigNumbers, observe, rates, within_limits
-from sealscope.physics.solvers.loop import APART, Loop, sampled
 from sealscope.physics.state import State, moved, state_of, survey
 
 #: Nodes of the step at which the inputs are needed.
@@ -73,37 +72,33 @@ def advance_rk4(
 
 
 @kernel
-def closed_rk4(
+def sampled_rk4(
     y: np.ndarray,
     h: float,
+    u: np.ndarray,
     G: np.ndarray,
     C: np.ndarray,
     F: np.ndarray,
     p: RigNumbers,
     euler_integral: bool,
     every: int,
-    start: int,
+    ahead: int,
+    apart: int,
     rows: np.ndarray,
-    loop: Loop,
-) -> tuple[int, bool, float, float]:
-    """Advance as `advance_rk4` over the outputs `rows` from `start` on, under a controller.
+) -> Iterator[tuple[int, tuple[bool, float, float]]]:
+    """Advance as `advance_rk4`, and stop at each sample of a controller: `ahead` outputs on, then every `apart`.
 
-    Return how many outputs there are and their `survey`: fewer than rows where a state or a voltage is not finite.
+    `u`: (apart every, 3) command, which the caller may change wherever this stops. Yields how many outputs there are,
+    and the `survey` of those since the stop before. One call for many samples: unpacking `p` takes longer than the
+    steps between two.
     """
-    apart, n = loop.whole[APART], rows.shape[0]
-    u = np.empty((apart * every, G.shape[1]))
-    first, finite, reach, least = 0, True, 0.0, math.inf
-    while first < n and finite:
-        k = (start + first) // apart
-        if (start + first) % apart == 0 and not sampled(loop, k, y):
-            break
-        u[:] = loop.volts[k]
-        last = min((k + 1) * apart - start, n)
+    first, last, n = 0, ahead, rows.shape[0]
+    while first < n:
+        last = min(last, n)
         begin, end = first * every, last * every
         load = F[begin:end] if F.shape[0] > 0 else F
         advance_rk4(
             y, h, u[: end - begin], G[begin:end], C[begin:end], load, p, euler_integral, every, rows[first:last]
         )
-        finite, far, low = survey(rows[first:last])
-        first, reach, least = last, max(reach, far), min(least, low)
-    return first, finite, reach, least
+        yield last, survey(rows[first:last])
+        first, last = last, last + apart
