@@ -1,6 +1,6 @@
 """A controller of one's own: `sealscope simulate --controller own_controller.py:Proportional ...`.
 
-The law is compiled, which a controller need not be; what it remembers between samples is an array of its own.
+Its law is machine code, which a controller's need not be: `start` may as well return a function of `Measured`.
 """
 
 from dataclasses import dataclass
@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from sealscope.control import CompiledLaw, Started
 
-@numba.njit
-def law(memory, measured, k_v, volts_per_speed):
+
+@numba.cfunc("float64(CPointer(float64), CPointer(float64))")
+def law(memory, measured):
     """Velocity of the target and k_v times the averaged error, as a voltage."""
-    memory[0] += 0.5 * (measured.target - measured.x - memory[0])
-    return volts_per_speed * (measured.target_speed + k_v * memory[0])
+    target, target_speed, x = measured[1], measured[2], measured[3]
+    memory[3] += 0.5 * (target - x - memory[3])
+    return memory[1] * (target_speed + memory[2] * memory[3])
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,8 @@ class Proportional:
     def of(cls, rig):
         return cls(rig.cylinder.A_A / (rig.pump.q_b / (2 * np.pi)) / rig.motor.omega_per_volt)
 
+    def compiled(self):
+        return CompiledLaw(law.address, np.array([np.nan, self.volts_per_speed, self.k_v, 0.0]))
+
     def start(self):
-        memory = np.zeros(1)
-        return lambda measured: law(memory, measured, self.k_v, self.volts_per_speed)
+        return Started(self.compiled())

@@ -28,6 +28,7 @@ from threading import Lock
 from typing import Any, TypeVar
 
 import numba
+from llvmlite import ir as llvm
 from numba import types
 from numba.core import config, ir
 from numba.core.caching import FunctionCache
@@ -39,7 +40,7 @@ from numba.core.untyped_passes import RewriteSemanticConstants
 from numba.extending import intrinsic
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-_COMPILED_ROOMS = ("compiled.py", "physics", "signals", "simulation", "diagnosis")
+_COMPILED_ROOMS = ("compiled.py", "physics", "signals", "control", "simulation", "diagnosis")
 _KEPT_GENERATIONS = 4
 _log = logging.getLogger(__name__)
 
@@ -212,8 +213,12 @@ class _Compiler(CompilerBase):  # type: ignore[misc]
 
 def kernel(function: _F, fastmath: Any = False) -> _F:
     """Compile `function` (no Python objects, GIL released) with the safe cache; errors in floats follow IEEE 754."""
+    return _cached(function, {"no_cfunc_wrapper": True, "fastmath": fastmath})
+
+
+def _cached(function: _F, own: dict[str, Any]) -> _F:
     directory = cache_directory()
-    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "fastmath": fastmath}
+    options = {"nogil": True, "error_model": "numpy"} | own
     dispatcher = numba.njit(pipeline_class=_Compiler, **options)(function)
     if directory is None:
         return dispatcher  # type: ignore[no-any-return]
@@ -271,6 +276,50 @@ def contracted(function: _F) -> _F:
     the lane.
     """
     return _law(function, {"contract", "arcp"})
+
+
+class Entry:
+    """A function double f(double *memory, double *given), compiled when its address is first asked for, and cached."""
+
+    _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._dispatcher: Any = _cached(function, {"no_cpython_wrapper": True})
+
+    @cached_property
+    def address(self) -> int:
+        """Where the compiled function is: C, `call_at` and ctypes can call it."""
+        self._dispatcher.compile(self._SIGNATURE)
+        compiled = self._dispatcher.overloads[self._SIGNATURE.args]
+        return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name))
+
+
+def entry(function: Callable[..., Any]) -> Entry:
+    """Compile a function of two blocks of numbers that is called by its address, by kernels that do not know it."""
+    return Entry(function)
+
+
+@intrinsic  # type: ignore[misc]
+def call_at(context: Any, address: Any, memory: Any, given: Any) -> Any:
+    """Call double f(double *memory, double *given) at an address; all three are addresses as whole numbers."""
+
+    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        double = target.get_value_type(numba.float64)
+        pointer = double.as_pointer()
+        function = builder.inttoptr(values[0], llvm.FunctionType(double, [pointer, pointer]).as_pointer())
+        return builder.call(function, [builder.inttoptr(value, pointer) for value in values[1:]])
+
+    return numba.float64(numba.int64, numba.int64, numba.int64), generate
+
+
+@intrinsic  # type: ignore[misc]
+def address_of(context: Any, pointer: Any) -> Any:
+    """Return the address of a pointer as a whole number."""
+
+    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.ptrtoint(values[0], target.get_value_type(numba.int64))
+
+    return numba.int64(pointer), generate
 
 
 @intrinsic  # type: ignore[misc]

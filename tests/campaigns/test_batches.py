@@ -221,7 +221,6 @@ def test_a_place_under_other_commands_is_that_of_the_recording(plan_with, comman
         ({"set": {"motor.integrator": "euler"}}, r"motor\.integrator = state, got euler"),
         ({"factors": {"daq.sample_rate": ["500 Hz", "250 Hz"]}}, r"one sampling rate, 500 Hz, got 250 Hz by a factor"),
         ({"factors": {"command": ["position 20 mm sin(2t)"]}}, r"a command, got a target for a controller"),
-        ({"factors": {"load": ["300 N"]}}, r"no load that changes with time, got load 300 N"),
         ({"onset": "5.9 s"}, r"records with details on both sides of the onset, got 6 s with 5\.9 s"),
     ],
 )

@@ -34,6 +34,8 @@ DRAWN = {
     "bench-thesis": "e034193cb0b6574f",
     "bench-valve": "c2065dbf8536fac1",
     "bench-volume": "afca12e9d27e4824",
+    "duty-pump": "b9abb89ca1d56dd8",
+    "duty-valve": "08b1c921bbe09801",
 }
 
 
@@ -48,6 +50,12 @@ def test_a_plan_is_read_with_its_units(tiny):
     assert (plan.duration_s, plan.onset_s, plan.size) == (6.0, 3.0, 26)
     assert [one.leak_lpm for one in plan.records] == pytest.approx([0.0, 0.0, 0.015, 0.03])
     assert plan.factors["closed"] == ("0 %", "50 %")
+
+
+def test_a_bound_is_asked_for_all_sizes_of_leaks_or_for_those_of_a_group():
+    assert load_plan("bench-load").bounded == {0.0042}
+    assert load_plan("bench-strangers").bounded == {0.0005, 0.0042, 0.1, 0.5}
+    assert not load_plan("bench-volume").bounded
 
 
 def test_kinds_of_records_take_turns(tiny):

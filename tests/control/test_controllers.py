@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -84,6 +84,56 @@ def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlie
         seen.append(observer.G)
     assert np.abs(seen[:5000]).max() < 1e-14
     assert seen[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)
+
+
+@dataclass(frozen=True)
+class Written:
+    """The PI law with feed-forward written out in Python, or another controller without its machine code."""
+
+    pi: PositionPI
+    other: object = None
+    rate: float = 500.0
+    delay: int = 1
+
+    def start(self):
+        if self.other is not None:
+            return self.other.start()
+        c, T = self.pi, 1 / self.rate
+        integral = dp = quick = before = 0.0
+
+        def voltage(measured):
+            nonlocal integral, dp, quick, before
+            dp += (1 - math.exp(-T / 0.02)) * (measured.p_A - measured.p_B - dp)
+            error = measured.target - measured.x
+            omega = (measured.target_speed + c.k_v * error + integral) * (c.area_A if dp > 0 else c.area_B)
+            omega /= c.displacement
+            quick = math.exp(-c.drive_corner * T) * (quick + omega - before)
+            before = omega
+            u = (omega + c.drive_shortfall * quick) / c.omega_per_volt
+            if abs(error) > c.dead_band and (abs(u) < c.u_max or u * error < 0):
+                integral += c.k_i * T * error
+            return min(max(u, -c.u_max), c.u_max)
+
+        return voltage
+
+
+def test_laws_in_machine_code_are_those_in_python():
+    """PI against one written out; the laws through Python, and tolerance around a controller in Python."""
+    words = {"command": "position step 30 mm at 0.3 s", "duration": 6.0, "lpm": 0.5, "seed": 3}
+    pi, tolerant = PositionPI.of(RIG), FaultTolerant.of(RIG)
+    run, _ = followed(pi, **words)
+    written, _ = followed(Written(pi), **words)
+    np.testing.assert_allclose(written.volts, run.volts, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(written.rows, run.rows, rtol=1e-12, atol=1e-9)
+    for controller in (tolerant, Flatness.of(RIG)):
+        run, _ = followed(controller, **words)
+        called, _ = followed(Written(pi, controller), **words)
+        np.testing.assert_array_equal(called.rows, run.rows)
+    beside, _ = followed(replace(tolerant, inner=Written(pi)), **words)
+    run, _ = followed(tolerant, **words)
+    assert run.compensated[-1] > 0.0
+    np.testing.assert_allclose(beside.compensated, run.compensated, rtol=1e-9)
+    np.testing.assert_allclose(beside.volts, run.volts, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

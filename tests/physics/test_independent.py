@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from sealscope.parameters import load_rig
 from sealscope.physics.rest import initial_state
 from sealscope.physics.state import STATES
+from sealscope.simulation.courses import parse_force
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 
@@ -28,9 +29,9 @@ def test_the_independent_results_come_out_with_default_steps(check_rig, drive, t
     assert abs(run["p_A"][-1] - p_A) <= 20.0
 
 
-def thesis(t, y, throttled, G, C, metering):
+def thesis(t, y, throttled, G, C, metering, load=lambda x, v: 0.0):
     """3 sin 4t; eqs. (4.1)-(4.22), Tables 2.1 and 4.1."""
-    integral, i, w, _theta, _x, v, pa, pb, p1, p2 = y
+    integral, i, w, _theta, x, v, pa, pb, p1, p2 = y
     if not throttled:
         p1, p2 = pa, pb
     R, L, Ce, Cm, J, B = 0.73, 3.55e-3, 0.6963, 0.6963, 8.74e-4, 4.855e-4
@@ -65,7 +66,7 @@ def thesis(t, y, throttled, G, C, metering):
         (Cm * i - B * w - torque) / J,  # (4.5)
         w,
         v,
-        (A * (pa - pb) - f) / M,  # (4.15)
+        (A * (pa - pb) - f - load(x, v)) / M,  # (4.15)
         K / V * (qa - A * v - ql),  # (4.18)
         K / V * (A * v + ql - qb_flow),  # (4.19)
         K / V12 * (q1 - qa) if throttled else 0.0,  # (4.16)
@@ -257,11 +258,27 @@ OPERATED = (
 BOILS = {"p_vap": "2 kPa", "p_charge": "0.1 MPa", "F_l": 120.0, "G_check": 1e-13, "G_ext_A": 2e-13}
 PUMPED = ("I", "i", "omega", "x", "v", "p_A", "p_B")
 LINED = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2")
+
+PRESS = (
+    "20 N/mm over x - 30 N/mm over x from 4 mm + 0.2 kN/mm over x from 6 mm + 500 N s/m over v + "
+    "2 kN s/m over v from 0 m/s"
+)
+
+
+def press(x, v):
+    force = 20e3 * x if x < 4e-3 else 80.0 - 10e3 * (x - 4e-3)
+    return force + (2e5 * (x - 6e-3) if x > 6e-3 else 0.0) + (2500.0 * v if v > 0 else 500.0 * v)
+
+
 FREE, THROTTLED = (False, 6e-13, 2e-10, "meter-out"), (True, 6e-13, 2e-10, "meter-out")
 #: Rig, its values, right-hand side and its arguments, states of it, volts and rad/s of the command, leak, options.
 VARIANTS = {
     "free": ("check", {}, thesis, FREE, LINED, (3.0, 4.0), {"G": 6e-13, "C": 2e-10}),
     "throttled": ("check", {"throttled": True}, thesis, THROTTLED, LINED, (3.0, 4.0), {"G": 6e-13, "C": 2e-10}),
+    "free, a load over position and velocity": (
+        *("check", {"p_charge": "6 MPa"}, thesis, (*FREE, press), LINED, (3.0, 4.0)),
+        {"G": 6e-13, "C": 2e-10, "load": parse_force(PRESS)},
+    ),
     "thesis-closed-loop": (
         *("thesis-closed-loop", {"G_ext_A": 2e-13}, closed_loop, (3.0, 0.0, 1e6, 1e-10, -math.inf), (*PUMPED, "V_up")),
         *((3.0, 3.0), {"G": 5e-12}),

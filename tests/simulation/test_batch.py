@@ -142,6 +142,26 @@ def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig):
 
 
 @pytest.mark.slow
+def test_loads_push_side_by_side_as_they_do_by_themselves(check_rig):
+    """Over time, two kinds of them, and over position and velocity."""
+    loads = [
+        "300 N sin(3t)",
+        "step 400 N at 2 s",
+        "150 N sin(3t) + 40 N/mm over x from 1 mm + 2 kN s/m over v - 1 kN s/m over v from 5 mm/s",
+    ]
+    experiments = [
+        Experiment.of(rig=check_rig(p_charge="2 MPa", F_v=300.0 + 20.0 * k, **QUIET), load=load, duration=6.0, **COMMON)
+        for k, load in enumerate(loads)
+    ]
+    bounds = [0.0, 3.0, 6.0]
+    batch = simulate_batch(experiments, bounds=bounds)
+    for k, experiment in enumerate(experiments):
+        alone = simulate_with_truth(experiment)
+        np.testing.assert_allclose(batch.rms[k], rms_of(alone.recording, bounds), rtol=1e-6)
+    assert np.ptp(batch.rms[:, 0, 1, 2]) > 1.0
+
+
+@pytest.mark.slow
 def test_oil_boils_side_by_side_as_it_does_by_itself(check_rig):
     values = {"p_vap": "2 kPa", "p_charge": "0 Pa", "F_v": 6000.0, **QUIET, "sensors.p_A.range_lo": -2e5}
     rig, bounds = check_rig(**values, **{"sensors.p_B.range_lo": -2e5}), [0.0, 6.0]

@@ -167,7 +167,10 @@ def test_a_recorded_force_is_taken_as_it_was(tmp_path):
     path.write_text("t [min],F [kN],note\n1,0.5,a\n1.01,1.5,b\n1.03,-0.5,c\n")
     force = Experiment.of(load=f"file {path}", duration=1.0).load
     np.testing.assert_allclose(force.at(np.array([0.0, 0.3, 0.6, 1.2, 9.0])), [500.0, 1000.0, 1500.0, 500.0, -500.0])
-    for words, rule in (("t [s],p [Pa]\n0,1\n", "columns t [s] and F [N]"), ("t [s],F [bar]\n0,1\n1,1\n", "bar")):
+    for words, rule in (
+        ("t [s],p [Pa]\n0,1\n", "columns t [s] and F [N], or F [N] with one of x [m] and v [m/s]"),
+        ("t [s],F [bar]\n0,1\n1,1\n", "bar"),
+    ):
         path.write_text(words)
         with pytest.raises(InputError) as refused:
             parse_force(f"file {path}")
@@ -228,8 +231,6 @@ def test_rates_and_voltages_that_cannot_be():
     target = Experiment.of(rig="thesis-closed-loop", command="position 10 mm sin(t)", duration=1.0)
     with pytest.raises(InputError, match="a run of a batch must have a command, got a target"):
         simulate_batch([target])
-    with pytest.raises(InputError, match="a run of a batch must have no load that changes"):
-        simulate_batch([Experiment.of(load="10 N", duration=1.0)])
 
     @dataclass(frozen=True)
     class Broken:
@@ -241,3 +242,11 @@ def test_rates_and_voltages_that_cannot_be():
 
     with pytest.raises(SimulationFailed, match="the controller must give a finite voltage, got nan at t = 0 s"):
         trajectory(replace(target, controller=Broken()), ())
+
+    @dataclass(frozen=True)
+    class Raising(Broken):
+        def start(self):
+            return lambda measured: 1.0 if measured.t < 0.1 else 1.0 / 0.0
+
+    with pytest.raises(ZeroDivisionError):
+        trajectory(replace(target, controller=Raising()), ())

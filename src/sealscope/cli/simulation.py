@@ -50,7 +50,11 @@ def simulate(
     ] = "3 sin(4t)",
     load: Annotated[
         str | None,
-        typer.Option("--load", help="Force against +x beside the rig's own, e.g. '2 kN', 'step 500 N at 3 s'."),
+        typer.Option(
+            "--load",
+            help="Force against +x beside the rig's own, e.g. '2 kN', 'step 500 N at 3 s', '200 N/mm over x', "
+            "'2 kN s/m over v', 'file LOAD.csv' (F [N] over t, x or v).",
+        ),
     ] = None,
     controller: Annotated[
         str | None,

@@ -1,7 +1,9 @@
 """Controllers around a rig, with parameters of their own: what they assume of the machine, not what it is."""
 
+from sealscope.control.controller import CompiledLaw as CompiledLaw
 from sealscope.control.controller import Controller as Controller
 from sealscope.control.controller import Measured as Measured
+from sealscope.control.controller import Started as Started
 from sealscope.control.drive import Drive as Drive
 from sealscope.control.drive import ValveDrive as ValveDrive
 from sealscope.control.drive import drive_of as drive_of

@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
+import numpy as np
+
+from sealscope.compiled import law
 from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -15,6 +19,29 @@ if TYPE_CHECKING:
 
 #: Least share of the supply that a controller assumes across a valve: beyond, a load is more than it can move.
 _LEAST_ACROSS = 0.1
+#: How many times its growth a small voltage is moved to where an overlap ends.
+_ACROSS_OVERLAP = 4.0
+#: Numbers of the inverse of a drive: which it is, and what that needs (`Drive.block`, `ValveDrive.block`).
+DRIVE_BLOCK = 8
+_PUMP, _VALVE = 0.0, 1.0
+
+
+@law
+def drive_voltage(m: Any, flow: float, dp: float) -> float:
+    """Return the voltage [V] that makes a drive give a flow [m^3/s] against p_A - p_B [Pa], sample by sample.
+
+    `m`: the block of numbers of a `Drive` or of a `ValveDrive`, which say what it is.
+    """
+    if m[0] == _VALVE:
+        p_s = m[4]
+        across = max(p_s - math.copysign(dp, dp * flow), _LEAST_ACROSS * p_s)
+        u = m[3] * flow / (m[1] * math.sqrt(0.5 * across / m[2]))
+        return u + min(max(_ACROSS_OVERLAP * u, -m[5]), m[5])  # type: ignore[no-any-return]
+    omega = flow / m[1]
+    voltages = omega + m[5] * dp
+    m[6] = m[4] * (m[6] + voltages - m[7])
+    m[7] = voltages
+    return (omega + m[3] * m[6]) / m[2]  # type: ignore[no-any-return]
 
 
 def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str, float]) -> None:
@@ -30,8 +57,8 @@ def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str,
 class FlowSource(Protocol):
     """What gives the cylinder its flow, as a controller assumes it."""
 
-    def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Return a function of a flow [m^3/s] and a pressure difference [Pa], called at `rate` [Hz]: the voltage."""
+    def block(self, rate: float) -> Array:
+        """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
         ...
 
     def steady(self, flow: float) -> float:
@@ -82,18 +109,13 @@ class Drive:
 
         The voltage makes the pump give the flow against the pressure difference (p_A - p_B).
         """
+        return _inverse(self.block(rate))
+
+    def block(self, rate: float) -> Array:
+        """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
         fading = math.exp(-self.corner / rate)
-        quick = before = 0.0
-
-        def voltage(flow: float, dp: float) -> float:
-            nonlocal quick, before
-            omega = flow / self.displacement
-            voltages = omega + self.droop * dp
-            quick = fading * (quick + voltages - before)
-            before = voltages
-            return (omega + self.shortfall * quick) / self.omega_per_volt
-
-        return voltage
+        numbers = (self.displacement, self.omega_per_volt, self.shortfall, fading, self.droop)
+        return np.array([_PUMP, *numbers, 0.0, 0.0])
 
     def steady(self, flow: float) -> float:
         """Return the voltage [V] of a flow [m^3/s] that lasts, of a drive that reaches its commanded speed."""
@@ -136,13 +158,14 @@ class ValveDrive:
 
         The voltage makes the valve give the flow against the pressure difference (p_A - p_B).
         """
-        least = _LEAST_ACROSS * self.p_s
+        return _inverse(self.block(rate))
 
-        def voltage(flow: float, dp: float) -> float:
-            across = max(self.p_s - math.copysign(dp, dp * flow), least)
-            return self.u_N * flow / (self.Q_N * math.sqrt(0.5 * across / self.dp_N))
+    def block(self, rate: float, dead: float = 0.0) -> Array:
+        """Return the numbers of the inverse as `drive_voltage` takes them.
 
-        return voltage
+        Within `dead` [V], the overlap of the edges, nothing flows: a small voltage is moved beyond it.
+        """
+        return np.array([_VALVE, self.Q_N, self.dp_N, self.u_N, self.p_s, dead, 0.0, 0.0])
 
     def steady(self, flow: float) -> float:
         """Return the voltage [V] of a flow [m^3/s] without a load."""
@@ -151,6 +174,10 @@ class ValveDrive:
     def largest(self, u_max: float) -> float:
         """Return the flow [m^3/s] at the voltage `u_max` [V], without a load."""
         return u_max / self.steady(1.0)
+
+
+def _inverse(block: Array) -> Callable[[float, float], float]:
+    return lambda flow, dp: drive_voltage(block, flow, dp)
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from sealscope.control.controller import Controller, Measured
-from sealscope.control.drive import Drive, check_numbers
-from sealscope.control.leak_observer import SHUT, Balance, LeakObserver
+import numpy as np
+
+from sealscope.compiled import address_of, call_at, entry, pointer_at
+from sealscope.control.controller import ANGLE, P_A, P_B, CompiledLaw, Controller, Measured, Started, X
+from sealscope.control.drive import DRIVE_BLOCK, Drive, check_numbers, drive_voltage
+from sealscope.control.leak_observer import SHUT, Balance, conductance, observed, observer_block
 from sealscope.control.position import PositionPI
 from sealscope.errors import InputError
 
@@ -26,6 +29,42 @@ _SIGNIFICANT = 4.0
 _COUNTS = 0.5
 #: Blocks that the observer must have used.
 _FEWEST = 4
+#: Places of the law's numbers in its block: law and memory of the inner one, as addresses, or 0 and its voltage where
+#: it is no machine code; the last are those of the drive's inverse and of the observer.
+_COMPENSATED, _INNER, _ITS_MEMORY, _ITS_VOLTAGE, _U_MAX, _ASSUMED, _KNOWN, _AVERAGED, _BLENDED = range(9)
+_MEAN_A, _MEAN_B, _G, _STANDS_OUT, _X_STEP, _AREA, _DRIVE = range(9, 16)
+_OBSERVER = _DRIVE + DRIVE_BLOCK
+
+
+@entry
+def _tolerant_law(m: Any, measured: Any) -> Any:
+    u = m[_ITS_VOLTAGE]
+    if m[_INNER] != 0.0:
+        u = call_at(int(m[_INNER]), int(m[_ITS_MEMORY]), address_of(measured))
+    if math.isnan(m[_MEAN_A]):
+        m[_MEAN_A], m[_MEAN_B] = measured[P_A], measured[P_B]
+    m[_MEAN_A] += m[_AVERAGED] * (measured[P_A] - m[_MEAN_A])
+    m[_MEAN_B] += m[_AVERAGED] * (measured[P_B] - m[_MEAN_B])
+    over = m[_MEAN_A] - m[_MEAN_B]
+    if m[_KNOWN] == 0.0:
+        observer = pointer_at(m, _OBSERVER)
+        observed(observer, measured[ANGLE], measured[X], measured[P_A], measured[P_B])
+        G, sd, blocks = conductance(observer)
+        above = G - m[_ASSUMED]
+        wanted = 0.0
+        if blocks >= _FEWEST:
+            unseen = _COUNTS * m[_X_STEP] * m[_AREA] / max(abs(over), 1.0)
+            needed = (0.5 if m[_STANDS_OUT] > 0.0 else 1.0) * max(_SIGNIFICANT * sd, unseen)
+            m[_STANDS_OUT] = 1.0 if above > needed else 0.0
+            wanted = above if above > needed else 0.0
+        m[_G] += m[_BLENDED] * (wanted - m[_G])
+        if m[_STANDS_OUT] == 0.0 and m[_G] < 1e-18:
+            m[_G] = 0.0
+    if m[_G] == 0.0:
+        m[_COMPENSATED] = 0.0
+        return u
+    m[_COMPENSATED] = m[_G] * over
+    return min(max(u + drive_voltage(pointer_at(m, _DRIVE), m[_COMPENSATED], 0.0), -m[_U_MAX]), m[_U_MAX])
 
 
 @dataclass(frozen=True)
@@ -83,48 +122,40 @@ class FaultTolerant:
 
     def start(self) -> Callable[[Measured], float]:
         """Return a function from what is measured to the voltage [V], for one run from its beginning."""
-        return _Compensating(self)
+        law = self.compiled()
+        return _Beside(self) if law is None else Started(law)
+
+    def compiled(self) -> CompiledLaw | None:
+        """Return the law in machine code, for one run from its beginning; None where the inner one has none."""
+        inner = self.inner.compiled() if hasattr(self.inner, "compiled") else None
+        return None if inner is None else self.around(inner)
+
+    def around(self, inner: CompiledLaw | None) -> CompiledLaw:
+        """Return the law around an inner one, or around the voltage that it is given (`_Beside`)."""
+        balance, rate = self.balance, self.rate
+        m = np.zeros(_OBSERVER)
+        if inner is not None:
+            m[_INNER], m[_ITS_MEMORY] = inner.address, inner.memory.ctypes.data  # below 2^53: exact as doubles
+        m[_U_MAX], m[_ASSUMED], m[_KNOWN] = self.u_max, self.G_assumed, self.known is not None
+        m[_AVERAGED], m[_BLENDED] = (1.0 - math.exp(-1.0 / (rate * lag)) for lag in (_PRESSURE_LAG, _BLEND))
+        m[_MEAN_A] = m[_MEAN_B] = math.nan
+        m[_G], m[_X_STEP], m[_AREA] = self.known or 0.0, balance.x_step, min(balance.area_A, balance.area_B)
+        m[_DRIVE:_OBSERVER] = self.drive.block(rate)
+        return CompiledLaw(_tolerant_law.address, np.r_[m, observer_block(balance, rate)], inner)
 
 
-class _Compensating:
-    """One run of a fault-tolerant controller."""
+class _Beside:
+    """One run of a fault-tolerant controller around one in Python."""
 
     def __init__(self, law: FaultTolerant) -> None:
-        self._law, self._inner = law, law.inner.start()
-        self._inverse = law.drive.inverse(law.rate)
-        self._observer = LeakObserver(law.balance, law.rate)
-        self._averaged = 1.0 - math.exp(-1.0 / (law.rate * _PRESSURE_LAG))
-        self._blended = 1.0 - math.exp(-1.0 / (law.rate * _BLEND))
-        self._p_A = self._p_B = math.nan
-        self._G = law.known or 0.0
-        self._stands_out = False
-        #: Leakage flow that is made good [m^3/s].
-        self.compensated = 0.0
+        self._inner, self._law = law.inner.start(), law.around(None)
+        self._outer = Started(self._law)
 
     def __call__(self, measured: Measured) -> float:
-        law = self._law
-        u = self._inner(measured)
-        if math.isnan(self._p_A):
-            self._p_A, self._p_B = measured.p_A, measured.p_B
-        self._p_A += self._averaged * (measured.p_A - self._p_A)
-        self._p_B += self._averaged * (measured.p_B - self._p_B)
-        if law.known is None:
-            self._observer.update(measured.theta, measured.x, measured.p_A, measured.p_B)
-            self._G += self._blended * (self._estimate() - self._G)
-            if not self._stands_out and self._G < 1e-18:
-                self._G = 0.0
-        if self._G == 0.0:
-            self.compensated = 0.0
-            return u
-        self.compensated = self._G * (self._p_A - self._p_B)
-        return min(max(u + self._inverse(self.compensated, 0.0), -law.u_max), law.u_max)
+        self._law.memory[_ITS_VOLTAGE] = self._inner(measured)
+        return self._outer(measured)
 
-    def _estimate(self) -> float:
-        observer, above = self._observer, self._observer.G - self._law.G_assumed
-        if observer.blocks < _FEWEST:
-            return 0.0
-        balance, dp = self._law.balance, max(abs(self._p_A - self._p_B), 1.0)
-        unseen = _COUNTS * balance.x_step * min(balance.area_A, balance.area_B) / dp
-        needed = (0.5 if self._stands_out else 1.0) * max(_SIGNIFICANT * observer.sd, unseen)
-        self._stands_out = above > needed
-        return above if self._stands_out else 0.0
+    @property
+    def compensated(self) -> float:
+        """Leakage flow that is made good [m^3/s]."""
+        return self._outer.compensated

@@ -5,17 +5,42 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from sealscope.control.controller import Measured
-from sealscope.control.drive import Drive, ValveDrive, check_numbers, drive_of
-from sealscope.control.position import PositionPI, ValvePI, position_controller
+import numpy as np
+
+from sealscope.compiled import entry, pointer_at
+from sealscope.control.controller import P_A, P_B, TARGET_SPEED, CompiledLaw, Measured, Started
+from sealscope.control.drive import DRIVE_BLOCK, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
+from sealscope.control.position import PositionPI, ValvePI, followed, position_controller
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Time [s] over which the load that the pressures carry is averaged.
 _LOAD_LAG = 0.1
+#: Places of the law's numbers in its block; the last are those of the drive's inverse and of the feedback.
+_V_MAX, _MASS, _F_C, _V_TH, _F_V, _G, _C, _T, _AVERAGED, _FIRST, _V, _DP, _LOAD, _AREA_A, _AREA_B, _U_MAX = range(1, 17)
+_DRIVE = 17
+_FEEDBACK = _DRIVE + DRIVE_BLOCK
+
+
+@entry
+def _flatness_law(m: Any, measured: Any) -> Any:
+    T, v_max, first = m[_T], m[_V_MAX], m[_FIRST] > 0.0
+    v = measured[TARGET_SPEED] if abs(measured[TARGET_SPEED]) <= v_max else 0.0
+    a = 0.0 if first else (v - m[_V]) / T
+    a = a if abs(a) * T < 0.1 * v_max else 0.0
+    force = m[_MASS] * a + m[_F_C] * math.tanh(v / m[_V_TH]) + m[_F_V] * v
+    pushed = m[_AREA_A] * measured[P_A] - m[_AREA_B] * measured[P_B]
+    m[_LOAD] += (1.0 if first else m[_AVERAGED]) * (pushed - force - m[_LOAD])
+    area = m[_AREA_A] if m[_LOAD] >= 0.0 else m[_AREA_B]
+    dp = (force + m[_LOAD]) / area
+    rate = 0.0 if first else (dp - m[_DP]) / T
+    flow = m[_G] * dp + m[_C] * rate
+    m[_V], m[_DP], m[_FIRST] = v, dp, 0.0
+    u = followed(pointer_at(m, _FEEDBACK), measured) + drive_voltage(pointer_at(m, _DRIVE), flow, dp)
+    return min(max(u, -m[_U_MAX]), m[_U_MAX])
 
 
 @dataclass(frozen=True)
@@ -79,25 +104,12 @@ class Flatness:
 
     def start(self) -> Callable[[Measured], float]:
         """Return a function from what is measured to the voltage [V], for one run from its beginning."""
-        feedback, inverse, T = self.feedback.start(), self.drive.inverse(self.rate), 1.0 / self.rate
-        area_A, area_B, u_max = self.feedback.area_A, self.feedback.area_B, self.feedback.u_max
-        averaged = 1.0 - math.exp(-T / _LOAD_LAG)
-        v_before = dp_before = load = 0.0
-        first = True
+        return Started(self.compiled())
 
-        def voltage(measured: Measured) -> float:
-            nonlocal v_before, dp_before, load, first
-            v = measured.target_speed if abs(measured.target_speed) <= self.v_max else 0.0
-            a = 0.0 if first else (v - v_before) / T
-            a = a if abs(a) * T < 0.1 * self.v_max else 0.0
-            force = self.M * a + self.F_C * math.tanh(v / self.v_th) + self.F_v * v
-            pushed = area_A * measured.p_A - area_B * measured.p_B
-            load += (1.0 if first else averaged) * (pushed - force - load)
-            area = area_A if load >= 0.0 else area_B
-            dp = (force + load) / area
-            rate = 0.0 if first else (dp - dp_before) / T
-            flow = self.G * dp + self.C * rate
-            v_before, dp_before, first = v, dp, False
-            return min(max(feedback(measured) + inverse(flow, dp), -u_max), u_max)
-
-        return voltage
+    def compiled(self) -> CompiledLaw:
+        """Return the law in machine code, for one run from its beginning."""
+        T, f = 1.0 / self.rate, self.feedback
+        own = (self.v_max, self.M, self.F_C, self.v_th, self.F_v, self.G, self.C, T, 1.0 - math.exp(-T / _LOAD_LAG))
+        states, outer = (1.0, 0.0, 0.0, 0.0), (f.area_A, f.area_B, f.u_max)
+        memory = np.array([math.nan, *own, *states, *outer, *self.drive.block(self.rate), *f.block()])
+        return CompiledLaw(_flatness_law.address, memory)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+
+from sealscope.compiled import law
+from sealscope.recordings.recording import Array
 
 #: Length of a block [s] over which volumes are balanced.
 BLOCK = 0.5
@@ -21,6 +25,91 @@ _WALK, _WALK_SHARE = 1e-15, 0.03
 _SURPRISE = 4.0
 #: Time [s] over which all four signals are averaged alike.
 _LAG = 0.01
+#: Places in the observer's block: what it assumes, then what it remembers. From _BEGIN and _AVERAGED on stand angle,
+#: position and both pressures; from _G on the three states, from _P on the rows of their covariance.
+_D, _AREA_A, _AREA_B, _V_A, _V_B, _K, _X_STEP, _NOISE, _SHUT, _RATE, _LENGTH, _SHARE = range(12)
+_COUNT, _SUM_DP, _LOW, _HIGH, _FORWARD, _BACK, _SURPRISED, _USED, _BEGIN, _AVERAGED = *range(12, 21), 24
+_G, _P = 28, 31
+OBSERVER_BLOCK = _P + 9
+
+
+@law
+def observed(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
+    """Take a sample into the observer's block `m`: angle [rad], position [m], pressures [Pa]."""
+    now = (theta, x, p_A, p_B)
+    if m[_COUNT] == 0.0:
+        for k in range(4):
+            m[_AVERAGED + k] = m[_BEGIN + k] = now[k]
+    before = m[_AVERAGED]
+    for k in range(4):
+        m[_AVERAGED + k] = m[_AVERAGED + k] + m[_SHARE] * (now[k] - m[_AVERAGED + k])
+    dp, turned = m[_AVERAGED + 2] - m[_AVERAGED + 3], m[_AVERAGED] - before
+    m[_LOW], m[_HIGH] = min(m[_LOW], dp), max(m[_HIGH], dp)
+    m[_SUM_DP] += dp
+    m[_FORWARD] += max(turned, 0.0)
+    m[_BACK] += max(-turned, 0.0)
+    m[_COUNT] += 1.0
+    if m[_COUNT] > m[_LENGTH]:
+        _close(m, m[_SUM_DP] - 0.5 * dp)
+        m[_COUNT], m[_SUM_DP], m[_LOW], m[_HIGH], m[_FORWARD], m[_BACK] = 1.0, 0.5 * dp, dp, dp, 0.0, 0.0
+        for k in range(4):
+            m[_BEGIN + k] = m[_AVERAGED + k]
+
+
+@law
+def _close(m: Any, total: float) -> None:
+    """Take a block into the filter; `total`: sum of p_A - p_B [Pa] over its samples."""
+    integral = total / m[_RATE]
+    if abs(integral) < LEAST_DP * m[_LENGTH] / m[_RATE] or m[_LOW] * m[_HIGH] <= 0.0:
+        return
+    if min(abs(m[_LOW]), abs(m[_HIGH])) < m[_SHUT]:
+        return
+    turned, moved = m[_D] * (m[_AVERAGED] - m[_BEGIN]), m[_AVERAGED + 1] - m[_BEGIN + 1]
+    middle = 0.5 * (m[_AVERAGED + 1] + m[_BEGIN + 1])
+    if integral > 0.0:
+        area_of, drawn = m[_AREA_A], m[_FORWARD]
+        V, change = m[_V_A] + area_of * middle, m[_AVERAGED + 2] - m[_BEGIN + 2]
+    else:
+        area_of, drawn = m[_AREA_B], m[_BACK]
+        V, change = m[_V_B] - area_of * middle, m[_BEGIN + 3] - m[_AVERAGED + 3]
+    area = area_of * moved
+    pressed = (V * change + m[_D] * drawn * integral * m[_RATE] / m[_LENGTH]) / m[_K]
+    measured = turned - area - pressed
+    # a count of the encoder at both ends, the pressures' noise over the average, and what the laws leave out
+    noise = (area_of * m[_X_STEP]) ** 2 / 6.0 + 0.1 * (V / m[_K] * m[_NOISE]) ** 2
+    variance = noise + (0.02 * pressed) ** 2 + (2e-4 * area) ** 2
+    row = (integral, pressed, area)
+    innovation = measured - (row[0] * m[_G] + row[1] * m[_G + 1] + row[2] * m[_G + 2])
+    walk = (_WALK + _WALK_SHARE * abs(m[_G])) ** 2
+    spread = row[0] * row[0] * walk + variance
+    for i in range(3):
+        for k in range(3):
+            spread += row[i] * m[_P + 3 * i + k] * row[k]
+    if innovation**2 > _SURPRISE**2 * spread:
+        before = m[_SURPRISED]
+        m[_SURPRISED] = innovation / integral
+        if before * m[_SURPRISED] <= 0.0:
+            return
+        more = m[_SURPRISED] ** 2
+        walk, spread = walk + more, spread + row[0] * row[0] * more
+    else:
+        m[_SURPRISED] = 0.0
+    m[_P] += walk
+    g_0 = (m[_P] * row[0] + m[_P + 1] * row[1] + m[_P + 2] * row[2]) / spread
+    g_1 = (m[_P + 3] * row[0] + m[_P + 4] * row[1] + m[_P + 5] * row[2]) / spread
+    g_2 = (m[_P + 6] * row[0] + m[_P + 7] * row[1] + m[_P + 8] * row[2]) / spread
+    gain = (g_0, g_1, g_2)
+    for i in range(3):
+        m[_G + i] += gain[i] * innovation
+        for k in range(3):  # P is symmetric: its product with the row is gain times spread
+            m[_P + 3 * i + k] -= gain[i] * gain[k] * spread
+    m[_USED] += 1.0
+
+
+@law
+def conductance(m: Any) -> tuple[float, float, float]:
+    """Return the estimated conductance [m^3/(s Pa)], its deviation, and how many blocks were used."""
+    return m[_G], math.sqrt(m[_P]), m[_USED]
 
 
 @dataclass(frozen=True)
@@ -50,83 +139,37 @@ class LeakObserver:
     for side B; dtheta_in is what the pump turned towards that side, whose oil it draws at the other pressure. Beside G
     the filter holds the errors of 1/K and of the area, as shares. Friction and load do not enter.
 
-    `G` [m^3/(s Pa)] and `sd`, `blocks`: how many were used.
+    `G` [m^3/(s Pa)] and `sd`; `blocks`: how many were used. The law is `observed`, compiled.
     """
 
     def __init__(self, balance: Balance, rate: float) -> None:
-        self._b, self._rate = balance, rate
-        self._length = max(2, round(BLOCK * rate))
-        self._state = np.zeros(3)
-        self._P = np.diag(np.square([_SD_G, _SD_C, _SD_AREA]))
-        self._k, self._sum_dp, self._low, self._high = 0, 0.0, math.inf, -math.inf
-        self._share = 1.0 - math.exp(-1.0 / (rate * _LAG))
-        self._begin = self._averaged = (0.0, 0.0, 0.0, 0.0)
-        self._forward = self._back = self._surprised = 0.0
-        self.blocks = 0
+        self._block = observer_block(balance, rate)
 
     @property
     def G(self) -> float:
         """Estimated conductance [m^3/(s Pa)]."""
-        return float(self._state[0])
+        return float(conductance(self._block)[0])
 
     @property
     def sd(self) -> float:
         """Deviation of the estimate [m^3/(s Pa)]."""
-        return float(math.sqrt(self._P[0, 0]))
+        return float(conductance(self._block)[1])
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks were used."""
+        return round(conductance(self._block)[2])
 
     def update(self, theta: float, x: float, p_A: float, p_B: float) -> None:
         """Take a sample in: angle [rad], position [m], pressures [Pa]."""
-        now = (theta, x, p_A, p_B)
-        if self._k == 0:
-            self._averaged = self._begin = now
-        before = self._averaged
-        theta, x, p_A, p_B = (old + self._share * (new - old) for old, new in zip(before, now, strict=True))
-        self._averaged = (theta, x, p_A, p_B)
-        dp = p_A - p_B
-        self._low, self._high = min(self._low, dp), max(self._high, dp)
-        self._sum_dp += dp
-        self._forward += max(theta - before[0], 0.0)
-        self._back += max(before[0] - theta, 0.0)
-        self._k += 1
-        if self._k > self._length:
-            self._close(self._averaged, self._sum_dp - 0.5 * dp)
-            self._k, self._sum_dp, self._low, self._high = 1, 0.5 * dp, dp, dp
-            self._begin = self._averaged
-            self._forward = self._back = 0.0
+        observed(self._block, float(theta), float(x), float(p_A), float(p_B))
 
-    def _close(self, end: tuple[float, float, float, float], total: float) -> None:
-        b, begin = self._b, self._begin
-        integral = total / self._rate
-        if abs(integral) < LEAST_DP * self._length / self._rate or self._low * self._high <= 0.0:
-            return
-        if min(abs(self._low), abs(self._high)) < b.shut:
-            return
-        turned, moved = b.D * (end[0] - begin[0]), end[1] - begin[1]
-        middle = 0.5 * (end[1] + begin[1])
-        if integral > 0.0:
-            area, V, change, drawn = b.area_A * moved, b.V_A + b.area_A * middle, end[2] - begin[2], self._forward
-        else:
-            area, V, change, drawn = b.area_B * moved, b.V_B - b.area_B * middle, begin[3] - end[3], self._back
-        pressed = (V * change + b.D * drawn * integral * self._rate / self._length) / b.K
-        measured = turned - area - pressed
-        row = np.array([integral, pressed, area])
-        # a count of the encoder at both ends, the pressures' noise over the average, and what the laws leave out
-        area_of = b.area_A if integral > 0.0 else b.area_B
-        noise = (area_of * b.x_step) ** 2 / 6.0 + 0.1 * (V / b.K * b.noise) ** 2
-        variance = noise + (0.02 * pressed) ** 2 + (2e-4 * area) ** 2
-        innovation = measured - float(row @ self._state)
-        walk = _WALK + _WALK_SHARE * abs(self._state[0])
-        P = self._P + np.diag([walk**2, 0.0, 0.0])
-        spread = float(row @ P @ row) + variance
-        if innovation**2 > _SURPRISE**2 * spread:
-            before, self._surprised = self._surprised, innovation / integral
-            if before * self._surprised <= 0.0:
-                return
-            P[0, 0] += self._surprised**2
-            spread = float(row @ P @ row) + variance
-        else:
-            self._surprised = 0.0
-        gain = P @ row / spread
-        self._state = self._state + gain * innovation
-        self._P = P - np.outer(gain, row @ P)
-        self.blocks += 1
+
+def observer_block(balance: Balance, rate: float) -> Array:
+    """Return the numbers of an observer that has seen nothing, as `observed` takes them."""
+    b, m = balance, np.zeros(OBSERVER_BLOCK)
+    m[: _RATE + 1] = b.D, b.area_A, b.area_B, b.V_A, b.V_B, b.K, b.x_step, b.noise, b.shut, rate
+    m[_LENGTH], m[_SHARE] = max(2, round(BLOCK * rate)), 1.0 - math.exp(-1.0 / (rate * _LAG))
+    m[_LOW], m[_HIGH] = math.inf, -math.inf
+    m[_P::4] = np.square([_SD_G, _SD_C, _SD_AREA])
+    return m

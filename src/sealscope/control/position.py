@@ -5,18 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
-from sealscope.control.controller import Measured
-from sealscope.control.drive import Drive, ValveDrive, check_numbers
+import numpy as np
+
+from sealscope.compiled import entry, law, pointer_at
+from sealscope.control.controller import P_A, P_B, TARGET, TARGET_SPEED, CompiledLaw, Measured, Started, X
+from sealscope.control.drive import DRIVE_BLOCK, Drive, ValveDrive, check_numbers, drive_voltage
+from sealscope.recordings.recording import Array
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Time [s] over which the pressures that tell the carrying side are averaged.
 _PRESSURE_LAG = 0.02
-#: How many times its growth a small voltage is moved to where an overlap ends.
-_ACROSS_OVERLAP = 4.0
+#: Places of the law's numbers in its block; the last are those of the drive's inverse.
+_AREA_A, _AREA_B, _K_V, _K_I_T, _DEAD_BAND, _U_MAX, _AVERAGED, _INTEGRAL, _DP, _DRIVE = range(1, 11)
+POSITION_BLOCK = _DRIVE + DRIVE_BLOCK
 
 
 class _Gains(Protocol):
@@ -38,24 +43,30 @@ class _Gains(Protocol):
     def rate(self) -> float: ...
 
 
-def _followed(law: _Gains, inverse: Callable[[float, float], float]) -> Callable[[Measured], float]:
-    """Return the PI law over the inverse of a drive: from what is measured to the voltage [V], for one run."""
+@law
+def followed(m: Any, measured: Any) -> float:
+    """Return the voltage [V] of the PI law over the inverse of a drive, from the law's block and what is measured."""
+    m[_DP] += m[_AVERAGED] * (measured[P_A] - measured[P_B] - m[_DP])
+    error = measured[TARGET] - measured[X]
+    velocity = measured[TARGET_SPEED] + m[_K_V] * error + m[_INTEGRAL]
+    area = m[_AREA_A] if m[_DP] > 0.0 else m[_AREA_B]
+    u = drive_voltage(pointer_at(m, _DRIVE), velocity * area, m[_DP])
+    if abs(error) > m[_DEAD_BAND] and (abs(u) < m[_U_MAX] or u * error < 0.0):
+        m[_INTEGRAL] += m[_K_I_T] * error
+    return min(max(u, -m[_U_MAX]), m[_U_MAX])  # type: ignore[no-any-return]
+
+
+@entry
+def _position_law(memory: Any, measured: Any) -> Any:
+    return followed(memory, measured)
+
+
+def _block(law: _Gains, drive: Array) -> Array:
+    """Return the block of the PI law, `drive` the one of its inverse."""
     T = 1.0 / law.rate
     averaged = 1.0 - math.exp(-T / _PRESSURE_LAG)
-    integral = dp = 0.0
-
-    def voltage(measured: Measured) -> float:
-        nonlocal integral, dp
-        dp += averaged * (measured.p_A - measured.p_B - dp)
-        error = measured.target - measured.x
-        velocity = measured.target_speed + law.k_v * error + integral
-        u = inverse(velocity * (law.area_A if dp > 0.0 else law.area_B), dp)
-        within = abs(error) <= law.dead_band
-        if not within and (abs(u) < law.u_max or u * error < 0.0):
-            integral += law.k_i * T * error
-        return min(max(u, -law.u_max), law.u_max)
-
-    return voltage
+    numbers = (law.area_A, law.area_B, law.k_v, law.k_i * T, law.dead_band, law.u_max, averaged, 0.0, 0.0)
+    return np.array([math.nan, *numbers, *drive])
 
 
 @dataclass(frozen=True)
@@ -113,8 +124,16 @@ class PositionPI:
 
     def start(self) -> Callable[[Measured], float]:
         """Return a function from what is measured to the voltage [V], for one run from its beginning."""
+        return Started(self.compiled())
+
+    def compiled(self) -> CompiledLaw:
+        """Return the law in machine code, for one run from its beginning."""
+        return CompiledLaw(_position_law.address, self.block())
+
+    def block(self) -> Array:
+        """Return the numbers of the law as `followed` takes them."""
         drive = Drive(self.displacement, self.omega_per_volt, self.drive_shortfall, self.drive_corner, 0.0)
-        return _followed(self, drive.inverse(self.rate))
+        return _block(self, drive.block(self.rate))
 
 
 @dataclass(frozen=True)
@@ -156,16 +175,15 @@ class ValvePI:
 
     def start(self) -> Callable[[Measured], float]:
         """Return a function from what is measured to the voltage [V], for one run from its beginning."""
-        return _followed(self, self._beyond_overlap(self.drive.inverse(self.rate)))
+        return Started(self.compiled())
 
-    def _beyond_overlap(self, inverse: Callable[[float, float], float]) -> Callable[[float, float], float]:
-        dead = self.dead_volts
+    def compiled(self) -> CompiledLaw:
+        """Return the law in machine code, for one run from its beginning."""
+        return CompiledLaw(_position_law.address, self.block())
 
-        def voltage(flow: float, dp: float) -> float:
-            u = inverse(flow, dp)
-            return u + min(max(_ACROSS_OVERLAP * u, -dead), dead)
-
-        return voltage
+    def block(self) -> Array:
+        """Return the numbers of the law as `followed` takes them."""
+        return _block(self, self.drive.block(self.rate, self.dead_volts))
 
 
 def position_controller(rig: Rig) -> PositionPI | ValvePI:

@@ -164,6 +164,8 @@ def _driven(
     """
     half = 0.5 * (t[1] - t[0])
     u, G, C = (values[:, 0] for values in RunInputs(experiment, experiment.leaks).at_nodes(t, np.array([half])))
+    if experiment.load is not None and experiment.load.tables() is not None:
+        raise InputError(f"a unit takes its load over time, got one over position or velocity ({experiment.load})")
     load = np.zeros(t.size) if experiment.load is None else np.asarray(experiment.load.at(t + half))
     given = {"u": u, "G": G, "C": C, "F": load}
     columns: dict[str, Array] = {}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from sealscope.compiled import contracted
 from sealscope.physics.fluid import P_ATM
 from sealscope.physics.lanes import select
@@ -47,6 +49,18 @@ def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) 
 def load_force(x: float, F_l: float, k_load: float) -> float:
     """Force [N] of the load against +x: F_l + k_load x, a constant force (weight) and a spring about mid-stroke."""
     return F_l + k_load * x
+
+
+@contracted
+def force_over(s: float, bends: np.ndarray) -> float:
+    """Force [N] of a load over a position s [m] or a velocity [m/s], linear between bends.
+
+    a + b s + sum of c_k max(s - s_k, 0). `bends` (n, 2): (a, b), then (s_k, c_k), the change c_k of the slope at s_k.
+    """
+    force = bends[0, 0] + bends[0, 1] * s
+    for k in range(1, bends.shape[0]):
+        force = force + bends[k, 1] * max(s - bends[k, 0], 0.0)
+    return force  # type: ignore[no-any-return]
 
 
 @contracted

@@ -24,6 +24,7 @@ from sealscope.parameters import Rig
 from sealscope.parameters.fields import leaves, unit_of
 from sealscope.physics.cylinder import (
     chamber_volumes,
+    force_over,
     hard_stop_force,
     load_force,
     opposing_force,
@@ -122,9 +123,9 @@ NUMBERS = (*PARAMETERS, *DERIVED)
 #: Laws that some rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out.
 #: Throttles in the lines; air in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has
 #: bristles, that differs between the directions; check valves with pilots, relief valves, an accumulator that exchanges
-#: little heat; a damper, a load that changes with time (of a run, not of a rig); a servo valve between a supply and the
-#: cylinder; filters in the lines; losses of motor and pump beyond the linear ones; an opposing cylinder; oil
-#: that boils.
+#: little heat; a damper; a load of a run beside the rig's own, over time, or with the two tables of `force_over` in
+#: place of (True,) over position and velocity too; a servo valve between a supply and the cylinder; filters in the
+#: lines; losses of motor and pump beyond the linear ones; an opposing cylinder; oil that boils.
 LAWS = (
     *("throttled", "aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
     *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
@@ -154,7 +155,7 @@ if TYPE_CHECKING:
         relieved: tuple[bool, ...]
         polytropic: tuple[bool, ...]
         damped: tuple[bool, ...]
-        pushed: tuple[bool, ...]
+        pushed: tuple[Any, ...]
         valved: tuple[bool, ...]
         filtered: tuple[bool, ...]
         lossy: tuple[bool, ...]
@@ -542,6 +543,8 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         load = load + opposing_force(v, p.A_opp, p.p_opp, p.C_opp)
     if len(p.pushed) > 0:
         load = load + F
+    if len(p.pushed) > 1:
+        load = load + force_over(x, p.pushed[0]) + force_over(v, p.pushed[1])
     friction, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
     push = piston_acceleration(p_A, p_B, friction, load, stop, p.A_A, p.A_B, p.M_eq)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Callable
 
 import numpy as np
 
-from sealscope.control.controller import Controller, Measured
+from sealscope.control.controller import LAW, CompiledLaw, Controller, Measured
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig
 from sealscope.physics.fluid import P_ATM
-from sealscope.physics.state import P_A, P_B, POSITION, THETA
+from sealscope.physics.solvers.loop import ASKED, REPORTED, TAKEN, Loop
 from sealscope.recordings.recording import Array
 from sealscope.simulation.courses import Position
 
@@ -35,10 +36,10 @@ def outputs_per_sample(rate: float, controller_rate: float, least: int) -> int:
 
 
 class Feedback:
-    """The voltage of a controller over a run, sample after sample.
+    """The voltage of a controller over a run, sample after sample (`Loop`, of which the solver calls the controller).
 
     Position, angle and pressures are read as the rig's encoders and transducers do: whole counts, and the transducer's
-    own noise, from `seed`. `apart`: outputs of the solver between two samples of the controller.
+    own noise, from `seed`. A controller in machine code (`compiled`) is called as it is, one in Python through C.
     """
 
     def __init__(
@@ -47,74 +48,82 @@ class Feedback:
         """Begin a run; `outputs`: duration [s] of it, and rate [Hz] of the solver's outputs."""
         duration, rate = outputs
         self._controller = controller
-        self.apart = round(rate / controller.rate)
-        samples = round(duration * rate) // self.apart + 1
+        self._apart = round(rate / controller.rate)
+        samples = round(duration * rate) // self._apart + 1
         t = np.arange(samples + 1) / controller.rate
-        # plain numbers: a run asks for them one by one, and from lists that takes a tenth of the time
-        self._t = t.tolist()
-        self._target = np.broadcast_to(target.at(t), t.shape).tolist()
+        given = np.zeros((samples + 1, 5))
+        given[:, 0], given[:, 1] = t, target.at(t)
         # the voltage of a sample acts from `delay` to `delay + 1` samples later
         ahead = target.at(t + controller.delay / controller.rate)
-        self._speed = (np.diff(np.broadcast_to(ahead, t.shape)) * controller.rate).tolist()
+        given[:-1, 2] = np.diff(np.broadcast_to(ahead, t.shape)) * controller.rate
         random = np.random.default_rng([seed, 2])
         sensors = rig.sensors
-        self._noise = (random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)).tolist()
-        self._counts = sensors.x.resolution, 2.0 * math.pi / sensors.theta.counts
-        self._limit = rig.daq.u_max
-        self._floor = rig.fluid.p_vap - P_ATM if rig.fluid.p_vap > 0 else -math.inf
-        self._voltage: Callable[[Measured], float]
+        given[:-1, 3:] = random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)
+        self._given = given
+        floor = rig.fluid.p_vap - P_ATM if rig.fluid.p_vap > 0 else -math.inf
+        self._numbers = sensors.x.resolution, 2.0 * math.pi / sensors.theta.counts, floor, rig.daq.u_max, 0.0
+        self._called: _Called | None = None
+        self.loop: Loop
         self.restart()
 
     def restart(self) -> None:
         """Begin the run anew."""
-        self._voltage = self._controller.start()
-        self._volts = [0.0] * (len(self._t) + self._controller.delay)
-        self._compensated: Array | None = None
-        self._sampled = 0
-
-    def sample(self, output: int, y: Array) -> None:
-        """Let the controller see the state `y` at an output of the solver, unless it has."""
-        k = output // self.apart
-        if k < self._sampled:
-            return
-        (noise_A, noise_B), (x_count, angle_count) = self._noise[k], self._counts
-        volts = float(
-            self._voltage(
-                Measured(
-                    self._t[k],
-                    self._target[k],
-                    self._speed[k],
-                    _counted(y.item(POSITION), x_count),
-                    max(y.item(P_A), self._floor) + noise_A,
-                    max(y.item(P_B), self._floor) + noise_B,
-                    _counted(y.item(THETA), angle_count),
-                )
-            )
+        controller, samples = self._controller, len(self._given)
+        measured = np.empty(len(Measured._fields))
+        law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
+        self._called = None
+        if law is None:
+            self._called = _Called(controller.start(), measured)
+            law = self._called.law
+        self._law, memory = law, law.memory
+        self.loop = Loop(
+            self._given,
+            np.zeros(samples + controller.delay),
+            np.zeros(samples),
+            measured,
+            memory,
+            np.array([law.address, memory.ctypes.data, measured.ctypes.data]),
+            np.array(self._numbers),
+            np.array([self._apart, controller.delay, 0, 0]),
         )
-        flow = getattr(self._voltage, "compensated", None)
-        if flow is not None:
-            if self._compensated is None:
-                self._compensated = np.zeros(len(self._t))
-            self._compensated[k] = flow
-        if not math.isfinite(volts):
-            raise SimulationFailed(f"the controller must give a finite voltage, got {volts} at t = {self._t[k]:.4g} s")
-        self._volts[k + self._controller.delay] = min(max(volts, -self._limit), self._limit)
-        self._sampled = k + 1
 
-    def held(self, output: int) -> float:
-        """Return the voltage [V] that acts from an output of the solver to the controller's next sample."""
-        return self._volts[output // self.apart]
+    def refuse(self) -> None:
+        """Raise what a controller in Python raised, or else SimulationFailed for its voltage that is not finite."""
+        if self._called is not None and self._called.raised is not None:
+            raise self._called.raised
+        t = self._given[self.loop.whole[TAKEN], 0]
+        raise SimulationFailed(
+            f"the controller must give a finite voltage, got {self.loop.numbers[ASKED]} at t = {t:.4g} s"
+        )
 
     def volts(self, outputs: int) -> Array:
         """Return the voltages [V], (n,), at the first outputs of the solver."""
-        return np.asarray(self._volts)[np.arange(outputs) // self.apart]
+        return np.asarray(self.loop.volts[np.arange(outputs) // self._apart])
 
     def compensated(self, outputs: int) -> Array | None:
         """Return the leakage flow [m^3/s] that is made good, at the first outputs; None where none is reported."""
-        if self._compensated is None:
+        if not self.loop.whole[REPORTED]:
             return None
-        return np.asarray(self._compensated[np.arange(outputs) // self.apart])
+        return np.asarray(self.loop.compensated[np.arange(outputs) // self._apart])
 
 
-def _counted(value: float, count: float) -> float:
-    return math.floor(value / count) * count if count > 0 else value
+class _Called:
+    """A controller in Python as a law that is called by its address."""
+
+    def __init__(self, voltage: Callable[[Measured], float], measured: Array) -> None:
+        self._voltage, self._measured, self._memory = voltage, measured, np.full(1, math.nan)
+        self.raised: BaseException | None = None
+        function = LAW(self._volts)
+        address = ctypes.cast(function, ctypes.c_void_p).value
+        assert address is not None
+        self.law = CompiledLaw(address, self._memory, function)
+
+    def _volts(self, _memory: int, _measured: int) -> float:
+        try:
+            volts = float(self._voltage(Measured(*self._measured.tolist())))
+            flow = getattr(self._voltage, "compensated", None)
+            self._memory[0] = math.nan if flow is None else flow
+        except BaseException as error:  # an exception cannot pass through C
+            self.raised = error
+            return math.nan
+        return volts

@@ -1,10 +1,11 @@
-"""Courses over time of what is no voltage: the position that a piston is to take, the force of a load."""
+"""Courses of what is no voltage: the position that a piston is to take, the force of a load (also over x and v)."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -14,8 +15,19 @@ from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Recorded, S
 from sealscope.storage.opening import open_regular
 from sealscope.units import to_si
 
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+    from sealscope.physics.rig import RigNumbers
+
 _LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _FORCES = {"N": 1.0, "kN": 1e3}
+_SPEEDS = {"mm/s": 1e-3, "cm/s": 1e-2, "m/s": 1.0}
+_STIFFNESSES = {"N/mm": 1e3, "kN/mm": 1e6, "N/m": 1.0, "kN/m": 1e3}
+_DAMPINGS = {"N s/mm": 1e3, "kN s/mm": 1e6, "N s/m": 1.0, "kN s/m": 1e3}
+#: Most rows of a table of force over position or velocity: each is looked at in every stage of every step.
+MOST_ROWS = 200
+#: A force over s that is linear between bends: (a, b), then (s_k, c_k): a + b s + sum of c_k max(s - s_k, 0).
+Bends = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -39,13 +51,52 @@ class Force:
 
     course: Command
     words: str
+    #: What depends on the position and on the velocity of the piston (`ForceOver`).
+    over_x: ClassVar[Bends] = ()
+    over_v: ClassVar[Bends] = ()
 
     def at(self, t: Array) -> Array:
-        """Return the force [N] at times t [s]."""
+        """Return the force [N] at times t [s], but for what depends on the piston."""
         return self.course.volts(t)
+
+    def tables(self) -> tuple[Array, Array] | None:
+        """Return the bends over position and velocity as `physics.cylinder.force_over` takes them; None without any."""
+        if not (self.over_x or self.over_v):
+            return None
+        x, v = (np.array(bends or ((0.0, 0.0),), dtype=np.float64) for bends in (self.over_x, self.over_v))
+        return x, v
+
+    def at_rest(self, x: float) -> float:
+        """Return the force [N] at t = 0 on a piston at rest at x [m]."""
+        from sealscope.physics.cylinder import force_over
+
+        force, tables = float(self.at(np.zeros(()))), self.tables()
+        return force if tables is None else float(force + force_over(x, tables[0]) + force_over(0.0, tables[1]))
 
     def __str__(self) -> str:
         return f"load {self.words}"
+
+
+def numbers_under(rig: Rig, load: Force | None) -> RigNumbers:
+    """Return the numbers of a rig with the laws of a load beside its own."""
+    from sealscope.physics.rig import rig_numbers
+
+    numbers = rig_numbers(rig)
+    return numbers if load is None else numbers._replace(pushed=load.tables() or (True,))
+
+
+@dataclass(frozen=True)
+class ForceOver(Force):
+    """A load that also depends on the piston: course(t) and what is linear between bends over x [m] and v [m/s]."""
+
+    over_x: Bends = ()  # type: ignore[misc]
+    over_v: Bends = ()  # type: ignore[misc]
+
+
+def bends_of(s: Array, F: Array) -> Bends:
+    """Return the force linear between the points (s, F), s rising; the first and the last force hold beyond them."""
+    slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])
+    return (float(F[0]), 0.0), *zip(s.tolist(), np.diff(slopes).tolist(), strict=True)
 
 
 def _course(words: str, units: Mapping[str, float], what: str) -> Command:
@@ -92,33 +143,83 @@ def command_or_target(text: str) -> Command | Position:
     return parse_position(text) or parse_command(text)
 
 
-def _recorded_force(path: str) -> Recorded:
-    """Return the force over time of a text table with the columns ``t [s]`` and ``F [N]``, each in any unit of its own.
+def _recorded_force(path: str, words: str) -> Force:
+    """Return the force of a text table: column ``F [N]`` over ``t [s]``, ``x [m]`` or ``v [m/s]``, in any unit.
 
-    The first row is at t = 0; linear between the rows, the last value afterwards.
+    Linear between the rows. Over time the first row is at t = 0; where there are times, positions are not looked at.
+    Beyond the first and the last row their forces hold.
     """
     with open_regular(path, "a recorded load") as file:
         head = file.readline(4096).decode("utf-8-sig", "replace")
         named = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in head.split(",")]
         columns = {match[1]: (k, match[2]) for k, match in enumerate(named) if match}
-        if not {"t", "F"} <= columns.keys():
+        over = [name for name in ("t", "x", "v") if name in columns]
+        if "F" not in columns or not over or over == ["x", "v"]:
             raise InputError(
-                f"a recorded load must have the columns t [s] and F [N], got {head.strip()[:80]!r} ({path})"
+                "a recorded load must have the columns t [s] and F [N], or F [N] with one of x [m] and v [m/s], got "
+                f"{head.strip()[:80]!r} ({path})"
             )
         try:
-            table = np.loadtxt(file, delimiter=",", usecols=[columns["t"][0], columns["F"][0]], ndmin=2)
+            table = np.loadtxt(file, delimiter=",", usecols=[columns[over[0]][0], columns["F"][0]], ndmin=2)
         except ValueError as error:
             raise InputError(f"a recorded load must hold numbers, got a table of which {error} ({path})") from None
-    t = to_si(table[:, 0], columns["t"][1], "s", name="t", place=path)
-    return Recorded(t - t[:1], to_si(table[:, 1], columns["F"][1], "N", name="F", place=path), path)
+    unit = {"t": "s", "x": "m", "v": "m/s"}[over[0]]
+    s = to_si(table[:, 0], columns[over[0]][1], unit, name=over[0], place=path)
+    F = to_si(table[:, 1], columns["F"][1], "N", name="F", place=path)
+    if over[0] == "t":
+        return Force(Recorded(s - s[:1], F, path), words)
+    if s.size > 1 and s[0] > s[-1]:
+        s, F = s[::-1], F[::-1]
+    if not (2 <= s.size <= MOST_ROWS and np.all(np.diff(s) > 0) and np.all(np.isfinite(table))):
+        raise InputError(
+            f"a load over {over[0]} must have 2 to {MOST_ROWS} rows of finite numbers whose {over[0]} rises, got "
+            f"{s.size} rows ({path})"
+        )
+    return ForceOver(_NO_FORCE, words, **{f"over_{over[0]}": bends_of(s, F)})
+
+
+_NO_FORCE = Sine(0.0, 0.0)
+
+
+def _any_of(units: Mapping[str, float]) -> str:
+    return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in sorted(units, key=len, reverse=True))
+
+
+def _over(letter: str, slopes: Mapping[str, float], places: Mapping[str, float]) -> re.Pattern[str]:
+    start = rf"(?:\s+from\s+([-+]?{UNSIGNED})\s*\[?({_any_of(places)})\b\]?)?"
+    return re.compile(rf"(?:^|([-+]))\s*({UNSIGNED})\s*\[?({_any_of(slopes)})\b\]?\s+over\s+{letter}\b{start}\s*")
+
+
+_OVER = {"x": (_STIFFNESSES, _LENGTHS), "v": (_DAMPINGS, _SPEEDS)}
 
 
 def parse_force(text: str) -> Force:
     """Read a load such as ``2 kN``, ``500 N sin(2t) + 100 N``, ``step 2 kN at 3 s`` in the words of `parse_command`.
 
-    ``file LOAD.csv`` is a recorded one: columns ``t [s]`` and ``F [N]``.
+    Terms over the piston's position or velocity may be added: ``200 N/mm over x``, ``5 kN/mm over x from 50 mm`` (none
+    before it), ``2 kN s/m over v``. ``file LOAD.csv`` is a recorded one: column ``F [N]`` over ``t [s]``, ``x [m]`` or
+    ``v [m/s]``.
     """
     words = plain_text(text, "load")
     if words.lower().startswith("file "):
-        return Force(_recorded_force(words[5:].strip()), words)
-    return Force(_course(words, _FORCES, "load"), words)
+        return _recorded_force(words[5:].strip(), words)
+    rest, over = words, {}
+    for letter, (slopes, places) in _OVER.items():
+        pattern, line, bends = _over(letter, slopes, places), 0.0, []
+        for sign, number, unit, place, place_unit in pattern.findall(rest):
+            slope = float(f"{sign}{number}") * slopes[_spelled(unit, slopes)]
+            if place:
+                bends.append((float(place) * places[place_unit], slope))
+            else:
+                line += slope
+        if pattern.search(rest):
+            over[f"over_{letter}"] = ((0.0, line), *bends)
+        rest = pattern.sub("", rest)
+    if not over:
+        return Force(_course(words, _FORCES, "load"), words)
+    rest = re.sub(r"^\s*\+|[+]\s*$", "", rest).strip()
+    return ForceOver(_course(rest, _FORCES, "load") if rest else _NO_FORCE, words, **over)
+
+
+def _spelled(unit: str, units: Mapping[str, float]) -> str:
+    return next(own for own in units if own.replace(" ", "") == unit.replace(" ", ""))

@@ -110,7 +110,7 @@ class Experiment:
     error : float, optional
         Rms error that a pressure may have [Pa], by which the step is chosen; None: 100 Pa.
     load : Force, optional
-        Force on the rod over time.
+        Force on the rod over time, position or velocity.
     controller : Controller, optional
         Closes the loop on the position.
 

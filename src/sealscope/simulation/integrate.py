@@ -21,7 +21,7 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Effect, Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
-from sealscope.simulation.courses import Force
+from sealscope.simulation.courses import Force, numbers_under
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, Method, choose_method
 from sealscope.simulation.faults import Leak
 from sealscope.simulation.instruments import FILTER_REACH
@@ -254,12 +254,11 @@ def integrate(
     a pressure falls below vacuum; `allow_unresolved` lets all but a state that is not finite pass.
     """
     from sealscope.physics.rest import initial_state
-    from sealscope.physics.rig import rig_numbers
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
-    base = rig_numbers(rig) if load is None else rig_numbers(rig)._replace(pushed=(True,))
-    start_state = initial_state(rig, x_0, 0.0 if load is None else float(load.at(np.zeros(()))))
+    base = numbers_under(rig, load)
+    start_state = initial_state(rig, x_0, 0.0 if load is None else load.at_rest(x_0))
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
     if error is not None and not (math.isfinite(error) and error > 0):
@@ -381,32 +380,19 @@ class _Run:
         start: int,
     ) -> None:
         """Advance the state over the outputs `out` from `start` on, under a controller; `inputs`: G, C and load."""
-        from sealscope.physics.solvers.imex import sampled_imex
-        from sealscope.physics.solvers.rk4 import sampled_rk4
+        from sealscope.physics.solvers.imex import closed_imex
+        from sealscope.physics.solvers.rk4 import closed_rk4
 
-        apart = feedback.apart
-        u = np.empty((apart * every, inputs[0].shape[1]))
-
-        def hold(output: int) -> None:
-            if output % apart == 0:
-                feedback.sample(output, y)
-            u.fill(feedback.held(output))
-
-        ahead = apart - start % apart
-        parts = (
-            sampled_imex(y, h, u, *inputs, p, every, ahead, apart, out)
+        outputs, *surveyed = (
+            closed_imex(y, h, *inputs, p, every, start, out, feedback.loop)
             if self.method == "imex"
-            else sampled_rk4(y, h, u, *inputs, p, self.euler, every, ahead, apart, out)
+            else closed_rk4(y, h, *inputs, p, self.euler, every, start, out, feedback.loop)
         )
-        first = 0
-        hold(start)
-        for last, surveyed in parts:
-            self._refuse(surveyed, p, h, out[first:last], start + first)
-            first = last
-            if last < len(out):
-                hold(start + last)
+        self._refuse(surveyed, p, h, out[:outputs], start)
+        if outputs < len(out):
+            feedback.refuse()
 
-    def _refuse(self, surveyed: tuple[bool, float, float], p: RigNumbers, h: float, rows: Array, first: int) -> None:
+    def _refuse(self, surveyed: Sequence[float], p: RigNumbers, h: float, rows: Array, first: int) -> None:
         """Raise SimulationFailed where rows from the output `first` on, as surveyed, are beyond what the rig allows."""
         from sealscope.physics.solvers.limits import longest_step_on_stop
 
@@ -427,7 +413,9 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed where a step h [s] cannot resolve the rig."""
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
-    refuse_long(h, longest_step(p), "speed loop, oil columns and friction of this rig")
+    refuse_long(
+        h, longest_step(p), "speed loop, oil columns and friction of this rig" + " under its load" * (len(p.pushed) > 1)
+    )
     rate = stiffest_rate(p)
     if method == "rk4" and p.throttled and h * rate > DECAY_LIMIT:
         raise SimulationFailed(

@@ -372,7 +372,8 @@ def simulate(
         Let an unstable or under-resolved run through, marked in the provenance.
     load : str or Force, optional
         Force against +x beside the rig's own (``cylinder.F_l``), in a command's words: ``"2 kN"``, ``"500 N sin(2t)"``,
-        ``"step 2 kN at 3 s"``.
+        ``"step 2 kN at 3 s"``; terms over the piston's position and velocity may be added: ``"200 N/mm over x"``, ``"5
+        kN/mm over x from 50 mm"``, ``"2 kN s/m over v"``; or ``"file LOAD.csv"``: F [N] over t [s], x [m] or v [m/s].
     controller : Controller or str, optional
         What follows a target: a controller, or the name of one (``"pi"``, ``"flatness"``, ``"fault-tolerant"``,
         ``"FILE.py:NAME"`` of your own), which assumes the rig as it is; by default ``"pi"``.

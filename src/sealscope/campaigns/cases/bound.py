@@ -28,8 +28,8 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Parameters that are not known of a machine: the friction law (level, viscous slope, breakaway, its decay), the oil's
-#: stiffness and the gain of the speed loop.
+#: Parameters that are not known of a pump-controlled machine: the friction law (level, viscous slope, breakaway, its
+#: decay), the oil's stiffness and the gain of the speed loop.
 UNKNOWN = (
     "friction.F_pr",
     "friction.F_v",
@@ -38,6 +38,8 @@ UNKNOWN = (
     "fluid.K_oil",
     "motor.omega_per_volt",
 )
+#: The gain behind a servo valve, in place of the speed loop's.
+_VALVE_GAIN = "valve.Q_N"
 #: Length [s] of the run whose bound stands for a record's: four periods of the slowest of the bench's commands.
 BOUND_SECONDS = 25.2
 #: Reciprocal condition of the scaled information below which a parameter cannot be told from the others.
@@ -57,6 +59,15 @@ class LeakBound:
     unknown_parameters: tuple[str, ...]
     duration: float
     nonlinearity: float
+
+
+def unknown_of(rig: Rig) -> tuple[str, ...]:
+    """Return the parameters that are not known of a machine of this rig's kind.
+
+    Behind a servo valve the rated flow of the edges stands for the speed loop's gain. Overlaps are taken as known: they
+    do not change within a record.
+    """
+    return (*UNKNOWN[:-1], _VALVE_GAIN) if rig.valve.spool == "present" else UNKNOWN
 
 
 def in_lpm(conductance: float, dp: float = REFERENCE_DP) -> float:
@@ -151,7 +162,7 @@ def change_bound(experiment: Experiment, before: float, after: float, dp: float)
     """Return the standard deviation [L/min] of the best unbiased estimate of a leak's onset at a known time.
 
     The leak's change from `before` [s] without to `after` [s] with it, under a mean pressure difference `dp` [Pa], from
-    pressures and command of a machine whose `UNKNOWN` parameters are found from either part alone:
+    pressures and command of a machine whose parameters `unknown_of` are found from either part alone:
     ``s sqrt(T/before + T/after)``, s the bound over a run of T = `BOUND_SECONDS` without leak, fault or drift. None
     where that run has no bound. Drift, hum, skew, an unknown load and an unknown onset can only raise the true limit.
 
@@ -162,7 +173,7 @@ def change_bound(experiment: Experiment, before: float, after: float, dp: float)
         experiment, leaks=(), faults=(), drifts=(), duration=min(BOUND_SECONDS, experiment.duration), step=None
     )
     try:
-        bound = leak_bound(_opened(run), unknown=UNKNOWN).unknown
+        bound = leak_bound(_opened(run), unknown=unknown_of(run.rig)).unknown
     except (InputError, SimulationFailed):
         return None
     if bound is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sealscope.campaigns.cases.online import online_balance
 from sealscope.campaigns.cases.row import STATED, Scores, finite, rank_of, stated_evidence
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, Views, plan_detector
 from sealscope.diagnosis.calibration.scorers import Look, Sides, scorer, split_view
@@ -21,8 +22,12 @@ def stated(look: Look, names: Sequence[str], views: Views) -> tuple[Scores, dict
         seen = looks[detector.view]
         if detector.detector and detector.key not in statements:
             examination = seen.examination
-            fused = detector.of == DIAGNOSE
-            evidence = examination.fused(detector.quick) if fused else examination.evidence(detector.of)
+            if detector.online:
+                evidence = online_balance(seen.recording, examination.rig, examination.false_alarm_probability)
+            elif detector.of == DIAGNOSE:
+                evidence = examination.fused(detector.quick)
+            else:
+                evidence = examination.evidence(detector.of)
             statements[detector.key] = stated_evidence({name: getattr(evidence, name) for name in STATED})
         if detector.own:
             statement = statements[detector.key]

@@ -48,7 +48,7 @@ def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow
     look = Look(record.part, plan.onset_s, plan.false_alarm, plan.assumed or plan.rig)
     scores, statements = stated(look, plan.detectors, plan.views)
     bound = None
-    if plan.bound and case.leak_lpm:
+    if case.leak_lpm in plan.bounded:
         truth = simulated.truth
         healthy = truth.t < plan.onset_s
         dp = float(np.mean(np.abs(truth.outputs["p_A"] - truth.outputs["p_B"])[healthy]))

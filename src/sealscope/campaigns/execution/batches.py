@@ -174,10 +174,10 @@ class _Batches:
 
     def _sized(self, experiments: Sequence[Experiment]) -> list[Experiment]:
         """Return the experiments with steps that resolve their leaks, sized side by side as `sized_once` does."""
-        from sealscope.physics.rig import rig_numbers
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.simulation.batch.batch import simulate_batch
         from sealscope.simulation.batch.run import with_sizes
+        from sealscope.simulation.courses import numbers_under
 
         sized = list(experiments)
         leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
@@ -193,7 +193,8 @@ class _Batches:
         for k, size in zip(leaky, sizes, strict=True):
             experiment = with_sizes(experiments[k], size)
             laminar = experiment.leaks[0].law == "laminar"
-            limit = longest_step(rig_numbers(experiment.rig), size if laminar else 0.0, 0.0 if laminar else size)
+            numbers = numbers_under(experiment.rig, experiment.load)
+            limit = longest_step(numbers, size if laminar else 0.0, 0.0 if laminar else size)
             if experiment.step is not None and experiment.step > limit:
                 experiment = replace(experiment, step=stepped(experiment.rate * oversampling(experiment), limit))
             sized[k] = experiment
@@ -214,14 +215,14 @@ class StepChooser:
         It is what `integrate` chooses by error on `SCOUTS` machines of the case's cell with seeds of their own, the
         finest of those with its method.
         """
-        from sealscope.physics.rig import rig_numbers
         from sealscope.physics.solvers.limits import longest_step
+        from sealscope.simulation.courses import numbers_under
         from sealscope.simulation.experiment import LONGEST_STEP, choose_method
         from sealscope.simulation.integrate import FINEST
 
         method = choose_method(experiment.rig, experiment.method)
         step = self._cell(case.levels).get(method) or chosen_step(experiment)
-        limit = max(longest_step(rig_numbers(experiment.rig)), LONGEST_STEP / FINEST)
+        limit = max(longest_step(numbers_under(experiment.rig, experiment.load)), LONGEST_STEP / FINEST)
         return step if step <= limit else stepped(experiment.rate * oversampling(experiment), limit)
 
     def _cell(self, levels: Mapping[str, str | float]) -> dict[str, float]:

@@ -6,6 +6,7 @@
 "diagnose"                      the fused verdict of all registered detectors
 "diagnose @ pressures"          the same, given the channels of the view `pressures` alone
 "diagnose, quick"               the same verdict, by the detectors down to the one that judges
+"volume balance, online"        what its stream has raised by the record's end, samples coming second by second
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
 
 DIAGNOSE = "diagnose"
-_OWN, _QUICK = ", own threshold", ", quick"
+_OWN, _QUICK, _ONLINE = ", own threshold", ", quick", ", online"
+#: Detectors that have a stream which raises alarms at a stated rate.
+_STREAMED = ("volume balance",)
 #: name -> channels; the name "" stands for what detectors see that name no view.
 Views = Mapping[str, tuple[str, ...]]
 #: Channels that detectors see by default: all but the flow meter of the bypass, which is no part of the machine.
@@ -34,7 +37,8 @@ class PlanDetector:
 
     `of`: the scorer, the detector or `diagnose`; `own`: whether its verdict is by its own threshold; `detector`:
     whether it is a registered detector or `diagnose`; `view`: the set of channels it sees, "" where none is named;
-    `quick`: whether it ends at the detector that judges (`diagnose(..., quick=True)`).
+    `quick`: whether it ends at the detector that judges (`diagnose(..., quick=True)`); `online`: whether it is the
+    detector's stream.
     """
 
     name: str
@@ -43,11 +47,12 @@ class PlanDetector:
     detector: bool
     view: str
     quick: bool = False
+    online: bool = False
 
     @property
     def key(self) -> str:
         """The name under which its statement is stored: the same for its own and for a calibrated threshold."""
-        of = f"{self.of}{_QUICK}" if self.quick else self.of
+        of = f"{self.of}{_QUICK if self.quick else ''}{_ONLINE if self.online else ''}"
         return f"{of}{VIEW}{self.view}" if self.view else of
 
     @property
@@ -64,8 +69,9 @@ def plan_detector(name: str) -> PlanDetector:
         return PlanDetector(name, base, False, False, view)
     if base.endswith(CALIBRATED):
         return PlanDetector(name, base.removesuffix(CALIBRATED), False, True, view)
-    quick = base == f"{DIAGNOSE}{_QUICK}"
-    return PlanDetector(name, base.removesuffix(_QUICK if quick else _OWN), True, True, view, quick)
+    quick, online = base == f"{DIAGNOSE}{_QUICK}", base.endswith(_ONLINE)
+    of = base.removesuffix(_QUICK if quick else _ONLINE if online else _OWN)
+    return PlanDetector(name, of, True, True, view, quick, online)
 
 
 def check_detector(name: str, views: Views) -> None:
@@ -79,6 +85,8 @@ def check_detector(name: str, views: Views) -> None:
     known = [DIAGNOSE, *detectors()]
     if parsed.of == DIAGNOSE and not parsed.own:
         raise InputError(f"{DIAGNOSE!r} has no score of its own and cannot be calibrated, got {name!r}")
+    if parsed.online and parsed.of not in _STREAMED:
+        raise InputError(f"online must be one of {', '.join(_STREAMED)}, got {name!r}")
     if parsed.of in known:
         return
     choices = [*SCORERS, *known, *(f"{detector}{CALIBRATED}" for detector in known[1:])]

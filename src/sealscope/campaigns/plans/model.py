@@ -23,7 +23,8 @@ class RecordGroup:
 
     `use`: `calibrate` sets thresholds (leak-free), `judge` is judged by them, on seeds of its own; `leak_lpm`: mean
     flow [L/min] of a leak of that `law` (`mixture`: half of each) from the plan's onset on, 0 for none; `fault`:
-    another fault, as text.
+    another fault, as text; `bound`: whether the rows of leaks of this size say what the Cramer-Rao bound of their
+    machine allows, which does not depend on the size.
     """
 
     use: Use
@@ -31,6 +32,7 @@ class RecordGroup:
     leak_lpm: float = 0.0
     law: LeakLaw = "laminar"
     fault: str = ""
+    bound: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +63,7 @@ class SimulatedPlan(_JudgedPlan):
     `profile`: the bench whose nuisances each record draws, "" for the rig without drift; `factors`: name -> levels,
     every combination is a cell; `command` and `closed` are the duty, `family` names families of the profile, other
     names are parameters of the rig; `seed`: the base of every case's seed; `part`: what the plan is for, such as
-    development or judging; `bound`: whether a leaky record's row says what the Cramer-Rao bound of its machine allows.
+    development or judging.
     """
 
     rig: Rig
@@ -73,12 +75,16 @@ class SimulatedPlan(_JudgedPlan):
     records: tuple[RecordGroup, ...]
     factors: Mapping[str, tuple[str | float, ...]] = field(default_factory=dict)
     part: str = ""
-    bound: bool = False
 
     @property
     def size(self) -> int:
         """Number of records."""
         return sum(group.count for group in self.records)
+
+    @property
+    def bounded(self) -> frozenset[float]:
+        """Sizes of leaks [L/min] whose rows get the bound of their machine."""
+        return frozenset(group.leak_lpm for group in self.records if group.bound and group.leak_lpm)
 
 
 @dataclass(frozen=True)

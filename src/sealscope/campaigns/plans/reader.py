@@ -134,8 +134,7 @@ def _simulated(tree: Mapping[str, Any], place: str) -> SimulatedPlan:
         keep_recordings=head.flag("keep_recordings"),
         factors=_factors(tree.get("factors", {}), rig, profile, duration, place),
         part=head.text("part", ""),
-        bound=head.flag("bound"),
-        records=_records(tree.get("records", ()), onset, place),
+        records=_records(tree.get("records", ()), onset, head.flag("bound"), place),
         **_judged(head, tree, rig),
     )
     head.end()
@@ -227,7 +226,7 @@ def _check_level(name: str, level: str | float, rig: Rig, profile: str, duration
         rig.with_overrides(closing_values(level) if name == "closed" else {name: level})
 
 
-def _records(given: Any, onset: float, place: str) -> tuple[RecordGroup, ...]:
+def _records(given: Any, onset: float, bound: bool, place: str) -> tuple[RecordGroup, ...]:
     if not isinstance(given, list) or not given:
         raise InputError(f"a plan must have [[records]], got none ({place})")
     groups: dict[tuple[str, float, str, str], RecordGroup] = {}
@@ -239,6 +238,7 @@ def _records(given: Any, onset: float, place: str) -> tuple[RecordGroup, ...]:
             leak_lpm=table.number("leak", 0.0, unit="L/min") if "leak" in table.left else 0.0,
             law=table.choice("law", get_args(LeakLaw), "laminar"),
             fault=table.text("fault", ""),
+            bound=table.flag("bound") or bound,
         )
         table.end()
         if group.leak_lpm < 0:

@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from sealscope.campaigns.cases.bound import (
-    UNKNOWN,
     LeakBound,
     in_lpm,
     leak_bound,
     noise_covariance,
     smallest_found,
+    unknown_of,
 )
 from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, ChangeDetector, Responses, smallest_leaks
 from sealscope.campaigns.prediction.judges import judge_predictions
@@ -182,7 +182,9 @@ def predict(
     noise = instrument_noise(experiment, _affordable(experiment), target.seed)
     alone, dp = noise_responses(experiment, SIZES, target.detectors, noise, lambda share: report(0.5 * share))
     responses = elsewhere or alone
-    bound = leak_bound(_half_of(experiment), unknown=UNKNOWN, progress=lambda share: report(0.5 + 0.5 * share))
+    bound = leak_bound(
+        _half_of(experiment), unknown=unknown_of(experiment.rig), progress=lambda share: report(0.5 + 0.5 * share)
+    )
     report(1.0)
     judging = partial(progress, "judging detectors")
     judges = judge_predictions(experiment, target.false_alarm, target.detection, target.seed, judging)

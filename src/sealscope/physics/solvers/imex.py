@@ -11,7 +11,7 @@ work-precision table that chose it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from sealscope.physics.rig import (
     volumes_at,
     within_limits,
 )
+from sealscope.physics.solvers.loop import APART, Loop, sampled
 from sealscope.physics.state import (
     P_1,
     P_2,
@@ -190,25 +191,34 @@ def advance_imex(
 
 
 @kernel
-def sampled_imex(
+def closed_imex(
     y: np.ndarray,
     h: float,
-    u: np.ndarray,
     G: np.ndarray,
     C: np.ndarray,
     F: np.ndarray,
     p: RigNumbers,
     every: int,
-    ahead: int,
-    apart: int,
+    start: int,
     rows: np.ndarray,
-) -> Iterator[tuple[int, tuple[bool, float, float]]]:
-    """Advance as `advance_imex`, and stop at each sample of a controller, as `rk4.sampled_rk4` does."""
-    first, last, n = 0, ahead, rows.shape[0]
-    while first < n:
-        last = min(last, n)
+    loop: Loop,
+) -> tuple[int, bool, float, float]:
+    """Advance as `advance_imex` over the outputs `rows` from `start` on, under a controller.
+
+    Return how many outputs there are and their `survey`: fewer than rows where a state or a voltage is not finite.
+    """
+    apart, n = loop.whole[APART], rows.shape[0]
+    u = np.empty((apart * every, G.shape[1]))
+    first, finite, reach, least = 0, True, 0.0, math.inf
+    while first < n and finite:
+        k = (start + first) // apart
+        if (start + first) % apart == 0 and not sampled(loop, k, y):
+            break
+        u[:] = loop.volts[k]
+        last = min((k + 1) * apart - start, n)
         begin, end = first * every, last * every
         load = F[begin:end] if F.shape[0] > 0 else F
         advance_imex(y, h, u[: end - begin], G[begin:end], C[begin:end], load, p, every, rows[first:last])
-        yield last, survey(rows[first:last])
-        first, last = last, last + apart
+        finite, far, low = survey(rows[first:last])
+        first, reach, least = last, max(reach, far), min(least, low)
+    return first, finite, reach, least

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from sealscope.physics.rig import RigNumbers
 
 #: Most that h |lambda| may be for an oscillation that is to be resolved, and for a decay that is to stay stable
@@ -29,6 +31,11 @@ def _longest_for_pair(damping: float, stiffness: float) -> float:
     return DECAY_LIMIT / decay if decay > 0.0 else math.inf
 
 
+def _steepest_rise(bends: np.ndarray) -> float:
+    """Return the steepest rise [N/m] or [N s/m] of a load that is linear between bends (`force_over`), 0 if none."""
+    return max(0.0, float(np.cumsum(bends[:, 1]).max()))
+
+
 def stiffest_rate(p: RigNumbers) -> float:
     """Return the fastest decay rate [1/s] of the throttled rig.
 
@@ -45,9 +52,10 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     """Return the longest step [s] at which an explicit method resolves all but the throttles, for leaks up to `G`, `C`.
 
     The shortest of: speed loop (winding and shaft), piston between its oil columns (running, and within the linear part
-    of the friction, F_C/v_th with F_C = F_pr + F_cfr (p_A + p_B) at the charge pressure), pump and motor between the
-    volumes at the pump's ports, leakage between the chambers, leakage outwards and make-up. An oscillation needs h
-    |lambda| <= 1, a decay h lambda <= 2.785 (stability of RK4, which the explicit part of ARK4(3)6L[2]SA exceeds).
+    of the friction, F_C/v_th with F_C = F_pr + F_cfr (p_A + p_B) at the charge pressure, with the load's spring and
+    damper), pump and motor between the volumes at the pump's ports, leakage between the chambers, leakage outwards and
+    make-up. An oscillation needs h |lambda| <= 1, a decay h lambda <= 2.785 (stability of RK4, which the explicit part
+    of ARK4(3)6L[2]SA exceeds).
     Position-dependent volumes are taken at the end of the stroke where the oil is stiffer; air only makes it softer.
     """
     ends = _end_volumes(p)
@@ -62,10 +70,14 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
     breakaway = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
     breakaway += 0.0 if p.literal_bracket else p.F_v
-    running = _longest_for_pair((p.F_v + p.d_load) / p.M_eq, column)
-    stuck = _longest_for_pair((max(1.0, p.backward) * breakaway + p.d_load) / p.M_eq, column)
+    damper = p.d_load
+    if len(p.pushed) > 1:
+        column += _steepest_rise(p.pushed[0]) / p.M_eq
+        damper += _steepest_rise(p.pushed[1])
+    running = _longest_for_pair((p.F_v + damper) / p.M_eq, column)
+    stuck = _longest_for_pair((max(1.0, p.backward) * breakaway + damper) / p.M_eq, column)
     if len(p.bristled) > 0:
-        stuck = _longest_for_pair((p.sigma_1 + p.F_v + p.d_load) / p.M_eq, column + p.sigma_0 / p.M_eq)
+        stuck = _longest_for_pair((p.sigma_1 + p.F_v + damper) / p.M_eq, column + p.sigma_0 / p.M_eq)
     ports = 0.0 if len(p.valved) > 0 else ports  # the pump works on the supply: see there
     pump = _longest_for_pair(ports * G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
     leak = _longest_for_pair(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)

@@ -5,12 +5,13 @@ Exact enough without throttles, unstable with them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
 
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.rig import RigNumbers, observe, rates, within_limits
+from sealscope.physics.solvers.loop import APART, Loop, sampled
 from sealscope.physics.state import State, moved, state_of, survey
 
 #: Nodes of the step at which the inputs are needed.
@@ -72,33 +73,37 @@ def advance_rk4(
 
 
 @kernel
-def sampled_rk4(
+def closed_rk4(
     y: np.ndarray,
     h: float,
-    u: np.ndarray,
     G: np.ndarray,
     C: np.ndarray,
     F: np.ndarray,
     p: RigNumbers,
     euler_integral: bool,
     every: int,
-    ahead: int,
-    apart: int,
+    start: int,
     rows: np.ndarray,
-) -> Iterator[tuple[int, tuple[bool, float, float]]]:
-    """Advance as `advance_rk4`, and stop at each sample of a controller: `ahead` outputs on, then every `apart`.
+    loop: Loop,
+) -> tuple[int, bool, float, float]:
+    """Advance as `advance_rk4` over the outputs `rows` from `start` on, under a controller.
 
-    `u`: (apart every, 3) command, which the caller may change wherever this stops. Yields how many outputs there are,
-    and the `survey` of those since the stop before. One call for many samples: unpacking `p` takes longer than the
-    steps between two.
+    Return how many outputs there are and their `survey`: fewer than rows where a state or a voltage is not finite.
     """
-    first, last, n = 0, ahead, rows.shape[0]
-    while first < n:
-        last = min(last, n)
+    apart, n = loop.whole[APART], rows.shape[0]
+    u = np.empty((apart * every, G.shape[1]))
+    first, finite, reach, least = 0, True, 0.0, math.inf
+    while first < n and finite:
+        k = (start + first) // apart
+        if (start + first) % apart == 0 and not sampled(loop, k, y):
+            break
+        u[:] = loop.volts[k]
+        last = min((k + 1) * apart - start, n)
         begin, end = first * every, last * every
         load = F[begin:end] if F.shape[0] > 0 else F
         advance_rk4(
             y, h, u[: end - begin], G[begin:end], C[begin:end], load, p, euler_integral, every, rows[first:last]
         )
-        yield last, survey(rows[first:last])
-        first, last = last, last + apart
+        finite, far, low = survey(rows[first:last])
+        first, reach, least = last, max(reach, far), min(least, low)
+    return first, finite, reach, least

@@ -89,7 +89,8 @@ def _rk4(
     s = (opening(leak, t + nodes[0]), opening(leak, t + nodes[1]), opening(leak, t + nodes[2]))
     G = (leak[0] * s[0], leak[0] * s[1], leak[0] * s[2])
     C = (leak[1] * s[0], leak[1] * s[1], leak[1] * s[2])
-    return rk4_step(z, h, u, G, C, (0.0, 0.0, 0.0), q, False)
+    F = (shape[k, 3], shape[k, 4], shape[k, 5]) if len(q.pushed) > 0 else (0.0, 0.0, 0.0)
+    return rk4_step(z, h, u, G, C, F, q, False)
 
 
 @contracted
@@ -108,7 +109,10 @@ def _imex(
     s_3, s_4, s_5 = opening(leak, t + nodes[3]), opening(leak, t + nodes[4]), opening(leak, t + nodes[5])
     G = (leak[0] * s_0, leak[0] * s_1, leak[0] * s_2, leak[0] * s_3, leak[0] * s_4, leak[0] * s_5)
     C = (leak[1] * s_0, leak[1] * s_1, leak[1] * s_2, leak[1] * s_3, leak[1] * s_4, leak[1] * s_5)
-    return imex_step(z, h, u, G, C, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), q)
+    F = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if len(q.pushed) > 0:
+        F = (shape[k, 6], shape[k, 7], shape[k, 8], shape[k, 9], shape[k, 10], shape[k, 11])
+    return imex_step(z, h, u, G, C, F, q)
 
 
 @contracted
@@ -150,10 +154,11 @@ def advance(
 
     By the implicit-explicit method where `implicit`, else by RK4; for lanes, or on a GPU for a thread's one number.
 
-    `y`: (groups, 14, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, `drive`: (groups, 2,
-    WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields, WIDTH) with
-    `bounds` (cells + 1,) the step at which each cell begins; `pressures`: (groups, outputs, CHANNELS, WIDTH), written
-    from output `begin` on, one every `every` steps, before the step; `account`: (groups, ACCOUNTS, WIDTH).
+    `y`: (groups, 14, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, or (n, 2 nodes) with
+    the load [N] of all runs behind; `drive`: (groups, 2, WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS,
+    WIDTH); `table`: (groups, cells, fields, WIDTH) with `bounds` (cells + 1,) the step at which each cell begins;
+    `pressures`: (groups, outputs, CHANNELS, WIDTH), written from output `begin` on, one every `every` steps, before the
+    step; `account`: (groups, ACCOUNTS, WIDTH).
     """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):

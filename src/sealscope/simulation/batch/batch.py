@@ -130,10 +130,10 @@ def simulate_batch(
 ) -> Batch:
     """Simulate experiments side by side and keep the RMS of the db8 details of p_A and p_B as recorded.
 
-    The runs have one duration and one sampling rate; rigs, leaks (one each, opening abruptly or evenly), drifts and
-    faults of the machine may all differ. A run's step is its own `step`, or one that is chosen by its own or this
-    `error` for all runs of its kind and command. Results do not depend on the order of the runs, their number or
-    `threads`. The noise is another stream than that of `simulate`.
+    The runs have one duration and one sampling rate; rigs, leaks (one each, opening abruptly or evenly), drifts,
+    faults of the machine and loads may all differ. A run's step is its own `step`, or one that is chosen by its own or
+    this `error` for all runs of its kind, command and load. Results do not depend on the order of the runs, their
+    number or `threads`. The noise is another stream than that of `simulate`.
 
     Parameters
     ----------
@@ -273,6 +273,7 @@ def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
             error=error,
             allow_unresolved=experiment.allow_unresolved,
             effects=experiment.effects(),
+            load=experiment.load,
         )
         steps.append(run.step)
     return float(min(steps))

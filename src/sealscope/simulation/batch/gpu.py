@@ -139,6 +139,8 @@ class DeviceRun(SetRun):
 
         The others stand in the table.
         """
+        if len(numbers.pushed) > 1:
+            raise InputError("a load over position or velocity needs device cpu, got device gpu")
         differ = np.any(self.cells.base != self.cells.base[0], axis=0)
         differ[list(self.cells.changing)] = True
         own = [name for name, differs in zip(NUMBERS, differ, strict=True) if differs]

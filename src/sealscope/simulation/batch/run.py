@@ -28,6 +28,7 @@ from sealscope.simulation.changes import (
     values_of,
 )
 from sealscope.simulation.commands import Command, Sine
+from sealscope.simulation.courses import numbers_under
 from sealscope.simulation.experiment import Experiment, choose_method, exact
 from sealscope.simulation.faults import From, Growing, Leak
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
@@ -76,7 +77,7 @@ class Member:
 
 @dataclass(frozen=True)
 class LaneSet:
-    """Experiments of one kind under one shape of a command."""
+    """Experiments of one kind under one shape of a command and one load."""
 
     members: tuple[Member, ...]
     shape: Command
@@ -95,8 +96,6 @@ def refuse(experiment: Experiment, place: int) -> None:
 
     if experiment.controlled is not None:
         raise no(f"a command, got a target for a controller ({experiment.command})")
-    if experiment.load is not None:
-        raise no(f"no load that changes with time, got {experiment.load}")
     if len(experiment.leaks) > 1:
         raise no(f"at most one leak, got {len(experiment.leaks)}")
     if experiment.leaks and not isinstance(experiment.leaks[0].opening, From | Growing):
@@ -130,14 +129,14 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
 
     Raises InputError where one cannot be in a batch, or their records differ in length or rate.
     """
-    from sealscope.physics.rig import CHOICES, rig_numbers
+    from sealscope.physics.rig import CHOICES
 
     if not experiments:
         raise InputError("a batch must have experiments, got none")
     first = experiments[0]
     by_kind: dict[Any, list[Member]] = {}
     shapes: dict[Any, Command] = {}
-    known: dict[int, RigNumbers] = {}  # by rig: most batches have few of them
+    known: dict[Any, RigNumbers] = {}  # by rig and load: most batches have few of them
     for place, experiment in enumerate(experiments):
         for name, own, common in (
             ("duration", experiment.duration, first.duration),
@@ -146,15 +145,18 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
             if own != common:
                 raise InputError(f"runs of a batch must have one {name}, got {common:g} and {own:g} (run {place})")
         refuse(experiment, place)
-        numbers = known.get(id(experiment.rig)) or known.setdefault(id(experiment.rig), rig_numbers(experiment.rig))
+        load = None if experiment.load is None else str(exact(experiment.load))
+        if (id(experiment.rig), load) not in known:
+            known[id(experiment.rig), load] = numbers_under(experiment.rig, experiment.load)
+        numbers = known[id(experiment.rig), load]
         effects = experiment.effects()
         if any(effect.field.startswith("G_ext") for effect in effects):
             numbers = numbers._replace(open_circuit=(True,))
         if any(effect.field == "air" for effect in effects):
             numbers = numbers._replace(aerated=(True,))
         key, shape, gain, offset = _shape(experiment.commanded)
-        choices = tuple(getattr(numbers, name) for name in CHOICES)
-        kind = (key, choices, choose_method(experiment.rig, experiment.method))
+        choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")
+        kind = (key, load, choices, choose_method(experiment.rig, experiment.method))
         shapes[kind] = shape
         by_kind.setdefault(kind, []).append(Member(place, experiment, numbers, effects, gain, offset))
     return [LaneSet(tuple(members), shapes[kind]) for kind, members in by_kind.items()]
@@ -298,6 +300,10 @@ def _row(rig: Rig, name: str, readings: Readings, ends: Array, samples: int) -> 
     return row
 
 
+def _at_rest(experiment: Experiment) -> float:
+    return 0.0 if experiment.load is None else experiment.load.at_rest(experiment.x_0)
+
+
 #: Steps of a chunk, and so the arrays of the command's shape; the cells of a chunk never are cut.
 CHUNK_STEPS = 4096
 
@@ -353,7 +359,7 @@ class SetRun:
                     refuse_unresolved(numbers, self.h, self.method)
                     refuse_long(self.h, longest_step(numbers, G, C), f"the leak of run {member.place}")
         self.state = in_lanes(
-            np.array([initial_state(m.experiment.rig, m.experiment.x_0) for m in members]), self.width
+            np.array([initial_state(e.rig, e.x_0, _at_rest(e)) for e in (m.experiment for m in members)]), self.width
         )
         self.groups = len(self.state)
         self.drive = in_lanes(np.array([[m.gain, m.offset] for m in members]), self.width)
@@ -497,16 +503,34 @@ class SetRun:
         return np.asarray((np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * self.every)
 
     def _shapes(self) -> Callable[[int, int], Array]:
-        """Return the command's shape at the nodes of the steps between two outputs, for one thread's use."""
+        """Return the command's shape at the nodes of the steps between two outputs, for one thread's use.
+
+        Where there is a load, its forces [N] at the nodes stand behind.
+        """
 
         def times(start: int, stop: int) -> Array:
             return np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
 
-        shape = self.part.shape
+        shape, load = self.part.shape, self.part.experiment.load
         if isinstance(shape, Sine):
             sines = NodeSines(shape.omega, shape.phase)
-            return lambda start, stop: sines.at(times(start, stop), self.nodes, 1.0, 0.0)
-        return lambda start, stop: np.ascontiguousarray(shape.volts(times(start, stop)[:, None] + self.nodes))
+
+            def volts(t: Array) -> Array:
+                return sines.at(t, self.nodes, 1.0, 0.0)
+
+        else:
+
+            def volts(t: Array) -> Array:
+                return np.ascontiguousarray(shape.volts(t[:, None] + self.nodes))
+
+        if load is None:
+            return lambda start, stop: volts(times(start, stop))
+
+        def pushed(start: int, stop: int) -> Array:
+            t = times(start, stop)
+            return np.hstack([volts(t), np.broadcast_to(load.at(t[:, None] + self.nodes), (t.size, self.nodes.size))])
+
+        return pushed
 
     def sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
         """Instruments of the groups for samples first .. last, (groups, 2, INSTRUMENT_ROWS, width)."""
