@@ -155,7 +155,15 @@ def _range(name: str) -> tuple[float, float]:
 
 
 #: What the messages of rules across values say, as far as a single number of this rig can break one.
-ACROSS = ("range", "sensor_volts", "must be < V", "relief valves must have an accumulator", 'when volumes = "position"')
+ACROSS = (
+    "range",
+    "sensor_volts",
+    "must be < V",
+    "relief valves must have an accumulator",
+    'when volumes = "position"',
+    "must be in a line",
+    "must stand with a filter",
+)
 
 
 @pytest.mark.parametrize("name", NUMBERS)

@@ -192,8 +192,13 @@ def servo_valve(t, y):
 
 
 def lines_and_losses(t, y):
-    """4 sin 3t, a leak of 1e-12, oil that becomes 3 K warmer within 2 s, a line that shuts and opens again."""
-    integral, i, w, _, v, pa, pb, p1, p2 = y
+    """4 sin 3t, a leak of 1e-12, oil that becomes 3 K warmer within 2 s, a line that shuts and opens again.
+
+    Filters that clog (standard blocking) have bypass valves.
+    """
+    integral, i, w, _, v, pa, pb, p1, p2, *passed = y
+    fouled = [(1 - 0.5 * k * V) ** -2 for k, V in zip((4e3, 1e4), passed, strict=True)]
+    G_b, p_b = 1e-9, 1.5e5
     T = 313.15 + 3.0 * min(max(t / 2.0, 0.0), 1.0)
     logs = [math.log(math.log(nu + 0.7)) for nu in (32.0, 5.4)]
     nu = math.exp(math.exp(logs[0] - (logs[0] - logs[1]) / math.log(373.15 / 313.15) * math.log(T / 313.15))) - 0.7
@@ -215,15 +220,22 @@ def lines_and_losses(t, y):
         c = c_line if (over > 0) == free_in else 0.5 * c_line
         c = 0.0 if s <= 0 else 1 / math.sqrt(1 / c**2 + (1 / s**2 - 1) / c_line**2)
         if c == 0.0 or over == 0.0:
-            return 0.0
+            return 0.0, 0.0
         d, step = 0.0, math.inf  # what is left for the orifice, by Newton's method from below: the sum is concave
         while step > 1e-12 * abs(over):
             root = (d * d + 2000.0**2) ** 0.25
-            step = (abs(over) - d - R * c * d / root) / (1 + R * c * (0.5 * d * d + 2000.0**2) / root**5)
+            through, steep = R * c * d / root, R
+            if through > p_b:
+                through, steep = (c * d / root + G_b * p_b) / (1 / R + G_b), 1 / (1 / R + G_b)
+            step = (abs(over) - d - through) / (1 + steep * c * (0.5 * d * d + 2000.0**2) / root**5)
             d += step
-        return math.copysign(c * d / (d * d + 2000.0**2) ** 0.25, over)
+        Q = c * d / (d * d + 2000.0**2) ** 0.25
+        return math.copysign(Q, over), min(Q, (Q + G_b * p_b) / (1 + G_b * R))
 
-    QA, QB = line(p1 - pa, True, shut, 2e9 * mu), line(pb - p2, False, 0.3, 5e9 * mu)
+    (QA, cleaned_A), (QB, cleaned_B) = (
+        line(p1 - pa, True, shut, 2e9 * mu * fouled[0]),
+        line(pb - p2, False, 0.3, 5e9 * mu * fouled[1]),
+    )
     leak = 1e-12 / mu * (pa - pb)
     fc = 25 + 1e-6 * (pa + pb)
     if abs(v) > 0.01:
@@ -241,6 +253,8 @@ def lines_and_losses(t, y):
         K / V * (A * v + leak - QB),
         K / V1 * (Q1 - QA),
         K / V1 * (QB - Q1),
+        cleaned_A,
+        cleaned_B,
     ]
 
 
@@ -250,6 +264,7 @@ PARTS = {
     **{"R_A": 2e9, "R_B": 5e9, "open_B": 0.3, "G_circ": 1e-9},
     **{"A_opp": "100[mm^2]", "p_opp": "1 MPa", "C_opp": 1e-7},
 }
+CLOGS = {"k_clog_A": 4e3, "k_clog_B": 1e4, "n_clog": 1.5, "p_bypass": 1.5e5, "G_bypass": 1e-9}
 OPERATED = (
     "shut-off A to 0 % from 1 s to 1.6 s within 0.2 s",
     "circulation from 1 s to 1.6 s within 0.2 s",
@@ -299,7 +314,10 @@ VARIANTS = {
         *("servo-valve", {"F_l": 1000.0}, servo_valve, (), (*PUMPED, "p_1", "x_s", "v_s"), (2.0, 2.0)),
         {"G": 1e-12},
     ),
-    "lines and losses": ("thesis", PARTS, lines_and_losses, (), (*LINED[:3], *LINED[4:]), (4.0, 3.0), {"G": 1e-12}),
+    "lines and losses": (
+        *("thesis", {**PARTS, **CLOGS}, lines_and_losses, ()),
+        *((*LINED[:3], *LINED[4:], "x_s", "v_s"), (4.0, 3.0), {"G": 1e-12}),
+    ),
 }
 #: Size of a state, by which the other program's tolerance is set.
 SIZES = {"omega": 10.0, "x": 1e-3, "v": 1e-2, "V_up": 1e-6, "x_s": 1e-5, "v_s": 1e-2}

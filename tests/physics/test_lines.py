@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.integrate import simpson
+from scipy.integrate import cumulative_simpson, simpson
 from scipy.optimize import brentq
 
 from sealscope.errors import InputError
@@ -22,7 +22,15 @@ from sealscope.physics.fluid import kinematic_viscosity, thermal_density, therma
 from sealscope.physics.lanes import WIDTH
 from sealscope.physics.pump import friction_torque, loss_coefficients, turbulent_slip
 from sealscope.physics.rest import initial_state
-from sealscope.physics.restrictors import behind_shut_off, behind_valve, implicit_orifice_flow, orifice_flow
+from sealscope.physics.restrictors import (
+    behind_shut_off,
+    behind_valve,
+    clogged_resistance,
+    filtered_flow,
+    flow_through_filter,
+    implicit_orifice_flow,
+    orifice_flow,
+)
 from sealscope.physics.rig import NUMBERS, rig_numbers
 from sealscope.physics.solvers.imex import IMEX_NODES
 from sealscope.physics.vector.fixed import left_to_table
@@ -239,10 +247,64 @@ def test_a_leak_passes_what_the_oil_s_viscosity_lets_it(warmer):
     np.testing.assert_allclose(o["P_hydraulic"], o["Q_1"] * (o["p_1"] - o["p_2"]))
 
 
+@given(k=st.floats(1.0, 1e4), passed=st.floats(0.0, 4e-5), R=st.floats(1e7, 1e11))
+def test_a_filter_clogs_by_what_passed_as_hermia_s_laws_say(k, passed, R):
+    s = k * passed
+    for n, grown in ((0.0, 1 + s), (1.0, math.exp(s)), (1.5, (1 - s / 2) ** -2), (2.0, 1 / (1 - s))):
+        assert clogged_resistance(R, passed, k, n) == pytest.approx(R * grown, rel=1e-6)
+    assert clogged_resistance(R, 1e9, 1e9, 2.0) == pytest.approx(1e3 * R)
+
+
+@given(
+    total=st.floats(-3e6, 3e6),
+    g=st.floats(0.0, 1e11),
+    R=st.floats(1e7, 1e11),
+    bypass=st.tuples(st.floats(1e4, 1e6), st.floats(0.0, 1e-8)),
+)
+def test_throttle_filter_and_bypass_share_the_pressure(total, g, R, bypass):
+    """The filter takes R Q_f, the bypass opens at its pressure, and both are under the same."""
+    c, (p_b, G_b), assumed = 1.7e-6, bypass, abs(total) > 1.0
+    Q = filtered_flow(total, g, R, p_b, G_b, c, 0.5 * c, 2000.0)
+    Q_f = flow_through_filter(Q, R, p_b, G_b)
+    dp_f = R * Q_f
+    assert Q_f + G_b * max(dp_f - p_b, 0.0) == pytest.approx(abs(Q), rel=1e-9)
+    d = abs(total) - dp_f - g * abs(Q)
+    if assumed:
+        assert orifice_flow(math.copysign(d, total), c if total > 0 else 0.5 * c, 2000.0) == pytest.approx(
+            Q, rel=1e-5, abs=1e-12 * abs(total)
+        )
+
+
+def test_a_filter_s_pressure_drop_over_what_passed_until_its_bypass_opens():
+    """One stroke, dp = R Q (1 - k V/2)^-2 with V the integral of the flow; the valve then takes what is above."""
+    values = {**PARTS, "k_clog_A": 4e4, "k_clog_B": 1e4, "n_clog": 1.5, "p_bypass": "2 bar", "G_bypass": 1e-9}
+    run = simulate_with_truth(Experiment.of(set={**values, "open_B": 1.0}, command="5 sin(0.5t)", duration=3.0))
+    o, t, line = run.truth.outputs, run.truth.t, rig_with(**values).line
+    Q = np.abs(o["Q_A"])
+    c = rig_numbers(rig_with(**values)).c_A_in
+    left = np.array([brentq(lambda d, q=q: orifice_flow(d, c, line.dp_0) - q, 0.0, 1e6, xtol=1e-9) for q in Q[::50]])
+    dp = (o["p_1"] - o["p_A"])[::50] - left
+    shut = dp < 0.95 * line.p_bypass
+    V = cumulative_simpson(Q, x=t, initial=0.0)
+    np.testing.assert_allclose(o["passed_A"][::50][shut], V[::50][shut], rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(dp[shut], (line.R_A * Q / (1 - 2e4 * V) ** 2)[::50][shut], rtol=1e-3, atol=20.0)
+    R = clogged_R(o["passed_A"], line.R_A, 4e4)[::50]
+    open_ = dp > 1.05 * line.p_bypass
+    np.testing.assert_allclose(dp[open_] / R[open_] + 1e-9 * (dp[open_] - line.p_bypass), Q[::50][open_], rtol=1e-4)
+    assert min(shut.sum(), open_.sum()) > 5
+    assert np.ptp(o["x_s"]) == 0.0
+
+
+def clogged_R(V, R, k):
+    return R * (1 - k * V / 2) ** -2
+
+
 @pytest.mark.slow
 def test_lanes_run_all_parts_as_a_run_by_itself_does(drive):
     """Two rigs side by side, each with numbers of its own, held still."""
-    rigs = [rig_with(**PARTS), rig_with(**{**PARTS, "R_A": 8e9, "T_f": 0.2, "C_opp": 2e-7, "open_A": 0.4})]
+    clogging = {**PARTS, "k_clog_A": 2e5, "k_clog_B": 1e5, "n_clog": 1.5, "p_bypass": 5e4, "G_bypass": 1e-9}
+    other = {"R_A": 8e9, "T_f": 0.2, "C_opp": 2e-7, "open_A": 0.4, "k_clog_A": 5e5, "n_clog": 1.0, "p_bypass": 3e4}
+    rigs = [rig_with(**clogging), rig_with(**{**clogging, **other})]
     h, n = 2.5e-4, 1600
     nodes = np.array(IMEX_NODES) * h
     shape = np.sin(4.0 * (np.arange(n)[:, None] * h + nodes))
@@ -258,7 +320,7 @@ def test_lanes_run_all_parts_as_a_run_by_itself_does(drive):
     for lane, rig in enumerate(rigs):
         alone = drive(rig, n * h, rate=4000.0, step=h)
         np.testing.assert_allclose(pressures[0, :, 0, lane], alone["p_A"], rtol=0, atol=1e-3)
-    assert np.ptp(pressures[0, -1, 0, :2]) > 1e3
+    assert np.abs(np.diff(pressures[0, :, 0, :2])).max() > 1e3
 
 
 @pytest.mark.parametrize(
@@ -268,6 +330,11 @@ def test_lanes_run_all_parts_as_a_run_by_itself_does(drive):
         ({"open_B": 0.5}, None, r"a shut-off valve must be in a line .* got line.open_B = 0.5"),
         ({}, "shut-off A to 0 %", r"a shut-off valve must be in a line \(line.orifices = present\), got absent"),
         ({}, "circulation from 1 s", r"a circulation valve must have line.G_circ > 0, got 0"),
+        (
+            {**LINES, "k_clog_A": 5.0},
+            None,
+            r"line.k_clog_A must stand with a filter \(R_A > 0\), got line.k_clog_A = 5",
+        ),
         (LINES, "filter B x3", r"a filter that clogs must have line.R_B > 0, got 0"),
         (LINES, "shut-off B to 120 %", r"must open 0 % to 100 %, got 120 %"),
         (LINES, "shut-off B to 0 % from 2 s to 2.1 s within 0.5 s", r"takes 0.5 s must end later .* got 2.1 s"),

@@ -54,7 +54,8 @@ class HydraulicLine(Part):
     """Lines between pump and cylinder, and what is in them: throttles (eqs. (4.7)-(4.12)), shut-off valves, filters.
 
     `orifices = "absent"`: the pump is piped to the cylinder directly (p_1 = p_A, p_2 = p_B, V_1 and V_2 unused), with
-    neither valves nor filters. A circulation valve connects the ports of the pump; it is shut unless a run opens it.
+    neither valves nor filters. Filters may clog by the volume that passes them (`clogged_resistance`) and have a
+    bypass valve. A circulation valve connects the ports of the pump; it is shut unless a run opens it.
     """
 
     orifices: Annotated[Literal["absent", "present"], choice("throttles and line volumes in the model")]
@@ -74,6 +75,21 @@ class HydraulicLine(Part):
     ]
     R_A: Annotated[float, quantity("resistance of the filter in line A", "Pa s/m^3", absent=0, ge=0, le=1e13)]
     R_B: Annotated[float, quantity("resistance of the filter in line B", "Pa s/m^3", absent=0, ge=0, le=1e13)]
+    k_clog_A: Annotated[
+        float, quantity("rise of R_A per volume that passed, over R_A, at first", "1/m^3", absent=0, ge=0, le=1e9)
+    ]
+    k_clog_B: Annotated[
+        float, quantity("rise of R_B per volume that passed, over R_B, at first", "1/m^3", absent=0, ge=0, le=1e9)
+    ]
+    n_clog: Annotated[
+        float, quantity("law of clogging: 0 cake, 1 intermediate, 1.5 standard, 2 complete", "1", absent=0, ge=0, le=2)
+    ]
+    p_bypass: Annotated[
+        float, quantity("pressure that opens a filter's bypass valve", "Pa", absent=3.5e5, gt=0, le=1e8)
+    ]
+    G_bypass: Annotated[
+        float, quantity("conductance of a filter's bypass above that pressure", "m^3/(s Pa)", absent=0, ge=0, le=1e-6)
+    ]
 
 
 class Fluid(Part):

@@ -178,6 +178,12 @@ class Rig(Part):
                     f"a {'filter' if absent == 0.0 else 'shut-off valve'} must be in a line (line.orifices = present), "
                     f"got line.{name} = {getattr(line, name):g} and line.orifices = absent"
                 )
+        for name, needed in (("k_clog_A", line.R_A), ("k_clog_B", line.R_B), ("G_bypass", max(line.R_A, line.R_B))):
+            if getattr(line, name) > 0.0 and needed == 0.0:
+                raise ValueError(
+                    f"line.{name} must stand with a filter ({name.replace('k_clog', 'R').replace('G_bypass', 'R_A')} > "
+                    f"0), got line.{name} = {getattr(line, name):g} and none"
+                )
         if not oil.nu_100 < oil.nu_40:
             raise ValueError(
                 f"fluid.nu_100 must be < nu_40 = {with_unit(oil.nu_40, 'm^2/s')}: oil thins as it warms, got "

@@ -3,11 +3,11 @@
 State y, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega [rad/s] and
 angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa], oil V_up [m^3] that
 the make-up has fed, deflection z [m] of the bristles of LuGre's friction, position x_s [m] and speed v_s [m/s] of a
-servo valve's spool. Without throttles the pump is connected to the chambers directly: there are no line volumes, p_1 =
-p_A and p_2 = p_B. With a servo valve the pump turns at a constant speed between the return (p_2) and the supply (p_1),
-and the valve's edges connect both with the chambers. With throttles the stiffness of the equations
-is in their two flows alone (microseconds, against milliseconds for all else), so the right-hand side comes in two
-parts: everything but the throttles, and the throttles.
+servo valve's spool, or in their places the oil [m^3] that passed the filters where these clog. Without throttles the
+pump is connected to the chambers directly: there are no line volumes, p_1 = p_A and p_2 = p_B. With a servo valve the
+pump turns at a constant speed between the return (p_2) and the supply (p_1), and the valve's edges connect both with
+the chambers. With throttles the stiffness of the equations is in their two flows alone (microseconds, against
+milliseconds for all else), so the right-hand side comes in two parts: everything but the throttles, and the throttles.
 """
 
 from __future__ import annotations
@@ -56,6 +56,9 @@ from sealscope.physics.motor import controller_voltage, shaft_acceleration, wind
 from sealscope.physics.pump import friction_torque, loss_coefficients, pump_flow, pump_torque, turbulent_slip
 from sealscope.physics.restrictors import (
     behind_valve,
+    clogged_resistance,
+    filtered_flow,
+    flow_through_filter,
     implicit_orifice_flow,
     one_way_coefficient,
     orifice_coefficient,
@@ -71,6 +74,8 @@ from sealscope.physics.state import (
     P_2,
     P_A,
     P_B,
+    PASSED_A,
+    PASSED_B,
     POSITION,
     SPOOL,
     SPOOL_SPEED,
@@ -125,11 +130,12 @@ NUMBERS = (*PARAMETERS, *DERIVED)
 #: bristles, that differs between the directions; check valves with pilots, relief valves, an accumulator that exchanges
 #: little heat; a damper; a load of a run beside the rig's own, over time, or with the two tables of `force_over` in
 #: place of (True,) over position and velocity too; a servo valve between a supply and the cylinder; filters in the
-#: lines; losses of motor and pump beyond the linear ones; an opposing cylinder; oil that boils.
+#: lines; losses of motor and pump beyond the linear ones; an opposing cylinder; oil
+#: that boils; filters that clog, filters with a bypass.
 LAWS = (
     *("throttled", "aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
     *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
-    *("filtered", "lossy", "opposed", "boiling"),
+    *("filtered", "lossy", "opposed", "boiling", "clogging", "bypassed"),
 )
 #: The choices: truth values, and the laws.
 CHOICES = (*_CHOICES, "made_up", *LAWS)
@@ -161,6 +167,8 @@ if TYPE_CHECKING:
         lossy: tuple[bool, ...]
         opposed: tuple[bool, ...]
         boiling: tuple[bool, ...]
+        clogging: tuple[bool, ...]
+        bypassed: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
         def __getattr__(self, name: str) -> float: ...
@@ -262,6 +270,8 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "lossy": rig.motor.T_f > 0 or rig.pump.C_st > 0 or rig.pump.C_f > 0 or rig.pump.C_h > 0,
         "opposed": rig.cylinder.A_opp > 0,
         "boiling": rig.fluid.p_vap > 0,
+        "clogging": rig.line.k_clog_A > 0 or rig.line.k_clog_B > 0,
+        "bypassed": rig.line.G_bypass > 0,
     }
     return RigNumbers(
         *(attrgetter(name)(rig) for name in PARAMETERS.values()),
@@ -286,6 +296,8 @@ def within_limits(y: State, p: RigNumbers) -> State:
     if len(p.valved) > 0:
         p_1, p_2 = y[P_1], p.p_return
         x_s, v_s = spool_within_stroke(y[SPOOL], y[SPOOL_SPEED], p.x_max, p.v_max)
+    if len(p.clogging) > 0:
+        x_s, v_s = y[PASSED_A], y[PASSED_B]
     return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, fed, z, x_s, v_s
 
 
@@ -348,6 +360,46 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 
 
 @contracted
+def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
+    """Resistances [Pa s/m^3] of the filters in line A and B, as the oil that passed has clogged them."""
+    if len(p.clogging) == 0:
+        return p.R_A, p.R_B
+    R_A = clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
+    return R_A, clogged_resistance(p.R_B, y[PASSED_B], p.k_clog_B, p.n_clog)
+
+
+@contracted
+def implicit_flows(
+    total_A: float, total_B: float, g_A: float, g_B: float, y: State, p: RigNumbers
+) -> tuple[float, float]:
+    """Return the flows Q_A, Q_B [m^3/s] of throttles and filters: d + g Q(d) = total in each line.
+
+    The filter is in series with its throttle, p_1 - p_A = d + R Q, and so adds to g.
+    """
+    if len(p.filtered) > 0:
+        R_A, R_B = filter_resistances(y, p)
+        if len(p.bypassed) > 0:
+            Q_A = filtered_flow(total_A, g_A, R_A, p.p_bypass, p.G_bypass, p.c_A_in, p.c_A_out, p.dp_0)
+            return Q_A, filtered_flow(total_B, g_B, R_B, p.p_bypass, p.G_bypass, p.c_B_out, p.c_B_in, p.dp_0)
+        g_A, g_B = g_A + R_A, g_B + R_B
+    Q_A = implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
+    return Q_A, implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
+
+
+@contracted
+def passing_filters(y: State, p: RigNumbers) -> tuple[float, float]:
+    """Return the oil [m^3/s] that passes the filters of line A and B, in either direction, beside their bypasses."""
+    Q_A, Q_B = throttle_flows(y, p)
+    if len(p.bypassed) == 0:
+        return abs(Q_A), abs(Q_B)
+    R_A, R_B = filter_resistances(y, p)
+    return (
+        flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass),
+        flow_through_filter(Q_B, R_B, p.p_bypass, p.G_bypass),
+    )
+
+
+@contracted
 def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Return the throttles' flows Q_A and Q_B [m^3/s].
 
@@ -357,8 +409,7 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
     if len(p.filtered) > 0:
-        Q_A = implicit_orifice_flow(dp_A, p.R_A, p.c_A_in, p.c_A_out, p.dp_0)
-        return Q_A, implicit_orifice_flow(dp_B, p.R_B, p.c_B_out, p.c_B_in, p.dp_0)
+        return implicit_flows(dp_A, dp_B, 0.0, 0.0, y, p)
     Q_A = orifice_flow(dp_A, one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
     return Q_A, orifice_flow(dp_B, one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
 
@@ -576,6 +627,8 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         d_x_s = spool_speed(y[SPOOL_SPEED], p.v_max)
         x_d = spool_target(u, p.u_N, p.x_max)
         d_v_s = spool_acceleration(y[SPOOL], y[SPOOL_SPEED], x_d, p.omega_s, p.zeta_s, p.v_max)
+    if len(p.clogging) > 0:
+        d_x_s, d_v_s = passing_filters(y, p)
     return error, current, spin, y[OMEGA], v, push, rate_A, rate_B, rate_1, rate_2, fed, dz, d_x_s, d_v_s  # eq. (4.13)
 
 

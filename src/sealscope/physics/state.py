@@ -13,6 +13,9 @@ INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP
     len(STATES)
 )
 
+#: A rig with lines has no servo valve: there the spool's places hold the oil [m^3] that passed the filters of A and B.
+PASSED_A, PASSED_B = SPOOL, SPOOL_SPEED
+
 #: What a run reports at each output instant: the states and the quantities that follow from them.
 OUTPUTS = (*STATES, "Q_1", "Q_A", "Q_B", "q_leak", "V", "q_ext", "q_up")
 

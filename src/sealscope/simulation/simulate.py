@@ -188,6 +188,11 @@ def simulate_with_truth(experiment: Experiment, progress: Progress | None = None
     units = {name: CHANNEL_UNITS[name] for name in channels}
     recording = replace(recorded, channels=channels, units=units, provenance=provenance, history=history)
     outputs = {name: path[name][: n * factor : factor] for name in TRUE_OUTPUTS}
+    if experiment.rig.line.k_clog_A > 0 or experiment.rig.line.k_clog_B > 0:
+        outputs |= {
+            f"passed_{side}": path[place][: n * factor : factor] for side, place in (("A", "x_s"), ("B", "v_s"))
+        }
+        outputs["x_s"] = np.zeros(n)
     outputs |= powers(outputs, experiment.rig)
     dp, dp_0 = path["p_A"] - path["p_B"], experiment.rig.line.dp_0
     flows = (leak_flow(leak, path.t, dp, dp_0) for leak in experiment.flowing(leaks))

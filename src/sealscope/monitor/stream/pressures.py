@@ -26,7 +26,7 @@ from sealscope.diagnosis.observer.stream import Formulation, ObserverStream
 from sealscope.monitor.stream.decisions import WINDOW, ConductanceRise, other_duty, rise_of
 from sealscope.monitor.stream.estimator import PAUSE_S, BlockConductance, NotJudged, RecentBlocks
 from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
-from sealscope.physics.rig import CHOICES, LAWS, RigNumbers
+from sealscope.physics.rig import CHOICES, LAWS, NUMBERS, RigNumbers
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import moves
@@ -275,7 +275,9 @@ def _passed_over(status: str, apart: bool = False) -> NotJudged:
 def _numbers_of(state: Mapping[str, Any]) -> RigNumbers:
     values: dict[str, Any] = {}
     for name in RigNumbers._fields:
-        if name in LAWS:
+        if name not in state and (name in LAWS or name in NUMBERS):  # of a law that came later
+            values[name] = () if name in LAWS else 0.0
+        elif name in LAWS:
             values[name] = tuple(bool(value) for value in part_of(state, name, list))
         elif name in CHOICES:
             values[name] = bool(part_of(state, name, bool))

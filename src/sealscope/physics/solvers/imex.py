@@ -2,7 +2,7 @@
 
 All stiffness sits in the two throttle flows, each of which couples one line volume to one chamber. They are taken
 implicitly, everything else explicitly, so that an implicit stage is no linear system but one scalar equation a side
-(`implicit_orifice_flow`). The implicit part is L-stable and stiffly accurate; both parts are of order four.
+(`implicit_flows`). The implicit part is L-stable and stiffly accurate; both parts are of order four.
 
 Source: C. A. Kennedy, M. H. Carpenter, Additive Runge-Kutta schemes for convection-diffusion-reaction equations,
 Applied Numerical Mathematics 44 (2003) 139-181, ARK4(3)6L[2]SA. `docs/decisions/0004-solvers.md` has the
@@ -19,10 +19,10 @@ from sealscope.compiled import contracted, kernel
 from sealscope.physics.cylinder import pressure_rate
 from sealscope.physics.fluid import P_ATM
 from sealscope.physics.lanes import anywhere, select
-from sealscope.physics.restrictors import implicit_orifice_flow
 from sealscope.physics.rig import (
     RigNumbers,
     bulk_modulus,
+    implicit_flows,
     observe,
     pressures_of,
     rates_without_throttles,
@@ -116,10 +116,7 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
             r_A, r_B = select(boils_A, 0.0 * r_A, r_A), select(boils_B, 0.0 * r_B, r_B)
             r_1, r_2 = select(boils_1, 0.0 * r_1, r_1), select(boils_2, 0.0 * r_2, r_2)
         g_A, g_B = step * (r_A + r_1), step * (r_B + r_2)
-        if len(p.filtered) > 0:  # p_1 - p_A = d + R Q once the flow has passed: the filter adds to g
-            g_A, g_B = g_A + p.R_A, g_B + p.R_B
-        Q_A = implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
-        Q_B = implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
+        Q_A, Q_B = implicit_flows(total_A, total_B, g_A, g_B, z, p)
         s = throttle_rates(moved, Q_A, Q_B, p)
         before = moved
         moved = pressures_moved(z, step, s)
