@@ -150,7 +150,8 @@ def main() -> None:
         rig, values, command = VARIANTS[name]
         own = figures[name] = measured((rig, values, command, options.duration), options)
         run, batch = own["run"][0], own["in a batch"]
-        row = f"{name:42} {run:8.4f} {batch:9.4f} {run / batch:8.1f}x {own['first']:7.2f}"
+        beside = f"{batch:9.4f} {run / batch:8.1f}x" if math.isfinite(batch) else f"{'refused':>9} {'':9}"
+        row = f"{name:42} {run:8.4f} {beside} {own['first']:7.2f}"
         if "over before" in own:
             middle, low, high = own["over before"]
             row += f"  {middle:.2f} ({low:.2f} to {high:.2f}), {own['first'] / own['first before']:.2f}"

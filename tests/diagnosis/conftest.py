@@ -12,8 +12,8 @@ from sealscope.diagnosis import registry
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
-from sealscope.simulation.integrate import oversampling, trajectory
-from sealscope.simulation.sizing import sized_leaks
+from sealscope.simulation.integrate import oversampling
+from sealscope.simulation.sizing import sized_run
 
 THROTTLED = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
 Records = Callable[..., Recording]
@@ -32,7 +32,7 @@ def records() -> Records:
     @lru_cache(maxsize=4)
     def case(command: str, leak: str | None, duration: float, throttled: bool):  # type: ignore[no-untyped-def]
         experiment = Experiment.of(command=command, leak=leak, duration=duration, set=THROTTLED if throttled else None)
-        path = trajectory(experiment, sized_leaks(experiment))
+        _, path = sized_run(experiment)
         return experiment, path, experiment.command.volts(experiment.sample_times()), oversampling(experiment)
 
     def make(

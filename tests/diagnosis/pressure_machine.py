@@ -15,8 +15,8 @@ from sealscope.simulation.changes import Linear, ParameterDrift
 from sealscope.simulation.commands import Command, Recorded
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
-from sealscope.simulation.integrate import Trajectory, oversampling, trajectory
-from sealscope.simulation.sizing import sized_leaks
+from sealscope.simulation.integrate import Trajectory, oversampling
+from sealscope.simulation.sizing import sized_run
 
 ONSET = 60.0
 LEAK = f"0.0042 L/min from {ONSET:g} s"
@@ -64,7 +64,7 @@ def _case(
         duration=duration,
         set={"pump.G_pump": G_PUMP, "fluid.p_charge": P_CHARGE, **dict(values)},
     )
-    path = trajectory(experiment, sized_leaks(experiment))
+    _, path = sized_run(experiment)
     return experiment, path, experiment.command.volts(experiment.sample_times())
 
 

@@ -135,16 +135,18 @@ def test_a_chattering_run_cannot_prove_itself():
     assert not prove(experiment).resolved
 
 
-def test_progress_is_told_from_nothing_to_all():
+@pytest.mark.parametrize(("leak", "words"), [("0.01 L/min", "sizing the leak"), (None, "simulating")])
+def test_progress_is_told_from_nothing_to_all(leak, words):
+    """The last run that sizes a leak is the run."""
     told: list[tuple[str, float]] = []
     simulate_with_truth(
-        Experiment.of(duration=10.0, leak="0.01 L/min"), progress=lambda words, share: told.append((words, share))
+        Experiment.of(duration=10.0, leak=leak), progress=lambda words, share: told.append((words, share))
     )
-    assert {words for words, _ in told} == {"sizing the leak", "simulating"}
-    simulating = [share for words, share in told if words == "simulating"]
-    assert simulating == sorted(simulating)
-    assert simulating[-1] == 1.0
-    assert all(0.0 <= share <= 1.0 for _, share in told)
+    assert {words for words, _ in told} == {words}
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert all(0.0 <= share <= 1.0 for share in shares)
 
 
 def test_a_text_means_what_the_number_means():

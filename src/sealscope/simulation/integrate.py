@@ -156,7 +156,9 @@ class RunInputs:
     def _leakage(self, t: Array) -> tuple[Array, Array]:
         G, C = self._none(t.shape), self._none(t.shape)
         for leak in self._leaks:
-            more = (leak.coefficient or 0.0) * leak.opening.share(t)
+            if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
+                continue
+            more = leak.coefficient * leak.opening.share(t)
             G, C = (G + more, C) if leak.law == "laminar" else (G, C + more)
         return G, C
 

@@ -20,7 +20,7 @@ from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment, Meth
 from sealscope.simulation.faults import Fault, Leak
 from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import DETAIL_TOLERANCE, Trajectory, oversampling, trajectory
-from sealscope.simulation.sizing import leak_flow, mean_while_open, sized_leaks
+from sealscope.simulation.sizing import leak_flow, mean_while_open, sized_run
 from sealscope.storage.atomic import atomic_write
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -155,8 +155,7 @@ def simulate_with_truth(experiment: Experiment, progress: Progress | None = None
 
         return tell
 
-    leaks = sized_leaks(experiment, progress)
-    path = trajectory(experiment, leaks, progress=report("simulating"))
+    leaks, path = sized_run(experiment, progress, report("simulating"))
     proof = None
     if prove:
         fine = trajectory(experiment, leaks, step=path.step / 2, progress=report("proving: half the step"))

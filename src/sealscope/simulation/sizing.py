@@ -12,7 +12,7 @@ from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Leak
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import Trajectory, trajectory
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Relative distance from the mean asked for at which the search ends.
@@ -63,8 +63,26 @@ def unsettled(leaks: Sequence[Leak]) -> SimulationFailed:
     )
 
 
+def _unsized(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
+    """Return leaks in which those of a stated mean have a coefficient of 0."""
+    return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
+
+
 def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] | None = None) -> tuple[Leak, ...]:
-    """Return the experiment's leaks with a coefficient each, so that each one's mean is what was asked for.
+    """Return the experiment's leaks with a coefficient each, so that each one's mean is what was asked for."""
+    if not any(leak.mean for leak in experiment.leaks):
+        return _unsized(experiment.leaks)
+    return sized_run(experiment, progress)[0]
+
+
+def sized_run(
+    experiment: Experiment,
+    progress: Callable[[str, float], None] | None = None,
+    simulating: Callable[[float], None] | None = None,
+) -> tuple[tuple[Leak, ...], Trajectory]:
+    """Return the experiment's leaks with a coefficient each, and its run with them.
+
+    `progress` is called while leaks are sized, `simulating` with the time reached where there is nothing to size.
 
     A small leak's flow is proportional to its coefficient (friction sets the pressure difference), a large one's grows
     less. So each coefficient is scaled by (asked/got)^(1/s), s the slope d log flow / d log coefficient of that leak
@@ -74,9 +92,9 @@ def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] |
     where the search does not settle.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
-    current = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
+    current = _unsized(leaks)
     if not any(leak.mean for leak in leaks):
-        return current
+        return current, trajectory(experiment, current, progress=simulating)
     before: list[tuple[float, float]] = [(0.0, 0.0)] * len(leaks)  # coefficient and mean flow of the run before
     for attempt in range(MOST_RUNS):
         if progress is not None:
@@ -108,6 +126,6 @@ def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] |
         if worst <= TOLERANCE:
             if progress is not None:
                 progress("sizing the leak", 1.0)
-            return current
+            return current, run
         current = tuple(following)
     raise unsettled(leaks)

@@ -61,8 +61,8 @@ def noise_free_squares(
     from sealscope.signals.details import details
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.instruments import decimate
-    from sealscope.simulation.integrate import oversampling, trajectory
-    from sealscope.simulation.sizing import sized_leaks
+    from sealscope.simulation.integrate import oversampling
+    from sealscope.simulation.sizing import sized_run
 
     padded = USED + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
     experiment = Experiment.of(
@@ -73,7 +73,7 @@ def noise_free_squares(
         duration=padded,
         x_0=x_0,
     )
-    path = trajectory(experiment, sized_leaks(experiment))
+    _, path = sized_run(experiment)
     factor, rate = oversampling(experiment), experiment.rate
     part = slice(round(SETTLING * rate), round((SETTLING + USED) * rate))
     result = np.empty((len(CHAMBERS), len(QUANTITIES)))
