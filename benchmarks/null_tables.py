@@ -1,6 +1,6 @@
 """Compute the tables of thresholds that `changepoint.smooth_drift` and `changepoint.random_walk` interpolate, or check.
 
-    python benchmarks/null_tables.py {smooth_drift,random_walk} [--draws N] [--blocks N ...]
+    python benchmarks/null_tables.py {smooth_drift,quiet_drift,random_walk} [--draws N] [--blocks N ...]
     python benchmarks/null_tables.py check [--draws N] [--blocks N ...]
     python benchmarks/null_tables.py beyond [--draws N] [--blocks N ...]
 
@@ -9,7 +9,8 @@ line. Seeds are the blocks' and the strength's numbers. It takes 20 to 60 minute
 
 smooth_drift: blocks, number of the strength of the drift. From 80 000 weighted draws (`tails.rare_draws`) a line, and
 24 000 at 96 blocks; the probability with which a threshold is exceeded is right within 5 and 9 % (one standard
-deviation), at 1e-6 and less within a factor of two or more for strong drifts.
+deviation), at 1e-6 and less within a factor of two or more for strong drifts. quiet_drift: the same for its strengths,
+24 000 draws a line.
 random_walk: blocks, number of the walk, expected walk. From 200 000 plain draws a line, and beyond a probability of
 0.01 by a generalised Pareto tail fitted to that share of them (probability-weighted moments: Hosking & Wallis,
 Technometrics 29 (1987) 339-349): within 3 % at 0.01, 6 % at 0.001, 12 % at 0.0001.
@@ -32,6 +33,7 @@ from sealscope.diagnosis.changepoint import random_walk, smooth_drift, tails
 
 FOLDER = Path(tails.__file__).parent
 DRIFT_BLOCKS = (16, 18, 20, 21, 24, 28, 34, 42, 52, 64, 78, 96)
+QUIET_BLOCKS = (16, 20, 26, 34, 46, 64, 96)
 DRIFT_PROBABILITIES = (0.2, 0.1, 0.05, 0.02, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 1e-6, 1e-7)
 WALK_BLOCKS = (16, 20, 26, 36, 52, 78, 120)
 EXPECTED = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
@@ -42,15 +44,23 @@ CHUNK = 2000
 
 
 def drift_lines(
-    draws: int, blocks: tuple[int, ...], probabilities: tuple[float, ...] = DRIFT_PROBABILITIES, levels: int = 18
+    draws: int,
+    blocks: tuple[int, ...],
+    probabilities: tuple[float, ...] = DRIFT_PROBABILITIES,
+    levels: int = 18,
+    *,
+    quiet: bool = False,
 ) -> Iterator[tuple[float, ...]]:
-    """Yield the lines of the table of `smooth_drift`; so many `levels` of draws, each half a decade rarer."""
+    """Yield the lines of the table of `smooth_drift`, or of `quiet` series.
+
+    So many `levels` of draws, each half a decade rarer.
+    """
     rare = 0.3 * 10.0 ** (-0.5 * np.arange(levels))
     for n in blocks:
-        family = smooth_drift.DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)))
+        family = smooth_drift.DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)), quiet=quiet)
         for number, drift in enumerate(family.drifts):
             scores, weights = [], []
-            for chunk in range((draws if n < DRIFT_BLOCKS[-1] else draws * 3 // 10) // CHUNK):
+            for chunk in range((draws if n < DRIFT_BLOCKS[-1] or quiet else draws * 3 // 10) // CHUNK):
                 z, weight = tails.rare_draws(drift.steps @ drift.root, rare, CHUNK, 10**6 * n + 10**4 * number + chunk)
                 scores.append(family.scores(drift.root @ z, 1)[0].max(axis=0))
                 weights.append(weight)
@@ -188,7 +198,7 @@ def walk_alarms(g: np.ndarray, expected: float) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scan", choices=("smooth_drift", "random_walk", "check", "beyond"))
+    parser.add_argument("scan", choices=("smooth_drift", "quiet_drift", "random_walk", "check", "beyond"))
     parser.add_argument("--draws", type=int)
     parser.add_argument("--blocks", type=int, nargs="+")
     chosen = parser.parse_args()
@@ -198,8 +208,10 @@ def main() -> None:
     if chosen.scan == "beyond":
         beyond(chosen.draws or 24_000, tuple(chosen.blocks or (20,)))
         return
-    if chosen.scan == "smooth_drift":
-        lines, names = drift_lines(chosen.draws or 80_000, tuple(chosen.blocks or DRIFT_BLOCKS)), "blocks,strength"
+    if chosen.scan != "random_walk":
+        quiet, names = chosen.scan == "quiet_drift", "blocks,strength"
+        blocks = tuple(chosen.blocks or (QUIET_BLOCKS if quiet else DRIFT_BLOCKS))
+        lines = drift_lines(chosen.draws or (24_000 if quiet else 80_000), blocks, quiet=quiet)
         head, form = ",".join([names, *(f"{p:g}" for p in DRIFT_PROBABILITIES)]), "%g,%g" + ",%.2f" * 12
     else:
         lines, names = walk_lines(chosen.draws or 200_000, tuple(chosen.blocks or WALK_BLOCKS)), "blocks,walk,expected"

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
+from sealscope.diagnosis.volume_balance.blocks import DP_12, Geometry, balance_channels, cut_blocks, volumes
 from sealscope.diagnosis.volume_balance.sums import beyond_pressure, block_means, volume_columns
+
+from .balance_machine import AREA, DISPLACEMENT, machine
 
 N, L, STEP, HALF = 3, 90, 0.01, 4
 
@@ -48,7 +51,7 @@ def test_columns_are_volumes_integrals_and_ways(samples):
 
 def test_what_offset_slope_and_pressure_leave_is_that_of_least_squares(samples):
     x, theta, dp = samples
-    rest, slope, stored, steady, along = beyond_pressure(np.stack([x, theta], axis=1), dp, STEP)
+    rest, slope, stored, steady, along, pressed = beyond_pressure(np.stack([x, theta], axis=1), dp, STEP)
     tau = (np.arange(L) - 0.5 * (L - 1)) * STEP
     for k in range(N):
         basis = np.stack([np.ones(L), tau, dp[k]], axis=1)
@@ -60,6 +63,7 @@ def test_what_offset_slope_and_pressure_leave_is_that_of_least_squares(samples):
         centred = dp[k] - dp[k].mean()
         assert along[k] == pytest.approx(centred @ tau / (centred @ centred))
         assert steady[k] == pytest.approx(np.sum((tau - along[k] * centred) ** 2))
+        assert pressed[k] == pytest.approx(np.sum((centred - tau * (centred @ tau) / (tau @ tau)) ** 2))
 
 
 def test_means_of_blocks(samples):
@@ -87,3 +91,19 @@ def test_means_of_blocks(samples):
         np.testing.assert_allclose(means[:, k], expected, rtol=1e-8)
         alone = [np.ascontiguousarray(values[k : k + 1]) for values in (x, columns[:, 2], rest, dp, smooth, both)]
         assert np.array_equal(block_means(*alone, STEP, HALF)[:, 0], means[:, k])
+
+
+def test_kept_slopes_and_stored_oil_give_back_the_whole_columns():
+    """Sums beyond the offset alone, put together from what offset, slope and dp leave, are those of the samples."""
+    recording = machine(1, duration=12.0, load=lambda t: 5e5 * np.sin(0.9 * t))
+    rows = {name: recording[name][None] for name in balance_channels(recording)}
+    geometry = Geometry(AREA, DISPLACEMENT)
+    blocks = cut_blocks(recording.t, {name: row[0] for name, row in rows.items()}, len(recording), 200.0, geometry)
+    columns, dp, _ = volumes(rows, 200.0, geometry)
+    columns = np.append(columns[0], recording.t[None], axis=0)
+    along = np.stack([np.ones(dp.size), recording.t, dp[0]], axis=1)
+    beyond_dp = np.linalg.lstsq(along, columns[DP_12], rcond=None)[0][2]
+    columns[DP_12] -= beyond_dp * dp[0]
+    columns -= columns.mean(axis=1, keepdims=True)
+    whole, size = blocks.whole().gram[0], np.sqrt(np.sum(columns**2, axis=1))
+    np.testing.assert_allclose(whole / np.outer(size, size), columns @ columns.T / np.outer(size, size), atol=1e-9)

@@ -146,7 +146,8 @@ def test_slopes_that_are_kept_are_those_that_were_taken() -> None:
     assert len(kept) == len(recording) // length > 5
     rows = {name: recording[name][: length * len(kept)].reshape(len(kept), length) for name in names}
     columns, dp, _ = volumes(rows, recording.rate, balance.geometry)
-    for gram, stored, block, pressure in zip(kept.gram, kept.stored, columns, dp, strict=True):
+    for gram, stored, cut, pressure in zip(kept.gram, kept.stored, columns, dp, strict=True):
+        block = np.append(cut, recording.t[None, :length], axis=0)  # the time is the last column then
         free = np.column_stack([np.ones(length), pressure - pressure.mean()])
         coefficients, *_ = np.linalg.lstsq(free, block.T, rcond=None)
         rest = block.T - free @ coefficients

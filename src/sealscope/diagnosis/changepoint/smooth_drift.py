@@ -45,6 +45,8 @@ _WALKS_BESIDE_SLOPES = (0.0, 1e-2, 0.25)
 STRENGTHS = tuple((walk, 0.0) for walk in _WALKS) + tuple(
     (walk, slope) for walk in _WALKS_BESIDE_SLOPES for slope in _SLOPES
 )
+#: ... and, where the noise is far below the drift, of integrated walks beside these.
+QUIET_STRENGTHS = (*STRENGTHS, (0.0, 1.0), (0.0, 10.0), (0.0, 100.0))
 #: Onsets tried in a block.
 _FRACTIONS = 3
 #: Interventions whose score is within this of the best take part in the height of the step.
@@ -121,12 +123,13 @@ class Posterior:
 class DriftFamily:
     """All drifts for one time axis `t` (n,) in blocks, and one set of relative deviations `sd` (n,).
 
-    `shared` (n, m): errors common to the blocks, as columns, in units of the deviations.
+    `shared` (n, m): errors common to the blocks, as columns, in units of the deviations; `quiet`: with
+    `QUIET_STRENGTHS`.
     """
 
-    def __init__(self, t: Array, sd: Array, shared: Array) -> None:
+    def __init__(self, t: Array, sd: Array, shared: Array, *, quiet: bool = False) -> None:
         n = t.size
-        self.n, self.t = n, t
+        self.n, self.t, self.quiet = n, t, quiet
         least = least_blocks(n)
         starts, durations = [], []
         for share in _RISES:
@@ -152,7 +155,8 @@ class DriftFamily:
         noise = np.diag(relative**2) + some @ some.T
         low, high = np.minimum.outer(u, u), np.maximum.outer(u, u)
         walk, slope = low, low**2 * (3.0 * high - low) / 6.0
-        self.drifts = [self._drift(noise, q1 * walk + q2 * slope, warm, swings) for q1, q2 in STRENGTHS]
+        strengths = QUIET_STRENGTHS if quiet else STRENGTHS
+        self.drifts = [self._drift(noise, q1 * walk + q2 * slope, warm, swings) for q1, q2 in strengths]
 
     def _drift(self, noise: Array, drift: Array, warm: Array, swings: Array) -> WhitenedDrift:
         root = np.linalg.cholesky(noise + drift)
@@ -177,6 +181,11 @@ class DriftFamily:
             np.asarray(root, dtype=np.float64),
             drift,
         )
+
+    @property
+    def table(self) -> str:
+        """Name of the table of its thresholds."""
+        return "quiet_drift" if self.quiet else "smooth_drift"
 
     def scores(self, y: Array, sign: int) -> tuple[Array, NDArray[np.intp]]:
         """Return the score of every intervention (k, m) in series y (n, m), and the drift (m,) likeliest without any.
@@ -239,16 +248,16 @@ class DriftFamily:
 
 
 @lru_cache(maxsize=16)
-def _even_family(n: int) -> DriftFamily:
+def _even_family(n: int, quiet: bool = False) -> DriftFamily:
     """Return the family of blocks of equal length and equal noise, the common case."""
-    return DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)))
+    return DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)), quiet=quiet)
 
 
-def _family(t: Array, sd: Array, shared: Array | None) -> DriftFamily:
+def _family(t: Array, sd: Array, shared: Array | None, quiet: bool) -> DriftFamily:
     even = np.allclose(np.diff(t), t[1] - t[0], rtol=0.02) and np.ptp(sd) <= 0.1 * float(np.median(sd))
     if even and shared is None:
-        return _even_family(t.size)
-    return DriftFamily(t, sd, np.zeros((t.size, 1)) if shared is None else shared)
+        return _even_family(t.size, quiet)
+    return DriftFamily(t, sd, np.zeros((t.size, 1)) if shared is None else shared, quiet=quiet)
 
 
 def find_step(
@@ -259,12 +268,14 @@ def find_step(
     *,
     sign: int = 1,
     shared: Array | None = None,
+    quiet: bool = False,
 ) -> DriftStep:
     """Look for a step or a growth in a series of block estimates against a smooth drift.
 
     `t` (n,): middles of the blocks, rising; `g` (n,): estimates; `sd` (n,): their deviations, whose common scale is
     estimated anew (only the ratios matter); `sign`: 1 only a rise counts, -1 only a fall; `shared` (n, m): errors
-    common to the blocks, as columns: their covariance is shared shared^T, in the units of `g`.
+    common to the blocks, as columns: their covariance is shared shared^T, in the units of `g`; `quiet`: the noise is
+    far below the drift (`QUIET_STRENGTHS`).
 
     Raises InputError where there are fewer than 16 blocks, or shapes or values do not fit.
     """
@@ -273,7 +284,7 @@ def find_step(
     spacing = float(np.median(np.diff(t)))
     u = (t - t[0]) / spacing
     unit = np.median(sd)
-    family = _family(u, sd / unit, None if shared is None else shared / unit)
+    family = _family(u, sd / unit, None if shared is None else shared / unit, quiet)
     y = g / unit
     scores, plain = family.scores(y[:, None], sign)
     course = scores[:, 0]
@@ -283,13 +294,13 @@ def find_step(
     here = int(np.flatnonzero(near == best)[0])
     beside = int(np.argmax(post.log_l[:, here]))
     drifts = (int(plain[0]), beside)
-    threshold = max(null_threshold("smooth_drift", false_alarm_probability, family.n, number) for number in drifts)
+    threshold = max(null_threshold(family.table, false_alarm_probability, family.n, number) for number in drifts)
     size, size_sd = _height(post)
     onset, first, last = _onset(u, y, family, sign, beside, course)
     return DriftStep(
         score=float(course[best]),
         threshold=threshold,
-        chance=max(null_chance("smooth_drift", float(course[best]), family.n, number) for number in drifts),
+        chance=max(null_chance(family.table, float(course[best]), family.n, number) for number in drifts),
         index=int(np.searchsorted(u, onset)),
         onset=float(t[0] + spacing * onset),
         onset_interval=(float(t[0] + spacing * first), float(t[0] + spacing * last)),
@@ -319,22 +330,29 @@ def _least_threshold(false_alarm_probability: float, n: int) -> float:
 
 
 def findable_step(
-    t: Array, g: Array, sd: Array, false_alarm_probability: float, noise: float, *, shared: Array | None = None
+    t: Array,
+    g: Array,
+    sd: Array,
+    false_alarm_probability: float,
+    noise: float,
+    *,
+    shared: Array | None = None,
+    quiet: bool = False,
 ) -> float:
     """Return the smallest step that would have been an alarm in a series in which none was.
 
     Steps of growing height are added at three places of the middle of the series, to its own noise and drift; the
     height is that over which all three, and every higher one, exceed the threshold of any drift; infinite where none
-    does. `noise`: scale of the noise over the stated one.
+    does. `noise`: scale of the noise over the stated one; `quiet`: as in `find_step`.
     """
     u = (t - t[0]) / float(np.median(np.diff(t)))
     unit = float(np.median(sd))
-    family = _family(u, sd / unit, None if shared is None else shared / unit)
+    family = _family(u, sd / unit, None if shared is None else shared / unit, quiet)
     heights = noise * np.geomspace(0.2, 200.0, 36)
     shapes = rises(u, u[0] + np.array(_ADDED_AT) * (u[-1] - u[0]))
     series = (g / unit)[:, None] + (shapes.T[:, :, None] * heights).reshape(u.size, -1)
     threshold = max(
-        null_threshold("smooth_drift", false_alarm_probability, family.n, number) for number in range(len(STRENGTHS))
+        null_threshold(family.table, false_alarm_probability, family.n, number) for number in range(len(family.drifts))
     )
     seen = np.max(family.scores(series, 1)[0], axis=0).reshape(len(_ADDED_AT), -1).min(axis=0) > threshold
     if not seen[-1]:

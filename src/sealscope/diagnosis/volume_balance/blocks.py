@@ -29,6 +29,7 @@ from sealscope.diagnosis.volume_balance.sums import (
     WALK,
     beyond_pressure,
     block_means,
+    carried_columns,
     volume_columns,
 )
 from sealscope.recordings.chambers import CHAMBERS
@@ -39,9 +40,12 @@ from sealscope.recordings.recording import Array, Recording
 #: displaced volume counted by the pump's direction, and by the side of the higher pressure; and pressure difference at
 #: the pump's ports with its integral, these two only where the pump's ports are recorded.
 Y, THETA, FLOW, I_AB, I_ROOT, Y_PUMP, Y_SIDE, DP_12, I_12 = range(9)
-#: Columns that blocks of a piston with unequal sides have, too (those of the ports are 0 there, where not recorded):
-#: rise of p_B, and integrals of x dp_A and of x dp_B, each while that side carries the load.
-STORED_B, STORED_X_A, STORED_X_B = range(9, 12)
+#: Columns of the side that has the higher pressure, which carries the load: rise of p_B, integrals of x dp_A and of x
+#: dp_B, rise of p_A, each while that side carries; what the pump compresses, the integral of its flow times dp while
+#: it delivers there. Those of the ports are 0 where these are not recorded.
+STORED_B, STORED_X_A, STORED_X_B, STORED_A, COMPRESSED = range(9, 14)
+#: The time, the last column of blocks whose slopes are kept (`BalanceBlocks.with_slopes` and `whole`).
+TIME = 14
 #: Length a block should have [s], and the share of a short recording it may take.
 BLOCK_SECONDS = 3.0
 #: The size and the root of dp are taken of means over so long [s], which noise hardly moves and strokes do not notice.
@@ -69,11 +73,13 @@ class BalanceBlocks:
     flow, smoothed, by the assumed displacement [m^3/s]; `lift` (n,): the share by which noise
     lifts that root where dp is not smoothed; `motion` (n,): mean of dp times the piston's velocity; `walk` (n,):
     variance of the conductance, over its square, that the noise of dp makes in the integral; `filled` (n,): by how much
-    the sum of both pressures rises from the first tenth of a block to its last; `swinging` (n,): share of the way that
+    the sum of both pressures rises from the first tenth of a block to its last; `lower` (n,): mean of the lower of both
+    pressures [Pa]; `swinging` (n,): share of the way that
     the piston goes while dp has another sign than dp smoothed; `noise`, `noise_12` (n,):
     variance of the noise of dp, of dp_12; `steady` (n,): sum of squares of the time beyond offset and stored oil [s^2],
     by which the slopes count where they are kept (`with_slopes`), and `along` (n,): the coefficient of dp in the time
-    [s/Pa]; `samples`: samples of a block; `seconds`: its length.
+    [s/Pa]; `pressed` (n,): sum of squares of dp beyond offset and slope [Pa^2]; `samples`:
+    samples of a block; `seconds`: its length.
     """
 
     t: Array
@@ -87,11 +93,13 @@ class BalanceBlocks:
     motion: Array
     walk: Array
     filled: Array
+    lower: Array
     swinging: Array
     noise: Array
     noise_12: Array
     steady: Array
     along: Array
+    pressed: Array
     samples: int
     seconds: float
 
@@ -107,20 +115,38 @@ class BalanceBlocks:
         """Return the blocks with sums of products of the columns beyond offset and stored oil alone, slopes kept.
 
         What remains beyond offset and dp is what remains beyond the slope, too, and the slope times what is left of the
-        time. A random walk of noise is told from a steady flow less well than from a swinging one: of a steady dp the
+        time, which becomes a column of its own (`TIME`).
+        """
+        slope = np.pad(self.slope, ((0, 0), (0, 1)), constant_values=1.0)
+        stored = np.pad(self.stored, ((0, 0), (0, 1))) + slope * self.along[:, None]
+        return self._with(slope, self.steady, stored)
+
+    def whole(self) -> BalanceBlocks:
+        """Return the blocks with sums of products of the columns beyond offset alone, slopes and stored oil kept.
+
+        The time becomes a column of its own (`TIME`); of the difference at the pump's ports, what is beyond dp is kept.
+        """
+        tilt = self.along * self.pressed / self.steady
+        stored = np.pad(self.stored, ((0, 0), (0, 1)))
+        stored[:, DP_12] = 0.0
+        slope = np.pad(self.slope, ((0, 0), (0, 1)), constant_values=1.0) + stored * tilt[:, None]
+        own = (self.seconds / self.samples) ** 2 * self.samples * (self.samples**2 - 1) / 12.0
+        kept = self._with(slope, np.full(len(self), own), np.zeros_like(stored))
+        return replace(kept, gram=kept.gram + self.pressed[:, None, None] * stored[:, :, None] * stored[:, None, :])
+
+    def _with(self, slope: Array, squares: Array, stored: Array) -> BalanceBlocks:
+        """Return the blocks with slopes (n, c + 1) of a time that has the sum of `squares` (n,), and `stored` as given.
+
+        A random walk of noise is told from a steady flow less well than from a swinging one: of a steady dp the
         integral is known to 1.2/samples of the variance of dp over dp^2.
         """
-        gram = self.gram + self.steady[:, None, None] * self.slope[:, :, None] * self.slope[:, None, :]
+        gram = np.pad(self.gram, ((0, 0), (0, 1), (0, 1)))
+        gram += squares[:, None, None] * slope[:, :, None] * slope[:, None, :]
         own = np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny)
         swing = self.gram[:, I_AB, I_AB] / own
-        steadily = 1.2 * self.noise / self.samples * (self.steady * self.slope[:, I_AB] / own) ** 2
-        return replace(
-            self,
-            gram=gram,
-            slope=np.zeros_like(self.slope),
-            stored=self.stored + self.slope * self.along[:, None],
-            walk=self.walk * swing**2 + steadily,
-        )
+        steadily = 1.2 * self.noise / self.samples * (squares * slope[:, I_AB] / own) ** 2
+        walk = self.walk * swing**2 + steadily
+        return replace(self, gram=gram, slope=np.zeros_like(slope), stored=stored, walk=walk)
 
     @staticmethod
     def joined(parts: list[BalanceBlocks]) -> BalanceBlocks:
@@ -193,7 +219,8 @@ def _integral(rows: Array, step: float) -> Array:
 class _Beyond(NamedTuple):
     """What offset, slope and dp leave of columns (n, c, L), and coefficients (n, c) of slope [1/s] and dp.
 
-    `steady` (n,): sum of squares of the time beyond offset and dp [s^2]; `along` (n,): coefficient of dp in it [s/Pa].
+    `steady` (n,): sum of squares of the time beyond offset and dp [s^2]; `along` (n,): coefficient of dp in it [s/Pa];
+    `pressed` (n,): sum of squares of dp beyond offset and slope.
     """
 
     rest: Array
@@ -201,6 +228,7 @@ class _Beyond(NamedTuple):
     stored: Array
     steady: Array
     along: Array
+    pressed: Array
 
 
 def _plain(values: Array) -> Array:
@@ -262,14 +290,10 @@ def volumes(rows: Mapping[str, Array], rate: float, geometry: Geometry) -> tuple
     # the mean of a root is not the root of the mean: noise would pass for a smaller root near zero
     half = _half(dp.shape[1], rate)
     common, smooth = volume_columns(_plain(rows["x"] * geometry.area), _plain(turned), by_angle, dp, step, half)
-    more: list[Array] = []
-    if "p_1" in rows:
-        dp_12 = rows["p_1"] - rows["p_2"]
-        more += [dp_12, _integral(dp_12, step)]
-    if geometry.unequal:
-        more += [] if "p_1" in rows else [np.zeros_like(dp)] * 2
-        more += _stored(rows, smooth > 0.0)
-    columns = np.concatenate([common, np.stack(more, axis=1)], axis=1) if more else common
+    dp_12 = rows["p_1"] - rows["p_2"] if "p_1" in rows else np.zeros_like(dp)
+    x, p_A, p_B = (_plain(rows[name]) for name in ("x", *CHAMBERS))
+    carried = carried_columns(x, p_A, p_B, _plain(common[:, FLOW]), smooth, step, half)
+    columns = np.concatenate([common, np.stack([dp_12, _integral(dp_12, step)], axis=1), carried], axis=1)
     return _under_load(columns, dp, smooth) if geometry.unequal else (columns, dp, smooth)
 
 
@@ -291,27 +315,13 @@ def _under_load(columns: Array, dp: Array, smooth: Array) -> tuple[Array, Array,
     return both[:, :-1], both[:, -1], smooth
 
 
-def _stored(rows: Mapping[str, Array], on_A: NDArray[np.bool_]) -> list[Array]:
-    """Return what tells the oil stored in the side that carries the load from (V/2K) dp: three columns (n, L).
-
-    The side that does not carry is open to the supply. With side A carrying the oil stored is the integral of ``(V_A +
-    A_A x)/K dp_A``, with side B that of ``-(V_B - A_B x)/K dp_B``: beside dp, by which side A's constant part goes,
-    the rise of p_B while it carries, and x times either rise. `on_A` (n, L): side A carries.
-    """
-    x = rows["x"]
-    middle = 0.5 * (x + np.roll(x, 1, axis=1))
-    rise_A, rise_B = (np.diff(rows[name], axis=1, prepend=rows[name][:, :1]) for name in ("p_A", "p_B"))
-    on_B = ~on_A
-    return [np.cumsum(rise, axis=1) for rise in (on_B * rise_B, on_A * middle * rise_A, on_B * middle * rise_B)]
-
-
 def _shown(columns: Array, beyond: _Beyond) -> _Beyond:
     """Return what offset, slope and dp leave, with 0 for the oil stored in a side where that is mostly noise.
 
     Where one side carries throughout, the rise of its pressure is that of dp, and nothing but noise is beyond it.
     """
     rest, slope, stored = beyond.rest.copy(), beyond.slope.copy(), beyond.stored.copy()
-    for column in range(STORED_B, columns.shape[1]):
+    for column in (STORED_B, STORED_X_A, STORED_X_B):
         hidden = np.var(rest[:, column], axis=1) <= _MORE_THAN_NOISE * _noise(columns[:, column])
         rest[hidden, column], slope[hidden, column], stored[hidden, column] = 0.0, 0.0, 0.0
     return beyond._replace(rest=rest, slope=slope, stored=stored)
@@ -387,7 +397,7 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
     columns, dp, smooth = volumes(cut, rate, geometry)
     columns, dp = _plain(columns), _plain(dp)
     beyond = _Beyond(*beyond_pressure(columns, dp, step))
-    if columns.shape[1] > STORED_B:
+    if geometry.unequal:
         beyond = _shown(columns, beyond)
     rest = beyond.rest
     y, flow, integral = (_plain(values) for values in (columns[:, Y], columns[:, FLOW], rest[:, I_AB]))
@@ -409,10 +419,12 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
         walk=means[WALK],
         swinging=means[SWINGING],
         filled=means[FILLED],
+        lower=np.minimum(cut["p_A"], cut["p_B"]).mean(axis=1),
         noise=means[NOISE],
         noise_12=_noise(columns[:, DP_12]) if "p_1" in cut else np.zeros_like(abs_dp),
         steady=beyond.steady,
         along=beyond.along,
+        pressed=beyond.pressed,
         samples=length,
         seconds=length * step,
     )

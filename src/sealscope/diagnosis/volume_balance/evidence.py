@@ -23,10 +23,11 @@ from sealscope.diagnosis.verdict.evidence import (
     RelativeLeak,
     Verdict,
 )
-from sealscope.diagnosis.volume_balance.blocks import Y
+from sealscope.diagnosis.volume_balance.blocks import I_AB, Y
 from sealscope.diagnosis.volume_balance.fit import GEOMETRY, BalanceFit, Law, discriminate, findable, search, swings
 from sealscope.diagnosis.volume_balance.growth import grown
 from sealscope.diagnosis.volume_balance.law import (
+    ONE_SIDED,
     OrificeShare,
     evened,
     one_sided_share,
@@ -69,10 +70,17 @@ _DECISIVE = 10.0
 _SLIPPED = 20.0
 #: Flow that leaves for good, over what the rise of the conductance alone leaks, from which oil is lost to the outside.
 _LOST = 0.6
+#: A transducer's zero drifts by less within a recording [Pa]: 1 psi.
+_SENSOR_DRIFT = 7e3
+#: Share of a recording at its start in which the circuit may be filled.
+_FILLING = 0.1
 #: A step is the whole of what grew where it is over this share of it.
 _WHOLE = 0.6
 #: A drift over this share of the conductance at the start is more than warm oil does within a recording.
 _LARGE_DRIFT = 0.5
+#: Under a force that swings, what blocks miss recurs with the beat of force and strokes: heights scatter by so many
+#: times what their blocks state (development records).
+_BEATS = 1.5
 #: Conductances are the same within this share of their deviations: what was found in them holds.
 _SAME = 0.05
 #: A share through an orifice from which a leak shows unevenly.
@@ -473,14 +481,14 @@ def describe_leak(
     after the onset and end with the last whole cycle.
     """
     shape = shape_of(fit, step)
-    near = discriminate(fit, step.onset, step.rise, within=reach(fit))
-    cause, place = _place(fit, step, shape, near)
+    near = discriminate(fit.without_slopes, step.onset, step.rise, within=reach(fit))
+    cause, place = _place(fit, step, near)
     open_ = shape >= 1.0 if step.rise == 0.0 else shape > 0.0
     law = orifice_share(fit, step)
     even, unit_flow = evened(fit, law, open_) if open_.any() else (fit, fit.unit_flow("laminar"))
     again = search(even, probability) if step.rise == 0.0 and open_.any() and law.mean > _UNEVEN else step
     by_law = again if again.alarm and again.rise == step.rise else step
-    size, size_sd = by_law.size, by_law.size_sd
+    size, size_sd = by_law.size, by_law.size_sd * (_BEATS if _reverses(fit) else 1.0)
     lpm, interval, course, relative = None, None, None, None
     if open_.any():
         laminar, orifice = (float(np.mean((fit.unit_flow(name) * shape)[open_])) / LITRE_PER_MINUTE for name in _LAWS)
@@ -530,6 +538,12 @@ def describe_leak(
     return replace(evidence, leak_lpm=None, leak_interval_lpm=None, course=None, relative=None)
 
 
+def _reverses(fit: BalanceFit) -> bool:
+    """Return whether slopes are kept on a double rod under a force that swings."""
+    cut = fit.without_slopes.blocks
+    return fit.swinging is not None and abs(float(cut.slope[:, I_AB].mean())) < ONE_SIDED * float(cut.abs_dp.mean())
+
+
 def _while_open(fit: BalanceFit, open_: NDArray[np.bool_], pressed: tuple[float, float] | None) -> tuple[float, float]:
     """Return means of the size of the pressure difference and of its root over those of the open blocks."""
     usual = float(np.mean(fit.blocks.abs_dp[open_])), float(np.mean(fit.blocks.root_dp[open_]))
@@ -549,10 +563,15 @@ def _law_text(law: OrificeShare, near: dict[str, float]) -> str:
     return ""
 
 
-def _place(fit: BalanceFit, step: DriftStep, shape: Array, near: dict[str, float]) -> tuple[Cause, str]:
+def _place(fit: BalanceFit, step: DriftStep, near: dict[str, float]) -> tuple[Cause, str]:
     """Return where the oil goes, as a cause and in words."""
-    lost = _lost(fit, step, shape)
-    steady = one_sided_share(fit, step) if lost > 0.0 else None
+    drop = _drained(fit, step)
+    if drop > 0.0:
+        return "external leak", (
+            f"from then on the lower pressure falls, by {drop / 1e3:.2g} kPa so far: oil leaves to the outside"
+        )
+    lost = _lost(fit.without_slopes, step)
+    steady = one_sided_share(fit.without_slopes, step) if lost > 0.0 else None
     if steady is not None and abs(steady[0] - 0.5) < 0.5 + 2.0 * steady[1]:
         cause, place = _between(near)
         return cause, f"{place}; under a load that never reverses, a leak to the outside would look alike"
@@ -582,11 +601,32 @@ def _between(near: dict[str, float]) -> tuple[Cause, str]:
     )
 
 
-def _lost(fit: BalanceFit, step: DriftStep, shape: Array) -> float:
+def _drained(fit: BalanceFit, step: DriftStep) -> float:
+    """Return by how much the lower pressure has fallen since a rise [Pa], as oil that leaves empties the circuit.
+
+    At the rise it drops to that of the make-up, which is emptied from then on: a line that steps and bends there is
+    fitted to the blocks' lower pressures, beside the size of the pressure difference, which a closed circuit takes from
+    it. 0 where transducers may drift so, and where step and bend leave more of the squares than they explain.
+    """
+    blocks = fit.blocks.chosen(fit.blocks.t > fit.blocks.t[0] + _FILLING * np.ptp(fit.blocks.t))
+    after = np.clip((blocks.t - step.onset) / blocks.seconds + 0.5, 0.0, 1.0)
+    if min(np.count_nonzero(after == 0.0), np.count_nonzero(after == 1.0)) < 3:
+        return 0.0
+    since = np.maximum(blocks.t - step.onset, 0.0)
+    columns = np.stack([np.ones(len(blocks)), blocks.t, blocks.abs_dp, after, since], axis=1)
+    without, falls = (np.linalg.lstsq(part, blocks.lower, rcond=None)[0] for part in (columns[:, :3], columns))
+    squares = float(np.sum((blocks.lower - columns[:, :3] @ without) ** 2))
+    left = float(np.sum((blocks.lower - columns @ falls) ** 2))
+    drop = -float(columns[-1, 3:] @ falls[3:])
+    return drop if drop > _SENSOR_DRIFT and left < 0.5 * squares else 0.0
+
+
+def _lost(fit: BalanceFit, step: DriftStep) -> float:
     """Return the flow [m^3/s] that one side loses more than the other since the rise, whatever the pressure difference.
 
     0 where it is no more than a bias of the pressures makes of a leak between the sides.
     """
+    shape = shape_of(fit, step)
     close = np.abs(fit.blocks.t - step.onset - 0.5 * step.rise) < reach(fit) + 0.5 * step.rise
     before, after = fit.slip[close & (shape == 0.0)], fit.slip[close & (shape == 1.0)]
     if min(before.size, after.size) < 3:

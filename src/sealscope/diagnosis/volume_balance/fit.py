@@ -12,6 +12,7 @@ pump's direction or by the higher pressure. docs/decisions/0023-volume-balance.m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -20,15 +21,18 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import DriftStep, find_step, findable_step
 from sealscope.diagnosis.volume_balance.blocks import (
+    COMPRESSED,
     DP_12,
     FLOW,
     I_12,
     I_AB,
     I_ROOT,
+    STORED_A,
     STORED_B,
     STORED_X_A,
     STORED_X_B,
     THETA,
+    TIME,
     Y_PUMP,
     Y_SIDE,
     BalanceBlocks,
@@ -72,8 +76,16 @@ MOST_BLOCKS = 96
 #: Share of the way on which the higher pressure may change sides unseen: 0.001 on single rods whose load keeps it on a
 #: side, 0.23 to 0.34 where the circuit swings between its valves.
 _SWINGING = 0.05
-#: Slopes are not kept where conductances scatter by over so many times what they do without; blocks that show it.
-_SCATTERS, _FEW = 2.0, 3
+#: Slopes are not kept where conductances of a single rod scatter by over so many times what they do without; those of a
+#: double rod where they scatter by over this share; blocks that show it.
+_SCATTERS, _CALMER, _FEW = 2.0, 0.7, 4
+#: What double rods share under a load: the oil stored in the side that carries it, what the pump compresses, and a
+#: steady flow, which zeros of the transducers make.
+_CARRIED = (STORED_A, STORED_X_A, COMPRESSED, TIME)
+#: ... and single rods: the oil stored in either side.
+_STORED = (STORED_B, STORED_X_A, STORED_X_B)
+#: A load acts where the steady part of dp has this share of the squares of its integral, and more.
+_LOADED = 0.75
 #: Median of the size of a standard normal number.
 _QUARTILE = 0.6745
 #: Displacement over area may differ by this share from that of a stated machine before it is another one.
@@ -94,7 +106,8 @@ class BalanceFit:
     rms; `signal` [m^3]: rms of the volume delivered; `slip` (n,): flow that nothing explains [m^3/s]; `metres`: the
     position has a unit; `unequal`: the sides' areas differ; `scale_sd`: deviation of `scale`; `geometry`: as assumed;
     `side`: 1 where p_A is the higher one along most of the way, -1 where p_B is; `by_side`: the volume displaced is
-    counted by the assumed area of the side that carries the load, sample by sample.
+    counted by the assumed area of the side that carries the load, sample by sample; `swinging`: the fit of the same
+    blocks without their slopes, where these are kept because a load acts on a double rod, else None.
     """
 
     blocks: BalanceBlocks
@@ -116,6 +129,17 @@ class BalanceFit:
     geometry: Geometry
     side: int
     by_side: bool
+    swinging: BalanceFit | None = None
+
+    @property
+    def without_slopes(self) -> BalanceFit:
+        """The fit by what swings alone, whose `slip` shows the steady flow that no conductance explains."""
+        return self if self.swinging is None else self.swinging
+
+    @property
+    def keeps_slopes(self) -> bool:
+        """Whether slopes are kept: conductances are known so well then that their drift is far above the noise."""
+        return int(self.blocks.gram.shape[1]) > TIME
 
     @property
     def weights(self) -> Array:
@@ -123,7 +147,7 @@ class BalanceFit:
         weights = np.zeros(self.blocks.gram.shape[1])
         weights[Y] = 1.0
         weights[list(self.columns)] -= self.beta
-        return np.asarray(weights @ _turn(weights.size, self.side, self._counted))
+        return np.asarray(weights @ _turn(weights.size, self.side, self._counted, self.swinging is not None))[:TIME]
 
     @property
     def _counted(self) -> float:
@@ -198,20 +222,19 @@ def swings(blocks: BalanceBlocks) -> bool:
     return float(np.median(blocks.swinging)) > _SWINGING
 
 
-def _shared_columns(blocks: BalanceBlocks) -> list[int]:
+def _shared_columns(blocks: BalanceBlocks, stored: Sequence[int]) -> list[int]:
     """Return the columns whose coefficients all blocks share.
 
-    They are the angle, its lag (the flow), the pump's ports where they are recorded, the oil stored in unequal sides,
-    and the pump's leakage where throttles set the ports so far apart from the chambers that it can be told from the
-    piston's.
+    They are the angle, its lag (the flow), the pump's ports where they are recorded, those of `stored` that show
+    anything, and the pump's leakage where throttles set the ports so far apart from the chambers that it can be told
+    from the piston's; not where slopes are kept, as ports and chambers have other zeros.
     """
     diagonal = np.einsum("ncc->c", blocks.gram)
-    known = range(STORED_B, STORED_B if swings(blocks) else diagonal.size)
-    stored = [column for column in known if diagonal[column] > 0.0]
+    stored = [column for column in stored if diagonal[column] > 0.0]
     if not np.any(blocks.noise_12):
         return [THETA, FLOW, *stored]
     own = float(np.median(_beyond(blocks.gram, I_AB)[:, I_12, I_12]))
-    own_pump = own > _SEPARATE * _noise_of_integrals(blocks)
+    own_pump = own > _SEPARATE * _noise_of_integrals(blocks) and diagonal.size <= TIME
     return [THETA, FLOW, DP_12, *stored, I_12] if own_pump else [THETA, FLOW, DP_12, *stored]
 
 
@@ -322,17 +345,20 @@ def _filling(blocks: BalanceBlocks) -> NDArray[np.bool_]:
     return np.asarray(filling & (np.mean(filling) <= _SELDOM))
 
 
-def _turn(columns: int, side: int, asymmetry: float) -> Array:
+def _turn(columns: int, side: int, asymmetry: float, alike: bool = False) -> Array:
     """Return what makes the columns of the fit from those of a block as it was cut (c, c).
 
     In place of `Y_SIDE` there is the volume displaced under pressure from the side that has it less (`side`: 1 where
     that is B, -1 where it is A), which is nothing where one side carries the load throughout: twice it and the volume
     displaced differ by a sign only. The volume displaced is counted by areas that differ by `asymmetry` of their sum.
+    `alike`: the oil stored in either side counts alike, by the columns of side A.
     """
     turn = np.eye(columns)
     turn[Y_SIDE, Y_SIDE] = -0.5 * side
     turn[Y_SIDE, Y] = 0.5
     turn[Y, Y_SIDE] = asymmetry
+    if alike:
+        turn[STORED_A, STORED_B], turn[STORED_X_A, STORED_X_B] = -1.0, 1.0
     return turn
 
 
@@ -345,37 +371,53 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
     """Fit the balance; blocks in which the machine stands or is filled, or that do not balance at all, are left out.
 
     `geometry`: what made volumes of the samples. Needs one block or more; `residual` and `signal` show a fit that means
-    nothing (no motion, encoders that do not belong together). Where the sides' areas differ, and one of them carries
-    the load, a leak is a steady flow: the slopes are kept then, unless the conductances scatter for it.
+    nothing (no motion, encoders that do not belong together). Under a load a leak is a steady flow: the slopes are
+    kept then, where the conductances scatter less for it (of a double rod), or not more (of a single rod, where one
+    side carries the load).
     """
     fit = _fitted(blocks, metres, geometry)
-    if not geometry.unequal or swings(blocks):
+    if geometry.unequal:
+        if swings(blocks):
+            return fit
+        steady = _slipping(_fitted(blocks.with_slopes(), metres, geometry))
+        return fit if _scatter(steady) > _SCATTERS * _scatter(fit) else steady
+    if fit.unequal or not _loaded(blocks):
         return fit
-    steady = _slipping(_fitted(blocks.with_slopes(), metres, geometry), blocks)
-    return fit if _scatter(steady) > _SCATTERS * _scatter(fit) else steady
+    steady = _slipping(_fitted(blocks.whole(), metres, geometry, loaded=True))
+    if not _scatter(steady) < _CALMER * _scatter(fit):
+        return fit
+    return replace(steady, sense=fit.sense, g=steady.g * (steady.sense * fit.sense), swinging=fit)
+
+
+def _loaded(blocks: BalanceBlocks) -> bool:
+    """Return whether a load acts: within blocks the integral of dp is steady rather than swinging."""
+    steady = float(np.sum(blocks.steady * blocks.slope[:, I_AB] ** 2))
+    return steady > _LOADED * (steady + float(np.sum(blocks.gram[:, I_AB, I_AB])))
 
 
 def _scatter(fit: BalanceFit) -> float:
-    """Return by how much the conductances of neighbouring blocks differ; infinite where too few balance."""
+    """Return by how much a conductance differs from the mean of its neighbours; infinite where too few balance.
+
+    What drifts, or steps once, does not count.
+    """
     if len(fit.blocks) < _FEW or len(fit.left_out) > len(fit.blocks):
         return float("inf")
-    return float(np.median(np.abs(np.diff(fit.g))))
+    return float(np.median(np.abs(np.diff(fit.g, 2))))
 
 
-def _slipping(fit: BalanceFit, cut: BalanceBlocks) -> BalanceFit:
+def _slipping(fit: BalanceFit) -> BalanceFit:
     """Return a fit with slopes kept, with the flow that neither motion nor leak explains in the deviations.
 
     Valves that change over as the load changes sides, and zeros of the transducers, make a flow of the deviation q that
     is another in each block. It moves a block's conductance by ``q <I_AB, t>/<I_AB, I_AB>``, and q is what the
-    differences of neighbouring blocks show. `cut`: the blocks as they were cut.
+    second differences of the blocks show.
     """
     if len(fit.blocks) < _FEW:
         return fit
-    used = cut.chosen(np.searchsorted(cut.t, fit.blocks.t))
-    own = np.maximum(fit.blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
-    moved = used.steady * np.abs(used.slope[:, I_AB]) / own
-    spread = np.maximum(moved[1:] ** 2 + moved[:-1] ** 2, np.finfo(float).tiny)
-    slip = float(np.median(np.abs(np.diff(fit.g)) / np.sqrt(spread))) / _QUARTILE
+    gram = fit.blocks.gram
+    moved = np.abs(gram[:, I_AB, TIME]) / np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny)
+    spread = np.maximum(moved[2:] ** 2 + 4.0 * moved[1:-1] ** 2 + moved[:-2] ** 2, np.finfo(float).tiny)
+    slip = float(np.median(np.abs(np.diff(fit.g, 2)) / np.sqrt(spread))) / _QUARTILE
     return replace(fit, sd=np.hypot(fit.sd, slip * moved))
 
 
@@ -384,21 +426,23 @@ def _share_off(beta: Array) -> float:
     return abs(abs(float(beta[0])) - 1.0)
 
 
-def _fitted(blocks: BalanceBlocks, metres: bool, geometry: Geometry) -> BalanceFit:
+def _fitted(blocks: BalanceBlocks, metres: bool, geometry: Geometry, *, loaded: bool = False) -> BalanceFit:
+    """Return the fit of blocks; `loaded`: of a double rod under a load, with slopes kept."""
     side = 1 if float(np.sum(blocks.gram[:, Y, Y_SIDE])) >= 0 else -1
     cut = blocks
     by_side = geometry.asymmetry != 0.0 and geometry.area_stated and not swings(cut)
-    blocks = _turned(cut, _turn(cut.gram.shape[1], side, geometry.asymmetry if by_side else 0.0))
+    blocks = _turned(cut, _turn(cut.gram.shape[1], side, geometry.asymmetry if by_side else 0.0, loaded))
     keep = _moving(blocks) & ~_filling(blocks)
     if not keep.any():
         keep = np.ones(len(blocks), dtype=bool)
     freedom = max(1, blocks.samples - 4)
-    shared = _shared_columns(blocks.chosen(keep))
+    stored = _STORED if geometry.unequal and not swings(blocks) else ()
+    shared = _shared_columns(blocks.chosen(keep), _CARRIED if loaded else stored)
     beta, inverse = _geometry(blocks.gram[keep], shared)
     least = _UNEQUAL * _least(blocks.gram[keep], shared, beta)
     known = by_side and geometry.displacement_stated
     plainly = _turned(cut, _turn(cut.gram.shape[1], side, 0.0)) if by_side else blocks
-    for column in (Y_PUMP, Y_SIDE):
+    for column in () if loaded else (Y_PUMP, Y_SIDE):
         apart = [*shared[:2], column, *[other for other in shared[2:] if other not in (Y_PUMP, Y_SIDE)]]
         counted = _geometry(plainly.gram[keep], apart)
         left_over = _least(plainly.gram[keep], apart, counted[0])
@@ -540,16 +584,16 @@ def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> DriftStep:
     shared = _shared_errors(fit)
     every = -(-len(fit.blocks) // MOST_BLOCKS)
     if every == 1:
-        return find_step(fit.blocks.t, fit.g, fit.sd, probability, sign=sign, shared=shared)
+        return find_step(fit.blocks.t, fit.g, fit.sd, probability, sign=sign, shared=shared, quiet=fit.keeps_slopes)
     t, g, sd, common = _merged(fit, shared, every)
-    coarse = find_step(t, g, sd, probability, sign=sign, shared=common)
+    coarse = find_step(t, g, sd, probability, sign=sign, shared=common, quiet=fit.keeps_slopes)
     level = np.interp(fit.blocks.t, t, coarse.level)
     coarse = replace(coarse, level=level, index=int(np.searchsorted(fit.blocks.t, coarse.onset)))
     if not coarse.alarm or coarse.rise > 0:
         return coarse
     first = max(0, min(coarse.index - MOST_BLOCKS // 2, len(fit.blocks) - MOST_BLOCKS))
     near = slice(first, first + MOST_BLOCKS)
-    fine = find_step(fit.blocks.t[near], fit.g[near], fit.sd[near], probability, sign=sign)
+    fine = find_step(fit.blocks.t[near], fit.g[near], fit.sd[near], probability, sign=sign, quiet=fit.keeps_slopes)
     low, high = coarse.onset_interval
     if not (fine.alarm and fine.rise == 0 and low <= fine.onset <= high):
         return coarse
@@ -564,9 +608,9 @@ def findable(fit: BalanceFit, probability: float, noise: float) -> float:
     shared = _shared_errors(fit)
     every = -(-len(fit.blocks) // MOST_BLOCKS)
     if every == 1:
-        return findable_step(fit.blocks.t, fit.g, fit.sd, probability, noise, shared=shared)
+        return findable_step(fit.blocks.t, fit.g, fit.sd, probability, noise, shared=shared, quiet=fit.keeps_slopes)
     t, g, sd, common = _merged(fit, shared, every)
-    return findable_step(t, g, sd, probability, noise, shared=common)
+    return findable_step(t, g, sd, probability, noise, shared=common, quiet=fit.keeps_slopes)
 
 
 def _merged(fit: BalanceFit, shared: Array | None, every: int) -> tuple[Array, Array, Array, Array | None]:

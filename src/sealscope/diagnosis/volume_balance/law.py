@@ -28,7 +28,7 @@ _REACH = 60.0
 _ZERO, _LARGEST_ZERO = 0.3, 0.5
 #: Least mean of the pressure difference, over its usual size, where it never reverses (0.89 and 1 on the rig
 #: `single-rod-eha`, about 0 on the bench); zero error of a transducer that is reckoned with there, 5 psi [Pa].
-_ONE_SIDED, _SENSOR_ZERO = 0.75, 3.5e4
+ONE_SIDED, _SENSOR_ZERO = 0.75, 3.5e4
 #: Deviation of the share from what the balance does not model (own bench, development families of `strangers`).
 _MISSED = 0.03
 #: Share of the squares of the integrated noise that passes for a root, and the relative error of that.
@@ -91,10 +91,10 @@ def zero_error(fit: BalanceFit, step: DriftStep) -> float:
     """Return the pressure [Pa] to add to p_A - p_B so that a leak passes nothing without a pressure difference.
 
     With g and the flow f that nothing explains regressed on the opening of the leak, ``zero = -sense f/g``, drawn
-    towards 0 by its own error against the usual zero error. 0 where the sides' areas differ, and where it would be so
-    large that it is no zero error but oil that leaves for good.
+    towards 0 by its own error against the usual zero error. 0 where the sides' areas differ, under a load, and where it
+    would be so large that it is no zero error but oil that leaves for good.
     """
-    seen = None if fit.unequal else _apparent_zero(fit, step)
+    seen = None if fit.unequal or fit.swinging is not None else _apparent_zero(fit, step)
     if seen is None:
         return 0.0
     zero, error = seen
@@ -128,7 +128,7 @@ def one_sided_share(fit: BalanceFit, step: DriftStep) -> tuple[float, float] | N
     """
     level, usual = float(fit.blocks.slope[:, I_AB].mean()), float(fit.blocks.abs_dp.mean())
     seen = _apparent_zero(fit, step)
-    if seen is None or abs(level) < _ONE_SIDED * usual:
+    if seen is None or abs(level) < ONE_SIDED * usual:
         return None
     zero, error = seen
     rho = min(max(zero / level, -0.5), 2.0)
@@ -145,10 +145,11 @@ def orifice_share(fit: BalanceFit, step: DriftStep) -> OrificeShare:
     that ``moved = w + (1 - w) N/4`` (errors in variables: Fuller, Measurement Error Models, 1987, ch. 1).
     """
     moved = moved_share(fit, I_ROOT, step.onset, step.rise, within=reach(fit))
-    steady = one_sided_share(fit, step)
+    steady = one_sided_share(fit.without_slopes, step)
     if moved is None:
         return OrificeShare(0.5, 0.0, 1.0) if steady is None else OrificeShare.seen(*steady)
-    bent = _BENDS * abs(zero_error(fit, step)) / float(fit.blocks.abs_dp.mean())
+    zero = _BENDS * abs(zero_error(fit, step)) if fit.swinging is None else 2.0 * _SENSOR_ZERO
+    bent = zero / float(fit.blocks.abs_dp.mean())
     blurred = min(_BLUR * moved.noise, 0.9)
     deviation = math.hypot(moved.deviation, bent, _BLUR_ERROR * blurred, _MISSED) / (1.0 - blurred)
     share = (moved.share - blurred) / (1.0 - blurred)

@@ -88,8 +88,54 @@ def volume_columns(x: Array, turned: Array, by_angle: bool, dp: Array, step: flo
     return columns, smoothed
 
 
-def _beyond(columns: Array, pressure: Array, step: float) -> tuple[Array, Array, Array, Array, Array]:
-    """Return what offset, slope and dp leave of columns (n, c, L), and slopes, coefficients of dp, steady and along.
+@kernel
+def carried_columns(x: Array, p_A: Array, p_B: Array, flow: Array, smooth: Array, step: float, half: int) -> Array:
+    """Return what tells the oil stored in the side that carries the load, and compressed there: columns (n, 5, L).
+
+    The side of the lower pressure is open to the supply, or holds oil of its own. With side A carrying the oil stored
+    is the integral of ``(V_A + A_A x)/K dp_A``, with side B that of ``-(V_B - A_B x)/K dp_B``. The columns: rise of p_B
+    while B carries, integrals of x dp_A and of x dp_B while that side carries, and rise of p_A while A carries. Oil
+    that the pump delivers there gives way by dp/K of its volume: the integral of the flow's size times dp while it
+    delivers into the side that carries.
+
+    Parameters
+    ----------
+    x, p_A, p_B : Array, shape (n, L)
+        Position [m], pressures [Pa].
+    flow, smooth : Array, shape (n, L)
+        Flow of the pump [m^3/s], and p_A - p_B smoothed [Pa].
+    step : float
+        Time between samples [s].
+    half : int
+        Samples to either side over which pressures and flow are smoothed.
+    """
+    count, size = x.shape
+    columns = np.zeros((count, 5, size))
+    sums = np.empty(size + 1)
+    above, below, flows = np.empty(size), np.empty(size), np.empty(size)
+    for k in range(count):
+        rise_B, rise_x_A, rise_x_B, rise_A, compressed = columns[k]
+        _smooth_into(p_A[k], half, sums, above)
+        _smooth_into(p_B[k], half, sums, below)
+        _smooth_into(flow[k], half, sums, flows)
+        before = 0.0
+        for t in range(size):
+            dp = smooth[k, t]
+            now = abs(flows[t]) * dp if flows[t] * dp > 0.0 else 0.0
+            if t > 0:
+                on_A = dp > 0.0
+                up_A = above[t] - above[t - 1] if on_A else 0.0
+                up_B = 0.0 if on_A else below[t] - below[t - 1]
+                middle = 0.5 * (x[k, t] + x[k, t - 1])
+                rise_A[t], rise_B[t] = rise_A[t - 1] + up_A, rise_B[t - 1] + up_B
+                rise_x_A[t], rise_x_B[t] = rise_x_A[t - 1] + middle * up_A, rise_x_B[t - 1] + middle * up_B
+                compressed[t] = compressed[t - 1] + 0.5 * step * (now + before)
+            before = now
+    return columns
+
+
+def _beyond(columns: Array, pressure: Array, step: float) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Return what offset, slope and dp leave of columns (n, c, L), slopes, coefficients of dp, steady, along, d' d.
 
     tau is the time from the middle of the block; the tilt of dp and what is left of it, d, are orthogonal to it:
 
@@ -101,7 +147,7 @@ def _beyond(columns: Array, pressure: Array, step: float) -> tuple[Array, Array,
     count, width, size = columns.shape
     rest = np.empty((count, width, size))
     slope, stored = np.empty((count, width)), np.empty((count, width))
-    steady, along = np.empty(count), np.empty(count)
+    steady, along, pressed = np.empty(count), np.empty(count), np.empty(count)
     tau = (np.arange(size) - 0.5 * (size - 1)) * step
     own = np.sum(tau**2)
     dp = np.empty(size)
@@ -123,6 +169,7 @@ def _beyond(columns: Array, pressure: Array, step: float) -> tuple[Array, Array,
         along[k] = tilt * own / max(swept, _TINY)
         steady[k] = own * (1.0 - tilt * along[k])
         left = max(left, _TINY)
+        pressed[k] = left
         for j in range(width):
             column, beyond = columns[k, j], rest[k, j]
             first, total, leaned, share = column[0], 0.0, 0.0, 0.0
@@ -140,7 +187,7 @@ def _beyond(columns: Array, pressure: Array, step: float) -> tuple[Array, Array,
             for t in range(size):
                 beyond[t] -= share * dp[t]
             slope[k, j], stored[k, j] = lean - share * tilt, share
-    return rest, slope, stored, steady, along
+    return rest, slope, stored, steady, along, pressed
 
 
 beyond_pressure = kernel(_beyond, _ANY_ORDER)

@@ -88,7 +88,7 @@ class VolumeEstimator:
             half = len(window) // 2
             self._keep(window.chosen(slice(half, None)))
             return NotJudged(problem, "blocks: no balance can be fitted", half)
-        self._balance = FrozenBalance.of(fit)
+        self._balance = FrozenBalance.of(fit.without_slopes)
         self._keep(None)
         shown = [self._reading(window.chosen(np.array([k]))) for k in range(len(window))]
         return [block for blocks in shown if not isinstance(blocks, NotJudged) for block in blocks] or shown[-1]

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 5
+STATE_VERSION = 6
 #: The duty's cycle is looked for in so long a run without a hole [s].
 _LEARN_SECONDS = 60.0
 #: Means of blocks are not compared across a pause of over so many seconds.
