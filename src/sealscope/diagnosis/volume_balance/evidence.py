@@ -24,7 +24,16 @@ from sealscope.diagnosis.verdict.evidence import (
     Verdict,
 )
 from sealscope.diagnosis.volume_balance.blocks import I_AB, Y
-from sealscope.diagnosis.volume_balance.fit import GEOMETRY, BalanceFit, Law, discriminate, findable, search, swings
+from sealscope.diagnosis.volume_balance.fit import (
+    GEOMETRY,
+    BalanceFit,
+    Law,
+    discriminate,
+    findable,
+    loaded,
+    search,
+    swings,
+)
 from sealscope.diagnosis.volume_balance.growth import grown
 from sealscope.diagnosis.volume_balance.law import (
     ONE_SIDED,
@@ -72,8 +81,9 @@ _SLIPPED = 20.0
 _LOST = 0.6
 #: A transducer's zero drifts by less within a recording [Pa]: 1 psi.
 _SENSOR_DRIFT = 7e3
-#: Share of a recording at its start in which the circuit may be filled.
-_FILLING = 0.1
+#: Share of a recording at its start in which the circuit may be filled; share of the pressure difference by which its
+#: size changes under a force that does.
+_FILLING, _UNSTEADY = 0.1, 0.1
 #: A step is the whole of what grew where it is over this share of it.
 _WHOLE = 0.6
 #: A drift over this share of the conductance at the start is more than warm oil does within a recording.
@@ -606,18 +616,25 @@ def _drained(fit: BalanceFit, step: DriftStep) -> float:
 
     At the rise it drops to that of the make-up, which is emptied from then on: a line that steps and bends there is
     fitted to the blocks' lower pressures, beside the size of the pressure difference, which a closed circuit takes from
-    it. 0 where transducers may drift so, and where step and bend leave more of the squares than they explain.
+    it. 0 where no load acts, where transducers may drift so, where step and bend leave more of the squares than
+    they explain, and where it merely stops rising, as a circuit does that has been filled.
     """
+    if not (fit.keeps_slopes or loaded(fit.blocks)):
+        return 0.0
+
     blocks = fit.blocks.chosen(fit.blocks.t > fit.blocks.t[0] + _FILLING * np.ptp(fit.blocks.t))
     after = np.clip((blocks.t - step.onset) / blocks.seconds + 0.5, 0.0, 1.0)
     if min(np.count_nonzero(after == 0.0), np.count_nonzero(after == 1.0)) < 3:
         return 0.0
     since = np.maximum(blocks.t - step.onset, 0.0)
-    columns = np.stack([np.ones(len(blocks)), blocks.t, blocks.abs_dp, after, since], axis=1)
+    size = blocks.abs_dp if np.ptp(blocks.abs_dp) > _UNSTEADY * float(blocks.abs_dp.mean()) else np.zeros(len(blocks))
+    columns = np.stack([np.ones(len(blocks)), blocks.t, size, after, since], axis=1)
     without, falls = (np.linalg.lstsq(part, blocks.lower, rcond=None)[0] for part in (columns[:, :3], columns))
     squares = float(np.sum((blocks.lower - columns[:, :3] @ without) ** 2))
     left = float(np.sum((blocks.lower - columns @ falls) ** 2))
-    drop = -float(columns[-1, 3:] @ falls[3:])
+    level = blocks.lower - columns[:, 2] * falls[2]
+    fallen = float(np.mean(level[after == 0.0][-3:]) - np.mean(level[after == 1.0][-3:]))
+    drop = min(-float(columns[-1, 3:] @ falls[3:]), fallen)
     return drop if drop > _SENSOR_DRIFT and left < 0.5 * squares else 0.0
 
 

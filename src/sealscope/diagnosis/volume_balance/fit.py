@@ -381,15 +381,15 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
             return fit
         steady = _slipping(_fitted(blocks.with_slopes(), metres, geometry))
         return fit if _scatter(steady) > _SCATTERS * _scatter(fit) else steady
-    if fit.unequal or not _loaded(blocks):
+    if fit.unequal or not loaded(blocks):
         return fit
-    steady = _slipping(_fitted(blocks.whole(), metres, geometry, loaded=True))
+    steady = _slipping(_fitted(blocks.whole(), metres, geometry, whole=True))
     if not _scatter(steady) < _CALMER * _scatter(fit):
         return fit
     return replace(steady, sense=fit.sense, g=steady.g * (steady.sense * fit.sense), swinging=fit)
 
 
-def _loaded(blocks: BalanceBlocks) -> bool:
+def loaded(blocks: BalanceBlocks) -> bool:
     """Return whether a load acts: within blocks the integral of dp is steady rather than swinging."""
     steady = float(np.sum(blocks.steady * blocks.slope[:, I_AB] ** 2))
     return steady > _LOADED * (steady + float(np.sum(blocks.gram[:, I_AB, I_AB])))
@@ -426,23 +426,23 @@ def _share_off(beta: Array) -> float:
     return abs(abs(float(beta[0])) - 1.0)
 
 
-def _fitted(blocks: BalanceBlocks, metres: bool, geometry: Geometry, *, loaded: bool = False) -> BalanceFit:
-    """Return the fit of blocks; `loaded`: of a double rod under a load, with slopes kept."""
+def _fitted(blocks: BalanceBlocks, metres: bool, geometry: Geometry, *, whole: bool = False) -> BalanceFit:
+    """Return the fit of blocks; `whole`: those of a double rod under a load, slopes and stored oil kept."""
     side = 1 if float(np.sum(blocks.gram[:, Y, Y_SIDE])) >= 0 else -1
     cut = blocks
     by_side = geometry.asymmetry != 0.0 and geometry.area_stated and not swings(cut)
-    blocks = _turned(cut, _turn(cut.gram.shape[1], side, geometry.asymmetry if by_side else 0.0, loaded))
+    blocks = _turned(cut, _turn(cut.gram.shape[1], side, geometry.asymmetry if by_side else 0.0, whole))
     keep = _moving(blocks) & ~_filling(blocks)
     if not keep.any():
         keep = np.ones(len(blocks), dtype=bool)
     freedom = max(1, blocks.samples - 4)
     stored = _STORED if geometry.unequal and not swings(blocks) else ()
-    shared = _shared_columns(blocks.chosen(keep), _CARRIED if loaded else stored)
+    shared = _shared_columns(blocks.chosen(keep), _CARRIED if whole else stored)
     beta, inverse = _geometry(blocks.gram[keep], shared)
     least = _UNEQUAL * _least(blocks.gram[keep], shared, beta)
     known = by_side and geometry.displacement_stated
     plainly = _turned(cut, _turn(cut.gram.shape[1], side, 0.0)) if by_side else blocks
-    for column in () if loaded else (Y_PUMP, Y_SIDE):
+    for column in () if whole else (Y_PUMP, Y_SIDE):
         apart = [*shared[:2], column, *[other for other in shared[2:] if other not in (Y_PUMP, Y_SIDE)]]
         counted = _geometry(plainly.gram[keep], apart)
         left_over = _least(plainly.gram[keep], apart, counted[0])
