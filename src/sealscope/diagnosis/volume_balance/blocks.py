@@ -74,7 +74,7 @@ class BalanceBlocks:
     lifts that root where dp is not smoothed; `motion` (n,): mean of dp times the piston's velocity; `walk` (n,):
     variance of the conductance, over its square, that the noise of dp makes in the integral; `filled` (n,): by how much
     the sum of both pressures rises from the first tenth of a block to its last; `lower` (n,): mean of the lower of both
-    pressures [Pa]; `swinging` (n,): share of the way that
+    pressures [Pa]; `place` (n,): mean position [m]; `swinging` (n,): share of the way that
     the piston goes while dp has another sign than dp smoothed; `noise`, `noise_12` (n,):
     variance of the noise of dp, of dp_12; `steady` (n,): sum of squares of the time beyond offset and stored oil [s^2],
     by which the slopes count where they are kept (`with_slopes`), and `along` (n,): the coefficient of dp in the time
@@ -94,6 +94,7 @@ class BalanceBlocks:
     walk: Array
     filled: Array
     lower: Array
+    place: Array
     swinging: Array
     noise: Array
     noise_12: Array
@@ -420,6 +421,7 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
         swinging=means[SWINGING],
         filled=means[FILLED],
         lower=np.minimum(cut["p_A"], cut["p_B"]).mean(axis=1),
+        place=cut["x"].mean(axis=1),
         noise=means[NOISE],
         noise_12=_noise(columns[:, DP_12]) if "p_1" in cut else np.zeros_like(abs_dp),
         steady=beyond.steady,

@@ -466,6 +466,9 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
             f"the conductance falls at {fall.onset:.1f} s by {_flow_text(-fall.size, fit)}, which no "
             f"leak does, and never rises beyond its drift ({_figures(step)})"
         )
+        if fit.changes_over or _swings(fit):
+            verdict = "cannot tell"
+            reason += "; or it rises: where either side carries in turn, the sense of the pressures is not surely told"
     if verdict == "no leak":
         reason += f"; {_passes_text(passage(fit, smallest, None))}"
         if fit.pump is not None:
@@ -616,8 +619,9 @@ def _drained(fit: BalanceFit, step: DriftStep) -> float:
 
     At the rise it drops to that of the make-up, which is emptied from then on: a line that steps and bends there is
     fitted to the blocks' lower pressures, beside the size of the pressure difference, which a closed circuit takes from
-    it. 0 where no load acts, where transducers may drift so, where step and bend leave more of the squares than
-    they explain, and where it merely stops rising, as a circuit does that has been filled.
+    it, and a single rod's position, by which it takes oil from the make-up. 0 where no load acts, where transducers may
+    drift so, where step and bend leave more of the squares than they explain, and where it merely stops rising, as a
+    circuit does that has been filled.
     """
     if not (fit.keeps_slopes or loaded(fit.blocks)):
         return 0.0
@@ -628,13 +632,15 @@ def _drained(fit: BalanceFit, step: DriftStep) -> float:
         return 0.0
     since = np.maximum(blocks.t - step.onset, 0.0)
     size = blocks.abs_dp if np.ptp(blocks.abs_dp) > _UNSTEADY * float(blocks.abs_dp.mean()) else np.zeros(len(blocks))
-    columns = np.stack([np.ones(len(blocks)), blocks.t, size, after, since], axis=1)
-    without, falls = (np.linalg.lstsq(part, blocks.lower, rcond=None)[0] for part in (columns[:, :3], columns))
-    squares = float(np.sum((blocks.lower - columns[:, :3] @ without) ** 2))
+    place = blocks.place - blocks.place.mean() if fit.unequal else np.zeros(len(blocks))
+    columns = np.stack([np.ones(len(blocks)), blocks.t, size, place, after, since], axis=1)
+    columns /= np.maximum(np.abs(columns).max(axis=0), np.finfo(float).tiny)
+    without, falls = (np.linalg.lstsq(part, blocks.lower, rcond=None)[0] for part in (columns[:, :4], columns))
+    squares = float(np.sum((blocks.lower - columns[:, :4] @ without) ** 2))
     left = float(np.sum((blocks.lower - columns @ falls) ** 2))
-    level = blocks.lower - columns[:, 2] * falls[2]
+    level = blocks.lower - columns[:, 2:4] @ falls[2:4]
     fallen = float(np.mean(level[after == 0.0][-3:]) - np.mean(level[after == 1.0][-3:]))
-    drop = min(-float(columns[-1, 3:] @ falls[3:]), fallen)
+    drop = min(-float(columns[-1, 4:] @ falls[4:]), fallen)
     return drop if drop > _SENSOR_DRIFT and left < 0.5 * squares else 0.0
 
 
