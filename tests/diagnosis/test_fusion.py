@@ -55,6 +55,18 @@ def test_a_detector_abstains_where_nothing_was_seen_and_judges_where_something_w
     assert DRIFT.alarmed
 
 
+def test_the_least_specific_calls_nothing_sound_in_which_another_saw_a_change_without_a_name() -> None:
+    change = replace(DRIFT, detector="large change")
+    seen = replace(UNFIT, parts=(change,))
+    kept = fused(rms_change=NONE, pressure_model=seen)
+    assert (kept.detector, kept.verdict) == (RMS, "cannot tell")
+    assert "the model does not fit" in kept.reason
+    assert fused(rms_change=LEAK, pressure_model=seen).verdict == "leak"
+    assert fused(observer=NONE, pressure_model=seen).verdict == "no leak"
+    unclear = replace(seen, parts=(replace(change, score=2.0),))
+    assert fused(rms_change=NONE, pressure_model=unclear).verdict == "no leak"
+
+
 def test_a_detector_that_could_not_look_is_told_and_never_judges() -> None:
     needs = unusable(BALANCE, "needs theta")
     found = fuse([needs, replace(NONE, detector=RMS)])

@@ -77,6 +77,24 @@ def test_another_machine_from_half_on_is_no_leak(change: dict[str, float], detec
 
 
 @pytest.mark.slow
+def test_a_large_leak_of_a_machine_with_bristles_is_found_and_not_sized(detector: PressureModel) -> None:
+    """LuGre's friction, which the model does not have: the leak looks like a drive at a fifth of its speed, as no drive
+    becomes. One that loses two fifths is no leak."""
+    bristles = {"friction__law": "lugre", "friction__sigma_0": 3e5}
+    found = detector.examine(recorded(1, command="3 sin(4t)", leak=f"0.5 L/min from {ONSET:g} s", **bristles), [], P)
+    assert found.verdict == "leak", found.reason
+    low, high = found.onset_interval_s
+    assert low <= ONSET <= high
+    assert found.leak_lpm is None
+    slower = 0.6 * load_rig("thesis").motor.omega_per_volt
+    first, second = (
+        recorded(seed, command="3 sin(4t)", **bristles, **values)
+        for seed, values in ((1, {}), (2, {"motor__omega_per_volt": slower}))
+    )
+    assert detector.examine(spliced(first, second), [], P).verdict != "leak"
+
+
+@pytest.mark.slow
 def test_what_the_leak_was_weighed_against_does_not_take_its_verdict() -> None:
     """A leak of 0.4 L/min lowers the strokes' pressure difference, as less friction does: that is no objection."""
     recording = recorded(1, command="5 sin(2t)", leak=f"0.4 L/min orifice from {ONSET:g} s")

@@ -54,6 +54,8 @@ _GIVES_WAY = 4e-13
 #: Of two laws the dearer is excluded by this difference of cost (twice the log likelihood), which must also be this
 #: share of what the leak itself explains: a model that is off by some per cent misses more of a larger leak.
 _DECISIVE, _DECISIVE_SHARE = 6.0, 0.4
+#: Why a large leak is not sized.
+_UNSIZED = "this machine moves unlike the rig, so that the flow cannot be told from pressures and command"
 #: Areas of a piston are alike within this share of their mean.
 UNEQUAL = 0.1
 #: Commands are alike within this ratio of their rms.
@@ -189,7 +191,7 @@ def _flow(
     leaks = followed.leaks or (
         PossibleLeak(WORN_SEAL, after, float(steps.size[after]), float(steps.deviation[after]), 0.0),
     )
-    explained = float(np.max(steps.z)) ** 2 if followed.large is None else followed.large.better
+    explained = float(np.max(steps.z)) ** 2 if followed.large is None else followed.large.explained
     decisive = max(_DECISIVE, _DECISIVE_SHARE * explained)
     likely = [leak for leak in leaks if leak.cost <= leaks[0].cost + decisive]
     stated = []
@@ -228,10 +230,18 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
             "friction change": f"; the friction changed by {100.0 * followed.friction_change:.0f} %",
             "air in the oil": f"; the oil's stiffness changed by {100.0 * followed.stiffness_change:.0f} %",
         }[cause]
+        change = followed.change
+        parts: tuple[Evidence, ...] = ()
+        if change is not None:
+            at = begin + change.onset / recording.rate
+            seen += f"; at {at:.0f} s the machine changed: a large leak, or its drive"
+            clear = change.z / math.sqrt(max(1.0, change.excess))
+            parts = (Evidence("cannot tell", "", clear, threshold, detector="large change"),)
         return Evidence(
             "cannot tell",
             f"the model of the rig does not follow this record: its parameters wander {excess:.2f} times as much as "
             f"those of a healthy machine may, {UNRULY:g} are allowed{seen}",
+            parts=parts,
             cause=cause,
         )
     edges = begin + followed.edges / recording.rate
@@ -256,7 +266,8 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
     estimate, low, high = (np.where(edges[:-1] < onset, 0.0, value) for value in (lpm, *limits))
     course = LeakCourse(0.5 * (edges[:-1] + edges[1:]), estimate, low, high)
     reason = f"the leakage conductance past piston or pump rose at {onset:.1f} s{law} ({figures})"
-    if cause is not None or followed.another or lpm <= 0.0:
+    sized = large is None or large.sized
+    if cause is not None or followed.another or (sized and lpm <= 0.0):
         why = {
             "friction change": "the friction changed more than it does in a healthy machine",
             "air in the oil": "the oil's stiffness changed more than it does in a healthy machine",
@@ -273,7 +284,7 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
             cause=cause,
             chance=chance,
         )
-    return Evidence(
+    found = Evidence(
         "leak",
         reason,
         score,
@@ -288,6 +299,7 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
         chance=chance,
         weighed=frozenset() if large is None else _WEIGHED,
     )
+    return found if sized else without_flow(found, _UNSIZED)
 
 
 def _other_cause(followed: Followed) -> Cause | None:

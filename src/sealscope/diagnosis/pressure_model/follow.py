@@ -25,7 +25,7 @@ from sealscope.diagnosis.pressure_model.fit import (
     window_at,
 )
 from sealscope.diagnosis.pressure_model.interference import advanced, lines_in, skew
-from sealscope.diagnosis.pressure_model.large import BETTER, WORSE, LargeLeak, large_leak
+from sealscope.diagnosis.pressure_model.large import WORSE, LargeLeak, large_leak
 from sealscope.diagnosis.pressure_model.model import (
     F_C,
     F_V,
@@ -84,8 +84,8 @@ class Followed:
     `excess`: chi square a degree of freedom of what scatters beside it; `edges` (b + 1,) [samples] from the first
     sample; `seconds` of a block; `level` [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to
     the last third, as shares; `share` of the blocks that have no missing samples and count;
-    `large`: a leak that linear blocks did not reach, beside which all this is then taken; `another`: a leak
-    would be large, but another machine from its onset on explains the record far better.
+    `large`: a leak that linear blocks did not reach, beside which all this is then taken; `change`: what looks like
+    one, but another machine from then on explains the record as well.
     """
 
     theta: Array
@@ -101,7 +101,12 @@ class Followed:
     command_rms: float
     share: float
     large: LargeLeak | None = None
-    another: bool = False
+    change: LargeLeak | None = None
+
+    @property
+    def another(self) -> bool:
+        """Whether another machine from an instant on explains the record far better than a large leak."""
+        return self.change is not None and self.change.better < WORSE
 
     @property
     def blocks(self) -> int:
@@ -171,7 +176,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
     look, large = _tracked(model, dp, edges, theta, skip, seen, None if humming else shown), None
     if isinstance(look, str) or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
         large = _large(plain, raw, edges, seen, prior)
-        if large is not None and large.better > BETTER:
+        if large is not None and large.stated:
             return _seen_so(
                 _Look(large.track, large.steps, large.leaks, large.excess),
                 large.theta,
@@ -201,8 +206,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
             f"the rig does not describe this machine: its oil would be {stiffness:.2g} times as stiff as the rig's; "
             "the fit has a ring too many in each reversal, or another --rig describes it"
         )
-    followed = _seen_so(look, theta, model, edges, length, share)
-    return followed if large is None else replace(followed, another=large.better < WORSE)
+    return replace(_seen_so(look, theta, model, edges, length, share), change=large)
 
 
 def _seen_so(

@@ -11,6 +11,7 @@ command is such another machine.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -58,12 +59,19 @@ _FALL, _FALL_COST = 0.03, 200.0
 #: Another machine's gain of the drive and stiffness of the oil, as shares of those before (standard deviation). The
 #: pressures hardly tell a laminar leak from a slower drive on stiffer oil: of either the strokes become shorter.
 _GAIN_CHANGE, _STIFFNESS_CHANGE = 0.15, 0.1
+#: ... of which the gain is at least this share of that before: no drive loses more from one instant to the next.
+_LEAST_GAIN = 0.5
+#: Stiffnesses at which such a fit begins where the gain is held there, as shares of that before.
+_STIFFNESSES = (0.7, 0.85, 1.0, 1.2, 1.4)
 #: Difference of cost to another machine from which the leak is the better explanation, and from which the other is.
 BETTER, WORSE = 8.0, -100.0
-#: The largest excess: a model that is off by some per cent misses more of a large leak than of what wanders.
-_LARGEST_EXCESS = 4.0
-#: Least z: a leak that linear blocks do not reach is at least as clear as those that they do.
-_CLEAR = 10.0
+#: The largest excess at which a leak is sized (a model that is off by some per cent misses more of a large leak than of
+#: what wanders), and the largest cost of a sample, over that before the leak. Beyond, the model is of another kind of
+#: machine: there a leak must be better by this share of what it explains.
+_LARGEST_EXCESS, _AS_BEFORE, _PLAIN = 4.0, 1.25, 0.1
+#: Least z, also over the root of the excess: a leak that linear blocks do not reach is at least as clear as those that
+#: they do.
+_CLEAR, _CLEAR_OF_SCATTER = 10.0, 5.0
 #: The onset is anywhere where the cost is within this of the least, and that much [s] before and after.
 _LIKELY, _TRANSIENT = 20.0, 0.5
 
@@ -74,7 +82,9 @@ class LargeLeak:
 
     `theta` (13,): the sound machine; `track`; `steps` beside the leak; `leaks` by either law and by both, the likelier
     first; `z` of the leak; `better`: cost of another machine less that of the leak; `onset`, its `limits` [samples];
-    `excess`: chi square a degree of freedom of what scatters beside the leak.
+    `excess`: chi square a degree of freedom of what scatters beside the leak; `sized`: whether the model follows the
+    machine so well that the sizes of the leaks mean something; `explained`: as
+    `better`, to another machine with any drive.
     """
 
     theta: Array
@@ -86,6 +96,13 @@ class LargeLeak:
     onset: int
     limits: tuple[int, int]
     excess: float
+    sized: bool
+    explained: float
+
+    @property
+    def stated(self) -> bool:
+        """Whether a leak is the better explanation: by little, or by much of what it explains where it is not sized."""
+        return self.better > (BETTER if self.sized else _PLAIN * self.z**2)
 
 
 def large_leak(
@@ -111,7 +128,7 @@ def large_leak(
     if tried is None:
         return None
     block, best = tried
-    theta = _refitted(model, dp, int(edges[max(block - 1, _SOUND_BLOCKS)]), theta, prior)
+    theta, usual = _refitted(model, dp, int(edges[max(block - 1, _SOUND_BLOCKS)]), theta, prior)
     tried = _ladder(model, dp, edges, theta, seen, {law: _NEAR * size for law, size in best.items()})
     if tried is None:
         return None
@@ -128,15 +145,15 @@ def large_leak(
         path = np.tile(theta, (blocks, 1))
         path[block:] = leaking.sound
         rise, start = (leaking.law, block - 1), np.zeros(STATES)
-        followed.append(
-            track(model, dp, edges, theta, start, int(edges[0]), rise, path, seen=counted, size=leaking.size)
-        )
+        with suppress(FloatingPointError):  # of a leak that is none of this machine the model may diverge
+            there = track(model, dp, edges, theta, start, int(edges[0]), rise, path, seen=counted, size=leaking.size)
+            followed.append((leaking, there))
     if not followed:
         return None
-    variance = min(each.variance for each in followed)
+    variance = min(each.variance for _, each in followed)
     speed = model.speed_amplitude(theta)
     looks = []
-    for leaking, each in zip(fitted, followed, strict=True):
+    for leaking, each in followed:
         steps = steps_in(each, theta, speed, law=leaking.law)
         cost = each.misfit / variance + each.strain
         size, deviation = float(steps.size[block - 1]), float(steps.deviation[block - 1])
@@ -146,11 +163,27 @@ def large_leak(
     steps = steps_in(there, theta, speed, law=likely.law, beside=likely)
     excess = excess_of(steps)
     z = float(np.sqrt(max(0.0, after.sound() - cost)))
-    if not (z > _CLEAR and excess <= _LARGEST_EXCESS):
+    if not z > max(_CLEAR, _CLEAR_OF_SCATTER * float(np.sqrt(max(1.0, excess)))):
         return None
-    better = after.another() - cost
+    another, any_drive = after.another()
+    better = another - cost
     onset, limits = _onset(model, dp, edges, there, likely)
-    return LargeLeak(theta, there, steps, tuple(leak for leak, *_ in looks), z, better, onset, limits, excess)
+    sized = excess <= _LARGEST_EXCESS and cost <= _AS_BEFORE * usual * after.window.dp.size
+    if not sized:  # what the model misses moves the onset, too: it is in these blocks
+        limits = min(limits[0], int(edges[block - 1])), max(limits[1], int(edges[min(block + 2, blocks)]))
+    return LargeLeak(
+        theta,
+        there,
+        steps,
+        tuple(leak for leak, *_ in looks),
+        z,
+        better,
+        onset,
+        limits,
+        excess,
+        sized,
+        any_drive - cost,
+    )
 
 
 def _ladder(
@@ -194,10 +227,13 @@ def _flows(model: DrivenModel, dp: Array, theta: Array) -> dict[Law, float]:
     return {WORN_SEAL: flow / drop, HOLE: flow / np.sqrt(drop)}
 
 
-def _refitted(model: DrivenModel, dp: Array, until: int, theta: Array, prior: Prior) -> Array:
-    """Return the machine that is fitted to all that is sound, as far as the longest window reaches."""
+def _refitted(model: DrivenModel, dp: Array, until: int, theta: Array, prior: Prior) -> tuple[Array, float]:
+    """Return the machine that is fitted to all that is sound, as far as the longest window reaches, and its cost.
+
+    The cost is that of a sample.
+    """
     length = min(until, int(LONG_WINDOW[-1] * model.rate))
-    return refit(window_at(model, dp, theta, until - length, length), theta, prior)[0]
+    return refit(window_at(model, dp, theta, until - length, length), theta, prior)
 
 
 class _Leaking(NamedTuple):
@@ -262,16 +298,30 @@ class _After:
             size = size if law.orifice > 0.0 else 0.0
         return _Leaking(law, size, sound, theta, float(costs[0]))
 
-    def another(self) -> float:
+    def another(self) -> tuple[float, float]:
         """Return the cost of another machine, which does not leak: all else is free within a prior about that before.
 
-        A machine with another gain is far off, so a fit begins at the gain that suits best, too.
+        The second is its cost with any gain of the drive.
+
+        A machine with another gain is far off, so a fit begins at the gain that suits best, too. To a model that misses
+        some of how the machine moves, such as bristles, a leak of half of the pump's flow is best a drive that turns at
+        a fifth of its speed: no drive does, so the gain is held at half of that before.
         """
         prior = prior_of(self.theta)
         gain, stiffness = _GAIN_CHANGE * self.theta[GAIN], _STIFFNESS_CHANGE * self.theta[K]
         prior.deviation[[GAIN, K, G]] = gain, stiffness, self.wander[G]
         guesses = self.theta, first_guess(self.short, prior)
-        return self.window.dp.size * min(fit(self.window, self.short, prior, guess)[1] for guess in guesses)
+        fits = [fit(self.window, self.short, prior, guess)[:2] for guess in guesses]
+        least = _LEAST_GAIN * self.theta[GAIN]
+        costs = [self.window.dp.size * each for theta, each in fits if theta[GAIN] >= least]
+        free = self.window.dp.size * min(cost for _, cost in fits)
+        if len(costs) == len(fits):
+            return free, free
+        starts = np.array([*(theta for theta, _ in fits), *np.tile(self.theta, (len(_STIFFNESSES), 1))])
+        starts[len(fits) :, K] *= _STIFFNESSES
+        starts[:, GAIN] = np.maximum(starts[:, GAIN], least)
+        held = [k for k in range(SOUND) if k != GAIN]
+        return float(min(*costs, *minimise(self.window, starts, prior, held, 20, 1.0)[1])), free
 
 
 def _onset(

@@ -367,7 +367,7 @@ def track(
             reached = misfits(np.concatenate([there[:1], others]) + lack).sum(axis=1)
             costs = reached / followed.variance + np.array([strain(path + each * move, allowed) for each in shares])
             whole = bool(before_it - costs[0] > _KEPT * promised)
-            if not (whole or before_it - np.nanmin(costs) > _KEPT * promised):
+            if not (whole or np.any(before_it - costs > _KEPT * promised)):
                 shares = _SHARES
                 tries = now.run(sets(shares, move, grown), segment, np.tile(start, (shares.size, 1)))
                 reached = misfits(tries + lack).sum(axis=1)

@@ -24,8 +24,8 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     next detector that found a leak, too, and has them, unless a detector refuses the figure; the cause is the judge's,
     else the one that another detector names. Where others differ, the reason says so. `no leak` of the least specific
     detector, which states no size, becomes `cannot tell` where another one says that a leak worth finding would not
-    have shown. `detector` of the result is the
-    judge, `parts` are the evidences, the judge's first.
+    have shown, or that something changed which it cannot name. `detector` of the result is the judge, `parts` are the
+    evidences, the judge's first.
     """
     ranked = sorted(evidences, key=lambda own: rank(own.detector))
     usable = [own for own in ranked if own.usable]
@@ -65,9 +65,12 @@ def judges(evidence: Evidence) -> bool:
 
 
 def _blind(evidence: Evidence) -> bool:
-    """Whether a detector would not have seen a leak worth finding, and says so."""
+    """Whether a detector would not have seen a leak worth finding, or saw a change that it has no name for."""
+    if not evidence.abstains:
+        return False
     passage = evidence.passage
-    return evidence.abstains and passage is not None and (passage.findable_share or 0.0) > LEAK_WORTH_FINDING
+    unseen = passage is not None and (passage.findable_share or 0.0) > LEAK_WORTH_FINDING
+    return unseen or any(part.verdict == "cannot tell" and part.alarmed for part in evidence.parts)
 
 
 def _other_cause(evidence: Evidence) -> bool:
