@@ -18,6 +18,7 @@ from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import TEMPLATE, read_settings
 from sealscope.monitor.sources.source_block import digest_of
+from sealscope.monitor.stream.watch import STATE_VERSION
 from sealscope.simulation.simulate import simulate
 
 from ..diagnosis.balance_machine import machine, step
@@ -247,9 +248,9 @@ def test_a_state_of_another_version_begins_a_new_baseline(tmp_path, caplog):
         service.store.keep_rows(connection, rows)
     again = Service(settings, once=True)
     again._hold.close()
-    assert "press 1: its state has version 1, not 5, begins anew" in caplog.text
+    assert f"press 1: its state has version 1, not {STATE_VERSION}, begins anew" in caplog.text
     _, state, pending = again.store.checkpoint("press 1")
-    assert (state["watch"]["version"], state["watch"]["baseline_version"], pending) == (5, 4, [])
+    assert (state["watch"]["version"], state["watch"]["baseline_version"], pending) == (STATE_VERSION, 4, [])
     assert state["watch"]["blocks"] == max(row[1] for row in before)
     assert [row for row in rows_of(settings.database)["estimates"] if row[0] == "press 1"] == before
 

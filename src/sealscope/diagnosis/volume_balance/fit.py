@@ -84,8 +84,9 @@ _SCATTERS, _CALMER, _FEW = 2.0, 0.7, 4
 _CARRIED = (STORED_A, STORED_X_A, COMPRESSED, TIME)
 #: ... and single rods: the oil stored in either side.
 _STORED = (STORED_B, STORED_X_A, STORED_X_B)
-#: A load acts where the steady part of dp has this share of the squares of its integral, and more.
-_LOADED = 0.75
+#: A load acts where the steady part of dp has this share of the squares of its integral, and more, and the steady part
+#: of the way has less than this share of its: blocks are no parts of strokes, as those of short recordings are.
+_LOADED, _OF_STROKES = 0.75, 0.7
 #: Median of the size of a standard normal number.
 _QUARTILE = 0.6745
 #: Displacement over area may differ by this share from that of a stated machine before it is another one.
@@ -390,9 +391,13 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
 
 
 def loaded(blocks: BalanceBlocks) -> bool:
-    """Return whether a load acts: within blocks the integral of dp is steady rather than swinging."""
-    steady = float(np.sum(blocks.steady * blocks.slope[:, I_AB] ** 2))
-    return steady > _LOADED * (steady + float(np.sum(blocks.gram[:, I_AB, I_AB])))
+    """Return whether a load acts: within blocks the integral of dp is steady rather than swinging, the way is not."""
+
+    def steady(column: int) -> float:
+        flow = float(np.sum(blocks.steady * blocks.slope[:, column] ** 2))
+        return flow / max(flow + float(np.sum(blocks.gram[:, column, column])), np.finfo(float).tiny)
+
+    return steady(I_AB) > _LOADED and steady(Y) < _OF_STROKES
 
 
 def _scatter(fit: BalanceFit) -> float:
