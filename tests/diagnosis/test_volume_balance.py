@@ -13,6 +13,8 @@ from sealscope.diagnosis.volume_balance.evidence import level
 from sealscope.diagnosis.volume_balance.fit import discriminate
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import COUNTS, Recording
+from sealscope.simulation.bench.machines import draw
+from sealscope.simulation.simulate import simulate_with_truth
 
 from .balance_machine import irregular, machine, step
 
@@ -220,6 +222,28 @@ def test_under_a_load_a_leak_is_a_steady_flow(
     assert found.leak_interval_lpm[0] <= flow_of(leaks, G) <= found.leak_interval_lpm[1]
     assert found.onset_s == pytest.approx(60.0, abs=3.0)
     assert detector.examine(sound, [], P).verdict == "no leak"
+
+
+@pytest.mark.parametrize("seed", [102, 104, 105])
+def test_a_weight_that_is_held_shows_what_pump_and_piston_pass(seed: int) -> None:
+    """Held, the pressure difference is one constant, and a steady flow beside it took any share of what leaks.
+
+    What zeros of the transducers make of the leakage bounds that flow; levels were -3 to 9 times the truth.
+    """
+    drawn = draw("load", seed, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
+    balance = VolumeBalance(load_rig("thesis-closed-loop"))
+    sound = simulate_with_truth(drawn.experiment(seed=seed))
+    shown = {name: sound.truth.outputs[name] for name in ("omega", "p_1", "p_2", "Q_1")}
+    dp = shown["p_1"] - shown["p_2"]
+    leaked = drawn.experiment().rig.pump.q_b / (2.0 * np.pi) * shown["omega"] - shown["Q_1"]
+    fit = fitted(balance, sound.recording)
+    assert level(fit).value == pytest.approx(float(leaked @ dp / (dp @ dp)), rel=0.04)
+    assert balance.examine(sound.recording, [], P).verdict == "no leak"
+    leaks = simulate_with_truth(drawn.experiment(seed=seed, leak="0.0042 L/min from 60 s"))
+    found = balance.examine(leaks.recording, [], P)
+    assert (found.verdict, found.cause) == ("leak", "piston or pump leak")
+    assert found.leak_interval_lpm is not None
+    assert found.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= found.leak_interval_lpm[1]
 
 
 def test_a_fall_is_told_and_is_no_leak(detector: VolumeBalance) -> None:

@@ -87,6 +87,9 @@ _STORED = (STORED_B, STORED_X_A, STORED_X_B)
 #: A load acts where the steady part of dp has this share of the squares of its integral, and more, and the steady part
 #: of the way has less than this share of its: blocks are no parts of strokes, as those of short recordings are.
 _LOADED, _OF_STROKES = 0.75, 0.7
+#: Zero of a pressure difference as makers state it [Pa]: 0.1 % of 20 MPa; and values of a block that are independent of
+#: each other, beyond what all share: what is left is no white noise.
+_ZERO, _INDEPENDENT = 2e4, 10.0
 #: Median of the size of a standard normal number.
 _QUARTILE = 0.6745
 #: Displacement over area may differ by this share from that of a stated machine before it is another one.
@@ -255,12 +258,15 @@ def _noise_of_integrals(blocks: BalanceBlocks) -> float:
     return float(_noise_of_integral(blocks, np.asarray(variance)))
 
 
-def _solve(rest: Array, shared: list[int], weight: Array) -> tuple[Array, Array]:
+def _solve(rest: Array, shared: list[int], weight: Array, known: float = 0.0) -> tuple[Array, Array]:
     """Return the coefficients (m,) of the shared columns, and their covariance over the residual's variance (m, m).
 
-    `rest` (n, c, c): sums of products beyond the leak of each block; `weight` (n,) of the blocks.
+    `rest` (n, c, c): sums of products beyond the leak of each block; `weight` (n,) of the blocks; `known`: by how many
+    squares of the time the steady flow is known to be none.
     """
     total = np.tensordot(weight, rest, 1)
+    if known > 0.0:
+        total[TIME, TIME] += known
     size = np.sqrt(np.maximum(np.diag(total)[shared], np.finfo(float).tiny))
     scaled = total[np.ix_(shared, shared)] / np.outer(size, size)
     inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) / np.outer(size, size)
@@ -289,13 +295,26 @@ def _geometry(gram: Array, shared: list[int]) -> tuple[Array, Array]:
     the fit of the higher likelihood is taken.
     """
     laws = _beyond(gram, I_AB), _beyond(gram, I_ROOT)
-    fits = [_reweighted(laws, first, shared) for first in laws]
+    steady = _steady_flow(gram) if TIME in shared else float("inf")
+    fits = [_reweighted(laws, first, shared, steady) for first in laws]
     likeliest = min(fits, key=lambda fit: fit[2])
     return likeliest[:2]
 
 
-def _reweighted(laws: tuple[Array, Array], first: Array, shared: list[int]) -> tuple[Array, Array, float]:
-    """Return coefficients, covariance, and the sum of the logarithms of what is left, from the law `first`."""
+def _steady_flow(gram: Array) -> float:
+    """Return the deviation of the steady flow that zeros of the transducers make of what leaks [m^3/s]."""
+    flows = gram[:, TIME] / gram[:, TIME, TIME, None]
+    lost = float(np.median(np.abs(flows[:, Y] - flows[:, THETA])))
+    return lost * _ZERO / float(np.median(np.abs(flows[:, I_AB])))
+
+
+def _reweighted(
+    laws: tuple[Array, Array], first: Array, shared: list[int], steady: float
+) -> tuple[Array, Array, float]:
+    """Return coefficients, covariance, and the sum of the logarithms of what is left, from the law `first`.
+
+    `steady`: deviation of the coefficient of the time [m^3/s].
+    """
     beta, inverse = _solve(first, shared, np.ones(len(first)))
     rest, logs = first, float("inf")
     for convex, rounds in ((True, _ROUNDS[0]), (False, _ROUNDS[1])):
@@ -308,7 +327,9 @@ def _reweighted(laws: tuple[Array, Array], first: Array, shared: list[int]) -> t
             least = max(float(np.quantile(left, _USUAL)), np.finfo(float).tiny)
             weight = least / np.maximum(left, least)
             before, logs = beta, float(np.log(np.maximum(left, np.finfo(float).tiny)).sum())
-            beta, inverse = _solve(rest, shared, np.sqrt(weight) if convex else weight)
+            beta, inverse = _solve(
+                rest, shared, np.sqrt(weight) if convex else weight, least / _INDEPENDENT / steady**2
+            )
             if np.all(np.abs(beta - before) <= (_CLOSE if convex else _EXACT) * np.abs(before)):
                 break
     return beta, inverse, logs
@@ -382,7 +403,7 @@ def fit_balance(blocks: BalanceBlocks, *, metres: bool = True, geometry: Geometr
             return fit
         steady = _slipping(_fitted(blocks.with_slopes(), metres, geometry))
         return fit if _scatter(steady) > _SCATTERS * _scatter(fit) else steady
-    if fit.unequal or not loaded(blocks):
+    if (fit.unequal and not geometry.area_stated) or not loaded(blocks):
         return fit
     steady = _slipping(_fitted(blocks.whole(), metres, geometry, whole=True))
     if not _scatter(steady) < _CALMER * _scatter(fit):
