@@ -315,9 +315,11 @@ def test_a_machine_of_another_kind_is_not_judged(detector: PressureModel, sound:
 def test_a_rise_that_a_closer_look_does_not_confirm_is_no_leak(
     detector: PressureModel, worn: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its blocks linearised with a leak allowed, such a record shows none: the flow is not above zero."""
+    """Its blocks linearised with a leak allowed, such a record shows none: no law's flow is above zero."""
     assert detector.examine(worn, (), P).verdict == "leak"
-    monkeypatch.setattr("sealscope.diagnosis.pressure_model.detector._flow", lambda *_: (-0.0015, (0.0, 0.0010), ""))
+    monkeypatch.setattr(
+        "sealscope.diagnosis.pressure_model.detector._flow", lambda *_: (0.0005, (0.0, 0.0010), "", False)
+    )
     evidence = detector.examine(worn, (), P)
     assert evidence.verdict == "cannot tell"
     assert evidence.reason.endswith("but followed with a leak from then on, the record shows none")

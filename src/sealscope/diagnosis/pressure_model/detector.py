@@ -96,11 +96,11 @@ class PressureModel:
         """Return the evidence of a rise of G within the recording, and of its level against the baseline's."""
         followed = self.follow(recording)
         if isinstance(followed, str):
-            return Evidence("cannot tell", followed)
+            return _under_force(Evidence("cannot tell", followed), recording)
         probability = share_of_each(false_alarm_probability, baseline)
         unsure = _GIVES_WAY if self.rig.valve.spool == "present" else 0.0
         within = _within(followed, recording, probability, unsure)
-        within = replace(within, share=followed.share)
+        within = _under_force(replace(within, share=followed.share), recording)
         if not self.states_flow and within.verdict == "leak":
             within = without_flow(within, NO_RIG)
         if not baseline or within.score is None:
@@ -159,6 +159,21 @@ class PressureModel:
             return follow(self.rig, recording, cycle)
 
 
+def _under_force(evidence: Evidence, recording: Recording) -> Evidence:
+    """Return the evidence, a force that swings named where the record cannot be followed under it."""
+    from sealscope.diagnosis.pressure_model.load import SWINGS, swing
+
+    share = swing(recording["p_A"] - recording["p_B"], recording.rate, find_cycle(recording))
+    if evidence.verdict != "cannot tell" or share < SWINGS:
+        return evidence
+    part = Evidence("cannot tell", "", share, SWINGS, detector="force that swings")
+    return replace(
+        evidence,
+        reason=f"{evidence.reason}; a force swings: the mean of p_A - p_B over a cycle deviates by {share:.0%} of it",
+        parts=(*evidence.parts, part),
+    )
+
+
 def _comparable(followed: Followed, other: Followed) -> bool:
     """Return whether another record has the same command, and the model follows it."""
     return 1.0 / _ALIKE < other.command_rms / followed.command_rms < _ALIKE and is_followed(other)
@@ -179,8 +194,11 @@ def _mean_drop(recording: Recording) -> float:
 
 def _flow(
     followed: Followed, recording: Recording, after: int, onset: float, scatter: float, unsure: float
-) -> tuple[float, tuple[float, float], str]:
+) -> tuple[float, tuple[float, float], str, bool]:
     """Return the mean flow [L/min] of a rise after a block, its 95 % interval, and the law in words where it is known.
+
+    Last, whether a leak of either law is above zero by itself: blocks that the model follows badly may rise together,
+    and the record followed with a leak from then on shows none.
 
     Where several laws explain the record, the flow is the mean of theirs and the interval holds what any says.
     `scatter` of the blocks over their stated deviation; `unsure` [m^3/(s Pa)]: deviation of G that no scatter shows.
@@ -208,6 +226,7 @@ def _flow(
         float(np.mean([lpm for lpm, *_ in stated])),
         (min(low for _, low, _ in stated), max(high for *_, high in stated)),
         law,
+        any(leak.size > 1.96 * scatter * leak.deviation for leak in likely),
     )
 
 
@@ -262,12 +281,12 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
         interval = float(edges[inner.start + near[0]]), float(edges[min(inner.start + near[-1] + 2, edges.size - 1)])
     else:
         interval = begin + large.limits[0] / recording.rate, begin + large.limits[1] / recording.rate
-    lpm, limits, law = _flow(followed, recording, inner.start + best, onset, scatter, unsure)
+    lpm, limits, law, leaks = _flow(followed, recording, inner.start + best, onset, scatter, unsure)
     estimate, low, high = (np.where(edges[:-1] < onset, 0.0, value) for value in (lpm, *limits))
     course = LeakCourse(0.5 * (edges[:-1] + edges[1:]), estimate, low, high)
     reason = f"the leakage conductance past piston or pump rose at {onset:.1f} s{law} ({figures})"
     sized = large is None or large.sized
-    if cause is not None or followed.another or (sized and lpm <= 0.0):
+    if cause is not None or followed.another or (sized and not leaks):
         why = {
             "friction change": "the friction changed more than it does in a healthy machine",
             "air in the oil": "the oil's stiffness changed more than it does in a healthy machine",

@@ -118,6 +118,7 @@ class Window:
     def runs(self, thetas: Array) -> Array:
         """Return what the model shows in the window for parameter sets (runs, 13), as `slow` leaves it."""
         start = np.zeros((len(thetas), STATES))
+        start[:, 0] = self.model.carried[0]
         start[:, 4] = self.integral * thetas[:, GAIN]
         start[:, 2] = 0.9 * self.model.u[0] * thetas[:, GAIN]
         start[:, 1] = self.model.piston_speed(start[:, 2])
@@ -137,6 +138,7 @@ def noise_variance(dp: Array) -> float:
 def window_at(model: DrivenModel, dp: Array, theta: Array, first: int, length: int) -> Window:
     """Return the window of `length` samples from `first` on; the model comes to it with parameters `theta` (13,)."""
     state = np.zeros((1, STATES))
+    state[:, 0] = model.carried[0]
     if first > 0:
         model.coarse(theta).part(0, first).run(theta[None], start=state)
     integral = float(state[0, _INTEGRAL] / theta[GAIN])

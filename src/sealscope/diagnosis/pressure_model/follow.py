@@ -26,6 +26,7 @@ from sealscope.diagnosis.pressure_model.fit import (
 )
 from sealscope.diagnosis.pressure_model.interference import advanced, lines_in, skew
 from sealscope.diagnosis.pressure_model.large import WORSE, LargeLeak, large_leak
+from sealscope.diagnosis.pressure_model.load import carried_by_load
 from sealscope.diagnosis.pressure_model.model import (
     F_C,
     F_V,
@@ -52,8 +53,9 @@ from sealscope.recordings.recording import Array, Recording
 
 #: The model must explain this share of the pressure difference's variance, in so many blocks or more.
 EXPLAINED, FEWEST_BLOCKS = 0.9, 12
-#: Blocks are whole cycles of at least so long [s]; what comes before is left out: the start from rest.
-BLOCK, FIRST = 6.0, 3.0
+#: Blocks are whole cycles of at least so long [s], or of so long where these are too few; what comes before is left
+#: out: the start from rest.
+BLOCK, SHORTER, FIRST = 6.0, 4.9, 3.0
 #: The window begins at this share of the record: what a start leaves behind has decayed there.
 _WINDOW_AT = 0.55
 _EARLY = 4
@@ -142,7 +144,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
     dp = raw = dp * (1.0 if _same_sense(u, dp) else -1.0)
     centre = nominal(rig)
     centre[G] = max(centre[G], USUAL_G)
-    model = plain = DrivenModel.of(u, rate, numbers, p_A + p_B)
+    carried = None if numbers.valved or cycle is None else carried_by_load(u, dp, rate, cycle)
+    model = plain = DrivenModel.of(u, rate, numbers, p_A + p_B, carried)
     span = BLOCK if cycle is None else cycle
     if model.numbers.valved and (at := stalled(dp, model.supply, rate)) is not None:
         return (
@@ -164,7 +167,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
         dp = dp - hum
         long, short = _windows(model, dp, theta, span)
         theta, cost = refit(long, theta, prior)
-    length = max(1, int(np.ceil(BLOCK / span - 1e-9))) * span
+    lengths = [max(1, int(np.ceil(least / span - 1e-9))) * span for least in (BLOCK, SHORTER)]
+    length = lengths[dp.size / rate - FIRST < FEWEST_BLOCKS * lengths[0]]
     edges = np.round(np.arange(FIRST, dp.size / rate, length) * rate).astype(np.int64)
     seen = ~touched(recording, edges)
     share = float(np.mean(seen)) if seen.size else 0.0
@@ -278,7 +282,7 @@ def _tracked(
         )
     except FloatingPointError:
         return DIVERGED
-    explained = 1.0 - followed.variance / float(np.var(dp))
+    explained = 1.0 - followed.variance / float(np.var(dp - model.carried))
     if not explained >= EXPLAINED:
         return (
             f"the model of the rig explains {100.0 * explained:.0f} % of the pressure difference, "
@@ -328,12 +332,13 @@ def _friction(theta: Array, model: DrivenModel, speed: float) -> float:
 def _starts(model: DrivenModel, theta: Array) -> list[Array]:
     """Return the states (5,) that the record may begin with: at rest, or in motion where the command is not at zero."""
     rest = np.zeros(STATES)
+    rest[0] = model.carried[0]
     u, slope = (model.inputs[: -1 : 2 * model.every, column] for column in (0, 1))
     if abs(u[0]) <= 0.02 * float(np.max(np.abs(model.u))) and abs(slope[0]) > 0.0:
         return [rest]
     n = model.samples
     apart = np.abs(u - u[0]) / np.std(u) + np.abs(slope - slope[0]) / np.std(slope)
     same = n // 2 + int(np.argmin(apart[n // 2 :]))
-    state = np.zeros((1, STATES))
+    state = rest[None].copy()
     model.part(0, same).run(theta[None], start=state)
     return [rest, state[0]]

@@ -119,7 +119,8 @@ def reduced_rates(
 ) -> State:
     """Return dy/dt of y = (dp, v, omega, i, I) under the command u [V], `stiffness` [Pa] and `coulomb` friction [N].
 
-    Behind a servo valve y is that of `rates_behind_a_valve`, whose arguments `aside` and `supply` are.
+    Behind a servo valve y is that of `rates_behind_a_valve`, whose arguments `aside` and `supply` are; else `supply` is
+    the load on the piston [N].
     """
     dp, v, omega, i, integral = y
     friction = stribeck_friction(v, coulomb, theta[K_BRK], theta[C_C], theta[F_V], m.v_th, False)
@@ -131,7 +132,7 @@ def reduced_rates(
     voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
     return (
         2.0 * pressure_rate(pump_flow(omega, dp, m.q_b, 0.0) - past, m.V, stiffness),
-        piston_acceleration(0.5 * dp, -0.5 * dp, friction, 0.0, 0.0, m.A_A, m.A_A, m.M_eq),
+        piston_acceleration(0.5 * dp, -0.5 * dp, friction, supply, 0.0, m.A_A, m.A_A, m.M_eq),
         shaft_acceleration(i, omega, pump_torque(dp, m.q_b), m.C_m, m.B_M, m.J_M),
         winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
         error,
@@ -171,7 +172,8 @@ def pressure_differences(
 
     `theta`, `state` and `out` are in single precision for RUNS lanes, or doubles for half as many. The method is RK4 in
     steps of h [s], `every` to a sample. `inputs`: (2 every n + 1, 5) at every half step: command [V], its derivative
-    [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa], a servo valve's supply [Pa]; `theta`:
+    [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa], a servo valve's supply [Pa] or, without one,
+    the load [N]; `theta`:
     (segments, 13, lanes) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, lanes) at the first
     sample, in place.
     """
@@ -231,19 +233,24 @@ class DrivenModel:
     numbers: RigNumbers
 
     @staticmethod
-    def of(u: Array, rate: float, numbers: RigNumbers, pressures: Array | None = None) -> DrivenModel:
+    def of(
+        u: Array, rate: float, numbers: RigNumbers, pressures: Array | None = None, carried: Array | None = None
+    ) -> DrivenModel:
         """Return the model under a command (n,) [V], with the piston in mid-stroke.
 
-        The command ramps from one sample to the next. `pressures` (n,): p_A + p_B [Pa], constant by default.
+        The command ramps from one sample to the next. `pressures` (n,): p_A + p_B [Pa], constant by default; `carried`
+        (n,): the part of p_A - p_B that carries a load [Pa], none by default.
         """
         every = int(np.ceil(1.0 / rate / LONGEST_STEP))
         n, h = u.size, 1.0 / rate / every
         fine = finer(u, 2 * every)
         lift = np.zeros(n) if pressures is None else smoothed(pressures, rate)
         lift = finer(lift, 2 * every)
-        supply = np.full(n, numbers.p_set)
-        if numbers.valved and pressures is not None:
-            supply = supply_of(smoothed(pressures, rate, SUPPLY_WIDTH), numbers)
+        supply = np.zeros(n) if carried is None else numbers.A_A * carried
+        if numbers.valved:
+            supply = np.full(n, numbers.p_set)
+            if pressures is not None:
+                supply = supply_of(smoothed(pressures, rate, SUPPLY_WIDTH), numbers)
         inputs = np.column_stack(
             [fine, np.gradient(fine, 0.5 * h), np.zeros(fine.size), lift - lift.mean(), finer(supply, 2 * every)]
         )
@@ -291,6 +298,11 @@ class DrivenModel:
         """Pressure between a servo valve's supply and return (n,) [Pa], at the samples."""
         return self.inputs[: -1 : 2 * self.every, 4]
 
+    @property
+    def carried(self) -> Array:
+        """The part of p_A - p_B that carries a load (n,) [Pa], at the samples."""
+        return np.zeros(self.samples) if self.numbers.valved else self.supply / self.numbers.A_A
+
     @cached_property
     def _halved(self) -> DrivenModel:
         return replace(self, inputs=np.ascontiguousarray(self.inputs[::2]), h=2.0 * self.h, every=self.every // 2)
@@ -330,7 +342,7 @@ class DrivenModel:
         """Return dp [Pa], or v [m/s] if `speeds`, (runs, n) of parameter sets `thetas`.
 
         `thetas` (runs, 13), or (runs, segments, 13) with `segment` (n,), which of them holds at a sample; `start`
-        (runs, 5): the state at the first sample, at rest by default, which becomes the last.
+        (runs, 5): the state at the first sample, at rest under the load by default, which becomes the last.
         """
         sets = thetas[:, None, :] if thetas.ndim == 2 else thetas
         runs, n = len(sets), self.samples
@@ -340,6 +352,7 @@ class DrivenModel:
             lanes = np.minimum(np.arange(first, first + RUNS), runs - 1)
             table = np.ascontiguousarray(np.moveaxis(sets[lanes], 0, -1), dtype=np.float32)
             state = np.zeros((STATES, RUNS), dtype=np.float32)
+            state[0] = self.carried[:1]
             if start is not None:
                 state[:] = start[lanes].T
             out = np.empty((n, RUNS), dtype=np.float32)
