@@ -36,8 +36,8 @@ _PROBABILITIES = (1e-4, 0.2)
 WHOLE = 0.95
 #: Detectors that name a cause by the pressures: they do so of nothing that another cause explains, alone either.
 _ISOLATED = ("pressure model", "observer")
-#: Why the change of RMS alone does not call a valve-controlled machine sound.
-_DAMPED = "behind a servo valve, whose edges damp the ringing as well, that shows few leaks"
+#: Why the change of RMS alone judges no valve-controlled machine.
+_DAMPED = "behind a servo valve, whose edges damp the ringing as well, that tells no leak from a sound machine"
 
 
 def check_probability(probability: float) -> None:
@@ -140,8 +140,11 @@ class Examination:
                 evidence = replace(evidence, reason=f"{evidence.reason}; {self.no_baseline}")
             else:
                 evidence = replace(evidence, verdict="cannot tell", reason=self.no_baseline)
-        if self._behind_valve and name == ORDER[-1] and evidence.verdict == "no leak":
-            evidence = replace(evidence, verdict="cannot tell", reason=f"{evidence.reason}; {_DAMPED}")
+        if self._behind_valve and name == ORDER[-1] and evidence.verdict != "cannot tell":
+            reason = f"{evidence.reason}; {_DAMPED}"
+            evidence = replace(
+                evidence, verdict="cannot tell", reason=reason, cause=None, onset_s=None, onset_interval_s=None
+            )
         return self._isolated(evidence) if name in _ISOLATED else evidence
 
     def _with_share(self, evidence: Evidence) -> Evidence:
