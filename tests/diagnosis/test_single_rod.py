@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from sealscope.diagnosis.volume_balance.blocks import I_AB, STORED_X_A, balance_
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.parameters.new_rig import rig_text
+from sealscope.simulation.bench.machines import draw
+from sealscope.simulation.courses import command_or_target
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import Run, simulate_with_truth
 
@@ -134,6 +137,27 @@ def test_where_the_circuit_swings_between_its_valves_a_leak_is_seen_and_not_size
     assert evidence.leak_lpm is None and evidence.relative is None and evidence.ratio is None
     assert "leak_lpm" in evidence.refuses
     assert "the higher pressure changes sides" in evidence.reason
+
+
+@pytest.mark.parametrize(
+    ("machine", "noise", "leak"),
+    [
+        (6388249294222089364, 6061251898084139105, ""),
+        (7002016117366985403, 1949227791346030499, "0.05 L/min from 60 s"),
+    ],
+)
+def test_rests_of_which_only_some_are_passed_over_look_like_no_leak(machine: int, noise: int, leak: str) -> None:
+    """What the pump turns in a rest makes good the rest's leakage, which is in no integral: a sound machine leaked."""
+    drawn = draw("single-rod", machine, rig="single-rod-eha", duration=120.0)
+    target = command_or_target("position trapezoid 30 mm within 1.2 s every 5.5 s")
+    leaks = {"leak": leak} if leak else {}
+    run = simulate_with_truth(replace(drawn, command=target, controller="pi").experiment(seed=noise, **leaks))
+    evidence = VolumeBalance(load_rig("single-rod-eha")).examine(run.recording, [], P)
+    if not leak:
+        assert evidence.verdict == "no leak", evidence.reason
+        return
+    assert (evidence.verdict, evidence.cause) == ("leak", "piston or pump leak")
+    assert evidence.leak_lpm == pytest.approx(run.truth.mean_leak_lpm, rel=0.1)
 
 
 def test_slopes_that_are_kept_are_those_that_were_taken() -> None:

@@ -333,7 +333,8 @@ def _passed_over(
 ) -> tuple[Array, Array, dict[str, Array]]:
     """Return times, times without what is passed over, and samples, of those in motion alone.
 
-    What the pump delivers against a stop does not count.
+    What the pump delivers against a stop does not count, nor what makes good the leakage of a rest, which is in no
+    integral: where only some rests of a record are passed over, it looked like a leak.
     """
     kept = np.flatnonzero(moving)
     steps = np.diff(t[kept], prepend=t[kept[:1]])
@@ -341,7 +342,7 @@ def _passed_over(
     rest = {name: np.asarray(values, dtype=np.float64) for name, values in samples.items()}
     if "theta" in rest:
         turns = np.diff(rest["theta"], prepend=rest["theta"][0])
-        rest["theta"] = np.cumsum(np.where(stopped, 0.0, turns))
+        rest["theta"] = np.cumsum(np.where(moving, turns, 0.0))
     return t[kept], np.cumsum(steps), {name: values[kept] for name, values in rest.items()}
 
 

@@ -159,6 +159,7 @@ def judge(
             risen = samples.dated(fit, risen)
         pressed = samples.pressed(risen.onset) if samples is not None and risen.rise == 0.0 else None
         leak = describe_leak(fit, risen, probability, pressed)
+        leak = leak if window else _above_zero(leak)
         return _measured(replace(leak, passage=passage(fit, None, healthy)), fit)
     if window:
         return no_step(fit, step, None, 0.0)
@@ -167,6 +168,28 @@ def judge(
     course = _whole_course(fit) if states_flow(fit) else None
     evidence = replace(evidence, passage=passage(fit, smallest, healthy), refuses=_refused(fit), course=course)
     return _measured(_from_the_start(evidence, fit, probability), fit)
+
+
+def _above_zero(leak: Evidence) -> Evidence:
+    """Return the evidence of a leak, `cannot tell` where by its own interval there may be none.
+
+    A step that rises over several blocks, where the laws of a leak differ much, is often a circuit that settles.
+    """
+    if leak.verdict != "leak" or leak.leak_interval_lpm is None or leak.leak_interval_lpm[0] > 0.0:
+        return leak
+    reason = f"{leak.reason}; by the other law of a leak there may be none"
+    return replace(
+        leak,
+        verdict="cannot tell",
+        reason=reason,
+        cause=None,
+        onset_s=None,
+        onset_interval_s=None,
+        leak_lpm=None,
+        leak_interval_lpm=None,
+        course=None,
+        relative=None,
+    )
 
 
 def _risen(fit: BalanceFit, step: DriftStep, probability: float) -> DriftStep | None:
