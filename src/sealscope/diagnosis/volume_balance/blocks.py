@@ -329,7 +329,7 @@ def _shown(columns: Array, beyond: _Beyond) -> _Beyond:
 
 
 def _passed_over(
-    t: Array, samples: Mapping[str, Array], moving: NDArray[np.bool_], stopped: NDArray[np.bool_], rate: float
+    t: Array, samples: Mapping[str, Array], moving: NDArray[np.bool_], rate: float
 ) -> tuple[Array, Array, dict[str, Array]]:
     """Return times, times without what is passed over, and samples, of those in motion alone.
 
@@ -382,9 +382,9 @@ def cut_blocks(t: Array, samples: Mapping[str, Array], length: int, rate: float,
     elapsed, everything = t, samples
     motion = in_motion(samples, rate) if t.size > length else None
     if motion is not None:
-        moving, stopped = motion
+        moving, _ = motion
         length = max(_FEWEST_SAMPLES, round(length * float(np.mean(moving))))
-        t, elapsed, samples = _passed_over(t, samples, moving, stopped, rate)
+        t, elapsed, samples = _passed_over(t, samples, moving, rate)
     count = t.size // length
 
     def rows(values: Array) -> Array:
