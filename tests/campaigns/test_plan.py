@@ -24,7 +24,7 @@ DRAWN = {
     "bench-detectors": "c14436aede0a4bfe",
     "bench-faults": "fe66e262367aaedd",
     "bench-load": "8f873b29dd0e4b27",
-    "bench-load-development": "e4d8a6226d020574",
+    "bench-load-development": "595e7d8221f0a427",
     "bench-pressures": "a725a60b2a529fb9",
     "bench-quick": "5e2c6ad77f0da6f0",
     "bench-single-rod": "7ed0e63b533648d9",
