@@ -305,7 +305,8 @@ def _steady_flow(gram: Array) -> float:
     """Return the deviation of the steady flow that zeros of the transducers make of what leaks [m^3/s]."""
     flows = gram[:, TIME] / gram[:, TIME, TIME, None]
     lost = float(np.median(np.abs(flows[:, Y] - flows[:, THETA])))
-    return lost * _ZERO / float(np.median(np.abs(flows[:, I_AB])))
+    # exact data of a machine that leaks nothing leave none: then its square is above zero all the same
+    return max(lost * _ZERO / float(np.median(np.abs(flows[:, I_AB]))), 1e-30)
 
 
 def _reweighted(
