@@ -207,7 +207,8 @@ def test_hostile_messages_are_counted_and_change_no_row(tmp_path: Path, count: i
     assert len(passed_over) < 20
     before, after = wire.memory
     print(f"{count} messages: {(after - before) / 1e6:.1f} MB more after four fifths of them")
-    assert after - before < 30_000_000 or count < 10_000  # a brief run does not come to rest
+    # a kilobyte kept of each would be 100 MB; a brief run does not come to rest, nor a process that ran other tests
+    assert after - before < 60_000_000 or count < 10_000
     ours, theirs = rows_of(service.settings.database), rows_of(str(plain / "monitor.db"))
     for table, rows in theirs.items():
         assert [row for row in ours[table] if "press 3" not in row] == rows, table
