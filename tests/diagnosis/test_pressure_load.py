@@ -37,7 +37,7 @@ def test_a_force_that_swings_is_told_from_friction(stroke: float, share: float, 
     carried = carried_by_load(u, dp, RATE, 1.004 * 2.0 * np.pi / stroke)
     assert carried is not None
     inner = slice(int(4 * RATE), int(-4 * RATE))
-    assert np.sqrt(np.mean((carried - force)[inner] ** 2)) < 0.03 * size + 8e3
+    assert np.sqrt(np.mean((carried - force)[inner] ** 2)) < 0.015 * size + 4e3
 
 
 @pytest.mark.parametrize("stroke", [1.5, 2.7, 4.0])
@@ -67,10 +67,16 @@ def test_under_a_force_that_swings_a_leak_is_found_from_pressures() -> None:
     assert found.leak_interval_lpm[0] < 0.0042 < found.leak_interval_lpm[1]
 
 
-def test_a_force_too_large_to_follow_is_named_and_no_smaller_method_calls_the_machine_sound() -> None:
-    judged = diagnose(recorded("position 40 mm sin(1.57t)", "1 kN sin(0.3t)"), rig=RIG)
+def test_a_large_force_is_followed() -> None:
+    """Friction was fitted beside a force that leaked into its harmonics, and the record was not followed."""
+    judged = PressureModel(RIG).examine(recorded("position 40 mm sin(1.57t)", "1 kN sin(0.3t)"), [], 0.01)
+    assert judged.verdict == "no leak", judged.reason
+
+
+def test_a_force_too_quick_to_follow_is_named_and_no_smaller_method_calls_the_machine_sound() -> None:
+    judged = diagnose(recorded("position 40 mm sin(1.57t)", "1 kN sin(1.1t)"), rig=RIG)
     assert judged.verdict == "cannot tell"
-    assert "a force swings: the mean of p_A - p_B over a cycle deviates by 9" in judged.reason
+    assert "a force swings: the mean of p_A - p_B over a cycle deviates by 36% of it" in judged.reason
 
 
 def test_cycles_of_five_seconds_are_whole_blocks_each() -> None:

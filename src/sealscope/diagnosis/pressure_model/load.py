@@ -1,9 +1,9 @@
 """A force that swings, from what of the pressure difference neither repeats with the strokes nor rings.
 
 Friction reverses with the piston and repeats with the duty; a force that swings, or comes and goes at a rate of its
-own, does not. What both leave is told apart in turn: harmonics of the duty's cycle, fitted to the pressure difference
-less the force's part, and that part, the slow remainder of what they leave. A steady force is left alone: it makes a
-mean, which the fit takes out.
+own, does not. So harmonics of the duty's cycle are fitted to the pressure difference, and the slow remainder is the
+force's part. The fit is weighted by a Hann window, under which neither a mean nor a rate a few lines away leaks into
+the harmonics. A steady force is left alone: it makes a mean, which the fit takes out.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from sealscope.recordings.recording import Array
 #: 0.03 at most under a duty that repeats, 0.07 under sines that beat.
 SWINGS = 0.2
 #: Its part is slower than a Gaussian of this width [s] leaves; harmonics are taken to this frequency [Hz], on means
-#: over so long [s]; rounds in which both are told apart.
-_WIDTH, _HIGHEST, _MEANS, _ROUNDS = 0.08, 5.0, 0.02, 8
+#: over so long [s].
+_WIDTH, _HIGHEST, _MEANS = 0.08, 5.0, 0.02
 #: Fewest cycles.
 _CYCLES = 4
 
@@ -46,10 +46,9 @@ def carried_by_load(u: Array, dp: Array, rate: float, cycle: float | None) -> Ar
     orders = np.arange(1, max(2, int(_HIGHEST * cycle)))
     angles = 2.0 * np.pi * _frequency(command, t, cycle) * t[:, None] * orders
     columns = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
-    fitting = np.linalg.pinv(columns.T @ columns, hermitian=True) @ columns.T
-    load = np.zeros(count)
-    for _ in range(_ROUNDS):
-        load = smoothed(slow - columns @ (fitting @ (slow - load)), rate / stride, _WIDTH)
+    weighted = columns.T * np.hanning(count + 2)[1:-1]
+    repeated = columns @ (np.linalg.pinv(weighted @ columns, hermitian=True) @ (weighted @ slow))
+    load = smoothed(slow - repeated, rate / stride, _WIDTH)
     return np.interp(np.arange(dp.size) / rate, t, load)
 
 
