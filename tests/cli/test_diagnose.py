@@ -108,20 +108,9 @@ def test_text_says_the_same(call, recordings):
     assert any(line.startswith("  since") for line in lines)
 
 
-def to_digits(value, digits=6):
-    """Return JSON with numbers to so many digits: where memory lies decides the last bits of a sum of products."""
-    if isinstance(value, dict):
-        return {name: to_digits(each, digits) for name, each in value.items()}
-    if isinstance(value, list):
-        return [to_digits(each, digits) for each in value]
-    return f"{value:.{digits}g}" if isinstance(value, float) else value
-
-
 def test_a_process_of_its_own_prints_the_same(shell, call, recordings):
     words = ("diagnose", recordings / "leak.nc", "--format", "jsonl")
-    own, here = shell("sealscope", *words), call(*words)
-    assert (own.status, own.err) == (here.status, here.err)
-    assert to_digits(own.objects) == to_digits(here.objects)
+    assert shell("sealscope", *words) == call(*words)
 
 
 @pytest.mark.usefixtures("two_methods")

@@ -8,6 +8,8 @@ from __future__ import annotations
 import io
 import json
 import os
+import subprocess
+import sys
 import threading
 import time
 import urllib.request
@@ -167,10 +169,23 @@ def _eventually(true: Callable[[], bool], seconds: float) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
-@pytest.mark.parametrize(
-    ("count", "largest"), [(800, 2), pytest.param(100_000, 12, marks=[pytest.mark.slow])], ids=["share", "all"]
-)
-def test_hostile_messages_are_counted_and_change_no_row(tmp_path: Path, count: int, largest: int):
+def test_hostile_messages_are_counted_and_change_no_row(tmp_path: Path):
+    flooded(tmp_path, 800, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
+def test_a_hundred_thousand_hostile_messages_leave_no_memory_behind(tmp_path: Path):
+    """In a process of its own: what other tests leave to be freed is not the service's."""
+    call = (
+        f"from tests.monitor.test_hostile_service import flooded, Path; flooded(Path({str(tmp_path)!r}), 100_000, 12)"
+    )
+    done = subprocess.run([sys.executable, "-c", call], cwd=Path(__file__).parents[2], timeout=1500.0, check=False)
+    assert done.returncode == 0
+
+
+def flooded(tmp_path: Path, count: int, largest: int) -> None:
+    """Serve `count` hostile messages, `largest` of them oversized, and judge what is counted, stored and kept."""
     plain = tmp_path / "plain"
     plain.mkdir()
     served(settings_in(plain), LINES)
@@ -207,8 +222,7 @@ def test_hostile_messages_are_counted_and_change_no_row(tmp_path: Path, count: i
     assert len(passed_over) < 20
     before, after = wire.memory
     print(f"{count} messages: {(after - before) / 1e6:.1f} MB more after four fifths of them")
-    # a kilobyte kept of each would be 100 MB; a brief run does not come to rest, nor a process that ran other tests
-    assert after - before < 60_000_000 or count < 10_000
+    assert after - before < 30_000_000 or count < 10_000  # a brief run does not come to rest
     ours, theirs = rows_of(service.settings.database), rows_of(str(plain / "monitor.db"))
     for table, rows in theirs.items():
         assert [row for row in ours[table] if "press 3" not in row] == rows, table
