@@ -11,7 +11,7 @@ from sealscope.campaigns.cases.bound import _opened, change_bound
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.work import work
-from sealscope.campaigns.plans.reader import load_plan
+from sealscope.campaigns.plans.reader import load_plan, plan_names
 from sealscope.control import Flatness
 from sealscope.errors import InputError
 from sealscope.simulation.bench.machines import draw
@@ -101,12 +101,13 @@ def test_a_controller_of_ones_own_is_part_of_the_case(tmp_path):
 
 @pytest.mark.parametrize("name", PROFILES)
 def test_each_family_is_either_for_development_or_held_back(name):
-    halves = [load_plan(f"bench-{name}{half}") for half in ("-development", "")]
-    families = [plan.factors["family"] for plan in halves]
-    assert not set(families[0]) & set(families[1])
-    assert {*families[0], *families[1]} == {family.name for family in load_profile(name).families}
-    assert not {case.machine_seed for case in cases_of(halves[0])} & {case.machine_seed for case in cases_of(halves[1])}
-    for plan in halves:
+    plans = [load_plan(each) for each in plan_names() if each.startswith(f"bench-{name}")]
+    assert {plan.name for plan in plans if plan.part != "development"} == {f"bench-{name}"}
+    families = [family for plan in plans for family in plan.factors["family"]]
+    assert sorted(families) == sorted(family.name for family in load_profile(name).families)
+    seeds = [{case.machine_seed for case in cases_of(plan)} for plan in plans]
+    assert len(set().union(*seeds)) == sum(map(len, seeds))
+    for plan in plans:
         assert sum(group.count for group in plan.records if not (group.leak_lpm or group.fault)) >= 400
         for case in cases_of(plan)[:6]:
             experiment_of(plan, case)
