@@ -228,7 +228,7 @@ def test_under_a_load_a_leak_is_a_steady_flow(
 def test_a_weight_that_is_held_shows_what_pump_and_piston_pass(seed: int) -> None:
     """Held, the pressure difference is one constant, and a steady flow beside it took any share of what leaks.
 
-    What zeros of the transducers make of the leakage bounds that flow; levels were -3 to 9 times the truth.
+    What zeros of the transducers make of the leakage bounds that flow; levels were -13 to 9 times the truth.
     """
     drawn = draw("load", seed, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
     balance = VolumeBalance(load_rig("thesis-closed-loop"))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.baseline.level import Level
-from sealscope.diagnosis.pressure_model.behind_valve import loaded, stalled
+from sealscope.diagnosis.pressure_model.behind_valve import STANDING, stalled, standing_load
 from sealscope.diagnosis.pressure_model.fit import (
     LONG_WINDOW,
     PRIOR,
@@ -152,7 +152,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
             f"p_A - p_B takes nearly all of the supply's pressure at {recording.t[at]:.1f} s: the piston is at an end "
             "of its stroke there, or a load holds it"
         )
-    if model.numbers.valved and (ratio := loaded(dp)) > 1.0:
+    if model.numbers.valved and (ratio := standing_load(dp)) > STANDING:
         return (
             f"a load stands on the piston: the mean of p_A - p_B is {ratio:.2g} times its deviation, and what a servo "
             "valve's edges pass under it rises as a leak does"

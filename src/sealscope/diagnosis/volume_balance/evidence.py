@@ -179,17 +179,12 @@ def _above_zero(leak: Evidence) -> Evidence:
         return leak
     reason = f"{leak.reason}; by the other law of a leak there may be none"
     return replace(
-        leak,
-        verdict="cannot tell",
-        reason=reason,
-        cause=None,
-        onset_s=None,
-        onset_interval_s=None,
-        leak_lpm=None,
-        leak_interval_lpm=None,
-        course=None,
-        relative=None,
+        _unsized(leak), verdict="cannot tell", reason=reason, cause=None, onset_s=None, onset_interval_s=None
     )
+
+
+def _unsized(evidence: Evidence) -> Evidence:
+    return replace(evidence, leak_lpm=None, leak_interval_lpm=None, course=None, relative=None)
 
 
 def _risen(fit: BalanceFit, step: DriftStep, probability: float) -> DriftStep | None:
@@ -569,9 +564,7 @@ def describe_leak(
         chance=step.chance,
         relative=relative,
     )
-    if evidence.verdict == "leak":
-        return evidence
-    return replace(evidence, leak_lpm=None, leak_interval_lpm=None, course=None, relative=None)
+    return evidence if evidence.verdict == "leak" else _unsized(evidence)
 
 
 def _reverses(fit: BalanceFit) -> bool:
