@@ -174,9 +174,7 @@ class DriftFamily:
             units(self.shapes) @ whiten,
             units(warm) @ whiten,
             units(np.eye(self.n)) @ whiten,
-            np.asarray(
-                np.concatenate([np.linalg.qr(whiten @ pair.T)[0].T for pair in swings]) @ whiten, dtype=np.float64
-            ),
+            np.concatenate(np.linalg.qr(whiten @ swings.transpose(0, 2, 1))[0].transpose(0, 2, 1)) @ whiten,
             float(np.exp(log_det / self.freedom)),
             np.asarray(root, dtype=np.float64),
             drift,

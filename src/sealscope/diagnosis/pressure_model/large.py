@@ -67,8 +67,9 @@ _STIFFNESSES = (0.7, 0.85, 1.0, 1.2, 1.4)
 BETTER, WORSE = 8.0, -100.0
 #: The largest excess at which a leak is sized (a model that is off by some per cent misses more of a large leak than of
 #: what wanders), and the largest cost of a sample, over that before the leak. Beyond, the model is of another kind of
-#: machine: there a leak must be better by this share of what it explains.
-_LARGEST_EXCESS, _AS_BEFORE, _PLAIN = 4.0, 1.25, 0.1
+#: machine: there a leak must be better by this share of what it explains, and explain this share of what the sound
+#: machine misses (0.19 and more of leaks of 0.05 to 0.5 L/min, 0.065 at most where friction sticks and nothing leaks).
+_LARGEST_EXCESS, _AS_BEFORE, _PLAIN, _MUCH = 4.0, 1.25, 0.1, 0.12
 #: Least z, also over the root of the excess: a leak that linear blocks do not reach is at least as clear as those that
 #: they do.
 _CLEAR, _CLEAR_OF_SCATTER = 10.0, 5.0
@@ -83,8 +84,8 @@ class LargeLeak:
     `theta` (13,): the sound machine; `track`; `steps` beside the leak; `leaks` by either law and by both, the likelier
     first; `z` of the leak; `better`: cost of another machine less that of the leak; `onset`, its `limits` [samples];
     `excess`: chi square a degree of freedom of what scatters beside the leak; `sized`: whether the model follows the
-    machine so well that the sizes of the leaks mean something; `explained`: as
-    `better`, to another machine with any drive.
+    machine so well that the sizes of the leaks mean something; `explained`: as `better`, to another machine with any
+    drive; `share` of the sound machine's cost that the leak explains.
     """
 
     theta: Array
@@ -98,11 +99,12 @@ class LargeLeak:
     excess: float
     sized: bool
     explained: float
+    share: float
 
     @property
     def stated(self) -> bool:
-        """Whether a leak is the better explanation: by little, or by much of what it explains where it is not sized."""
-        return self.better > (BETTER if self.sized else _PLAIN * self.z**2)
+        """Whether a leak is the better explanation: by little, or of much and by much of it where it is not sized."""
+        return self.better > BETTER if self.sized else self.better > _PLAIN * self.z**2 and self.share > _MUCH
 
 
 def large_leak(
@@ -162,7 +164,8 @@ def large_leak(
     likely, there, cost = looks[0]
     steps = steps_in(there, theta, speed, law=likely.law, beside=likely)
     excess = excess_of(steps)
-    z = float(np.sqrt(max(0.0, after.sound() - cost)))
+    sound = after.sound()
+    z = float(np.sqrt(max(0.0, sound - cost)))
     if not z > max(_CLEAR, _CLEAR_OF_SCATTER * float(np.sqrt(max(1.0, excess)))):
         return None
     another, any_drive = after.another()
@@ -183,6 +186,7 @@ def large_leak(
         excess,
         sized,
         any_drive - cost,
+        z**2 / sound,
     )
 
 

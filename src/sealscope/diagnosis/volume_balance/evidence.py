@@ -599,8 +599,9 @@ def _place(fit: BalanceFit, step: DriftStep, near: dict[str, float]) -> tuple[Ca
         return "external leak", (
             f"from then on the lower pressure falls, by {drop / 1e3:.2g} kPa so far: oil leaves to the outside"
         )
-    lost = _lost(fit.without_slopes, step)
-    steady = one_sided_share(fit.without_slopes, step) if lost > 0.0 else None
+    # under a load the steady flow of what swings alone is that of a leak inside; oil that leaves lowers the pressure
+    lost = 0.0 if fit.swinging is not None else _lost(fit, step)
+    steady = one_sided_share(fit, step) if lost > 0.0 else None
     if steady is not None and abs(steady[0] - 0.5) < 0.5 + 2.0 * steady[1]:
         cause, place = _between(near)
         return cause, f"{place}; under a load that never reverses, a leak to the outside would look alike"

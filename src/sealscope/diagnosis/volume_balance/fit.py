@@ -258,32 +258,48 @@ def _noise_of_integrals(blocks: BalanceBlocks) -> float:
     return float(_noise_of_integral(blocks, np.asarray(variance)))
 
 
-def _solve(rest: Array, shared: list[int], weight: Array, known: float = 0.0) -> tuple[Array, Array]:
-    """Return the coefficients (m,) of the shared columns, and their covariance over the residual's variance (m, m).
+def _solve(rest: Array, weight: Array, steady: int | None = None, known: float = 0.0) -> tuple[Array, Array]:
+    """Return the coefficients (m,) of the columns behind the first, and their covariance over the residual's variance.
 
-    `rest` (n, c, c): sums of products beyond the leak of each block; `weight` (n,) of the blocks; `known`: by how many
-    squares of the time the steady flow is known to be none.
+    `rest` (n, 1 + m, 1 + m): sums of products beyond the leak of each block, those of the volume displaced first;
+    `weight` (n,) of the blocks; `known`: by how many squares of the time, the column `steady`, the steady flow is known
+    to be none.
     """
-    total = np.tensordot(weight, rest, 1)
-    if known > 0.0:
-        total[TIME, TIME] += known
-    size = np.sqrt(np.maximum(np.diag(total)[shared], np.finfo(float).tiny))
-    scaled = total[np.ix_(shared, shared)] / np.outer(size, size)
-    inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) / np.outer(size, size)
-    return inverse @ total[shared, Y], inverse
+    total = (weight @ rest.reshape(len(rest), -1)).reshape(rest.shape[1:])
+    if steady is not None:
+        total[steady, steady] += known
+    size = np.sqrt(np.maximum(np.diag(total)[1:], np.finfo(float).tiny))
+    sizes = np.outer(size, size)
+    values, vectors = np.linalg.eigh(total[1:, 1:] / sizes)
+    clear = np.abs(values) > 1e-10 * np.max(np.abs(values))
+    inverse = (vectors[:, clear] / values[clear]) @ vectors[:, clear].T / sizes
+    return inverse @ total[1:, 0], inverse
 
 
-def _left(rest: Array, shared: list[int], beta: Array) -> Array:
-    """Return the sum of squares (n,) that the balance with coefficients `beta` leaves in each block."""
-    left = rest[:, Y, Y] - 2.0 * rest[:, Y][:, shared] @ beta
-    left += np.einsum("i,nij,j->n", beta, rest[:, shared][:, :, shared], beta)
+def _left(rest: Array, beta: Array) -> Array:
+    """Return the sum of squares (n,) that the balance with coefficients `beta` leaves in each block (`_solve`)."""
+    weights = np.concatenate([[1.0], -beta])
     # differences of large numbers: what is left is known to rounding only
-    return np.asarray(np.maximum(left, 1e-15 * rest[:, Y, Y]))
+    return np.asarray(np.maximum((rest @ weights) @ weights, 1e-15 * rest[:, 0, 0]))
+
+
+def _displaced(gram: Array, shared: list[int]) -> Array:
+    """Return the sums of products (n, 1 + m, 1 + m) of the volume displaced and of the shared columns."""
+    columns = [Y, *shared]
+    return np.ascontiguousarray(gram[:, columns][:, :, columns])
+
+
+def _usual(left: Array) -> float:
+    """Return the usual one of what is left in blocks (n,): a quantile."""
+    at = _USUAL * (left.size - 1)
+    low = int(at)
+    ordered = np.partition(left, (low, min(low + 1, left.size - 1)))
+    return float(ordered[low] + (at - low) * (ordered[min(low + 1, left.size - 1)] - ordered[low]))
 
 
 def _least(gram: Array, shared: list[int], beta: Array) -> float:
     """Return the usual sum of squares that the balance leaves in a block."""
-    return float(np.quantile(_left(_beyond(gram, I_AB), shared, beta), _USUAL))
+    return _usual(_left(_displaced(_beyond(gram, I_AB), shared), beta))
 
 
 def _geometry(gram: Array, shared: list[int]) -> tuple[Array, Array]:
@@ -294,9 +310,10 @@ def _geometry(gram: Array, shared: list[int]) -> tuple[Array, Array]:
     residual (iteratively reweighted least squares). Both laws are begun with, as most blocks may leak by either, and
     the fit of the higher likelihood is taken.
     """
-    laws = _beyond(gram, I_AB), _beyond(gram, I_ROOT)
-    steady = _steady_flow(gram) if TIME in shared else float("inf")
-    fits = [_reweighted(laws, first, shared, steady) for first in laws]
+    laws = _displaced(_beyond(gram, I_AB), shared), _displaced(_beyond(gram, I_ROOT), shared)
+    steady = 1 + shared.index(TIME) if TIME in shared else None
+    precision = 0.0 if steady is None else 1.0 / _INDEPENDENT / _steady_flow(gram) ** 2
+    fits = [_reweighted(laws, first, steady, precision) for first in laws]
     likeliest = min(fits, key=lambda fit: fit[2])
     return likeliest[:2]
 
@@ -310,27 +327,25 @@ def _steady_flow(gram: Array) -> float:
 
 
 def _reweighted(
-    laws: tuple[Array, Array], first: Array, shared: list[int], steady: float
+    laws: tuple[Array, Array], first: Array, steady: int | None, precision: float
 ) -> tuple[Array, Array, float]:
     """Return coefficients, covariance, and the sum of the logarithms of what is left, from the law `first`.
 
-    `steady`: deviation of the coefficient of the time [m^3/s].
+    `precision` of the coefficient of the time, the column `steady`, over that of a usual block [s^2/m^6].
     """
-    beta, inverse = _solve(first, shared, np.ones(len(first)))
+    beta, inverse = _solve(first, np.ones(len(first)))
     rest, logs = first, float("inf")
     for convex, rounds in ((True, _ROUNDS[0]), (False, _ROUNDS[1])):
         for _ in range(rounds):
-            left = _left(rest if convex else laws[0], shared, beta)
+            left = _left(rest if convex else laws[0], beta)
             if not convex:
-                other = _left(laws[1], shared, beta)
+                other = _left(laws[1], beta)
                 rest = np.where((other < _OTHER_LAW * left)[:, None, None], laws[1], laws[0])
                 left = np.minimum(left, other)
-            least = max(float(np.quantile(left, _USUAL)), np.finfo(float).tiny)
+            least = max(_usual(left), np.finfo(float).tiny)
             weight = least / np.maximum(left, least)
             before, logs = beta, float(np.log(np.maximum(left, np.finfo(float).tiny)).sum())
-            beta, inverse = _solve(
-                rest, shared, np.sqrt(weight) if convex else weight, least / _INDEPENDENT / steady**2
-            )
+            beta, inverse = _solve(rest, np.sqrt(weight) if convex else weight, steady, least * precision)
             if np.all(np.abs(beta - before) <= (_CLOSE if convex else _EXACT) * np.abs(before)):
                 break
     return beta, inverse, logs
@@ -480,8 +495,8 @@ def _fitted(blocks: BalanceBlocks, metres: bool, geometry: Geometry, *, whole: b
     own = np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
     leaning = blocks.gram[:, I_AB][:, shared] / own[:, None]
     slope = blocks.gram[:, I_AB, Y] / own - leaning @ beta
-    left = _left(_beyond(_beyond(blocks.gram, I_AB), I_ROOT), shared, beta)
-    usual = float(np.quantile(left[keep], _USUAL)) / freedom
+    left = _left(_displaced(_beyond(_beyond(blocks.gram, I_AB), I_ROOT), shared), beta)
+    usual = _usual(left[keep]) / freedom
     spoilt = left > _SPOILT**2 * usual * freedom
     bent = spoilt & _between_neighbours(slope, spoilt, keep & ~spoilt)
     keep &= ~spoilt | bent | (left <= _UNBALANCED**2 * beta[0] ** 2 * blocks.gram[:, THETA, THETA])
