@@ -67,6 +67,17 @@ def test_under_a_force_that_swings_a_leak_is_found_from_pressures() -> None:
     assert found.leak_interval_lpm[0] < 0.0042 < found.leak_interval_lpm[1]
 
 
+def test_in_an_open_loop_a_leak_under_a_force_that_swings_is_not_sized() -> None:
+    """Leaks of 0.05 L/min were stated as 0.006 to 0.02, none of eight intervals held."""
+    experiment = Experiment.of(
+        rig=RIG, command="6 sin(2.5t)", load="900 N sin(0.7t)", leak="0.05 L/min from 60 s", duration=SECONDS, seed=4
+    )
+    found = PressureModel(RIG).examine(simulate_with_truth(experiment).recording.only(SEEN), [], 0.01)
+    assert (found.verdict, found.leak_lpm, found.leak_interval_lpm) == ("leak", None, None)
+    assert "no controller works against it" in found.reason
+    assert "leak_lpm" in found.refuses
+
+
 def test_a_large_force_is_followed() -> None:
     """Friction was fitted beside a force that leaked into its harmonics, and the record was not followed."""
     judged = PressureModel(RIG).examine(recorded("position 40 mm sin(1.57t)", "1 kN sin(0.3t)"), [], 0.01)

@@ -56,6 +56,11 @@ _GIVES_WAY = 4e-13
 _DECISIVE, _DECISIVE_SHARE = 6.0, 0.4
 #: Why a large leak is not sized.
 _UNSIZED = "this machine moves unlike the rig, so that the flow cannot be told from pressures and command"
+#: ... and a leak under a force that moves the strokes of an open loop.
+_MOVED = (
+    "a force swings and no controller works against it: what leaks moves the strokes with the force, so that the flow "
+    "cannot be told from pressures and command"
+)
 #: Areas of a piston are alike within this share of their mean.
 UNEQUAL = 0.1
 #: Commands are alike within this ratio of their rms.
@@ -101,8 +106,9 @@ class PressureModel:
         unsure = _GIVES_WAY if self.rig.valve.spool == "present" else 0.0
         within = _within(followed, recording, probability, unsure)
         within = _under_force(replace(within, share=followed.share), recording)
-        if not self.states_flow and within.verdict == "leak":
-            within = without_flow(within, NO_RIG)
+        unstated = NO_RIG if not self.states_flow else _MOVED if _strokes_move(recording) else None
+        if unstated is not None and within.verdict == "leak":
+            within = without_flow(within, unstated)
         if not baseline or within.score is None:
             return within
         if not is_followed(followed):
@@ -115,11 +121,11 @@ class PressureModel:
             DAY_TO_DAY,
             probability,
             part="level of G",
-            flows=(_mean_drop(recording) / LITRE_PER_MINUTE,) if self.states_flow else (),
+            flows=(_mean_drop(recording) / LITRE_PER_MINUTE,) if unstated is None else (),
             cause="piston or pump leak",
         )
-        if not self.states_flow and level.verdict == "leak" and level.onset_s is None:
-            level = without_flow(level, NO_RIG)
+        if unstated is not None and level.verdict == "leak" and level.onset_s is None:
+            level = without_flow(level, unstated)
         return replace(level, share=followed.share)
 
     def findable(self, recording: Recording, false_alarm_probability: float, detection: float) -> float | str:
@@ -157,6 +163,14 @@ class PressureModel:
         # parameters that are tried and make the model diverge are left again
         with np.errstate(over="ignore", invalid="ignore"):
             return follow(self.rig, recording, cycle)
+
+
+def _strokes_move(recording: Recording) -> bool:
+    """Return whether the strokes of an open loop give way to a force that swings."""
+    from sealscope.diagnosis.pressure_model.load import moves_strokes
+
+    dp = recording["p_A"] - recording["p_B"]
+    return moves_strokes(recording["u"], dp, recording.rate, find_cycle(recording))
 
 
 def _under_force(evidence: Evidence, recording: Recording) -> Evidence:
