@@ -246,6 +246,16 @@ def test_a_weight_that_is_held_shows_what_pump_and_piston_pass(seed: int) -> Non
     assert found.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= found.leak_interval_lpm[1]
 
 
+def test_under_a_weight_that_is_held_a_leak_inside_is_none_to_the_outside() -> None:
+    """What swings alone showed a steady flow of 0.02 L/min to the outside beside it: `no leak` for 14 of 96 leaks."""
+    drawn = draw("load", 100, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
+    leaks = simulate_with_truth(drawn.experiment(seed=100, leak="0.0015 L/min from 60 s"))
+    found = VolumeBalance(load_rig("thesis-closed-loop")).examine(leaks.recording, [], P)
+    assert (found.verdict, found.cause) == ("leak", "piston or pump leak"), found.reason
+    assert found.leak_interval_lpm is not None
+    assert found.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= found.leak_interval_lpm[1]
+
+
 def test_a_fall_is_told_and_is_no_leak(detector: VolumeBalance) -> None:
     found = detector.examine(machine(4, G=step(3.0e-13, 0.0)), [], P)
     assert found.verdict == "no leak"
