@@ -25,7 +25,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.recordings import write
+from sealscope.diagnosis.volume_balance.stream import SequentialBalance
+from sealscope.recordings import Recording, write
 from sealscope.simulation.simulate import simulate
 
 #: The thesis's duties.
@@ -88,6 +89,13 @@ def of_many(count: int, duration: float, cores: int) -> float:
         )
 
 
+def streamed(recording: Recording) -> None:
+    """The volume balance's stream of a recording, in blocks of its own length."""
+    balance = SequentialBalance("thesis-closed-loop", alarms_per_hour=1.0)
+    for start in range(0, int(recording.duration), 3):
+        balance.update(recording.between(start, start + 3))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
@@ -119,6 +127,9 @@ def main() -> None:
     for command in COMMANDS:
         record = simulate(command=command, seed=1, leak="0.0042 L/min from 90 s")
         cases[f"leak under {command}, no throttles"] = partial(diagnose, record)
+    loop = {"rig": "thesis-closed-loop", "duration": 120.0, "seed": 4}
+    pushed = simulate(command="position 40 mm sin(1.57t)", controller="pi", load="1 kN sin(0.3t)", **loop)
+    cases["the balance online, 120 s under a load"] = lambda: streamed(pushed)
     figures: dict[str, list[float]] = {}
     for name, call in cases.items():
         if chosen.only and not any(text in name for text in chosen.only):
