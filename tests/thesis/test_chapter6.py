@@ -102,6 +102,23 @@ def test_the_tables_are_made():
 
 
 @pytest.mark.slow
+def test_oil_that_leaves_past_a_rod_seal_lowers_pressure_and_stiffness():
+    class Quick:
+        quick = True
+
+    (table,) = chapter6.outside_table(Quick(), next(item for item in chapter6.ITEMS if item.id == "sec-6.2-outside"))
+    by = {row[0]: row[3:] for row in table.rows}
+    sound = chapter6.stiffness("pi", 0.0)
+    for side in ("A", "B"):
+        error, stiff, made_good, fallen = by[side]
+        assert error < 0.1
+        assert stiff < 0.6 * sound
+        assert made_good == 0.0
+        assert fallen < -50.0
+    assert by["A"][1] < 0.6 * by["B"][1]
+
+
+@pytest.mark.slow
 def test_the_comparison_of_pump_and_valve_is_made():
     class Quick:
         quick = True
