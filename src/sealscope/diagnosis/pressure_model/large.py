@@ -68,7 +68,7 @@ BETTER, WORSE = 8.0, -100.0
 #: The largest excess at which a leak is sized (a model that is off by some per cent misses more of a large leak than of
 #: what wanders), and the largest cost of a sample, over that before the leak. Beyond, the model is of another kind of
 #: machine: there a leak must be better by this share of what it explains, and explain this share of what the sound
-#: machine misses (0.19 and more of leaks of 0.05 to 0.5 L/min, 0.065 at most where friction sticks and nothing leaks).
+#: machine misses: 0.19 and more of leaks of 0.05 and 0.5 L/min, 0.065 at most where friction sticks and none is large.
 _LARGEST_EXCESS, _AS_BEFORE, _PLAIN, _MUCH = 4.0, 1.25, 0.1, 0.12
 #: Least z, also over the root of the excess: a leak that linear blocks do not reach is at least as clear as those that
 #: they do.
