@@ -246,6 +246,22 @@ def test_a_machine_of_another_kind_is_not_judged(thesis: Rig, machine) -> None: 
     assert found.score is None
 
 
+def test_a_record_that_the_filter_loses_is_not_judged(thesis: Rig, machine, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """Of an unloaded single rod the last block had a deviation without end, and the method ended in an error."""
+    observer, recording = Observer(thesis), machine(False).recording.only(PRESSURES)
+    series = observer.follow(recording)
+    assert series.sd.size > 1
+    sd, own = series.sd.copy(), series.estimates.sd.copy()
+    sd[-1] = own[-1] = np.inf
+    lost = replace(series, sd=sd, estimates=series.estimates._replace(sd=own))
+    monkeypatch.setattr(observer, "follow", lambda _: lost)
+    judged = observer.examine(recording, [], P)
+    assert (judged.verdict, judged.reason) == (
+        "cannot tell",
+        "the observer lost the recording: its model does not describe it",
+    )
+
+
 def test_a_slipping_encoder_is_named(thesis: Rig, machine) -> None:  # type: ignore[no-untyped-def]
     recording = machine(False).recording.only(ALL)
     x = np.array(recording["x"])

@@ -109,7 +109,7 @@ class Observer:
                 f"{FEWEST} are needed",
             )
         unfit = misfit(series.estimates, series.formulation, self.rig)
-        if unfit is not None and not np.all(np.isfinite(series.G)):
+        if unfit is not None and not np.isfinite([series.G, series.sd]).all():
             return Evidence("cannot tell", unfit)
         probability = share_of_each(false_alarm_probability, baseline)
         step = self._step(series, probability)
