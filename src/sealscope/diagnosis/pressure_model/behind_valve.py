@@ -26,7 +26,7 @@ State = tuple[float, float, float, float, float]
 #: |p_A - p_B| as a share of the supply at which the piston does not move, and for how long [s] it must stay there.
 STALLED, _STALLED_S = 0.7, 0.02
 #: The mean of p_A - p_B over its deviation from which a load stands on the piston: 0.17 at most on 60 sound machines of
-#: `bench-valve`, which have none, 20 at least on 30 of `duty-valve`, under 2 kN.
+#: `bench-valve`, which have none, 20 at least on 30 of `duty-valve`, under 2 kN. Loads between were not looked at.
 STANDING = 1.0
 
 
