@@ -67,6 +67,20 @@ def test_the_least_specific_calls_nothing_sound_in_which_another_saw_a_change_wi
     assert fused(rms_change=NONE, pressure_model=unclear).verdict == "no leak"
 
 
+def test_a_small_change_of_a_machine_that_wanders_is_no_leak_by_itself() -> None:
+    unruly = replace(UNFIT, reason="the parameters wander", unruly=True)
+    within = replace(LEAK, score=5.9, onset_s=30.0, onset_interval_s=(29.0, 31.0))
+    kept = fused(rms_change=within, pressure_model=unruly, my_own=replace(LEAK, leak_lpm=0.1))
+    assert (kept.detector, kept.verdict, kept.onset_s, kept.leak_lpm) == (RMS, "cannot tell", None, None)
+    assert kept.parts[0].verdict == "leak"
+    assert "the parameters wander" in kept.reason
+    assert fused(rms_change=replace(within, score=6.1), pressure_model=unruly).verdict == "leak"
+    assert fused(rms_change=within, pressure_model=UNFIT).verdict == "leak"
+    assert fused(observer=within, pressure_model=unruly).verdict == "leak"
+    against_baseline = replace(within, onset_s=None, onset_interval_s=None)
+    assert fused(rms_change=against_baseline, pressure_model=unruly).verdict == "leak"
+
+
 def test_a_detector_that_could_not_look_is_told_and_never_judges() -> None:
     needs = unusable(BALANCE, "needs theta")
     found = fuse([needs, replace(NONE, detector=RMS)])

@@ -276,6 +276,7 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
             f"those of a healthy machine may, {UNRULY:g} are allowed{seen}",
             parts=parts,
             cause=cause,
+            unruly=True,
         )
     edges = begin + followed.edges / recording.rate
     onset = float(edges[inner.start + 1 + best]) if large is None else begin + large.onset / recording.rate

@@ -152,6 +152,9 @@ class Evidence:
         Displacement over area as measured, over the assumed one, and its 95 % interval, where the detector measures it.
     weighed : frozenset of str
         Causes against which the detector has weighed the leak itself; what else stepped cannot be one of these.
+    unruly : bool
+        Whether the detector abstains because the machine's parameters wander more than those of a healthy one may: then
+        the details' RMS wander, too, and a change of it says less.
     """
 
     verdict: Verdict
@@ -175,6 +178,7 @@ class Evidence:
     ratio: float | None = None
     ratio_interval: tuple[float, float] | None = None
     weighed: frozenset[Cause] = frozenset()
+    unruly: bool = False
 
     @property
     def alarmed(self) -> bool:
