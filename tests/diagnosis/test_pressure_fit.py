@@ -161,7 +161,19 @@ def test_single_precision_is_within_a_pascal_of_doubles(thesis: Rig) -> None:
     table = np.ascontiguousarray(sets.T[None])
     shown, state = np.empty((model.samples, RUNS // 2)), np.zeros((STATES, RUNS // 2))
     segment = np.zeros(model.samples, dtype=np.int64)
-    pressure_differences(model.inputs, model.h, model.every, table, segment, model.numbers, state, shown, False)
+    pressure_differences(
+        model.inputs,
+        model.h,
+        model.every,
+        table,
+        segment,
+        model.numbers,
+        state,
+        shown,
+        False,
+        model.readings,
+        model.gain,
+    )
     apart = model.run(sets) - shown.T
     assert 0.0 < np.sqrt(np.mean(apart**2)) < 0.3
     assert np.abs(apart).max() < 2.0

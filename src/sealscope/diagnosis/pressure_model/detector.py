@@ -18,7 +18,14 @@ import numpy as np
 
 from sealscope.diagnosis.baseline.level import DayToDay, against_baseline, incomparable, share_of_each
 from sealscope.diagnosis.changepoint.tails import largest_normal, near_best, seed_of
-from sealscope.diagnosis.verdict.evidence import NO_RIG, Cause, Evidence, LeakCourse, without_flow
+from sealscope.diagnosis.verdict.evidence import (
+    LEAK_WORTH_FINDING,
+    NO_RIG,
+    Cause,
+    Evidence,
+    LeakCourse,
+    without_flow,
+)
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import constant
@@ -34,6 +41,8 @@ SHORTEST, SLOWEST_RATE, LEAST = 40.0, 250.0, 3
 #: Scatter of the blocks beyond the wandering, as chi square over its degrees of freedom: three deviations above 1, to
 #: which the level of a record can be compared, and the most for which a wider error makes up.
 STEADY, UNRULY = 1.2, 1.5
+#: Probability with which a leak worth finding must show for `no leak`, where the model is led by its readings.
+_FOUND = 0.9
 #: A change of a parameter from the first to the last third that no healthy machine shows within a record, as a share.
 _OTHER_CAUSE = {"friction": 0.18, "stiffness": 0.15}
 #: What a machine that is fitted anew after the onset may have had, beside which a large leak is weighed. The command is
@@ -112,7 +121,9 @@ class PressureModel:
         if not baseline or within.score is None:
             return within
         if not is_followed(followed):
-            return incomparable(within, "the fit has a ring too many or too few in each reversal")
+            led = "the model is led by the readings, which its level of G depends on"
+            ring = "the fit has a ring too many or too few in each reversal"
+            return incomparable(within, ring if followed.predicted is None else led)
         known = [remembered(other, (self.name, self.rig), self.follow) for other in baseline]
         level = against_baseline(
             within,
@@ -133,20 +144,15 @@ class PressureModel:
 
         With the deviation s of a step there, in the record's own scatter, it is ``(threshold + z_detection) s``.
         """
-        from scipy.special import ndtri
-
         followed = self.follow(recording)
         if isinstance(followed, str):
             return followed
         if followed.excess > UNRULY:
             return f"the model does not follow this record: its parameters wander {followed.excess:.2f} times"
-        steps, inner = followed.steps, slice(LEAST - 1, followed.blocks - LEAST)
-        z = steps.z[inner]
-        correlation = steps.correlation[inner, inner]
+        z = followed.steps.z[_inner(followed)]
+        correlation = followed.steps.correlation[_inner(followed), _inner(followed)]
         threshold, _ = largest_normal(correlation, false_alarm_probability, seed_of(z), float(np.max(z)))
-        middle = slice(followed.blocks // 3, max(followed.blocks // 3 + 1, 2 * followed.blocks // 3))
-        deviation = float(np.max(steps.deviation[middle])) * float(np.sqrt(max(1.0, followed.excess)))
-        return (threshold + float(ndtri(detection))) * deviation * _mean_drop(recording) / LITRE_PER_MINUTE
+        return _findable(followed, threshold, detection) * _mean_drop(recording) / LITRE_PER_MINUTE
 
     def follow(self, recording: Recording) -> Followed | str:
         """Return the record as the model follows it, or the reason why it does not."""
@@ -162,7 +168,21 @@ class PressureModel:
         cycle = find_cycle(recording)
         # parameters that are tried and make the model diverge are left again
         with np.errstate(over="ignore", invalid="ignore"):
-            return follow(self.rig, recording, cycle)
+            return follow(self.rig, recording, cycle, UNRULY)
+
+
+def _inner(followed: Followed) -> slice:
+    """Return the steps that are looked at: with `LEAST` blocks or more on either side."""
+    return slice(LEAST - 1, followed.blocks - LEAST)
+
+
+def _findable(followed: Followed, threshold: float, detection: float) -> float:
+    """Return the step of G in the middle of a record that is over a threshold with that probability [m^3/(s Pa)]."""
+    from scipy.special import ndtri
+
+    middle = slice(followed.blocks // 3, max(followed.blocks // 3 + 1, 2 * followed.blocks // 3))
+    deviation = float(np.max(followed.steps.deviation[middle])) * float(np.sqrt(max(1.0, followed.excess)))
+    return (threshold + float(ndtri(detection))) * deviation
 
 
 def _strokes_move(recording: Recording) -> bool:
@@ -198,7 +218,7 @@ def is_followed(followed: Followed) -> bool:
     from sealscope.diagnosis.pressure_model.model import LEAD
 
     lead = float(np.mean(followed.path[:, LEAD]))
-    return followed.excess <= STEADY and abs(lead) <= _LARGEST_LEAD
+    return followed.predicted is None and followed.excess <= STEADY and abs(lead) <= _LARGEST_LEAD
 
 
 def _mean_drop(recording: Recording) -> float:
@@ -229,6 +249,8 @@ def _flow(
     stated = []
     late = recording.t >= onset
     drop = recording["p_A"][late] - recording["p_B"][late]
+    if followed.predicted is not None:  # which law it is such a model does not tell, and readings at rest are noise
+        likely, drop = list(leaks), followed.predicted[late]
     for leak in likely:
         unit = leak.law.flow(drop) / LITRE_PER_MINUTE
         blind = unsure * float(np.mean(np.abs(drop))) / leak.law.flow(drop)
@@ -247,7 +269,7 @@ def _flow(
 def _within(followed: Followed, recording: Recording, probability: float, unsure: float = 0.0) -> Evidence:
     """Return the evidence on a rise of G within the record; `unsure` as `_flow` takes it."""
     steps, begin = followed.steps, float(recording.t[0])
-    inner = slice(LEAST - 1, followed.blocks - LEAST)
+    inner = _inner(followed)
     z = steps.z[inner]
     best = int(np.argmax(z))
     excess = followed.excess
@@ -281,8 +303,20 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
     edges = begin + followed.edges / recording.rate
     onset = float(edges[inner.start + 1 + best]) if large is None else begin + large.onset / recording.rate
     figures = f"z {score:.2f}, threshold {threshold:.2f}"
+    if followed.predicted is not None:
+        figures += ", predicted from sample to sample"
     alarm = score > threshold
     part = Evidence("leak" if alarm else "no leak", "", score, threshold, detector="rise of G")
+    if not alarm and followed.predicted is not None:
+        hidden = _findable(followed, threshold, _FOUND) * _mean_drop(recording)
+        if hidden > LEAK_WORTH_FINDING * followed.pumped:
+            return Evidence(
+                "cannot tell",
+                f"a leak of {hidden / followed.pumped:.0%} of the pump's flow would not show ({figures})",
+                parts=(part,),
+                cause=cause,
+                unruly=True,
+            )
     if not alarm:
         reason = {
             None: f"no rise of the leakage conductance beyond its scatter ({figures}); a leak that was there from the "

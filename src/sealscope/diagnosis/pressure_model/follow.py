@@ -30,6 +30,7 @@ from sealscope.diagnosis.pressure_model.load import carried_by_load
 from sealscope.diagnosis.pressure_model.model import (
     F_C,
     F_V,
+    GAIN,
     STATES,
     DrivenModel,
     G,
@@ -70,12 +71,16 @@ _AS_GOOD = 1e-3
 
 
 class _Look(NamedTuple):
-    """A record followed from one first fit; `excess`: chi square over its degrees of freedom, beside the best leak."""
+    """A record followed from one first fit; `excess`: chi square over its degrees of freedom, beside the best leak.
+
+    `risen`: the track with the likelier of `leaks` allowed, None without one.
+    """
 
     track: Track
     steps: ConductanceSteps
     leaks: tuple[PossibleLeak, ...]
     excess: float
+    risen: Track | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +92,9 @@ class Followed:
     sample; `seconds` of a block; `level` [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to
     the last third, as shares; `share` of the blocks that have no missing samples and count;
     `large`: a leak that linear blocks did not reach, beside which all this is then taken; `change`: what looks like
-    one, but another machine from then on explains the record as well.
+    one, but another machine from then on explains the record as well; `predicted` (n,): p_A - p_B [Pa] as a model that
+    is led by its readings predicts it, None where the model follows under the command alone; `pumped` [m^3/s]: the
+    pump's mean flow.
     """
 
     theta: Array
@@ -101,9 +108,11 @@ class Followed:
     friction_change: float
     stiffness_change: float
     command_rms: float
+    pumped: float
     share: float
     large: LargeLeak | None = None
     change: LargeLeak | None = None
+    predicted: Array | None = None
 
     @property
     def another(self) -> bool:
@@ -131,10 +140,11 @@ def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple
     return whole, replace(whole, model=starts.part(first, length), dp=whole.dp[: length - whole.settle])
 
 
-def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | str:
+def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float) -> Followed | str:
     """Fit and follow the chamber pressures and the command of a record, or return the reason why that is not possible.
 
-    `cycle` [s]: length of the duty's cycle, None where it does not repeat.
+    `cycle` [s]: length of the duty's cycle, None where it does not repeat; a record whose parameters wander `unruly`
+    times as much as a healthy machine's is followed by a model that is led by its readings.
     """
     u, p_A, p_B, rate = recording["u"], recording["p_A"], recording["p_B"], recording.rate
     numbers = assumed_numbers(rig)
@@ -185,19 +195,18 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
     look, large = _tracked(model, dp, edges, theta, skip, seen, None if humming else shown), None
     if isinstance(look, str) or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
         large = _large(plain, raw, edges, seen, prior)
-        if large is not None and large.stated:
-            return _seen_so(
-                _Look(large.track, large.steps, large.leaks, large.excess),
-                large.theta,
-                model,
-                edges,
-                length,
-                share,
-                large,
-            )
+        if large is not None and large.stated and large.sized:
+            return _beside(large, model, edges, length, share)
+    if not isinstance(look, str):
+        look = _looked_again(look, model, dp, edges, theta, skip, seen)
+        if look.excess > unruly and not numbers.valved:
+            led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, length, share)
+            if led is not None and (led.large is not None or led.excess <= unruly):
+                return led
+    if large is not None and large.stated:
+        return _beside(large, model, edges, length, share)
     if isinstance(look, str):
         return look
-    look = _looked_again(look, model, dp, edges, theta, skip, seen)
     if look.excess > RESTLESS:
         for first in anew:
             other, dearer = refit(long, first, prior)
@@ -216,6 +225,51 @@ def follow(rig: Rig, recording: Recording, cycle: float | None) -> Followed | st
             "the fit has a ring too many in each reversal, or another --rig describes it"
         )
     return replace(_seen_so(look, theta, model, edges, length, share), change=large)
+
+
+def _led(
+    model: DrivenModel,
+    dp: Array,
+    edges: NDArray[np.int64],
+    guess: Array,
+    prior: Prior,
+    span: float,
+    skip: int,
+    seen: NDArray[np.bool_],
+    seconds: float,
+    share: float,
+) -> Followed | None:
+    """Return the record as a model that is led by its readings sees it, None where it does not follow either.
+
+    A machine that rings by itself, or breaks away from a rest, keeps no phase that the command sets: to follow it under
+    the command alone all parameters must wander. Predicted from one sample to the next, the record is followed by those
+    of a machine (the prediction-error method: L. Ljung, System Identification, 2nd ed., 1999, ch. 7).
+    """
+    long, short = _windows(model, dp, guess, span)
+    try:
+        theta, cost, _ = fit(long, short, prior, guess)
+    except FloatingPointError:
+        return None
+    look = _tracked(model, dp, edges, theta, skip, seen) if np.isfinite(cost) else DIVERGED
+    if isinstance(look, str):
+        return None
+    look, large = _looked_again(look, model, dp, edges, theta, skip, seen), None
+    if np.max(look.steps.z) > _STRONG:
+        large = _large(model, dp, edges, seen, prior)
+        if large is not None and large.stated and large.sized:
+            followed = _beside(large, model, edges, seconds, share)
+            return replace(followed, predicted=_predicted(model, dp, edges, large.track))
+    # beside a leak friction and stiffness are those with the leak allowed: without it they take its part
+    beside = look.track if look.risen is None else look.risen
+    followed = _seen_so(look._replace(track=beside), theta, model, edges, seconds, share)
+    return replace(followed, change=large, predicted=_predicted(model, dp, edges, beside))
+
+
+def _predicted(model: DrivenModel, dp: Array, edges: NDArray[np.int64], followed: Track) -> Array:
+    """Return what a model that is led by its readings predicts of dp (n,) [Pa], with the mean of the readings."""
+    segment = np.clip(np.searchsorted(edges, np.arange(dp.size), side="right") - 1, 0, edges.size - 2)
+    shown = model.run(followed.path[None], segment.astype(np.int64), followed.start[None].copy())[0]
+    return np.asarray(shown + np.mean(dp - shown))
 
 
 def _seen_so(
@@ -244,9 +298,16 @@ def _seen_so(
         friction,
         float(late[K] / early[K] - 1.0),
         float(np.std(model.u[: -1 : 2 * model.every])),
+        float(model.piston_speed(theta[GAIN] * np.mean(np.abs(model.u)))) * model.numbers.A_A,
         share,
         large,
     )
+
+
+def _beside(large: LargeLeak, model: DrivenModel, edges: NDArray[np.int64], seconds: float, share: float) -> Followed:
+    """Return the record beside a large leak."""
+    look = _Look(large.track, large.steps, large.leaks, large.excess)
+    return _seen_so(look, large.theta, model, edges, seconds, share, large)
 
 
 def _same_sense(u: Array, dp: Array) -> bool:
@@ -326,7 +387,10 @@ def _looked_again(
         cost = fresh.misfit / variance + fresh.strain
         leaks.append(PossibleLeak(law, after, float(again.size[after]), float(again.deviation[after]), cost))
         excess = min(excess, excess_of(again))
-    return _Look(followed, steps, tuple(sorted(leaks, key=lambda leak: leak.cost)), excess)
+    costs = [leak.cost for leak in leaks]
+    return _Look(
+        followed, steps, tuple(sorted(leaks, key=lambda leak: leak.cost)), excess, risen[int(np.argmin(costs))]
+    )
 
 
 def _friction(theta: Array, model: DrivenModel, speed: float) -> float:

@@ -11,7 +11,8 @@ detector's own, from a rig it may assume, and none of them is the recorded machi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -55,6 +56,9 @@ _FARTHEST = 0.9
 LONGEST_STEP = 1.01e-3
 #: Most that a decay and a ringing [rad] may do within a coarse step: RK4 is stable up to 2.7 and 2.8.
 _FASTEST_DECAY, _FASTEST_RINGING = 2.0, 1.2
+#: A model that is led by its readings forgets within so long [s], a period of the ringing: a deviation that rings
+#: without damping decays so in the mean.
+MEMORY = 0.014
 #: The slow part of a pressure: a Gaussian of this width [s] takes the ringing (60 to 80 Hz) out.
 SLOW_WIDTH = 0.008
 #: ... and of this one the supply's part of p_A + p_B, without what unlike edges do where the valve passes its middle.
@@ -167,6 +171,8 @@ def pressure_differences(
     state: np.ndarray,
     out: np.ndarray,
     speeds: bool,
+    readings: np.ndarray,
+    gain: float,
 ) -> None:
     """Write dp [Pa], or v [m/s] if `speeds`, of all lanes at each sample into `out` (n, lanes).
 
@@ -175,11 +181,14 @@ def pressure_differences(
     [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa], a servo valve's supply [Pa] or, without one,
     the load [N]; `theta`:
     (segments, 13, lanes) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, lanes) at the first
-    sample, in place.
+    sample, in place. With a `gain` dp, once written, is led towards its `readings` (n,) [Pa] by that share of the
+    difference.
     """
     y = (load(state, 0), load(state, 1), load(state, 2), load(state, 3), load(state, 4))
     for sample in range(segment.size):
         store(out, sample, y[1] if speeds else y[0])
+        if gain > 0.0:
+            y = (y[0] + gain * (readings[sample] - y[0]), y[1], y[2], y[3], y[4])
         row = 13 * segment[sample]
         lead = load(theta, row + LEAD)
         now = (
@@ -224,13 +233,16 @@ class DrivenModel:
     """The reduced rig under a recorded command, run for many sets of parameters.
 
     `inputs` (m, 5) at every half step, as `pressure_differences` takes them; `every` steps of `h` [s] to a sample;
-    `numbers` of the assumed rig.
+    `numbers` of the assumed rig; `readings` (n,) [Pa] that lead dp by the share `gain` of what they add, none by
+    default.
     """
 
     inputs: Array
     h: float
     every: int
     numbers: RigNumbers
+    readings: Array = field(default_factory=lambda: np.empty(0))
+    gain: float = 0.0
 
     @staticmethod
     def of(
@@ -325,7 +337,19 @@ class DrivenModel:
 
     def part(self, first: int, n: int) -> DrivenModel:
         """Return the model over n samples from `first` on."""
-        return replace(self, inputs=self.inputs[2 * self.every * first : 2 * self.every * (first + n) + 1])
+        return replace(
+            self,
+            inputs=self.inputs[2 * self.every * first : 2 * self.every * (first + n) + 1],
+            readings=self.readings[first : first + n],
+        )
+
+    def led(self, readings: Array, theta: Array) -> DrivenModel:
+        """Return the model led by readings of dp (n,) [Pa]: what it shows is predicted from the samples before.
+
+        Their mean becomes that of what parameters `theta` (13,) show under the command alone.
+        """
+        readings = readings - float(np.mean(readings - self.run(theta[None])[0]))
+        return replace(self, readings=readings, gain=-math.expm1(-2.0 / (MEMORY * self.rate)))
 
     def piston_speed(self, omega: float | Array) -> float | Array:
         """Return the piston's speed [m/s] at a speed of the motor [rad/s], without leakage and stored oil."""
@@ -356,7 +380,19 @@ class DrivenModel:
             if start is not None:
                 state[:] = start[lanes].T
             out = np.empty((n, RUNS), dtype=np.float32)
-            pressure_differences(self.inputs, self.h, self.every, table, which, self.numbers, state, out, speeds)
+            pressure_differences(
+                self.inputs,
+                self.h,
+                self.every,
+                table,
+                which,
+                self.numbers,
+                state,
+                out,
+                speeds,
+                self.readings,
+                self.gain,
+            )
             here = lanes[: min(RUNS, runs - first)]
             for part in range(0, n, _TURNED):  # parts that stay in the processor's cache
                 shown[first : first + here.size, part : part + _TURNED] = out[part : part + _TURNED].T[: here.size]
