@@ -140,11 +140,11 @@ def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple
     return whole, replace(whole, model=starts.part(first, length), dp=whole.dp[: length - whole.settle])
 
 
-def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float) -> Followed | str:
+def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = np.inf) -> Followed | str:
     """Fit and follow the chamber pressures and the command of a record, or return the reason why that is not possible.
 
     `cycle` [s]: length of the duty's cycle, None where it does not repeat; a record whose parameters wander `unruly`
-    times as much as a healthy machine's is followed by a model that is led by its readings.
+    times as much as a healthy machine's is followed by a model that is led by its readings, by default none.
     """
     u, p_A, p_B, rate = recording["u"], recording["p_A"], recording["p_B"], recording.rate
     numbers = assumed_numbers(rig)
@@ -195,7 +195,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float) -
     look, large = _tracked(model, dp, edges, theta, skip, seen, None if humming else shown), None
     if isinstance(look, str) or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
         large = _large(plain, raw, edges, seen, prior)
-        if large is not None and large.stated and large.sized:
+        if large is not None and large.stated and large.sized and large.excess <= unruly:
             return _beside(large, model, edges, length, share)
     if not isinstance(look, str):
         look = _looked_again(look, model, dp, edges, theta, skip, seen)
