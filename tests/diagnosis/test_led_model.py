@@ -1,4 +1,4 @@
-"""The pressure model led by its readings: one sample ahead, for machines whose ringing keeps no phase of the command."""
+"""The pressure model led by its readings, one sample ahead: for machines that ring without regard to the command."""
 
 from __future__ import annotations
 
