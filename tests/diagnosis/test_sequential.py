@@ -15,6 +15,7 @@ from sealscope.diagnosis.volume_balance.stream import BalanceState, SequentialBa
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
+from sealscope.simulation.simulate import simulate
 
 from .balance_machine import machine, step
 
@@ -103,6 +104,28 @@ def test_alarm_soon_after_the_onset_and_stays() -> None:
     assert last.alarm is not None
     assert last.alarm.onset_s == pytest.approx(80.0, abs=2.0)
     assert last.alarm.leak_lpm == pytest.approx(3.0e-13 * 1.1e5 * 6e4, rel=0.15)
+
+
+def test_an_alarm_of_oil_that_leaves_becomes_one_to_the_outside_and_stays_one() -> None:
+    """Which side loses oil shows when the lower pressure has fallen, some windows after the alarm."""
+    recording = simulate(
+        rig="thesis-closed-loop",
+        command="position 35 mm sin(1.8t)",
+        controller="pi",
+        fault="rod seal A 0.02 L/min from 60 s",
+        duration="110 s",
+        seed=3,
+    )
+    detector = SequentialBalance("thesis-closed-loop", alarms_per_hour=0.3)
+    alarms = [detector.update(recording.between(second, second + 1.0)).alarm for second in range(110)]
+    causes = [alarm.cause for alarm in alarms if alarm is not None]
+    assert causes[0] in ("piston or pump leak", "piston leak")
+    assert causes[-1] == "external leak"
+    outside = causes.index("external leak")
+    assert set(causes[outside:]) == {"external leak"}
+    assert outside < 30
+    assert detector.state.alarm is not None
+    assert detector.state.alarm.verdict == "no leak"
 
 
 def test_no_alarm_without_a_leak() -> None:

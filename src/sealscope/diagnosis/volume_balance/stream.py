@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.diagnosis.volume_balance.blocks import (
     BLOCK_SECONDS,
     BalanceBlocks,
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 #: The duty's cycle is looked for in the first part of a stream [s].
 _LEARN_SECONDS = 60.0
 _CHANNELS = ("u", "x", "theta", "omega", "p_A", "p_B", "p_1", "p_2")
+#: What an alarm may turn out to be.
+_OUTSIDE: Cause = "external leak"
 #: Probability per window for which a threshold can be set.
 _PROBABILITIES = (1e-7, 0.05)
 
@@ -57,7 +59,9 @@ class BalanceState:
     evidence : Evidence
         Of the last window.
     alarm : Evidence or None
-        The evidence with the highest score since the alarm was raised, until it is acknowledged.
+        The evidence with the highest score since the alarm was raised, until it is acknowledged. A leak to the outside
+        is told from one inside by the pressures that fall, which takes its time: from then on the alarm is that
+        evidence, `no leak` past the piston with the cause `external leak`.
     total_lpm : float or None
         Mean leakage of pump and piston together over the window [L/min], None where L/min cannot be stated.
     """
@@ -209,8 +213,7 @@ class SequentialBalance:
             self._window = window.chosen(np.arange(max(0, len(window) - self.window), len(window)))
             if len(self._window) >= FEWEST:
                 evidence, total = self._judge(self._window, block.units["x"] == "m")
-        best = alarm is None or (evidence.score or 0.0) > (alarm.score or 0.0)
-        if evidence.verdict == "leak" and best:
+        if _replaces(evidence, alarm):
             alarm = evidence
         self.state = BalanceState(end, before.blocks + 1, before.refused + (not usable), evidence, alarm, total)
 
@@ -220,3 +223,22 @@ class SequentialBalance:
         if problem is not None:
             return Evidence("cannot tell", problem), None
         return judge(fit, self.alarms_per_hour * blocks.seconds / 3600.0, window=True), total_lpm(fit)
+
+
+def _replaces(evidence: Evidence, alarm: Evidence | None) -> bool:
+    """Return whether the evidence of a window is the alarm from now on."""
+    outside = evidence.cause == _OUTSIDE and evidence.alarmed
+    if alarm is None:
+        return evidence.verdict == "leak"
+    better = (evidence.score or 0.0) > (alarm.score or 0.0)
+    if alarm.cause == _OUTSIDE:
+        return outside and better
+    return (evidence.verdict == "leak" and better) or (outside and _same_rise(evidence, alarm))
+
+
+def _same_rise(one: Evidence, other: Evidence) -> bool:
+    """Return whether two windows date the same rise."""
+    if one.onset_interval_s is None or other.onset_interval_s is None:
+        return False
+    (begin, end), (first, last) = one.onset_interval_s, other.onset_interval_s
+    return begin <= last and first <= end
