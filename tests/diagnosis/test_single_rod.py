@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.volume_balance.blocks import I_AB, STORED_X_A, balance_channels, block_samples, volumes
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.parameters import load_rig
@@ -17,7 +18,7 @@ from sealscope.parameters.new_rig import rig_text
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.courses import command_or_target
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import Run, simulate_with_truth
+from sealscope.simulation.simulate import Run, simulate, simulate_with_truth
 
 from . import single_rod_machine
 from .single_rod_machine import A_A, A_B, single_rod
@@ -197,3 +198,15 @@ def test_weights_of_a_fit_leave_what_the_fit_leaves(load: float) -> None:
     left = np.einsum("c,ncd,d->n", fit.weights, used.gram, fit.weights) - own * g**2
     assert float(np.sqrt(np.median(left) / fit.blocks.samples)) < 3.0 * fit.residual
     assert_allclose(np.median(g), np.median(fit.g), rtol=0.05)
+
+
+def test_the_change_of_rms_calls_no_single_rod_sound() -> None:
+    """It called a leak of 0.5 L/min `no leak`: the two sides ring apart, and nothing changed in the details."""
+    leaky = simulate(rig="single-rod-eha", command="5 sin(2t)", leak="0.5 L/min from 40 s", duration="80 s", seed=2)
+    seen = leaky.only(("u", "p_A", "p_B"))
+    evidence = Examination(seen, false_alarm_probability=P, rig="single-rod-eha").evidence("rms change")
+    assert evidence.verdict == "cannot tell", evidence.reason
+    assert "single rod" in evidence.reason
+    assert not evidence.alarmed
+    assert load_rig("single-rod-eha").cylinder.single_rod
+    assert not load_rig("thesis").cylinder.single_rod

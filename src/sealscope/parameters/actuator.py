@@ -6,6 +6,9 @@ from typing import Annotated, Literal
 
 from sealscope.parameters.fields import Part, choice, quantity
 
+#: Areas of a double rod are alike within this share of their mean.
+_UNEVEN = 0.1
+
 
 class Cylinder(Part):
     """Cylinder between two caps, eqs. (4.13)-(4.15), (4.18), (4.19), and its load; x = 0 at mid-stroke.
@@ -35,6 +38,16 @@ class Cylinder(Part):
     F_l: Annotated[float, quantity("constant external load", "N", ge=-1e8, le=1e8)]
     G_ext_A: Annotated[float, quantity("leakage conductance of the rod seal of A", "m^3/(s Pa)", ge=0, le=1e-6)]
     G_ext_B: Annotated[float, quantity("leakage conductance of the rod seal of B", "m^3/(s Pa)", ge=0, le=1e-6)]
+
+    @property
+    def unevenness(self) -> float:
+        """Difference of both areas over their mean: 0 of a double rod."""
+        return abs(self.A_A - self.A_B) / (0.5 * (self.A_A + self.A_B))
+
+    @property
+    def single_rod(self) -> bool:
+        """Whether the areas differ by more than makers' tolerances do."""
+        return self.unevenness > _UNEVEN
 
 
 class Friction(Part):

@@ -70,8 +70,6 @@ _MOVED = (
     "a force swings and no controller works against it: what leaks moves the strokes with the force, so that the flow "
     "cannot be told from pressures and command"
 )
-#: Areas of a piston are alike within this share of their mean.
-UNEQUAL = 0.1
 #: Commands are alike within this ratio of their rms.
 _ALIKE = 1.1
 
@@ -158,12 +156,10 @@ class PressureModel:
         """Return the record as the model follows it, or the reason why it does not."""
         from sealscope.diagnosis.pressure_model.follow import follow
 
-        c = self.rig.cylinder
-        apart = abs(c.A_A - c.A_B) / (0.5 * (c.A_A + c.A_B))
-        if apart > UNEQUAL:
+        if self.rig.cylinder.single_rod:
             return (
                 "the model is of a piston whose two areas are alike, so that p_A and p_B move against each other; "
-                f"those of the rig {self.rig.name} differ by {apart:.0%}"
+                f"those of the rig {self.rig.name} differ by {self.rig.cylinder.unevenness:.0%}"
             )
         cycle = find_cycle(recording)
         # parameters that are tried and make the model diverge are left again
