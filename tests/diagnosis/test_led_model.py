@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.pressure_model.detector import UNRULY, PressureModel, is_followed
+from sealscope.diagnosis.pressure_model.detector import UNRULY, PressureModel, _makes_good, is_followed
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.model import STATES, DrivenModel, assumed_numbers, nominal
 from sealscope.parameters import load_rig
@@ -113,3 +113,16 @@ def test_the_level_of_a_led_model_is_not_compared() -> None:
     evidence = PressureModel(RIG).examine(leak, (recorded(),), 0.01)
     assert evidence.verdict == "leak"
     assert "led by the readings" in evidence.reason
+
+
+@pytest.mark.parametrize(
+    ("growth", "share", "good"),
+    [(0.03, 0.05, True), (0.05, 0.05, True), (0.1, 0.02, False), (-0.03, 0.05, False)],
+    ids=["by part of the leak", "by all of it", "by another duty", "it falls"],
+)
+def test_a_command_that_grows_by_what_leaks_is_a_controllers(growth: float, share: float, good: bool) -> None:
+    """Of 30 leaks of 0.05 L/min under flatness (development) two, at +3 %, were `changed duty`."""
+    t = np.arange(60000) / RATE
+    u = 3.0 * np.sin(0.4 * np.pi * t) * np.where(t < 60.0, 1.0, 1.0 + growth * (1.0 - 1e-9))
+    recording = Recording(t, {"u": u}, {"u": "V"}, RATE)
+    assert _makes_good(recording, 60.0, share) is good

@@ -358,7 +358,7 @@ def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] =
             other = None
         if other is None and evidence.detector != BALANCED:
             other = other_cause(seen, evidence.onset_s, weighed=evidence.weighed) or _readings(
-                seen, evidence.onset_s if evidence.cause is not None else None, bool(evidence.weighed)
+                seen, evidence.onset_s if evidence.cause is not None else None, "friction change" in evidence.weighed
             )
         if other is None and evidence.cause is None:
             other = _anywhere(seen)

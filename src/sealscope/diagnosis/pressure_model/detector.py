@@ -49,6 +49,8 @@ _OTHER_CAUSE = {"friction": 0.18, "stiffness": 0.15}
 #: the model's own, and how far a chamber's mean moves says nothing of what rings. Air makes the ringing slower and
 #: louder, which no leak does: it is asked for all the same.
 _WEIGHED: frozenset[Cause] = frozenset({"friction change", "changed duty"})
+#: A command that grows by no more than the leak takes is a controller's, which makes it good: no other duty.
+_MADE_GOOD: frozenset[Cause] = frozenset({"changed duty"})
 #: From day to day the level of G moves by this much [m^3/(s Pa)], known as from five recordings: fits differ with the
 #: machine's friction.
 DAY_TO_DAY = DayToDay(2e-13, 4.0)
@@ -262,6 +264,16 @@ def _flow(
     )
 
 
+def _makes_good(recording: Recording, onset: float, share: float) -> bool:
+    """Return whether the command grows from the onset on by no more than a leak of up to that share of the pump's flow.
+
+    A controller that holds the strokes adds what leaks to what the pump moves.
+    """
+    late = recording.t >= onset
+    before, after = (float(np.std(recording["u"][part])) for part in (~late, late))
+    return before < after <= before * (1.0 + share)
+
+
 def _within(followed: Followed, recording: Recording, probability: float, unsure: float = 0.0) -> Evidence:
     """Return the evidence on a rise of G within the record; `unsure` as `_flow` takes it."""
     steps, begin = followed.steps, float(recording.t[0])
@@ -331,6 +343,7 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
     course = LeakCourse(0.5 * (edges[:-1] + edges[1:]), estimate, low, high)
     reason = f"the leakage conductance past piston or pump rose at {onset:.1f} s{law} ({figures})"
     sized = large is None or large.sized
+    makes_good = _makes_good(recording, onset, limits[1] * LITRE_PER_MINUTE / followed.pumped)
     if cause is not None or followed.another or (sized and not leaks):
         why = {
             "friction change": "the friction changed more than it does in a healthy machine",
@@ -361,7 +374,7 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
         cause="piston or pump leak",
         course=course,
         chance=chance,
-        weighed=frozenset() if large is None else _WEIGHED,
+        weighed=_WEIGHED if large is not None else _MADE_GOOD if makes_good else frozenset(),
     )
     return found if sized else without_flow(found, _UNSIZED)
 
