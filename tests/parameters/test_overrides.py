@@ -163,6 +163,7 @@ ACROSS = (
     'when volumes = "position"',
     "must be in a line",
     "must stand with a filter",
+    "must be within the spool's stroke",
 )
 
 
