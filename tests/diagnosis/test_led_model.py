@@ -52,7 +52,7 @@ def test_a_led_run_is_that_of_single_samples_each_corrected_by_its_reading() -> 
     state, slowly = np.zeros((1, STATES)), np.empty(alone.size)
     for sample in range(alone.size):
         slowly[sample] = state[0, 0]
-        state[0, 0] += led.gain * (led.readings[sample] - state[0, 0])
+        state[0, 0] += led.correction * (led.readings[sample] - state[0, 0])
         model.part(sample, 1).run(theta[None], start=state)
     shown = led.run(theta[None])[0]
     np.testing.assert_allclose(shown, slowly, atol=1.0)

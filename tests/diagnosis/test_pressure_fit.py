@@ -172,7 +172,7 @@ def test_single_precision_is_within_a_pascal_of_doubles(thesis: Rig) -> None:
         shown,
         False,
         model.readings,
-        model.gain,
+        model.correction,
     )
     apart = model.run(sets) - shown.T
     assert 0.0 < np.sqrt(np.mean(apart**2)) < 0.3

@@ -172,7 +172,7 @@ def pressure_differences(
     out: np.ndarray,
     speeds: bool,
     readings: np.ndarray,
-    gain: float,
+    correction: float,
 ) -> None:
     """Write dp [Pa], or v [m/s] if `speeds`, of all lanes at each sample into `out` (n, lanes).
 
@@ -181,14 +181,14 @@ def pressure_differences(
     [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa], a servo valve's supply [Pa] or, without one,
     the load [N]; `theta`:
     (segments, 13, lanes) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, lanes) at the first
-    sample, in place. With a `gain` dp, once written, is led towards its `readings` (n,) [Pa] by that share of the
+    sample, in place. With a `correction` dp, once written, is led towards its `readings` (n,) [Pa] by that share of the
     difference.
     """
     y = (load(state, 0), load(state, 1), load(state, 2), load(state, 3), load(state, 4))
     for sample in range(segment.size):
         store(out, sample, y[1] if speeds else y[0])
-        if gain > 0.0:
-            y = (y[0] + gain * (readings[sample] - y[0]), y[1], y[2], y[3], y[4])
+        if correction > 0.0:
+            y = (y[0] + correction * (readings[sample] - y[0]), y[1], y[2], y[3], y[4])
         row = 13 * segment[sample]
         lead = load(theta, row + LEAD)
         now = (
@@ -233,8 +233,8 @@ class DrivenModel:
     """The reduced rig under a recorded command, run for many sets of parameters.
 
     `inputs` (m, 5) at every half step, as `pressure_differences` takes them; `every` steps of `h` [s] to a sample;
-    `numbers` of the assumed rig; `readings` (n,) [Pa] that lead dp by the share `gain` of what they add, none by
-    default.
+    `numbers` of the assumed rig; `readings` (n,) [Pa] that lead dp by the share `correction` of what they add, none
+    by default.
     """
 
     inputs: Array
@@ -242,7 +242,7 @@ class DrivenModel:
     every: int
     numbers: RigNumbers
     readings: Array = field(default_factory=lambda: np.empty(0))
-    gain: float = 0.0
+    correction: float = 0.0
 
     @staticmethod
     def of(
@@ -349,7 +349,7 @@ class DrivenModel:
         Their mean becomes that of what parameters `theta` (13,) show under the command alone.
         """
         readings = readings - float(np.mean(readings - self.run(theta[None])[0]))
-        return replace(self, readings=readings, gain=-math.expm1(-2.0 / (MEMORY * self.rate)))
+        return replace(self, readings=readings, correction=-math.expm1(-2.0 / (MEMORY * self.rate)))
 
     def piston_speed(self, omega: float | Array) -> float | Array:
         """Return the piston's speed [m/s] at a speed of the motor [rad/s], without leakage and stored oil."""
@@ -391,7 +391,7 @@ class DrivenModel:
                 out,
                 speeds,
                 self.readings,
-                self.gain,
+                self.correction,
             )
             here = lanes[: min(RUNS, runs - first)]
             for part in range(0, n, _TURNED):  # parts that stay in the processor's cache
