@@ -197,9 +197,11 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
         large = _large(plain, raw, edges, seen, prior)
         if large is not None and large.stated and large.sized and large.excess <= unruly:
             return _beside(large, model, edges, length, share)
+    # where the model follows beside a large leak, or beside another machine in its place, that is its word
+    weighed = large is not None and large.sized and large.excess <= unruly
     if not isinstance(look, str):
         look = _looked_again(look, model, dp, edges, theta, skip, seen)
-        if look.excess > unruly and not numbers.valved:
+        if look.excess > unruly and not weighed and not numbers.valved:
             led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, length, share)
             if led is not None and (led.large is not None or led.excess <= unruly):
                 return led
