@@ -343,7 +343,6 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
     course = LeakCourse(0.5 * (edges[:-1] + edges[1:]), estimate, low, high)
     reason = f"the leakage conductance past piston or pump rose at {onset:.1f} s{law} ({figures})"
     sized = large is None or large.sized
-    makes_good = _makes_good(recording, onset, limits[1] * LITRE_PER_MINUTE / followed.pumped)
     if cause is not None or followed.another or (sized and not leaks):
         why = {
             "friction change": "the friction changed more than it does in a healthy machine",
@@ -361,6 +360,7 @@ def _within(followed: Followed, recording: Recording, probability: float, unsure
             cause=cause,
             chance=chance,
         )
+    makes_good = _makes_good(recording, onset, limits[1] * LITRE_PER_MINUTE / followed.pumped)
     found = Evidence(
         "leak",
         reason,
