@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
-from sealscope.compiled import law
+from sealscope.compiled import kernel, law
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -42,6 +42,14 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
     m[6] = m[4] * (m[6] + voltages - m[7])
     m[7] = voltages
     return (omega + m[3] * m[6]) / m[2]  # type: ignore[no-any-return]
+
+
+@kernel
+def lagged(values: np.ndarray, fading: float, first: float, out: np.ndarray) -> None:
+    """Write the lag of values (n,) into `out` (n,): each is held from sample to sample, `fading` of the rest stays."""
+    for sample in range(values.size):
+        out[sample] = first
+        first = values[sample] + fading * (first - values[sample])
 
 
 def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str, float]) -> None:
@@ -110,6 +118,27 @@ class Drive:
         The voltage makes the pump give the flow against the pressure difference (p_A - p_B).
         """
         return _inverse(self.block(rate))
+
+    @property
+    def lag(self) -> float:
+        """Time [s] in which the speed loop takes up what it is short of: infinite without an integral."""
+        return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
+
+    def flow(self, u: Array, dp: Array, rate: float, settled: int = 0) -> Array:
+        """Return the flow (n,) [m^3/s] of voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
+
+        The drive's law above, solved for omega: with y, omega_d + droop dp after a `lag`, omega = (omega_d + shortfall
+        (y - droop dp))/(1 + shortfall). It starts from rest, where it carries the first dp; or so that y is the same
+        after the first `settled` samples as before them.
+        """
+        commanded, lift = self.omega_per_volt * u, self.droop * dp
+        wanted, late = commanded + lift, np.empty_like(commanded)
+        decay, first = -1.0 / (self.lag * rate), float(lift[0])
+        if settled and decay < 0.0:
+            lagged(wanted[: settled + 1], math.exp(decay), 0.0, late[: settled + 1])
+            first = float(late[settled]) / -math.expm1(settled * decay)
+        lagged(wanted, math.exp(decay), first, late)
+        return np.asarray(self.displacement * (commanded + self.shortfall * (late - lift)) / (1.0 + self.shortfall))
 
     def block(self, rate: float) -> Array:
         """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""

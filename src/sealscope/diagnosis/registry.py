@@ -24,6 +24,7 @@ def _built_in(room: str, name: str) -> Factory:
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
     "volume balance": _built_in("volume_balance", "VolumeBalance"),
+    "cycle balance": _built_in("volume_balance.over_cycles", "CycleBalance"),
     "pressure model": _built_in("pressure_model", "PressureModel"),
     "observer": _built_in("observer", "Observer"),
     "rms change": _built_in("rms_change", "RmsChange"),

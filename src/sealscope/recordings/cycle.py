@@ -61,3 +61,17 @@ def cycle_of(signal: Array, rate: float) -> float | None:
     a, b, c = correlation[k - 1 : k + 2]
     lag = (k + 0.5 * (a - c) / (a - 2 * b + c)) * stride / rate
     return float(lag) if lag >= 0.2 else None
+
+
+def fundamental(signal: Array, t: Array, cycle: float) -> float:
+    """Return the fundamental frequency [Hz] of a signal (n,) at even instants `t` (n,) [s]: the slope of its phase.
+
+    `cycle` [s]: about how long its cycle is (`cycle_of`), of which there must be two or more.
+    """
+    size = max(1, round(cycle / (t[1] - t[0])))
+    count = t.size // size
+    turned = (signal - signal.mean()) * np.exp(-2j * np.pi * t / cycle)
+    each = turned[: count * size].reshape(count, size).mean(axis=1)
+    phase = np.unwrap(np.angle(each))
+    slope = np.polyfit(t[: count * size].reshape(count, size).mean(axis=1), phase, 1, w=np.abs(each))[0]
+    return 1.0 / cycle + float(slope) / (2.0 * np.pi)

@@ -51,6 +51,9 @@ QUIET_STRENGTHS = (*STRENGTHS, (0.0, 1.0), (0.0, 10.0), (0.0, 100.0))
 _FRACTIONS = 3
 #: Interventions whose score is within this of the best take part in the height of the step.
 _NEAR = 20.0
+#: Highest steps that are looked for as the smallest that would have been seen, over the noise: where that is far below
+#: the drift, steps of the drift's size are far above it.
+_HIGHEST = {False: 200.0, True: 2e4}
 #: Where the smallest step that would have been seen is looked for, as shares of the series.
 _ADDED_AT = (0.3, 0.5, 0.7)
 #: Power of the likelihood that weighs drifts, onsets and rises for the height: under 1, because no real drift is of the
@@ -346,7 +349,7 @@ def findable_step(
     u = (t - t[0]) / float(np.median(np.diff(t)))
     unit = float(np.median(sd))
     family = _family(u, sd / unit, None if shared is None else shared / unit, quiet)
-    heights = noise * np.geomspace(0.2, 200.0, 36)
+    heights = noise * np.geomspace(0.2, _HIGHEST[quiet], 36)
     shapes = rises(u, u[0] + np.array(_ADDED_AT) * (u[-1] - u[0]))
     series = (g / unit)[:, None] + (shapes.T[:, :, None] * heights).reshape(u.size, -1)
     threshold = max(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.diagnosis.pressure_model.model import smoothed
+from sealscope.recordings.cycle import fundamental
 from sealscope.recordings.recording import Array
 
 #: A force swings where the mean of dp over a cycle deviates by this share of the deviation of dp: without one it is
@@ -56,20 +57,9 @@ def carried_by_load(u: Array, dp: Array, rate: float, cycle: float | None) -> Ar
     slow, command = (values[: count * stride].reshape(count, stride).mean(axis=1) for values in (dp, u))
     t = np.asarray((np.arange(count) + 0.5) * stride / rate, dtype=np.float64)
     orders = np.arange(1, max(2, int(_HIGHEST * cycle)))
-    angles = 2.0 * np.pi * _frequency(command, t, cycle) * t[:, None] * orders
+    angles = 2.0 * np.pi * fundamental(command, t, cycle) * t[:, None] * orders
     columns = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
     weighted = columns.T * np.hanning(count + 2)[1:-1]
     repeated = columns @ (np.linalg.pinv(weighted @ columns, hermitian=True) @ (weighted @ slow))
     load = smoothed(slow - repeated, rate / stride, _WIDTH)
     return np.interp(np.arange(dp.size) / rate, t, load)
-
-
-def _frequency(command: Array, t: Array, cycle: float) -> float:
-    """Return the fundamental frequency [Hz] of a command (n,) whose cycle is about `cycle` [s]: its phase's slope."""
-    size = max(1, round(cycle / (t[1] - t[0])))
-    count = t.size // size
-    turned = (command - command.mean()) * np.exp(-2j * np.pi * t / cycle)
-    each = turned[: count * size].reshape(count, size).mean(axis=1)
-    phase = np.unwrap(np.angle(each))
-    slope = np.polyfit(t[: count * size].reshape(count, size).mean(axis=1), phase, 1, w=np.abs(each))[0]
-    return 1.0 / cycle + float(slope) / (2.0 * np.pi)

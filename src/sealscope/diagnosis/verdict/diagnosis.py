@@ -115,7 +115,7 @@ class Diagnosis(Evidence):
     >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
     ('piston or pump leak', '79 mm/min')
     >>> [evidence.detector for evidence in diagnosis.parts if evidence.verdict == "cannot tell"]
-    ['pressure model', 'observer']
+    ['cycle balance', 'pressure model', 'observer']
     >>> [round(end, 1) for end in diagnosis.as_dict()["onset_interval_s"]]
     [29.9, 30.1]
     """

@@ -1,0 +1,1 @@
+"""The balance of volumes over whole cycles, after which the piston is where it was."""
