@@ -169,10 +169,9 @@ def _flow(flows: CycleFlows, step: DriftStep, dp: float, level: float) -> tuple[
         reach=(_BESIDE + 0.2) * flows.seconds,
         fewest=_FEWEST_BESIDE,
     )
-    size = step.size if ratio == 0.0 else 0.5 * (step.size + beside)
+    ends = (step.size, step.size if ratio == 0.0 else max(beside, 0.0))
     unit = dp / LITRE_PER_MINUTE
-    ends = (step.size, step.size if ratio == 0.0 else beside)
-    return size * unit, ((min(ends) - half) * unit, (max(ends) + half) * unit)
+    return float(np.mean(ends)) * unit, ((min(ends) - half) * unit, (max(ends) + half) * unit)
 
 
 def _no_step(flows: CycleFlows, step: DriftStep, smallest: float, figures: str) -> Evidence:

@@ -80,8 +80,6 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
     if counted is None or cycle is None:
         return "the duty does not repeat, so that the piston comes back at no known time"
     dp = recording["p_A"] - recording["p_B"]
-    if (whole := recording.duration / cycle) < FEWEST:
-        return f"too short for a balance over cycles: {whole:.0f} cycles of {cycle:.3g} s, {FEWEST} are needed"
     drive, settled = Drive.of(rig), 0
     if counted == "u":
         u = recording["u"]
@@ -105,14 +103,18 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         volume = volume - along * area * x
     length, half = cycle * rate * max(1, round(BLOCK / cycle)), 0.5 * _AT_ENDS * cycle * rate
     last = len(recording) - 1 - half
-    count = int((last - max(SETTLED, cycle) * rate) / length + 1e-6)
+    seconds = (last - max(SETTLED, cycle) * rate) / rate
+    # few long cycles overlap by half
+    overlap = 1 if seconds * rate >= FEWEST * length else 2
+    count = int(overlap * (seconds * rate / length - 1.0) + 1e-6) + 1
     if count < FEWEST:
         return (
-            f"too short for a balance over cycles: {count} blocks of {length / rate:.3g} s after the start, {FEWEST} "
-            "are needed"
+            f"too short for a balance over cycles: {seconds:.4g} s after the start, {(FEWEST + 1) / 2:g} cycles of "
+            f"{length / rate:.3g} s are needed"
         )
-    ends = last - length * np.arange(count, -1, -1.0)
-    used = ~touched(recording, np.floor(ends).astype(np.int64))
+    ends = last - length / overlap * np.arange(count + overlap - 1, -1, -1.0)
+    first, stop = ends[:-overlap], ends[overlap:]
+    used = ~np.array([touched(recording, np.array(pair, dtype=np.int64))[0] for pair in zip(first, stop, strict=True)])
     if np.count_nonzero(used) < FEWEST:
         return f"samples are missing in {count - np.count_nonzero(used)} of {count} blocks of {length / rate:.3g} s"
 
@@ -120,9 +122,9 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         """Return the mean over each block that counts of what has this integral (m,), averaged about a block's ends."""
         twice, places = _integral(integral, rate), np.arange(integral.size)
         at_ends = (np.interp(ends + half, places, twice) - np.interp(ends - half, places, twice)) / (2.0 * half / rate)
-        return np.asarray(np.diff(at_ends)[used] / (length / rate))
+        return np.asarray((at_ends[overlap:] - at_ends[:-overlap])[used] / (length / rate))
 
-    middles = 0.5 * (ends[:-1] + ends[1:])[used] / rate
+    middles = 0.5 * (first + stop)[used] / rate
     lower = recording["p_B" if side > 0.0 else "p_A"]
     return CycleFlows(
         t=float(recording.t[0]) + middles,
