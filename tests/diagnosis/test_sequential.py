@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy.special import pdtr
 
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
-from sealscope.diagnosis.volume_balance.stream import BalanceState, SequentialBalance
+from sealscope.diagnosis.volume_balance.live import BalanceState
+from sealscope.diagnosis.volume_balance.stream import SequentialBalance
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording

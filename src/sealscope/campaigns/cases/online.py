@@ -17,20 +17,22 @@ if TYPE_CHECKING:
 _PORTION = 1.0
 
 
-def online_balance(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
-    """Return the alarm of a `SequentialBalance` as it stands at the record's end, or its last word without an alarm.
+def online(detector: str, recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
+    """Return the alarm of a detector's stream as it stands at the record's end, or its last word without an alarm.
 
     Its rate of alarms is the one at which a healthy machine alarms within the record with the probability
     `false_alarm` at most. An alarm that was raised stays, whatever came later. A record without its channels is
     `cannot tell`.
     """
+    from sealscope.diagnosis.volume_balance.over_cycles.stream import SequentialCycles
     from sealscope.diagnosis.volume_balance.stream import SequentialBalance
 
-    balance = SequentialBalance(rig, alarms_per_hour=false_alarm * 3600.0 / recording.duration)
+    made = SequentialCycles if detector == "cycle balance" else SequentialBalance
+    stream: SequentialBalance | SequentialCycles = made(rig, alarms_per_hour=false_alarm * 3600.0 / recording.duration)
     begin = float(recording.t[0])
     try:
         for second in range(math.ceil(recording.duration / _PORTION)):
-            balance.update(recording.between(begin + second * _PORTION, begin + (second + 1) * _PORTION))
+            stream.update(recording.between(begin + second * _PORTION, begin + (second + 1) * _PORTION))
     except InputError as error:
         return Evidence("cannot tell", str(error))
-    return balance.state.alarm or balance.state.evidence
+    return stream.state.alarm or stream.state.evidence

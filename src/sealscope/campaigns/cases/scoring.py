@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sealscope.campaigns.cases.online import online_balance
+from sealscope.campaigns.cases.online import online
 from sealscope.campaigns.cases.row import STATED, Scores, finite, rank_of, stated_evidence
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, Views, plan_detector
 from sealscope.diagnosis.calibration.scorers import Look, Sides, scorer, split_view
@@ -23,7 +23,7 @@ def stated(look: Look, names: Sequence[str], views: Views) -> tuple[Scores, dict
         if detector.detector and detector.key not in statements:
             examination = seen.examination
             if detector.online:
-                evidence = online_balance(seen.recording, examination.rig, examination.false_alarm_probability)
+                evidence = online(detector.of, seen.recording, examination.rig, examination.false_alarm_probability)
             elif detector.of == DIAGNOSE:
                 evidence = examination.fused(detector.quick)
             else:

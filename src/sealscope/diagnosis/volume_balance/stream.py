@@ -14,13 +14,12 @@ overlap, so false alarms come in clusters, which leaves the true rate some 2 to 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.volume_balance.blocks import (
     BLOCK_SECONDS,
     BalanceBlocks,
@@ -31,47 +30,14 @@ from sealscope.diagnosis.volume_balance.blocks import (
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.diagnosis.volume_balance.evidence import judge, total_lpm, trouble
 from sealscope.diagnosis.volume_balance.fit import fit_balance
+from sealscope.diagnosis.volume_balance.live import LEARN_SECONDS, BalanceState, JoinedSamples, check_stream, replaces
 from sealscope.errors import InputError
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: The duty's cycle is looked for in the first part of a stream [s].
-_LEARN_SECONDS = 60.0
 _CHANNELS = ("u", "x", "theta", "omega", "p_A", "p_B", "p_1", "p_2")
-#: What an alarm may turn out to be.
-_OUTSIDE: Cause = "external leak"
-#: Probability per window for which a threshold can be set.
-_PROBABILITIES = (1e-7, 0.05)
-
-
-@dataclass(frozen=True)
-class BalanceState:
-    """State of a `SequentialBalance`.
-
-    Attributes
-    ----------
-    t : float
-        End of the last whole block [s].
-    blocks, refused : int
-        Whole blocks so far, and those of them with gaps or missing values.
-    evidence : Evidence
-        Of the last window.
-    alarm : Evidence or None
-        The evidence with the highest score since the alarm was raised, until it is acknowledged. A leak to the outside
-        is told from one inside by the pressures that fall, which takes its time: from then on the alarm is that
-        evidence, `no leak` past the piston with the cause `external leak`.
-    total_lpm : float or None
-        Mean leakage of pump and piston together over the window [L/min], None where L/min cannot be stated.
-    """
-
-    t: float
-    blocks: int
-    refused: int
-    evidence: Evidence
-    alarm: Evidence | None
-    total_lpm: float | None
 
 
 class SequentialBalance:
@@ -123,21 +89,13 @@ class SequentialBalance:
     ) -> None:
         from sealscope.parameters import load_rig
 
-        if window < FEWEST:
-            raise InputError(f"window must be {FEWEST} blocks or more, got {window}")
         if not block_seconds > 0:
             raise InputError(f"block_seconds must be > 0 s, got {block_seconds}")
-        low, high = (probability * 3600.0 / block_seconds for probability in _PROBABILITIES)
-        if not low <= alarms_per_hour <= high:
-            raise InputError(f"alarms_per_hour must be {low:.2g} to {high:.3g}, got {alarms_per_hour}")
+        check_stream(alarms_per_hour, window, block_seconds)
         self.alarms_per_hour, self.window, self.block_seconds = alarms_per_hour, window, block_seconds
         self._detector = VolumeBalance(load_rig(rig))
-        self._t: Array = np.empty(0)
-        self._channels: dict[str, Array] = {}
-        self._units: dict[str, str] = {}
-        self._rate = 0.0
+        self._samples = JoinedSamples(_CHANNELS)
         self._length = 0
-        self._names: tuple[str, ...] = ()
         self._used: tuple[str, ...] = ()
         self._window: BalanceBlocks | None = None
         waiting = Evidence("cannot tell", "waits for the first blocks")
@@ -167,40 +125,21 @@ class SequentialBalance:
         InputError
             Where channels, units or rate are not those of the stream's beginning.
         """
-        joined = self._join(samples)
+        if not self._samples.begun and (missing := channels_needed(samples)) is not None:
+            raise InputError(f"a stream for the volume balance {missing}")
+        joined = self._samples.joined(samples)
         if self._length == 0:
-            if joined.duration < _LEARN_SECONDS:
-                self._keep(joined, 0)
+            if joined.duration < LEARN_SECONDS:
+                self._samples.keep(joined, 0)
                 return self.state
-            first = joined.samples(slice(0, round(_LEARN_SECONDS * joined.rate)))
+            first = joined.samples(slice(0, round(LEARN_SECONDS * joined.rate)))
             self._length = block_samples(first, self.block_seconds)
             self._used = balance_channels(first)
         count = len(joined) // self._length
         for number in range(count):
             self._take(joined.samples(slice(number * self._length, (number + 1) * self._length)))
-        self._keep(joined, count * self._length)
+        self._samples.keep(joined, count * self._length)
         return self.state
-
-    def _keep(self, joined: Recording, first: int) -> None:
-        self._t = joined.t[first:].copy()
-        self._channels = {name: joined[name][first:].copy() for name in self._names}
-
-    def _join(self, samples: Recording) -> Recording:
-        if not self._names:
-            missing = channels_needed(samples)
-            if missing is not None:
-                raise InputError(f"a stream for the volume balance {missing}")
-            self._names = tuple(name for name in _CHANNELS if name in samples)
-            self._channels = {name: np.empty(0) for name in self._names}
-            self._units, self._rate = {name: samples.units[name] for name in self._names}, samples.rate
-        chosen = samples.only(self._names)
-        if samples.rate != self._rate or dict(chosen.units) != self._units:
-            raise InputError(
-                f"samples must have the rate ({self._rate:g} Hz) and units of the stream's beginning, got "
-                f"{samples.rate:g} Hz and {', '.join(f'{name} [{unit}]' for name, unit in chosen.units.items())}"
-            )
-        channels = {name: np.concatenate([self._channels[name], chosen[name]]) for name in self._names}
-        return Recording(np.concatenate([self._t, chosen.t]), channels, self._units, self._rate)
 
     def _take(self, block: Recording) -> None:
         cut = self._detector.blocks(block, self._length, self._used)
@@ -213,7 +152,7 @@ class SequentialBalance:
             self._window = window.chosen(np.arange(max(0, len(window) - self.window), len(window)))
             if len(self._window) >= FEWEST:
                 evidence, total = self._judge(self._window, block.units["x"] == "m")
-        if _replaces(evidence, alarm):
+        if replaces(evidence, alarm):
             alarm = evidence
         self.state = BalanceState(end, before.blocks + 1, before.refused + (not usable), evidence, alarm, total)
 
@@ -223,22 +162,3 @@ class SequentialBalance:
         if problem is not None:
             return Evidence("cannot tell", problem), None
         return judge(fit, self.alarms_per_hour * blocks.seconds / 3600.0, window=True), total_lpm(fit)
-
-
-def _replaces(evidence: Evidence, alarm: Evidence | None) -> bool:
-    """Return whether the evidence of a window is the alarm from now on."""
-    outside = evidence.cause == _OUTSIDE and evidence.alarmed
-    if alarm is None:
-        return evidence.verdict == "leak"
-    better = (evidence.score or 0.0) > (alarm.score or 0.0)
-    if alarm.cause == _OUTSIDE:
-        return outside and better
-    return (evidence.verdict == "leak" and better) or (outside and _same_rise(evidence, alarm))
-
-
-def _same_rise(one: Evidence, other: Evidence) -> bool:
-    """Return whether two windows date the same rise."""
-    if one.onset_interval_s is None or other.onset_interval_s is None:
-        return False
-    (begin, end), (first, last) = one.onset_interval_s, other.onset_interval_s
-    return begin <= last and first <= end
