@@ -125,6 +125,17 @@ class CycleBalance:
             share=flows.share,
             weighed=_WEIGHED,
         )
+        before = (level - step.size) * dp / LITRE_PER_MINUTE
+        if flows.settles and lpm < before:
+            return replace(
+                without_flow(
+                    leak,
+                    f"less than the {before:.2g} L/min that passed before may come of how the circuit of a single rod "
+                    "settles where it rests without a load",
+                ),
+                verdict="cannot tell",
+                cause=None,
+            )
         if lost:
             return replace(
                 leak, verdict="cannot tell", cause="external leak", leak_lpm=None, leak_interval_lpm=None, course=None

@@ -36,6 +36,9 @@ _AT_ENDS = 0.1
 #: One side has the higher pressure throughout where p_A - p_B, averaged over so long [s], has its mean's sign for all
 #: but this share of the time.
 _MEANS, _ELSEWHERE = 0.02, 0.002
+#: No load stands on a single rod where p_A - p_B falls under this share of its mean; it rests where it is below this
+#: share of its highest speed for longer than this share of the time.
+_LOADED, _SLOW, _RESTS = 0.5, 0.05, 0.1
 #: A recording starts from rest where its first command is under this share of the largest.
 _AT_REST = 0.02
 #: Cycles over which the drive of a machine that starts in motion is taken to be settled.
@@ -50,7 +53,8 @@ class CycleFlows:
     higher pressure and the piston does not take; `dp` (n,) [Pa]: mean pressure difference, > 0; `lower` (n,) [Pa]: mean
     of the other side's pressure; `pumped` [m^3/s]: mean size of the pump's flow; `fading` (n,): what the drive's state
     at the first sample, unknown, adds to the flow, in units of that state, None where nothing; `share` of the
-    recording's blocks that count; `counted`: the channel that shows the shaft.
+    recording's blocks that count; `counted`: the channel that shows the shaft; `settles`: whether it is a single rod
+    that rests unloaded, whose circuit may settle in another way at each rest.
     """
 
     t: Array
@@ -62,6 +66,7 @@ class CycleFlows:
     fading: Array | None
     share: float
     counted: str
+    settles: bool
 
 
 def shaft_shown(recording: Recording) -> str | None:
@@ -90,11 +95,13 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
     cycle = 1.0 / fundamental(speed, recording.t, cycle)
     sense = 1.0 if float(np.dot(speed - speed.mean(), dp - dp.mean())) >= 0.0 else -1.0
     side = math.copysign(1.0, float(dp.mean()))  # which pressure is the higher
-    if _changes_sides(side * dp, rate):
+    lowest = _lowest(side * dp, rate)
+    if lowest <= 0.0:
         return (
             "no load stands on the piston: neither side has the higher pressure throughout, and what leaks to and fro "
             "within a cycle is in no mean"
         )
+    rests = float(np.mean(np.abs(speed) < _SLOW * np.abs(speed).max())) > _RESTS
     flow = drive.flow(recording["u"], sense * dp, rate, settled) if counted == "u" else drive.displacement * speed
     volume = drive.displacement * recording["theta"] if counted == "theta" else _integral(flow, rate)
     if _shows(recording, "x", "m"):
@@ -136,6 +143,7 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         fading=np.exp(-middles / drive.lag) if settled and drive.lag > 0.5 * cycle else None,
         share=float(np.mean(used)),
         counted=counted,
+        settles=rig.cylinder.single_rod and lowest < _LOADED and rests,
     )
 
 
@@ -144,8 +152,8 @@ def _integral(values: Array, rate: float) -> Array:
     return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]))]) / rate
 
 
-def _changes_sides(dp: Array, rate: float) -> bool:
-    """Return whether a pressure difference (m,) whose mean is > 0 falls below zero now and then."""
+def _lowest(dp: Array, rate: float) -> float:
+    """Return the least of a pressure difference (m,) over its mean, which is > 0, but for `_ELSEWHERE` of the time."""
     size = max(1, round(_MEANS * rate))
     slow = dp[: dp.size // size * size].reshape(-1, size).mean(axis=1)
-    return float(np.mean(slow <= 0.0)) > _ELSEWHERE
+    return float(np.quantile(slow, _ELSEWHERE)) / float(dp.mean())
