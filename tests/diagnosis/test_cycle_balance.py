@@ -197,6 +197,25 @@ def test_says_why_it_cannot_tell(rig: str, command: str, load: str, why: str) ->
     assert why in evidence.reason
 
 
+@pytest.mark.parametrize(("leak", "verdict"), [("", "cannot tell"), ("0.05 L/min from 60 s", "leak")])
+def test_a_single_rod_that_rests_unloaded(leak: str, verdict: str) -> None:
+    """Its valves settle in one of several ways at each rest: only more than all that passed before is a leak."""
+    experiment = Experiment.of(
+        rig=SINGLE,
+        command="position trapezoid 45 mm within 1.1 s every 5.3 s",
+        controller="pi",
+        leak=leak or (),
+        duration=SECONDS,
+        seed=2,
+    )
+    recording = simulate_with_truth(experiment).recording.only(SEEN)
+    evidence = CycleBalance(load_rig(SINGLE)).examine(recording, [], P)
+    assert cycle_flows(recording, load_rig(SINGLE)).settles
+    assert evidence.verdict == verdict
+    if not leak:
+        assert "rests without a load" in evidence.reason
+
+
 def test_few_long_cycles_overlap() -> None:
     """13 cycles after the start: blocks of a cycle each, half a cycle apart."""
     recording = balanced(2.0 * math.pi / 8.0, 1e6, 1e-12, rise=2e-13)

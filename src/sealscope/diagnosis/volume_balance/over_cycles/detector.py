@@ -47,6 +47,8 @@ _BESIDE, _FEWEST_BESIDE = 4, 3
 _ZERO_DRIFT = 3.5e3
 #: What goes to the outside, as a share of a leak, over which it is external, and under which it is not.
 _LOST = 0.5
+#: What makes the mean of an unloaded single rod jump from rest to rest.
+_SETTLES = "how the circuit of a single rod settles where it rests without a load"
 #: What no mean over a cycle shows.
 _WEIGHED: frozenset[Cause] = frozenset({"friction change"})
 
@@ -130,8 +132,7 @@ class CycleBalance:
             return replace(
                 without_flow(
                     leak,
-                    f"less than the {before:.2g} L/min that passed before may come of how the circuit of a single rod "
-                    "settles where it rests without a load",
+                    f"less than the {before:.2g} L/min that passed before may come of {_SETTLES}",
                 ),
                 verdict="cannot tell",
                 cause=None,
@@ -196,8 +197,10 @@ def _no_step(flows: CycleFlows, step: DriftStep, smallest: float, figures: str) 
     known = share <= LEAK_WORTH_FINDING
     if not known:
         reason += f", more than {LEAK_WORTH_FINDING:.0%} of the pump's flow, the smallest leak worth finding"
+    elif flows.settles:
+        reason += f", but for {_SETTLES}, which hides leaks as well"
     return Evidence(
-        "no leak" if known else "cannot tell",
+        "no leak" if known and not flows.settles else "cannot tell",
         reason,
         step.score,
         step.threshold,
