@@ -41,6 +41,8 @@ _SCALE, _DRIVE_SCALE = 0.03, 0.05
 _DRIFTS = 0.01
 #: Least mean flow of a pump that makes good its own leakage, as a share of the flow to and fro: 0 in an open loop.
 _DELIVERED = 2e-4
+#: Blocks count by the pressure difference that stands in them, as a share of all at least.
+_LEAST_PRESSURE = 0.05
 #: Blocks on either side from which the size of a step is read once more, and fewest of them.
 _BESIDE, _FEWEST_BESIDE = 4, 3
 #: A transducer's zero drifts by up to 0.5 psi within a recording [Pa].
@@ -87,25 +89,28 @@ class CycleBalance:
         if isinstance(flows, str):
             return Evidence("cannot tell", flows)
         settled = slice(-flows.t.size // 3, None)  # by then, whatever the drive's state was at the start
-        level = float(np.mean(flows.flow[settled] / flows.dp[settled]))
-        if not level * float(np.mean(flows.dp)) > _DELIVERED * flows.pumped:
+        dp, size = flows.dp, float(np.mean(flows.size))
+        level = float(np.dot(flows.flow[settled], dp[settled]) / np.dot(dp[settled], dp[settled]))
+        if not level * float(np.sqrt(np.mean(dp**2))) > _DELIVERED * flows.pumped:
             return Evidence(
                 "cannot tell",
                 "what the pump delivers over a cycle does not make good what leaks under the load: no controller "
                 "brings the piston back, or the circuit changes over between its sides",
             )
-        G, unit = flows.flow / flows.dp, np.full(flows.t.size, 1e-3 * level)
-        shared = None if flows.fading is None else (flows.pumped / np.mean(flows.dp) * flows.fading)[:, None]
+        known = np.maximum(np.abs(dp), _LEAST_PRESSURE * float(np.sqrt(np.mean(dp**2))))
+        weak = np.median(known) / known if flows.by_orifice is not None else np.ones(dp.size)
+        G, unit = flows.flow / np.copysign(known, dp), 1e-3 * level * weak
+        shared = None if flows.shared is None else flows.shared / np.copysign(known, dp)[:, None]
         step = find_step(flows.t, G, unit, false_alarm_probability, shared=shared, quiet=True)
         figures = f"score {step.score:.1f}, threshold {step.threshold:.1f}"
         if step.alarm:
             return self._leak(flows, step, level, figures)
         smallest = findable_step(flows.t, G, unit, false_alarm_probability, step.noise, shared=shared, quiet=True)
-        return _no_step(flows, step, smallest * float(np.mean(flows.dp)), figures)
+        return _no_step(flows, step, smallest * size, figures)
 
     def _leak(self, flows: CycleFlows, step: DriftStep, level: float, figures: str) -> Evidence:
         late = flows.t > step.onset
-        dp = float(np.mean(flows.dp[late]))
+        dp = float(np.mean(flows.size[late]))
         lpm, limits = _flow(flows, step, dp, level)
         scale = math.hypot(_SCALE, _DRIVE_SCALE if flows.counted == "u" else 0.0)
         limits = max(0.0, limits[0] - 1.96 * scale * lpm), limits[1] + 1.96 * scale * lpm
@@ -149,7 +154,7 @@ class CycleBalance:
         What leaves is missing in the accumulator, whose gas expands: dp/dt = -n p Q/V_gas.
         """
         makeup = self.rig.makeup
-        if makeup.check_valves == "absent" or flow <= 0.0:
+        if makeup.check_valves == "absent" or flow <= 0.0 or flows.by_orifice is not None:
             return False, ""
         before = flows.t < step.onset - 0.5 * flows.seconds
         first = np.flatnonzero(before)[-_BESIDE:]
@@ -170,11 +175,17 @@ def _flow(flows: CycleFlows, step: DriftStep, dp: float, level: float) -> tuple[
     """Return the flow of a step [L/min] and its 95 % interval, which holds what the blocks beside it say, too."""
     from scipy.special import stdtrit
 
-    G = flows.flow / flows.dp
+    unit = dp / LITRE_PER_MINUTE
     half = float(stdtrit(max(step.freedom, 1.0), 0.975)) * step.size_sd + 1.96 * _DRIFTS * level
+    if flows.by_orifice is not None:
+        low, high = sorted((1.0, flows.by_orifice))
+        return 0.5 * (low + high) * step.size * unit, (
+            (step.size - half) * low * unit,
+            (step.size + half) * high * unit,
+        )
     beside, ratio = step_near(
         flows.t,
-        G,
+        flows.flow / flows.dp,
         0.5 * flows.seconds,
         step.onset,
         near=0.0,
@@ -182,7 +193,6 @@ def _flow(flows: CycleFlows, step: DriftStep, dp: float, level: float) -> tuple[
         fewest=_FEWEST_BESIDE,
     )
     ends = (step.size, step.size if ratio == 0.0 else max(beside, 0.0))
-    unit = dp / LITRE_PER_MINUTE
     return float(np.mean(ends)) * unit, ((min(ends) - half) * unit, (max(ends) + half) * unit)
 
 
@@ -205,6 +215,6 @@ def _no_step(flows: CycleFlows, step: DriftStep, smallest: float, figures: str) 
         step.score,
         step.threshold,
         chance=step.chance,
-        passage=Passage(None, None, float(np.mean(flows.dp)), smallest / LITRE_PER_MINUTE, None, None, share),
+        passage=Passage(None, None, float(np.mean(flows.size)), smallest / LITRE_PER_MINUTE, None, None, share),
         share=flows.share,
     )

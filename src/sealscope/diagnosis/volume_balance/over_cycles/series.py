@@ -5,7 +5,8 @@ Over a whole cycle of a closed position loop the piston comes back, so that the 
     D mean(omega) = G mean(p_A - p_B) + A dx/T,
 
 where x moves on from cycle to cycle (dx, known where it is recorded). That takes a load, or unlike areas, by which one
-side has the higher pressure throughout: what leaks to and fro in a cycle is in no mean. The shaft's angle is counted
+side has the higher pressure throughout: what leaks to and fro in a cycle is in no mean. A load that changes is as good
+on a double rod, once what its changes store is taken out (`_evened`). The shaft's angle is counted
 where it is recorded; else it is what the drive makes of its command (`control.drive`), whose speed loop misses no turn
 for long.
 """
@@ -13,7 +14,7 @@ for long.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,7 +40,17 @@ _MEANS, _ELSEWHERE = 0.02, 0.002
 #: No load stands on a single rod where p_A - p_B falls under this share of its mean; it rests where it is below this
 #: share of its highest speed for longer than this share of the time.
 _LOADED, _SLOW, _RESTS = 0.5, 0.05, 0.1
-#: A recording starts from rest where its first command is under this share of the largest.
+#: Why nothing is said of an unloaded piston.
+_UNLOADED = (
+    "no load stands on the piston: neither side has the higher pressure throughout, and what leaks to and fro within a "
+    "cycle is in no mean"
+)
+#: A load that changes moves the mean of p_A - p_B over a cycle by this share of its size (rms over mean) or more:
+#: without a load it is 0.37 at most, where friction holds the piston at rest, 0.59 at least under the loads developed
+#: on. Knots of the drift of G beside which its changes are fitted; the most by which flows may scatter about that, as
+#: a share.
+_STANDS, _KNOTS, _COMES_BACK = 0.45, 6, 0.01
+#: A recording starts from rest where its first command, or speed, is under this share of the largest.
 _AT_REST = 0.02
 #: Cycles over which the drive of a machine that starts in motion is taken to be settled.
 _SETTLED_CYCLES = 3
@@ -49,24 +60,28 @@ _SETTLED_CYCLES = 3
 class CycleFlows:
     """The balance over n blocks of whole cycles.
 
-    `t` (n,) middles [s]; `seconds` of a block; `flow` (n,) [m^3/s]: mean of what the pump delivers to the side of the
-    higher pressure and the piston does not take; `dp` (n,) [Pa]: mean pressure difference, > 0; `lower` (n,) [Pa]: mean
-    of the other side's pressure; `pumped` [m^3/s]: mean size of the pump's flow; `fading` (n,): what the drive's state
-    at the first sample, unknown, adds to the flow, in units of that state, None where nothing; `share` of the
-    recording's blocks that count; `counted`: the channel that shows the shaft; `settles`: whether it is a single rod
-    that rests unloaded, whose circuit may settle in another way at each rest.
+    `t` (n,) middles [s]; `seconds` of a block; `flow` (n,) [m^3/s]: mean of what the pump delivers to a side, to that
+    of the higher pressure where it does not change, and the piston does not take; `dp` (n,) [Pa]: mean pressure
+    difference in that sense; `size` (n,) [Pa]: mean of abs(p_A - p_B); `lower` (n,) [Pa]: mean of the other side's
+    pressure; `pumped` [m^3/s]: mean size of the pump's flow; `shared` (n, m) [m^3/s]: errors of `flow` that all
+    blocks share, as columns, None where there are none; `share` of the recording's blocks that count; `counted`: the
+    channel that shows the shaft; `settles`: whether it is a single rod that rests unloaded, whose circuit may settle
+    in another way at each rest; `by_orifice`: where the load changes, the mean flow of an orifice over that of a worn
+    seal which shows alike, else None.
     """
 
     t: Array
     seconds: float
     flow: Array
     dp: Array
+    size: Array
     lower: Array
     pumped: float
-    fading: Array | None
+    shared: Array | None
     share: float
     counted: str
     settles: bool
+    by_orifice: float | None = None
 
 
 def shaft_shown(recording: Recording) -> str | None:
@@ -82,25 +97,26 @@ def _shows(recording: Recording, name: str, unit: str) -> bool:
 def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
     """Return the balance of a recording that has both chamber pressures and a `shaft_shown`, or why there is none."""
     counted, cycle, rate = shaft_shown(recording), find_cycle(recording), recording.rate
-    if counted is None or cycle is None:
-        return "the duty does not repeat, so that the piston comes back at no known time"
+    if counted is None:
+        return "the shaft is not shown"
     dp = recording["p_A"] - recording["p_B"]
-    drive, settled = Drive.of(rig), 0
+    drive = Drive.of(rig)
     if counted == "u":
-        u = recording["u"]
-        settled = round(_SETTLED_CYCLES * cycle * rate) if abs(u[0]) > _AT_REST * np.max(np.abs(u)) else 0
-        speed = drive.omega_per_volt * u
+        speed = drive.omega_per_volt * recording["u"]
     else:
         speed = np.gradient(recording["theta"]) * rate if counted == "theta" else recording["omega"]
-    cycle = 1.0 / fundamental(speed, recording.t, cycle)
-    sense = 1.0 if float(np.dot(speed - speed.mean(), dp - dp.mean())) >= 0.0 else -1.0
     side = math.copysign(1.0, float(dp.mean()))  # which pressure is the higher
     lowest = _lowest(side * dp, rate)
-    if lowest <= 0.0:
-        return (
-            "no load stands on the piston: neither side has the higher pressure throughout, and what leaks to and fro "
-            "within a cycle is in no mean"
-        )
+    if changes := lowest <= 0.0 and not rig.cylinder.single_rod:
+        side, cycle = 1.0, _strokes(speed, rate)
+    elif lowest <= 0.0:
+        return _UNLOADED
+    if cycle is None:
+        return "the duty does not repeat, so that the piston comes back at no known time"
+    rest = abs(speed[0]) <= _AT_REST * np.max(np.abs(speed))
+    settled = 0 if rest or counted != "u" else round(_SETTLED_CYCLES * cycle * rate)
+    cycle = 1.0 / fundamental(speed, recording.t, cycle)
+    sense = 1.0 if float(np.dot(speed - speed.mean(), dp - dp.mean())) >= 0.0 else -1.0
     rests = float(np.mean(np.abs(speed) < _SLOW * np.abs(speed).max())) > _RESTS
     flow = drive.flow(recording["u"], sense * dp, rate, settled) if counted == "u" else drive.displacement * speed
     volume = drive.displacement * recording["theta"] if counted == "theta" else _integral(flow, rate)
@@ -133,18 +149,67 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
 
     middles = 0.5 * (first + stop)[used] / rate
     lower = recording["p_B" if side > 0.0 else "p_A"]
-    return CycleFlows(
+    flows = CycleFlows(
         t=float(recording.t[0]) + middles,
         seconds=length / rate,
         flow=side * sense * means(volume),
         dp=side * means(_integral(dp, rate)),
+        size=means(_integral(np.abs(dp), rate)),
         lower=means(_integral(lower, rate)),
         pumped=float(np.mean(np.abs(flow))),
-        fading=np.exp(-middles / drive.lag) if settled and drive.lag > 0.5 * cycle else None,
+        shared=None,
         share=float(np.mean(used)),
         counted=counted,
         settles=rig.cylinder.single_rod and lowest < _LOADED and rests,
     )
+    if settled and drive.lag > 0.5 * cycle:
+        flows = replace(flows, shared=(flows.pumped * np.exp(-middles / drive.lag))[:, None])
+    return _evened(flows, dp, means(dp), rate) if changes else flows
+
+
+def _evened(flows: CycleFlows, dp: Array, moved: Array, rate: float) -> CycleFlows | str:
+    """Return the flows under a load that changes without what its changes store, and without the drive's zero.
+
+    `dp` (m,): the samples of p_A - p_B; `moved` (n,) [Pa/s]: by how much it changes from a block's start to its end.
+    What the oil and the controller give way is C `moved`. C and the zero are fitted beside a conductance that drifts,
+    by least squares; what is not known of them is an error that all blocks share.
+    """
+    if float(np.sqrt(np.mean(flows.dp**2))) < _STANDS * float(np.mean(flows.size)):
+        return _UNLOADED
+    at = np.linspace(flows.t[0], flows.t[-1], _KNOTS)
+    drifting = np.stack([np.interp(flows.t, at, row) for row in np.eye(_KNOTS)], axis=1) * flows.dp[:, None]
+    fixed = np.stack([np.ones(flows.t.size), moved], axis=1)
+    columns = np.concatenate([fixed, drifting] if flows.shared is None else [fixed, drifting, flows.shared], axis=1)
+    columns_size = np.sqrt(np.mean(columns**2, axis=0)) + np.finfo(float).tiny
+    scaled = columns / columns_size
+    fitted, *_ = np.linalg.lstsq(scaled, flows.flow, rcond=None)
+    left = flows.flow - scaled @ fitted
+    deviation = float(np.sqrt(left @ left / max(1, left.size - columns.shape[1])))
+    if not deviation < _COMES_BACK * flows.pumped:
+        return f"the piston does not come back after each stroke: flows scatter by {deviation / flows.pumped:.1%}"
+    own = deviation * np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled)))[:2]
+    errors = scaled[:, :2] * own
+    size = np.abs(dp[: dp.size // 8 * 8].reshape(-1, 8).mean(axis=1))
+    ratio = float(np.mean(size**0.5) * np.mean(size**2) / (np.mean(size**1.5) * np.mean(size)))
+    return replace(
+        flows,
+        flow=flows.flow - scaled[:, :2] @ fitted[:2],
+        shared=errors if flows.shared is None else np.concatenate([flows.shared, errors], axis=1),
+        by_orifice=ratio,
+    )
+
+
+def _strokes(speed: Array, rate: float) -> float | None:
+    """Return the period [s] of the strongest line in the shaft's speed (m,), None where it is no line.
+
+    The cycle of strokes and load together is longer than a stroke, or without end.
+    """
+    spectrum = np.abs(np.fft.rfft((speed - speed.mean()) * np.hanning(speed.size))) ** 2
+    best = int(np.argmax(spectrum))
+    if best < FEWEST // 2 or best + 1 >= spectrum.size:
+        return None
+    a, b, c = np.log(spectrum[best - 1 : best + 2] + np.finfo(float).tiny)
+    return float(speed.size / rate / (best + 0.5 * (a - c) / (a - 2.0 * b + c)))
 
 
 def _integral(values: Array, rate: float) -> Array:
