@@ -185,6 +185,21 @@ def test_a_leak_under_a_load_that_changes(load: str, leak: str) -> None:
     assert low <= made.truth.mean_leak_lpm <= high < 1.6 * made.truth.mean_leak_lpm
 
 
+def test_oil_that_leaves_under_a_load_that_changes_is_no_leak_inside() -> None:
+    experiment = Experiment.of(
+        rig=DOUBLE,
+        command="position 40 mm sin(1.6t)",
+        controller="pi",
+        load="trapezoid 800 N within 0.7 s every 7.5 s",
+        fault="rod seal A 0.01 L/min from 60 s",
+        duration=SECONDS,
+        seed=6,
+    )
+    recording = simulate_with_truth(experiment).recording.only(SEEN)
+    evidence = CycleBalance(load_rig(DOUBLE)).examine(recording, [], P)
+    assert (evidence.verdict, evidence.cause) == ("cannot tell", "external leak")
+
+
 def test_no_leak_under_a_load_that_changes() -> None:
     evidence = CycleBalance(load_rig(DOUBLE)).examine(swinging().recording.only(SEEN), [], P)
     assert evidence.verdict == "no leak"

@@ -62,12 +62,12 @@ class CycleFlows:
 
     `t` (n,) middles [s]; `seconds` of a block; `flow` (n,) [m^3/s]: mean of what the pump delivers to a side, to that
     of the higher pressure where it does not change, and the piston does not take; `dp` (n,) [Pa]: mean pressure
-    difference in that sense; `size` (n,) [Pa]: mean of abs(p_A - p_B); `lower` (n,) [Pa]: mean of the other side's
-    pressure; `pumped` [m^3/s]: mean size of the pump's flow; `shared` (n, m) [m^3/s]: errors of `flow` that all
-    blocks share, as columns, None where there are none; `share` of the recording's blocks that count; `counted`: the
-    channel that shows the shaft; `settles`: whether it is a single rod that rests unloaded, whose circuit may settle
-    in another way at each rest; `by_orifice`: where the load changes, the mean flow of an orifice over that of a worn
-    seal which shows alike, else None.
+    difference in that sense; `size` (n,) [Pa]: mean of abs(p_A - p_B); `filled` (n,) [Pa]: mean of the other side's
+    pressure, of both where the load changes, which falls where oil leaves; `pumped` [m^3/s]: mean size of the pump's
+    flow; `shared` (n, m) [m^3/s]: errors of `flow` that all blocks share, as columns, None where there are none;
+    `share` of the recording's blocks that count; `counted`: the channel that shows the shaft; `settles`: whether it
+    is a single rod that rests unloaded, whose circuit may settle in another way at each rest; `by_orifice`: where the
+    load changes, the mean flow of an orifice over that of a worn seal which shows alike, else None.
     """
 
     t: Array
@@ -75,7 +75,7 @@ class CycleFlows:
     flow: Array
     dp: Array
     size: Array
-    lower: Array
+    filled: Array
     pumped: float
     shared: Array | None
     share: float
@@ -148,14 +148,14 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         return np.asarray((at_ends[overlap:] - at_ends[:-overlap])[used] / (length / rate))
 
     middles = 0.5 * (first + stop)[used] / rate
-    lower = recording["p_B" if side > 0.0 else "p_A"]
+    other = recording["p_B" if side > 0.0 else "p_A"]
     flows = CycleFlows(
         t=float(recording.t[0]) + middles,
         seconds=length / rate,
         flow=side * sense * means(volume),
         dp=side * means(_integral(dp, rate)),
         size=means(_integral(np.abs(dp), rate)),
-        lower=means(_integral(lower, rate)),
+        filled=means(_integral(other if not changes else 0.5 * (recording["p_A"] + recording["p_B"]), rate)),
         pumped=float(np.mean(np.abs(flow))),
         shared=None,
         share=float(np.mean(used)),
