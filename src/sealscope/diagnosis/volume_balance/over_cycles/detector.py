@@ -58,7 +58,7 @@ _WEIGHED: frozenset[Cause] = frozenset({"friction change"})
 
 
 class CycleBalance:
-    """Leakage under a standing load, from the command (or the shaft) and both chamber pressures."""
+    """Leakage under a load, from the command (or the shaft) and both chamber pressures."""
 
     name = "cycle balance"
     reads = ("u", "theta", "omega", "x", *CHAMBERS)
