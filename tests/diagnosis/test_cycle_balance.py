@@ -135,7 +135,7 @@ def test_the_drives_flow_is_that_of_the_simulated_shaft(rig: str) -> None:
     assert (by_command.counted, by_shaft.counted) == ("u", "theta")
     late = by_command.t > 25.0
     off = (by_command.flow - by_shaft.flow)[late] / LITRE_PER_MINUTE
-    assert np.abs(off).max() < (3e-4 if rig == DOUBLE else 3e-3)
+    assert np.abs(off).max() < 1e-4
     np.testing.assert_allclose(by_command.dp, by_shaft.dp, rtol=1e-4)
 
 

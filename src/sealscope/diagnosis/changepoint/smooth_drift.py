@@ -92,6 +92,13 @@ class DriftStep:
         """Whether the score exceeds the threshold."""
         return self.score > self.threshold
 
+    @property
+    def quantile(self) -> float:
+        """Half width of the 95 % interval of `size` over `size_sd`: Student's."""
+        from scipy.special import stdtrit
+
+        return float(stdtrit(max(self.freedom, 1.0), 0.975))
+
 
 @dataclass(frozen=True, eq=False)
 class WhitenedDrift:

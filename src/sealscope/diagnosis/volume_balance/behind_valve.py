@@ -32,7 +32,7 @@ from sealscope.diagnosis.verdict.evidence import (
     Passage,
     without_flow,
 )
-from sealscope.physics.leakage import leakage_series
+from sealscope.physics.leakage import leakage_series, orifice_over_laminar
 from sealscope.physics.valve import spool_series
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.gaps import touched
@@ -117,10 +117,8 @@ def examined(recording: Recording, rig: Rig, probability: float) -> Evidence:
         return _no_step(windows, step, probability, float(dp.mean()), figures)
     late = recording.t >= step.onset
     laminar = float(dp[late].mean()) / LITRE_PER_MINUTE
-    # of an orifice the same windows show another mean flow
-    size = dp[late]
-    other = laminar * float(np.mean(size**0.5) * np.mean(size**2) / (np.mean(size**1.5) * np.mean(size)))
-    half = _quantile(step.freedom) * math.hypot(step.size_sd, _SCALE * step.size)
+    other = laminar * orifice_over_laminar(dp[late])
+    half = step.quantile * math.hypot(step.size_sd, _SCALE * step.size)
     lpm = 0.5 * (laminar + other) * step.size
     limits = max(0.0, step.size - half) * min(laminar, other), (step.size + half) * max(laminar, other)
     open_ = windows.t > step.onset
@@ -167,12 +165,6 @@ def _no_step(windows: ValveWindows, step: DriftStep, probability: float, dp: flo
         passage=passage,
         share=windows.share,
     )
-
-
-def _quantile(freedom: float) -> float:
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(freedom, 1.0), 0.975))
 
 
 def conductances(recording: Recording, rig: Rig) -> ValveWindows | str:

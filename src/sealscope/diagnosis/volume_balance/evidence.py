@@ -250,13 +250,6 @@ def _normal_tail(score: float) -> float:
     return float(ndtr(-score))
 
 
-def _t_quantile(freedom: float) -> float:
-    """Return the factor of a deviation that gives a 95 % interval."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(freedom, 1.0), 0.975))
-
-
 def level(fit: BalanceFit) -> Level:
     """Return the mean conductance of the whole recording [m^3/(s Pa)], with the shared errors in its error."""
     weight = 1.0 / fit.sd**2
@@ -530,7 +523,7 @@ def describe_leak(
         more = abs(orifice - laminar) * size
         over = _CHANGING_OVER if fit.changes_over else 0.0
         lift = law.mean * float(np.mean(np.abs(fit.blocks.lift[open_])))
-        half = _t_quantile(step.freedom) * math.hypot(size_sd, _RELATIVE * size, over * size, lift * size) * flow
+        half = step.quantile * math.hypot(size_sd, _RELATIVE * size, over * size, lift * size) * flow
         less, most = (law.mean - law.low, law.high - law.mean)[:: 1 if orifice > laminar else -1]
         lpm = size * flow
         interval = max(0.0, lpm - half - less * more), lpm + half + most * more
@@ -691,5 +684,5 @@ def _course(fit: BalanceFit, step: DriftStep, shape: Array, unit_flow: Array) ->
     flow = unit_flow / LITRE_PER_MINUTE
     lpm = (fit.g - step.level) * flow
     noise = fit.sd * max(1.0, step.noise)
-    half = _t_quantile(step.freedom) * np.hypot(noise, step.size_sd * shape) * flow
+    half = step.quantile * np.hypot(noise, step.size_sd * shape) * flow
     return LeakCourse(fit.blocks.t, lpm, lpm - half, lpm + half)

@@ -178,10 +178,8 @@ class CycleBalance:
 
 def _flow(flows: CycleFlows, step: DriftStep, dp: float, level: float) -> tuple[float, tuple[float, float]]:
     """Return the flow of a step [L/min] and its 95 % interval, which holds what the blocks beside it say, too."""
-    from scipy.special import stdtrit
-
     unit = dp / LITRE_PER_MINUTE
-    half = float(stdtrit(max(step.freedom, 1.0), 0.975)) * step.size_sd + 1.96 * _DRIFTS * level
+    half = step.quantile * step.size_sd + 1.96 * _DRIFTS * level
     if flows.by_orifice is not None:
         low, high = sorted((1.0, flows.by_orifice))
         return 0.5 * (low + high) * step.size * unit, (

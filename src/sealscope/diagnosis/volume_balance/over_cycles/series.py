@@ -21,6 +21,7 @@ import numpy as np
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
+from sealscope.physics.leakage import orifice_over_laminar
 from sealscope.recordings.cycle import find_cycle, fundamental
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.motion import moves
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 #: Length of a block, but for rounding to cycles, and how much of a recording is left out at its start [s], or a cycle:
 #: a machine that starts from rest does not come back to where it was at first.
-BLOCK, SETTLED = 3.0, 5.0
+BLOCK, _START = 3.0, 5.0
 #: Readings are averaged about each end of a block over this share of a cycle: of the position, one instant is noise.
 _AT_ENDS = 0.1
 #: One side has the higher pressure throughout where p_A - p_B, averaged over so long [s], has its mean's sign for all
@@ -126,7 +127,7 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         volume = volume - along * area * x
     length, half = cycle * rate * max(1, round(BLOCK / cycle)), 0.5 * _AT_ENDS * cycle * rate
     last = len(recording) - 1 - half
-    seconds = (last - max(SETTLED, cycle) * rate) / rate
+    seconds = (last - max(_START, cycle) * rate) / rate
     # few long cycles overlap by half
     overlap = 1 if seconds * rate >= FEWEST * length else 2
     count = int(overlap * (seconds * rate / length - 1.0) + 1e-6) + 1
@@ -190,12 +191,11 @@ def _evened(flows: CycleFlows, dp: Array, moved: Array, rate: float) -> CycleFlo
     own = deviation * np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled)))[:2]
     errors = scaled[:, :2] * own
     size = np.abs(dp[: dp.size // 8 * 8].reshape(-1, 8).mean(axis=1))
-    ratio = float(np.mean(size**0.5) * np.mean(size**2) / (np.mean(size**1.5) * np.mean(size)))
     return replace(
         flows,
         flow=flows.flow - scaled[:, :2] @ fitted[:2],
         shared=errors if flows.shared is None else np.concatenate([flows.shared, errors], axis=1),
-        by_orifice=ratio,
+        by_orifice=orifice_over_laminar(size),
     )
 
 
