@@ -1,6 +1,7 @@
 """Compute the tables of thresholds that `changepoint.smooth_drift` and `changepoint.random_walk` interpolate, or check.
 
-    python benchmarks/null_tables.py {smooth_drift,quiet_drift,random_walk} [--draws N] [--blocks N ...]
+    python benchmarks/null_tables.py {smooth_drift,quiet_drift,overlapping_drift,random_walk} [--draws N]
+        [--blocks N ...]
     python benchmarks/null_tables.py check [--draws N] [--blocks N ...]
     python benchmarks/null_tables.py beyond [--draws N] [--blocks N ...]
 
@@ -10,7 +11,7 @@ line. Seeds are the blocks' and the strength's numbers. It takes 20 to 60 minute
 smooth_drift: blocks, number of the strength of the drift. From 80 000 weighted draws (`tails.rare_draws`) a line, and
 24 000 at 96 blocks; the probability with which a threshold is exceeded is right within 5 and 9 % (one standard
 deviation), at 1e-6 and less within a factor of two or more for strong drifts. quiet_drift: the same for its strengths,
-24 000 draws a line.
+24 000 draws a line; overlapping_drift: of quiet blocks that overlap by half.
 random_walk: blocks, number of the walk, expected walk. From 200 000 plain draws a line, and beyond a probability of
 0.01 by a generalised Pareto tail fitted to that share of them (probability-weighted moments: Hosking & Wallis,
 Technometrics 29 (1987) 339-349): within 3 % at 0.01, 6 % at 0.001, 12 % at 0.0001.
@@ -50,14 +51,17 @@ def drift_lines(
     levels: int = 18,
     *,
     quiet: bool = False,
+    halves: bool = False,
 ) -> Iterator[tuple[float, ...]]:
-    """Yield the lines of the table of `smooth_drift`, or of `quiet` series.
+    """Yield the lines of the table of `smooth_drift`, or of `quiet` series, whose blocks may overlap by `halves`.
 
     So many `levels` of draws, each half a decade rarer.
     """
     rare = 0.3 * 10.0 ** (-0.5 * np.arange(levels))
     for n in blocks:
-        family = smooth_drift.DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)), quiet=quiet)
+        length = 2.0 if halves else 1.0
+        t, none = np.arange(n, dtype=np.float64), np.zeros((n, 1))
+        family = smooth_drift.DriftFamily(t, np.ones(n), none, quiet=quiet, length=length)
         for number, drift in enumerate(family.drifts):
             scores, weights = [], []
             for chunk in range((draws if n < DRIFT_BLOCKS[-1] or quiet else draws * 3 // 10) // CHUNK):
@@ -198,7 +202,9 @@ def walk_alarms(g: np.ndarray, expected: float) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scan", choices=("smooth_drift", "quiet_drift", "random_walk", "check", "beyond"))
+    parser.add_argument(
+        "scan", choices=("smooth_drift", "quiet_drift", "overlapping_drift", "random_walk", "check", "beyond")
+    )
     parser.add_argument("--draws", type=int)
     parser.add_argument("--blocks", type=int, nargs="+")
     chosen = parser.parse_args()
@@ -209,9 +215,10 @@ def main() -> None:
         beyond(chosen.draws or 24_000, tuple(chosen.blocks or (20,)))
         return
     if chosen.scan != "random_walk":
-        quiet, names = chosen.scan == "quiet_drift", "blocks,strength"
+        halves, names = chosen.scan == "overlapping_drift", "blocks,strength"
+        quiet = halves or chosen.scan == "quiet_drift"
         blocks = tuple(chosen.blocks or (QUIET_BLOCKS if quiet else DRIFT_BLOCKS))
-        lines = drift_lines(chosen.draws or (24_000 if quiet else 80_000), blocks, quiet=quiet)
+        lines = drift_lines(chosen.draws or (24_000 if quiet else 80_000), blocks, quiet=quiet, halves=halves)
         head, form = ",".join([names, *(f"{p:g}" for p in DRIFT_PROBABILITIES)]), "%g,%g" + ",%.2f" * 12
     else:
         lines, names = walk_lines(chosen.draws or 200_000, tuple(chosen.blocks or WALK_BLOCKS)), "blocks,walk,expected"

@@ -7,17 +7,17 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sealscope.diagnosis.volume_balance.blocks import DP_12, Geometry, balance_channels, cut_blocks, volumes
-from sealscope.diagnosis.volume_balance.sums import beyond_pressure, block_means, volume_columns
+from sealscope.diagnosis.volume_balance.sums import beyond_pressure, block_means, carried_columns, volume_columns
 
 from .balance_machine import AREA, DISPLACEMENT, machine
 
 N, L, STEP, HALF = 3, 90, 0.01, 4
 
 
-def smoothed(row):
-    """Means over HALF samples to either side, over fewer at the ends."""
-    padded = np.pad(row, HALF, constant_values=np.nan)
-    return np.nanmean(sliding_window_view(padded, 2 * HALF + 1), axis=1)
+def smoothed(row, half=HALF):
+    """Means over `half` samples to either side, over fewer at the ends."""
+    padded = np.pad(row, half, constant_values=np.nan)
+    return np.nanmean(sliding_window_view(padded, 2 * half + 1), axis=1)
 
 
 def integral(row):
@@ -47,6 +47,25 @@ def test_columns_are_volumes_integrals_and_ways(samples):
         for column, values in zip(columns[k], expected, strict=True):
             np.testing.assert_allclose(column, values, rtol=1e-9, atol=1e-9 * np.ptp(values))
         np.testing.assert_allclose(by_flow[k, 1], integral(flow), atol=1e-12 * np.ptp(theta))
+
+
+def test_oil_stored_is_that_of_means_and_of_what_rings_about_them(samples):
+    x, theta, dp = samples
+    p_A, p_B = 3e5 + dp, 3e5 + 0.2 * np.roll(dp, 7, axis=1)
+    flow = np.gradient(theta, STEP, axis=1)
+    columns = carried_columns(x, p_A, p_B, flow, dp, STEP, HALF)
+    for k in range(N):
+        on_A = dp[k] > 0.0
+        for p, on, rise, by_place in ((p_A[k], on_A, 3, 1), (p_B[k], ~on_A, 0, 2)):
+            mean, ringing = smoothed(p), np.where(on, smoothed(p, HALF // 3) - smoothed(p), 0.0)
+            up = np.where(on, np.diff(mean, prepend=mean[0]), 0.0)
+            middle = 0.5 * (x[k] + np.concatenate([x[k, :1], x[k, :-1]]))
+            up[0] = 0.0
+            np.testing.assert_allclose(columns[k, rise], np.cumsum(up) + ringing, atol=1e-9 * np.ptp(p))
+            wanted = np.cumsum(middle * up) + x[k] * ringing
+            np.testing.assert_allclose(columns[k, by_place], wanted, atol=1e-9 * np.ptp(wanted))
+        delivered = np.where(smoothed(flow[k]) * dp[k] > 0.0, np.abs(smoothed(flow[k])) * dp[k], 0.0)
+        np.testing.assert_allclose(columns[k, 4], integral(delivered), rtol=1e-9, atol=1e-12)
 
 
 def test_what_offset_slope_and_pressure_leave_is_that_of_least_squares(samples):

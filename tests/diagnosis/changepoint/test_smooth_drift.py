@@ -9,7 +9,7 @@ import pytest
 from scipy.special import bdtr, bdtrc
 
 from sealscope.diagnosis.changepoint.shapes import rises
-from sealscope.diagnosis.changepoint.smooth_drift import STRENGTHS, DriftFamily, find_step
+from sealscope.diagnosis.changepoint.smooth_drift import QUIET_STRENGTHS, DriftFamily, find_step
 from sealscope.errors import InputError
 
 N = 57
@@ -38,19 +38,31 @@ DRIFTS: dict[str, Drift] = {
 }
 
 
-@pytest.mark.parametrize("number", [0, 3, 12, 20])
-def test_scores_are_likelihood_ratios(number: int) -> None:
+def twice_integrated(t: np.ndarray, span: float) -> np.ndarray:
+    """Covariance of a walk integrated twice, by summing its steps; its curvature has walked for `span` before."""
+    dt = 0.002
+    when = np.arange(0.5 * dt, t[-1], dt)
+    reached = 0.5 * np.maximum(t[:, None] - when, 0.0) ** 2
+    return np.asarray(dt * reached @ reached.T + span * np.outer(t**2, t**2) / 4.0)
+
+
+@pytest.mark.parametrize("length", [1.0, 2.0])
+@pytest.mark.parametrize("number", [0, 3, 12, 20, 31, 35])
+def test_scores_are_likelihood_ratios(number: int, length: float) -> None:
     """One strength of drift against generalised least squares written out, determinant and all."""
     n = 20
     t = np.arange(n) + np.where(np.arange(n) > 11, 2.0, 0.0)
     random = np.random.default_rng(number)
     sd = random.uniform(0.5, 2.0, n)
     sd /= np.median(sd)
-    walk, slope = STRENGTHS[number]
+    walk, slope, bend = QUIET_STRENGTHS[number]
     low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
     covariance = np.diag(sd**2) + walk * low + slope * low**2 * (3 * high - low) / 6
+    covariance += bend * twice_integrated(t, t[-1])
     inverse = np.linalg.inv(covariance)
     fixed = np.stack([np.ones(n), t], axis=1)
+    if length > 1.0:  # blocks that overlap: every other one has an offset and a slope of its own
+        fixed = np.concatenate([fixed, fixed * ((-1.0) ** t)[:, None]], axis=1)
     y = random.standard_normal(n) + 3.0 * (t > 9)
 
     def squares(columns: np.ndarray) -> float:
@@ -58,22 +70,24 @@ def test_scores_are_likelihood_ratios(number: int) -> None:
         rest = y - columns @ found
         return float(rest @ inverse @ rest)
 
-    family = DriftFamily(t, sd, np.zeros((n, 1)))
+    family = DriftFamily(t, sd, np.zeros((n, 1)), quiet=True, length=length)
     one = family.drifts[number]
     plain = squares(fixed)
-    assert np.sum((one.whiten @ y) ** 2) == pytest.approx(plain, rel=1e-9)
+    assert np.sum((one.whiten @ y) ** 2) == pytest.approx(plain, rel=1e-5 if bend else 1e-9)
     for k in (0, family.onsets.size // 2):
         with_step = squares(np.column_stack([fixed, family.shapes[k]]))
-        assert plain - (one.steps[k] @ y) ** 2 == pytest.approx(with_step, rel=1e-9)
+        assert plain - (one.steps[k] @ y) ** 2 == pytest.approx(with_step, rel=1e-5 if bend else 1e-9)
     pulse = squares(np.column_stack([fixed, np.eye(n)[7]]))
-    assert plain - (one.pulses[7] @ y) ** 2 == pytest.approx(pulse, rel=1e-9)
+    assert plain - (one.pulses[7] @ y) ** 2 == pytest.approx(pulse, rel=1e-5 if bend else 1e-9)
 
     def log_weight(covariance: np.ndarray) -> float:
-        inner = (fixed / [1.0, t[-1]]).T @ np.linalg.inv(covariance) @ (fixed / [1.0, t[-1]])
+        scaled = fixed / np.tile([1.0, t[-1]], fixed.shape[1] // 2)
+        inner = scaled.T @ np.linalg.inv(covariance) @ scaled
         return float(np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(inner)[1])
 
     rest = np.log(one.weight / family.drifts[0].weight) * family.freedom
-    assert rest == pytest.approx(log_weight(covariance) - log_weight(np.diag(sd**2)), rel=1e-9, abs=1e-9)
+    weight = log_weight(covariance) - log_weight(np.diag(sd**2))
+    assert rest == pytest.approx(weight, rel=1e-5 if bend else 1e-9, abs=1e-9)
 
 
 def test_interventions_share_the_block_they_begin_in() -> None:
@@ -210,3 +224,33 @@ def test_a_smaller_probability_asks_for_more() -> None:
 def test_what_makes_no_sense_is_told(t: np.ndarray, g: np.ndarray, sd: np.ndarray, told: str) -> None:
     with pytest.raises(InputError, match=told):
         find_step(t, g, sd, 0.01)
+
+
+def overlapping(random: np.random.Generator, height: float, step: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Means over 39 blocks of 6 s, each half a block after the other, of a drift 300 times their noise, and a step."""
+    t = 3.0 * (np.arange(39) + 1.0)
+    fine = np.arange(0.0, 120.0, 0.05)
+    course = height * wander(random, fine) + step * (fine > 60.0)
+    sums = np.concatenate([[0.0], np.cumsum(course)])
+    first, last = (np.searchsorted(fine, t + side * 3.0 - 1e-9) for side in (-1, 1))
+    g = (sums[last] - sums[first]) / (last - first) + random.standard_normal(t.size)
+    return t, g + 40.0 * (-1.0) ** np.arange(39)
+
+
+def test_a_step_far_below_a_smooth_drift_is_found_in_blocks_that_overlap() -> None:
+    random = np.random.default_rng(8)
+    series = [overlapping(random, 300.0, 30.0) for _ in range(40)]
+    found = [find_step(t, g, np.ones(39), 0.01, quiet=True, halves=True) for t, g in series]
+    assert sum(step.alarm for step in found) >= 28
+    seen = [step for step in found if step.alarm]
+    assert np.median([abs(step.onset - 60.0) for step in seen]) < 2.0
+    assert np.median([step.size for step in seen]) == pytest.approx(30.0, abs=5.0)
+    assert sum(abs(step.size - 30.0) < step.quantile * step.size_sd for step in seen) >= 0.8 * len(seen)
+
+
+def test_a_smooth_drift_alone_is_none() -> None:
+    random = np.random.default_rng(9)
+    alarms = sum(
+        find_step(*overlapping(random, 300.0), np.ones(39), 0.05, quiet=True, halves=True).alarm for _ in range(100)
+    )
+    assert bdtrc(alarms - 1, 100, 0.05) > 1e-4 if alarms else True

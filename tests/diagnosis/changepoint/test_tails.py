@@ -61,8 +61,13 @@ def test_weighted_quantile_of_equal_weights_is_the_order_statistic() -> None:
     assert weighted_quantile(values, np.ones(100), 0.05) == 96_000.0
 
 
-def drift_null(n: int, number: int, draws: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    family = DriftFamily(np.arange(n, dtype=float), np.ones(n), np.zeros((n, 1)))
+def drift_null(
+    n: int, number: int, draws: int, seed: int, table: str = "smooth_drift"
+) -> tuple[np.ndarray, np.ndarray]:
+    length = 2.0 if table == "overlapping_drift" else 1.0
+    quiet = table != "smooth_drift"
+    family = DriftFamily(np.arange(n, dtype=float), np.ones(n), np.zeros((n, 1)), quiet=quiet, length=length)
+    assert family.table == table
     drift = family.drifts[number]
     z, weights = rare_draws(drift.steps @ drift.root, 0.3 * 0.1 ** np.arange(8.0), draws, seed)
     return family.scores(drift.root @ z, 1)[0].max(axis=0), weights
@@ -81,6 +86,16 @@ def test_drift_table_against_fresh_draws(n: int, number: int) -> None:
     for probability in (0.1, 0.01, 1e-3, 1e-4):
         share, deviation = obtained(null_threshold("smooth_drift", probability, n, number), values, weights)
         assert abs(share - probability) < 0.15 * probability + 3.0 * deviation
+
+
+@pytest.mark.parametrize("table", ["quiet_drift", "overlapping_drift"])
+@pytest.mark.parametrize(("n", "number"), [(20, 28), (30, 35), (39, 37), (57, 33)])
+def test_tables_of_quiet_series_against_fresh_draws(table: str, n: int, number: int) -> None:
+    """Strong and smooth drifts, at the blocks of the table and between them: within 20 % and three deviations."""
+    values, weights = drift_null(n, number, 6000, 12, table)
+    for probability in (0.1, 0.01, 1e-3):
+        share, deviation = obtained(null_threshold(table, probability, n, number), values, weights)
+        assert abs(share - probability) < 0.2 * probability + 3.0 * deviation
 
 
 def test_beyond_the_table_a_threshold_is_exceeded_more_rarely_than_stated() -> None:

@@ -12,12 +12,13 @@ def least_blocks(n: int) -> int:
     return max(3, round(0.03 * n))
 
 
-def rises(t: Array, onsets: Array, duration: float = 0.0) -> Array:
+def rises(t: Array, onsets: Array, duration: float = 0.0, length: float = 1.0) -> Array:
     """Return S (k, n): 0 before each onset (k,), 1 after onset + duration, a straight line between; all in blocks.
 
-    `t` (n,): middles of the blocks, one block long: an abrupt step within a block moves it by the share that remains.
+    `t` (n,): middles of the blocks; `length` of a block, over the distance of two: an abrupt step within a block moves
+    it by the share that remains.
     """
-    lead, width = (0.5, 1.0) if duration == 0.0 else (0.0, duration)
+    lead, width = (0.5 * length, length) if duration == 0.0 else (0.0, duration)
     return np.clip((t[None, :] + lead - onsets[:, None]) / width, 0.0, 1.0)
 
 

@@ -30,6 +30,8 @@ from sealscope.recordings.recording import Array
 
 #: Fewest blocks in which a step can be distinguished from a drift.
 FEWEST = 16
+#: Blocks that are searched at once, at most: the last of the tables.
+MOST_BLOCKS = 96
 #: Durations of the rise, as a share of the series: an abrupt step, and a growth. Slower growths look like drifts that
 #: bend: with 0.3 half of all false alarms on a drifting bench were such.
 _RISES = (0.0, 0.1)
@@ -41,12 +43,18 @@ _SWINGS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 _WALKS = (0.0, 1e-3, 4e-3, 1.6e-2, 6e-2, 0.25, 1.0, 4.0, 20.0, 200.0)
 _SLOPES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 _WALKS_BESIDE_SLOPES = (0.0, 1e-2, 0.25)
-#: Strengths (walk, integrated walk) that are tried together.
-STRENGTHS = tuple((walk, 0.0) for walk in _WALKS) + tuple(
-    (walk, slope) for walk in _WALKS_BESIDE_SLOPES for slope in _SLOPES
+#: Strengths (walk, integrated walk, twice integrated walk) that are tried together.
+STRENGTHS = tuple((walk, 0.0, 0.0) for walk in _WALKS) + tuple(
+    (walk, slope, 0.0) for walk in _WALKS_BESIDE_SLOPES for slope in _SLOPES
 )
-#: ... and, where the noise is far below the drift, of integrated walks beside these.
-QUIET_STRENGTHS = (*STRENGTHS, (0.0, 1.0), (0.0, 10.0), (0.0, 100.0))
+#: ... and, where the noise is far below the drift, of stronger and of smoother walks beside these: only then a step is
+#: told from a drift that is far larger.
+_BENDS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
+QUIET_STRENGTHS = (
+    *STRENGTHS,
+    *((0.0, slope, 0.0) for slope in (1.0, 10.0, 100.0)),
+    *((0.0, 0.0, bend) for bend in _BENDS),
+)
 #: Onsets tried in a block.
 _FRACTIONS = 3
 #: Interventions whose score is within this of the best take part in the height of the step.
@@ -134,13 +142,14 @@ class DriftFamily:
     """All drifts for one time axis `t` (n,) in blocks, and one set of relative deviations `sd` (n,).
 
     `shared` (n, m): errors common to the blocks, as columns, in units of the deviations; `quiet`: with
-    `QUIET_STRENGTHS`.
+    `QUIET_STRENGTHS`; `length` of a block on the axis: over 1 where blocks overlap.
     """
 
-    def __init__(self, t: Array, sd: Array, shared: Array, *, quiet: bool = False) -> None:
+    def __init__(self, t: Array, sd: Array, shared: Array, *, quiet: bool = False, length: float = 1.0) -> None:
         n = t.size
-        self.n, self.t, self.quiet = n, t, quiet
-        least = least_blocks(n)
+        self.n, self.t, self.quiet, self.length = n, t, quiet, length
+        overlapping = length > 1.0
+        least = round(length * least_blocks(round(n / length)))
         starts, durations = [], []
         for share in _RISES:
             rise = share * float(t[-1] - t[0])
@@ -152,23 +161,32 @@ class DriftFamily:
             starts.append(usable)
             durations.append(np.full(usable.size, rise))
         self.onsets, self.rises = np.concatenate(starts), np.concatenate(durations)
-        self.shapes = np.concatenate([rises(t, some, float(r[0])) for some, r in zip(starts, durations, strict=True)])
+        self.shapes = np.concatenate(
+            [rises(t, some, float(r[0]), length) for some, r in zip(starts, durations, strict=True)]
+        )
         u = t - t[0]
-        length = u[-1]
-        turns = 2.0 * np.pi * u / length
+        span = float(u[-1])
+        turns = 2.0 * np.pi * u / span
         swings = np.array([[np.sin(turns / share), np.cos(turns / share)] for share in _SWINGS])
-        warm = warm_ups(u, length, _WARM_UPS)
-        self.fixed = np.stack([np.ones(n), u / length], axis=1)
+        warm = warm_ups(u, span, _WARM_UPS)
+        self.fixed = np.stack([np.ones(n), u / span], axis=1)
+        if overlapping:  # every other block lies in the same part of a cycle
+            self.fixed = np.concatenate([self.fixed, self.fixed * ((-1.0) ** np.round(u))[:, None]], axis=1)
         self.freedom = n - self.fixed.shape[1]
         relative = sd / np.median(sd)
         some = shared / np.median(sd)
         noise = np.diag(relative**2) + some @ some.T
         low, high = np.minimum.outer(u, u), np.maximum.outer(u, u)
-        walk, slope = low, low**2 * (3.0 * high - low) / 6.0
+        walk, slope, bend = low, low**2 * (3.0 * high - low) / 6.0, _twice_integrated(low, high, span)
+        pulses = np.eye(n)
+        if overlapping:
+            pulses = np.concatenate([pulses, pulses[:-1] + pulses[1:]])
         strengths = QUIET_STRENGTHS if quiet else STRENGTHS
-        self.drifts = [self._drift(noise, q1 * walk + q2 * slope, warm, swings) for q1, q2 in strengths]
+        self.drifts = [
+            self._drift(noise, q1 * walk + q2 * slope + q3 * bend, warm, swings, pulses) for q1, q2, q3 in strengths
+        ]
 
-    def _drift(self, noise: Array, drift: Array, warm: Array, swings: Array) -> WhitenedDrift:
+    def _drift(self, noise: Array, drift: Array, warm: Array, swings: Array, pulses: Array) -> WhitenedDrift:
         root = np.linalg.cholesky(noise + drift)
         inverse = np.linalg.inv(root)
         basis, triangle = np.linalg.qr(inverse @ self.fixed, mode="complete")
@@ -183,7 +201,7 @@ class DriftFamily:
             whiten,
             units(self.shapes) @ whiten,
             units(warm) @ whiten,
-            units(np.eye(self.n)) @ whiten,
+            units(pulses) @ whiten,
             np.concatenate(np.linalg.qr(whiten @ swings.transpose(0, 2, 1))[0].transpose(0, 2, 1)) @ whiten,
             float(np.exp(log_det / self.freedom)),
             np.asarray(root, dtype=np.float64),
@@ -193,6 +211,8 @@ class DriftFamily:
     @property
     def table(self) -> str:
         """Name of the table of its thresholds."""
+        if self.length > 1.0:
+            return "overlapping_drift"
         return "quiet_drift" if self.quiet else "smooth_drift"
 
     def scores(self, y: Array, sign: int) -> tuple[Array, NDArray[np.intp]]:
@@ -221,29 +241,42 @@ class DriftFamily:
     def posterior(self, y: Array, sign: int, near: NDArray[np.intp]) -> Posterior:
         """Return the posterior of one series y (n,) over every drift and every intervention of `near` (k,).
 
-        The block in which a step begins is left out: how far it is moved depends on more than when within it the step
-        came.
+        The blocks in which a step begins are left out: how far they are moved depends on more than when within them the
+        step came.
         """
         shape = (len(self.drifts), near.size)
         log_l, size, variance, scale = (np.empty(shape) for _ in range(4))
-        hit = np.argmin(np.abs(self.t[None, :] - np.floor(self.onsets[near] + 0.5)[:, None]), axis=1)
+        hits = self._hit(near)
         for row, drift in enumerate(self.drifts):
             target = drift.whiten @ y
-            squares = float(target @ target)
+            squares = np.full(near.size, float(target @ target))
             rise = drift.whiten @ self.shapes[near].T
-            spare = drift.whiten[:, hit] * (self.rises[near] == 0.0)
-            spare /= np.maximum(np.sqrt(np.sum(spare**2, axis=0)), 1e-12)
-            outside = target @ spare
-            rise -= spare * np.sum(spare * rise, axis=0)
+            spares: list[Array] = []
+            for hit in hits:
+                spare = drift.whiten[:, hit] * (self.rises[near] == 0.0)
+                for other in spares:
+                    spare -= other * np.sum(other * spare, axis=0)
+                spare /= np.maximum(np.sqrt(np.sum(spare**2, axis=0)), 1e-12)
+                squares -= (target @ spare) ** 2
+                rise -= spare * np.sum(spare * rise, axis=0)
+                spares.append(spare)
             norms = np.maximum(np.sqrt(np.sum(rise**2, axis=0)), 1e-9)
             moved = (target @ rise) / norms
-            rest = np.maximum(squares - outside**2 - moved**2, _TINY)
+            rest = np.maximum(squares - moved**2, _TINY)
             rest = np.where(sign * moved < 0, squares, rest)
             size[row] = moved / norms
             scale[row] = rest / (self.freedom - 2)
             variance[row] = scale[row] / norms**2
             log_l[row] = -0.5 * self.freedom * np.log(drift.weight * rest)
         return Posterior(log_l, size, variance, scale)
+
+    def _hit(self, near: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+        """Return the blocks (k,) in which each of the steps `near` (k,) begins: one where blocks do not overlap."""
+        onsets = self.onsets[near]
+        if self.length == 1.0:
+            return [np.argmin(np.abs(self.t[None, :] - np.floor(onsets + 0.5)[:, None]), axis=1)]
+        order = np.argsort(np.abs(self.t[None, :] - onsets[:, None]), axis=1, kind="stable")
+        return list(order[:, : round(self.length)].T)
 
     def level(self, y: Array, number: int, best: int) -> Array:
         """Return the smooth drift (n,), its mean and slope included, beside the intervention `best`."""
@@ -255,17 +288,28 @@ class DriftFamily:
         return np.asarray(self.fixed @ coefficients[:-1] + drift.drift @ rest)
 
 
+def _twice_integrated(low: Array, high: Array, span: float) -> Array:
+    """Return the covariance of a walk integrated twice, at the lower and the higher of two times since its start.
+
+    Its curvature has walked for as long as the series before it begins: ``span low^2 high^2 / 4``.
+    """
+    apart = high - low
+    own = low**3 * (low**2 / 5.0 + apart * low / 2.0 + apart**2 / 3.0) / 4.0
+    return np.asarray(own + span * (low * high) ** 2 / 4.0)
+
+
 @lru_cache(maxsize=16)
-def _even_family(n: int, quiet: bool = False) -> DriftFamily:
+def _even_family(n: int, quiet: bool = False, length: float = 1.0) -> DriftFamily:
     """Return the family of blocks of equal length and equal noise, the common case."""
-    return DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)), quiet=quiet)
+    return DriftFamily(np.arange(n, dtype=np.float64), np.ones(n), np.zeros((n, 1)), quiet=quiet, length=length)
 
 
-def _family(t: Array, sd: Array, shared: Array | None, quiet: bool) -> DriftFamily:
+def _family(t: Array, sd: Array, shared: Array | None, quiet: bool, length: float) -> DriftFamily:
     even = np.allclose(np.diff(t), t[1] - t[0], rtol=0.02) and np.ptp(sd) <= 0.1 * float(np.median(sd))
     if even and shared is None:
-        return _even_family(t.size, quiet)
-    return DriftFamily(t, sd, np.zeros((t.size, 1)) if shared is None else shared, quiet=quiet)
+        return _even_family(t.size, quiet, length)
+    zeros = np.zeros((t.size, 1))
+    return DriftFamily(t, sd, zeros if shared is None else shared, quiet=quiet, length=length)
 
 
 def find_step(
@@ -277,13 +321,14 @@ def find_step(
     sign: int = 1,
     shared: Array | None = None,
     quiet: bool = False,
+    halves: bool = False,
 ) -> DriftStep:
     """Look for a step or a growth in a series of block estimates against a smooth drift.
 
     `t` (n,): middles of the blocks, rising; `g` (n,): estimates; `sd` (n,): their deviations, whose common scale is
     estimated anew (only the ratios matter); `sign`: 1 only a rise counts, -1 only a fall; `shared` (n, m): errors
     common to the blocks, as columns: their covariance is shared shared^T, in the units of `g`; `quiet`: the noise is
-    far below the drift (`QUIET_STRENGTHS`).
+    far below the drift (`QUIET_STRENGTHS`); `halves`: quiet blocks that overlap by half.
 
     Raises InputError where there are fewer than 16 blocks, or shapes or values do not fit.
     """
@@ -292,7 +337,7 @@ def find_step(
     spacing = float(np.median(np.diff(t)))
     u = (t - t[0]) / spacing
     unit = np.median(sd)
-    family = _family(u, sd / unit, None if shared is None else shared / unit, quiet)
+    family = _family(u, sd / unit, None if shared is None else shared / unit, quiet, 2.0 if halves else 1.0)
     y = g / unit
     scores, plain = family.scores(y[:, None], sign)
     course = scores[:, 0]
@@ -346,18 +391,19 @@ def findable_step(
     *,
     shared: Array | None = None,
     quiet: bool = False,
+    halves: bool = False,
 ) -> float:
     """Return the smallest step that would have been an alarm in a series in which none was.
 
     Steps of growing height are added at three places of the middle of the series, to its own noise and drift; the
     height is that over which all three, and every higher one, exceed the threshold of any drift; infinite where none
-    does. `noise`: scale of the noise over the stated one; `quiet`: as in `find_step`.
+    does. `noise`: scale of the noise over the stated one; `quiet`, `halves`: as in `find_step`.
     """
     u = (t - t[0]) / float(np.median(np.diff(t)))
     unit = float(np.median(sd))
-    family = _family(u, sd / unit, None if shared is None else shared / unit, quiet)
+    family = _family(u, sd / unit, None if shared is None else shared / unit, quiet, 2.0 if halves else 1.0)
     heights = noise * np.geomspace(0.2, _HIGHEST[quiet], 36)
-    shapes = rises(u, u[0] + np.array(_ADDED_AT) * (u[-1] - u[0]))
+    shapes = rises(u, u[0] + np.array(_ADDED_AT) * (u[-1] - u[0]), length=family.length)
     series = (g / unit)[:, None] + (shapes.T[:, :, None] * heights).reshape(u.size, -1)
     threshold = max(
         null_threshold(family.table, false_alarm_probability, family.n, number) for number in range(len(family.drifts))
@@ -394,7 +440,7 @@ def _onset(
     best = int(np.argmax(course))
     fine = float(family.onsets[best]) + np.arange(-8, 9) / 8.0
     drift = family.drifts[beside]
-    white = drift.whiten @ rises(u, fine, float(family.rises[best])).T
+    white = drift.whiten @ rises(u, fine, float(family.rises[best]), family.length).T
     target = drift.whiten @ y
     moved = np.maximum(sign * (white.T @ target / np.maximum(np.sqrt(np.sum(white**2, axis=0)), 1e-12)), 0.0)
     gain = -family.freedom * np.log(np.maximum(target @ target - moved**2, _TINY))

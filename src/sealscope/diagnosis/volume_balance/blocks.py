@@ -179,11 +179,11 @@ def balance_channels(recording: Recording) -> tuple[str, ...]:
     return names + ports if moves else names
 
 
-def block_samples(recording: Recording, seconds: float | None = None) -> int:
+def block_samples(recording: Recording, seconds: float | None = None, cycles: int = _FEWEST_BLOCKS) -> int:
     """Return the samples of a block.
 
-    A block is whole cycles of the duty of about `seconds` (3 s, less for a short recording); without a cycle it is as
-    short as the information of the reversals within it allows.
+    A block is whole cycles of the duty of about `seconds` (3 s, less for a short recording), where there are so many
+    `cycles`; else it is as short as the information of the reversals within it allows.
     """
     rate, duration = recording.rate, recording.duration
     share = min(BLOCK_SECONDS, max(_SHORTEST_SECONDS, _SHARE * duration), max(duration, 1.0 / rate))
@@ -192,7 +192,7 @@ def block_samples(recording: Recording, seconds: float | None = None) -> int:
     cycle = find_cycle(recording)
     if cycle is not None:
         whole = max(fewest, round(cycle * max(1, round(wanted / cycle)) * rate))
-        if _FEWEST_BLOCKS * whole <= len(recording):
+        if cycles * whole <= len(recording):
             return whole
     lengths = [max(fewest, round(wanted * factor * rate)) for factor in _WITHOUT_CYCLE]
     lengths = [length for length in lengths if _FEWEST_BLOCKS * length <= len(recording)] or lengths[:1]

@@ -29,7 +29,7 @@ from sealscope.diagnosis.volume_balance.blocks import (
     mean_pressures,
 )
 from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trouble
-from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance
+from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance, with_between
 from sealscope.diagnosis.volume_balance.onset import date_step
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.gaps import touched
@@ -39,6 +39,8 @@ from sealscope.recordings.recording import Recording, remembered
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: Under a load blocks are whole cycles where there are so many: those half a block later are searched as well.
+FEWEST_CYCLES = 10
 #: Share of the recording for which the machine may stand at a time.
 _UNSEEN = 0.3
 #: Share of the samples that a pressure may be cut off.
@@ -123,19 +125,41 @@ class VolumeBalance:
             self.geometry,
         )
 
+    def length(
+        self,
+        recording: Recording,
+        names: Sequence[str] | None = None,
+        *,
+        seconds: float | None = None,
+        cycles: int = FEWEST_CYCLES,
+    ) -> int:
+        """Return the samples of a block of about `seconds`: whole cycles under a load, where there are `cycles`."""
+        length = block_samples(recording, seconds)
+        whole = block_samples(recording, seconds, cycles)
+        if whole == length:
+            return length
+        blocks = self.blocks(recording, whole, names)
+        # where rests are passed over, blocks are parts of a cycle
+        if blocks.samples != whole or not len(blocks) or not np.all(np.isfinite(blocks.gram)):
+            return length
+        return whole if fit_balance(blocks, geometry=self.geometry).keeps_slopes else length
+
     def fit(self, recording: Recording) -> tuple[BalanceFit | None, str]:
         """Return the balance of a recording, or None and the reason why there is none."""
         rail = _at_the_rail(recording)
         if rail is not None:
             return None, rail
-        blocks = self.blocks(recording)
-        if len(blocks) < FEWEST:
+        length = self.length(recording)
+        blocks = self.blocks(recording, length)
+        if len(blocks) < (FEWEST if length == block_samples(recording) else FEWEST_CYCLES):
             return None, (
                 f"too short for a balance: {len(blocks)} whole blocks of {blocks.seconds:.3g} s, {FEWEST} are needed"
             )
         if not np.all(np.isfinite(blocks.gram)):
             return None, "the balance cannot be computed: values are beyond floating point"
         fit = fit_balance(blocks, metres=recording.units["x"] == "m", geometry=self.geometry)
+        if fit.keeps_slopes and blocks.samples == length:  # where rests are passed over, what lies between is not known
+            fit = with_between(fit, self.blocks(recording.samples(slice(length // 2, None)), length))
         problem = trouble(fit) or _unseen(recording, fit)
         return (fit, "") if problem is None else (None, problem)
 

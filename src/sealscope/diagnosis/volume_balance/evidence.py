@@ -29,9 +29,7 @@ from sealscope.diagnosis.volume_balance.fit import (
     BalanceFit,
     Law,
     discriminate,
-    findable,
     loaded,
-    search,
     swings,
 )
 from sealscope.diagnosis.volume_balance.growth import grown
@@ -45,6 +43,7 @@ from sealscope.diagnosis.volume_balance.law import (
     shape_of,
     zero_error,
 )
+from sealscope.diagnosis.volume_balance.search import findable, search
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -105,7 +104,7 @@ def trouble(fit: BalanceFit) -> str | None:
     n = len(fit.blocks)
     if not np.isfinite(fit.residual) or not np.all(np.isfinite(fit.g)):
         return "the balance cannot be computed: values are beyond floating point"
-    if fit.share_left_out > _MOST_LEFT_OUT or n < FEWEST:
+    if fit.share_left_out > _MOST_LEFT_OUT or len(fit) < FEWEST:
         return (
             f"position and angle do not belong together, or the machine stands, in {len(fit.left_out)} of "
             f"{n + len(fit.left_out)} blocks of {fit.blocks.seconds:.3g} s"

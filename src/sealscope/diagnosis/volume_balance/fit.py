@@ -19,7 +19,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.changepoint.smooth_drift import DriftStep, find_step, findable_step
 from sealscope.diagnosis.volume_balance.blocks import (
     COMPRESSED,
     DP_12,
@@ -71,11 +70,12 @@ _APART = 1.5
 _SEPARATE = 10.0
 #: The stored oil tells the sense of the pressures where it is this many deviations from zero.
 _SURE = 5.0
-#: More blocks than this are merged for the search; around the rise they are searched one by one.
-MOST_BLOCKS = 96
 #: Share of the way on which the higher pressure may change sides unseen: 0.001 on single rods whose load keeps it on a
 #: side, 0.23 to 0.34 where the circuit swings between its valves.
 _SWINGING = 0.05
+#: Either side of a single rod carries in turn where over this share of the squares of the integral of dp swings: 0.0015
+#: at most under a load that stands on one side, 0.027 and more without a load (development machines).
+_IN_TURN = 0.01
 #: Slopes are not kept where conductances of a single rod scatter by over so many times what they do without; those of a
 #: double rod where they scatter by over this share; blocks that show it.
 _SCATTERS, _CALMER, _FEW = 2.0, 0.7, 4
@@ -94,8 +94,14 @@ _ZERO, _INDEPENDENT = 2e4, 10.0
 _QUARTILE = 0.6745
 #: Displacement over area may differ by this share from that of a stated machine before it is another one.
 GEOMETRY = 0.15
-#: Errors that the blocks share count where they differ between blocks by more than this share of a block's own error.
-_DIFFERENT = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Conductances:
+    """Conductances `g` (n,) [m^3/(s Pa)] of blocks at `t` (n,) [s]."""
+
+    t: Array
+    g: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +117,8 @@ class BalanceFit:
     position has a unit; `unequal`: the sides' areas differ; `scale_sd`: deviation of `scale`; `geometry`: as assumed;
     `side`: 1 where p_A is the higher one along most of the way, -1 where p_B is; `by_side`: the volume displaced is
     counted by the assumed area of the side that carries the load, sample by sample; `swinging`: the fit of the same
-    blocks without their slopes, where these are kept because a load acts on a double rod, else None.
+    blocks without their slopes, where these are kept because a load acts on a double rod, else None; `between`: blocks
+    half a block later by the same coefficients, where slopes are kept, else None.
     """
 
     blocks: BalanceBlocks
@@ -134,6 +141,11 @@ class BalanceFit:
     side: int
     by_side: bool
     swinging: BalanceFit | None = None
+    between: Conductances | None = None
+
+    def __len__(self) -> int:
+        """Count the blocks that took part, those between them included."""
+        return len(self.blocks) + (0 if self.between is None else self.between.t.size)
 
     @property
     def without_slopes(self) -> BalanceFit:
@@ -178,8 +190,12 @@ class BalanceFit:
 
     @property
     def changes_over(self) -> bool:
-        """Whether either side carries the load in turn."""
-        return STORED_X_A in self.columns and STORED_X_B in self.columns
+        """Whether either side of a single rod carries the load in turn: the integral of dp swings as well."""
+        if not (self.geometry.unequal and self.keeps_slopes):
+            return self.geometry.unequal
+        gram = self.blocks.gram
+        steady = gram[:, I_AB, TIME] ** 2 / (gram[:, I_AB, I_AB] * gram[:, TIME, TIME])
+        return bool(1.0 - np.median(steady) > _IN_TURN)
 
     @property
     def lag(self) -> float:
@@ -534,6 +550,24 @@ def _fitted(blocks: BalanceBlocks, metres: bool, geometry: Geometry, *, whole: b
     )
 
 
+def with_between(fit: BalanceFit, later: BalanceBlocks) -> BalanceFit:
+    """Return the fit with the conductances, by its coefficients, of `later` blocks: half a block after its own.
+
+    Only where slopes are kept: else it is what swings that tells a conductance, and half-way it is no other.
+    """
+    if not fit.keeps_slopes or not len(later):
+        return fit
+    whole = fit.swinging is not None
+    later = later.whole() if whole else later.with_slopes()
+    blocks = _turned(later, _turn(later.gram.shape[1], fit.side, fit._counted, whole))
+    shared = list(fit.columns)
+    own = np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
+    slope = (blocks.gram[:, I_AB, Y] - blocks.gram[:, I_AB][:, shared] @ fit.beta) / own
+    left = _left(_displaced(_beyond(_beyond(blocks.gram, I_AB), I_ROOT), shared), fit.beta)
+    keep = _moving(blocks) & (left <= _SPOILT**2 * fit.residual**2 * max(1, blocks.samples - 4))
+    return replace(fit, between=Conductances(blocks.t[keep], -fit.sense * slope[keep]))
+
+
 def _sense(blocks: BalanceBlocks, slope: Array, beta: Array, shared: list[int]) -> int:
     """Return 1 where p_A - p_B rises as the piston is pushed towards positive A x, -1 where channels count otherwise.
 
@@ -619,62 +653,3 @@ def moved_share(fit: BalanceFit, column: int, onset: float, rise: float, *, with
     freedom = int(before.sum() + after.sum()) - 2
     noise = _noise_of_integral(fit.blocks, fit.blocks.noise) * shown**2 / own
     return MovedShare(moved / whole if whole else 0.0, float(deviation) / size, freedom, float(np.mean(noise[after])))
-
-
-def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> DriftStep:
-    """Return the best rise (or fall, `sign` -1) of the conductance, with `level` at every block of the fit."""
-    shared = _shared_errors(fit)
-    every = -(-len(fit.blocks) // MOST_BLOCKS)
-    if every == 1:
-        return find_step(fit.blocks.t, fit.g, fit.sd, probability, sign=sign, shared=shared, quiet=fit.keeps_slopes)
-    t, g, sd, common = _merged(fit, shared, every)
-    coarse = find_step(t, g, sd, probability, sign=sign, shared=common, quiet=fit.keeps_slopes)
-    level = np.interp(fit.blocks.t, t, coarse.level)
-    coarse = replace(coarse, level=level, index=int(np.searchsorted(fit.blocks.t, coarse.onset)))
-    if not coarse.alarm or coarse.rise > 0:
-        return coarse
-    first = max(0, min(coarse.index - MOST_BLOCKS // 2, len(fit.blocks) - MOST_BLOCKS))
-    near = slice(first, first + MOST_BLOCKS)
-    fine = find_step(fit.blocks.t[near], fit.g[near], fit.sd[near], probability, sign=sign, quiet=fit.keeps_slopes)
-    low, high = coarse.onset_interval
-    if not (fine.alarm and fine.rise == 0 and low <= fine.onset <= high):
-        return coarse
-    return replace(coarse, onset=fine.onset, onset_interval=fine.onset_interval, index=first + fine.index)
-
-
-def findable(fit: BalanceFit, probability: float, noise: float) -> float:
-    """Return the smallest step of the conductance that would have been an alarm where `search` raised none.
-
-    `noise`: scale of the noise that it saw over the stated one.
-    """
-    shared = _shared_errors(fit)
-    every = -(-len(fit.blocks) // MOST_BLOCKS)
-    if every == 1:
-        return findable_step(fit.blocks.t, fit.g, fit.sd, probability, noise, shared=shared, quiet=fit.keeps_slopes)
-    t, g, sd, common = _merged(fit, shared, every)
-    return findable_step(t, g, sd, probability, noise, shared=common, quiet=fit.keeps_slopes)
-
-
-def _merged(fit: BalanceFit, shared: Array | None, every: int) -> tuple[Array, Array, Array, Array | None]:
-    """Return times, conductances, deviations and shared errors of `every` blocks merged by their weights."""
-    starts = np.arange(0, len(fit.blocks), every)
-    weight = 1.0 / fit.sd**2
-    total = np.add.reduceat(weight, starts)
-
-    def mean(values: Array) -> Array:
-        return np.asarray(np.add.reduceat(weight * values, starts) / total)
-
-    common = None if shared is None else np.stack([mean(column) for column in shared.T], axis=1)
-    return mean(fit.blocks.t), mean(fit.g), np.sqrt(1.0 / total), common
-
-
-def _shared_errors(fit: BalanceFit) -> Array | None:
-    """Return the errors that the blocks share where these differ enough from block to block to look like a change.
-
-    None where they are one constant, or grow evenly, as with a duty that repeats.
-    """
-    u = fit.blocks.t - fit.blocks.t.mean()
-    rest = fit.shared - fit.shared.mean(axis=0)
-    rest = rest - np.outer(u, u @ rest) / max(float(u @ u), np.finfo(float).tiny)
-    size = float(np.sqrt(np.sum(rest**2, axis=1).mean()))
-    return fit.shared if size > _DIFFERENT * float(np.median(fit.sd)) else None

@@ -171,4 +171,7 @@ def evened(fit: BalanceFit, law: OrificeShare, open_: NDArray[np.bool_]) -> tupl
     even = 1.0 - law.mean + law.mean * shown / usual
     volume = fit.unit_flow("laminar") / fit.blocks.abs_dp
     flow = volume * ((1.0 - law.mean) * fit.blocks.abs_dp + law.mean * fit.blocks.root_dp / usual)
-    return replace(fit, g=fit.g / even, sd=fit.sd / even, shared=fit.shared / even[:, None]), flow
+    between = fit.between
+    if between is not None:
+        between = replace(between, g=between.g / np.interp(between.t, fit.blocks.t, even))
+    return replace(fit, g=fit.g / even, sd=fit.sd / even, shared=fit.shared / even[:, None], between=between), flow

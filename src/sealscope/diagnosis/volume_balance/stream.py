@@ -24,12 +24,11 @@ from sealscope.diagnosis.volume_balance.blocks import (
     BLOCK_SECONDS,
     BalanceBlocks,
     balance_channels,
-    block_samples,
     channels_needed,
 )
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.diagnosis.volume_balance.evidence import judge, total_lpm, trouble
-from sealscope.diagnosis.volume_balance.fit import fit_balance
+from sealscope.diagnosis.volume_balance.fit import fit_balance, with_between
 from sealscope.diagnosis.volume_balance.live import LEARN_SECONDS, BalanceState, JoinedSamples, check_stream, replaces
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -37,6 +36,8 @@ from sealscope.recordings.recording import Recording
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: Cycles of a duty that the first part of a stream must hold for blocks to be whole ones.
+_CYCLES = 5
 _CHANNELS = ("u", "x", "theta", "omega", "p_A", "p_B", "p_1", "p_2")
 
 
@@ -97,13 +98,15 @@ class SequentialBalance:
         self._samples = JoinedSamples(_CHANNELS)
         self._length = 0
         self._used: tuple[str, ...] = ()
+        self._before = 0  # samples kept of the block before the next one
         self._window: BalanceBlocks | None = None
+        self._between: BalanceBlocks | None = None
         waiting = Evidence("cannot tell", "waits for the first blocks")
         self.state = BalanceState(float("nan"), 0, 0, waiting, None, None)
 
     def acknowledge(self) -> None:
         """Take the alarm back, and forget the blocks before now: the machine was repaired, or the leak accepted."""
-        self._window = None
+        self._window = self._between = None
         waiting = Evidence("cannot tell", "waits for blocks after the alarm was acknowledged")
         self.state = BalanceState(self.state.t, self.state.blocks, self.state.refused, waiting, None, None)
 
@@ -133,31 +136,47 @@ class SequentialBalance:
                 self._samples.keep(joined, 0)
                 return self.state
             first = joined.samples(slice(0, round(LEARN_SECONDS * joined.rate)))
-            self._length = block_samples(first, self.block_seconds)
             self._used = balance_channels(first)
-        count = len(joined) // self._length
-        for number in range(count):
-            self._take(joined.samples(slice(number * self._length, (number + 1) * self._length)))
-        self._samples.keep(joined, count * self._length)
+            self._length = self._detector.length(first, self._used, seconds=self.block_seconds, cycles=_CYCLES)
+        half = self._length // 2
+        starts = range(self._before, len(joined) - self._length + 1, self._length)
+        for start in starts:
+            between = joined.samples(slice(start - half, start - half + self._length)) if start else None
+            self._take(joined.samples(slice(start, start + self._length)), between)
+        if starts:
+            self._samples.keep(joined, starts[-1] + self._length - half)
+            self._before = half
+        else:
+            self._samples.keep(joined, 0)
         return self.state
 
-    def _take(self, block: Recording) -> None:
+    def _take(self, block: Recording, between: Recording | None) -> None:
+        if between is not None and self._window is not None:
+            self._between = self._joined(self._between, self._detector.blocks(between, self._length, self._used))
         cut = self._detector.blocks(block, self._length, self._used)
         end = float(block.t[-1]) + 1.0 / block.rate
         before = self.state
         evidence, alarm, total = before.evidence, before.alarm, before.total_lpm
         usable = len(cut) > 0 and bool(np.all(np.isfinite(cut.gram)))
         if usable:
-            window = cut if self._window is None else BalanceBlocks.joined([self._window, cut])
-            self._window = window.chosen(np.arange(max(0, len(window) - self.window), len(window)))
-            if len(self._window) >= FEWEST:
+            self._window = self._joined(self._window, cut)
+            if len(self._window) + (0 if self._between is None else len(self._between)) >= FEWEST:
                 evidence, total = self._judge(self._window, block.units["x"] == "m")
         if replaces(evidence, alarm):
             alarm = evidence
         self.state = BalanceState(end, before.blocks + 1, before.refused + (not usable), evidence, alarm, total)
 
+    def _joined(self, window: BalanceBlocks | None, cut: BalanceBlocks) -> BalanceBlocks:
+        """Return the last blocks of a window and of what was cut after it."""
+        joined = cut if window is None else BalanceBlocks.joined([window, cut])
+        return joined.chosen(slice(max(0, len(joined) - self.window), None))
+
     def _judge(self, blocks: BalanceBlocks, metres: bool) -> tuple[Evidence, float | None]:
         fit = fit_balance(blocks, metres=metres, geometry=self._detector.geometry)
+        if self._between is not None:
+            fit = with_between(fit, self._between)
+        if len(blocks) < FEWEST and fit.between is None:
+            return self.state.evidence, None
         problem = trouble(fit)
         if problem is not None:
             return Evidence("cannot tell", problem), None

@@ -96,7 +96,8 @@ def carried_columns(x: Array, p_A: Array, p_B: Array, flow: Array, smooth: Array
     is the integral of ``(V_A + A_A x)/K dp_A``, with side B that of ``-(V_B - A_B x)/K dp_B``. The columns: rise of p_B
     while B carries, integrals of x dp_A and of x dp_B while that side carries, and rise of p_A while A carries. Oil
     that the pump delivers there gives way by dp/K of its volume: the integral of the flow's size times dp while it
-    delivers into the side that carries.
+    delivers into the side that carries. Rises are those of means, which count no noise where the sides change over, and
+    what shorter means differ from them: a piston that starts and stops rings on its oil.
 
     Parameters
     ----------
@@ -107,16 +108,19 @@ def carried_columns(x: Array, p_A: Array, p_B: Array, flow: Array, smooth: Array
     step : float
         Time between samples [s].
     half : int
-        Samples to either side over which pressures and flow are smoothed.
+        Samples to either side over which pressures and flow are smoothed; a third of it for the shorter means.
     """
     count, size = x.shape
     columns = np.zeros((count, 5, size))
     sums = np.empty(size + 1)
     above, below, flows = np.empty(size), np.empty(size), np.empty(size)
+    near_A, near_B = np.empty(size), np.empty(size)
     for k in range(count):
         rise_B, rise_x_A, rise_x_B, rise_A, compressed = columns[k]
         _smooth_into(p_A[k], half, sums, above)
         _smooth_into(p_B[k], half, sums, below)
+        _smooth_into(p_A[k], half // 3, sums, near_A)
+        _smooth_into(p_B[k], half // 3, sums, near_B)
         _smooth_into(flow[k], half, sums, flows)
         before = 0.0
         for t in range(size):
@@ -131,6 +135,12 @@ def carried_columns(x: Array, p_A: Array, p_B: Array, flow: Array, smooth: Array
                 rise_x_A[t], rise_x_B[t] = rise_x_A[t - 1] + middle * up_A, rise_x_B[t - 1] + middle * up_B
                 compressed[t] = compressed[t - 1] + 0.5 * step * (now + before)
             before = now
+        for t in range(size):
+            on_A = smooth[k, t] > 0.0
+            ring_A = near_A[t] - above[t] if on_A else 0.0
+            ring_B = 0.0 if on_A else near_B[t] - below[t]
+            rise_A[t], rise_B[t] = rise_A[t] + ring_A, rise_B[t] + ring_B
+            rise_x_A[t], rise_x_B[t] = rise_x_A[t] + x[k, t] * ring_A, rise_x_B[t] + x[k, t] * ring_B
     return columns
 
 

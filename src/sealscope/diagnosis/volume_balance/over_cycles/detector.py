@@ -103,11 +103,12 @@ class CycleBalance:
         weak = np.median(known) / known if flows.by_orifice is not None else np.ones(dp.size)
         G, unit = flows.flow / np.copysign(known, dp), 1e-3 * level * weak
         shared = None if flows.shared is None else flows.shared / np.copysign(known, dp)[:, None]
-        step = find_step(flows.t, G, unit, false_alarm_probability, shared=shared, quiet=True)
+        probability, halves = false_alarm_probability, flows.halves
+        step = find_step(flows.t, G, unit, probability, shared=shared, quiet=True, halves=halves)
         figures = f"score {step.score:.1f}, threshold {step.threshold:.1f}"
         if step.alarm:
             return self._leak(flows, step, level, figures)
-        smallest = findable_step(flows.t, G, unit, false_alarm_probability, step.noise, shared=shared, quiet=True)
+        smallest = findable_step(flows.t, G, unit, probability, step.noise, shared=shared, quiet=True, halves=halves)
         return _no_step(flows, step, smallest * size, figures)
 
     def _leak(self, flows: CycleFlows, step: DriftStep, level: float, figures: str) -> Evidence:

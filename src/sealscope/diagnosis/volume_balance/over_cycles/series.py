@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
+from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, MOST_BLOCKS
 from sealscope.physics.leakage import orifice_over_laminar
 from sealscope.recordings.cycle import find_cycle, fundamental
 from sealscope.recordings.gaps import touched
@@ -67,7 +67,8 @@ class CycleFlows:
     pressure, of both where the load changes, which falls where oil leaves; `pumped` [m^3/s]: mean size of the pump's
     flow; `shared` (n, m) [m^3/s]: errors of `flow` that all blocks share, as columns, None where there are none;
     `share` of the recording's blocks that count; `counted`: the channel that shows the shaft; `settles`: whether it
-    is a single rod that rests unloaded, whose circuit may settle in another way at each rest; `by_orifice`: where the
+    is a single rod that rests unloaded, whose circuit may settle in another way at each rest; `halves`: whether blocks
+    overlap by half; `by_orifice`: where the
     load changes, the mean flow of an orifice over that of a worn seal which shows alike, else None.
     """
 
@@ -82,6 +83,7 @@ class CycleFlows:
     share: float
     counted: str
     settles: bool
+    halves: bool
     by_orifice: float | None = None
 
 
@@ -128,8 +130,9 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
     length, half = cycle * rate * max(1, round(BLOCK / cycle)), 0.5 * _AT_ENDS * cycle * rate
     last = len(recording) - 1 - half
     seconds = (last - max(_START, cycle) * rate) / rate
-    # few long cycles overlap by half
-    overlap = 1 if seconds * rate >= FEWEST * length else 2
+    # blocks that overlap by half follow a drift more closely; not where each differs by what changes of the load store
+    halves = not changes and 2.0 * seconds * rate < MOST_BLOCKS * length
+    overlap = 2 if halves or seconds * rate < FEWEST * length else 1
     count = int(overlap * (seconds * rate / length - 1.0) + 1e-6) + 1
     if count < FEWEST:
         return (
@@ -162,6 +165,7 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         share=float(np.mean(used)),
         counted=counted,
         settles=rig.cylinder.single_rod and lowest < _LOADED and rests,
+        halves=halves,
     )
     if settled and drive.lag > 0.5 * cycle:
         flows = replace(flows, shared=(flows.pumped * np.exp(-middles / drive.lag))[:, None])
