@@ -208,11 +208,11 @@ def test_under_a_load_a_leak_is_a_steady_flow(
 ) -> None:
     """0.0002 to 0.0006 L/min, one to ten parts in a hundred of what the pump passes; none before it opens.
 
-    Oil that is lost to the outside takes both pressures down with it, from then on; a circuit that fills and merely
-    stops rising has lost none.
+    Oil that is lost to the outside takes both pressures down with it, evenly from then on; a circuit that fills and
+    merely stops rising has lost none.
     """
     leaks, sound = (machine(7, load=load, G=size, G_pump=wanders) for size in (step(0.0, G), 0.0))
-    falls = step(0.0, lost)(leaks.t) * (1.0 + (leaks.t - 60.0) / 120.0) - 6e4 * (1.0 - np.exp(-leaks.t / 20.0))
+    falls = lost * np.maximum(leaks.t - 60.0, 0.0) / 60.0 - 6e4 * (1.0 - np.exp(-leaks.t / 20.0))
     found = detector.examine(with_channels(leaks, **{p: leaks[p] - falls for p in ("p_A", "p_B")}), [], P)
     if lost:
         assert (found.verdict, found.cause) == ("no leak", "external leak")

@@ -249,7 +249,8 @@ class DriftFamily:
         hits = self._hit(near)
         for row, drift in enumerate(self.drifts):
             target = drift.whiten @ y
-            squares = np.full(near.size, float(target @ target))
+            squares = float(target @ target)
+            outside = np.zeros(near.size)
             rise = drift.whiten @ self.shapes[near].T
             spares: list[Array] = []
             for hit in hits:
@@ -257,12 +258,12 @@ class DriftFamily:
                 for other in spares:
                     spare -= other * np.sum(other * spare, axis=0)
                 spare /= np.maximum(np.sqrt(np.sum(spare**2, axis=0)), 1e-12)
-                squares -= (target @ spare) ** 2
+                outside += (target @ spare) ** 2
                 rise -= spare * np.sum(spare * rise, axis=0)
                 spares.append(spare)
             norms = np.maximum(np.sqrt(np.sum(rise**2, axis=0)), 1e-9)
             moved = (target @ rise) / norms
-            rest = np.maximum(squares - moved**2, _TINY)
+            rest = np.maximum(squares - outside - moved**2, _TINY)
             rest = np.where(sign * moved < 0, squares, rest)
             size[row] = moved / norms
             scale[row] = rest / (self.freedom - 2)

@@ -87,7 +87,7 @@ def _searched(fit: BalanceFit) -> _Series:
     place = np.round(2.0 * (t - t[0]) / fit.blocks.seconds)
     alternating = (-1.0) ** place
     offsets = np.stack([alternating, alternating * place], axis=1)
-    if t.size > MOST_BLOCKS or not (own.t.size < FEWEST or _scatter(g, offsets) <= _AS_WELL * _scatter(own.g)):
+    if t.size > MOST_BLOCKS or not (own.t.size < FEWEST or scatter(g, offsets) <= _AS_WELL * scatter(own.g)):
         return own
 
     def between(values: Array) -> Array:
@@ -97,7 +97,7 @@ def _searched(fit: BalanceFit) -> _Series:
     return _Series(t, g, between(fit.sd), common, halves=True)
 
 
-def _scatter(values: Array, beside: Array | None = None) -> float:
+def scatter(values: Array, beside: Array | None = None) -> float:
     """Return the scatter of a series (n,) beyond what drifts, and beyond the columns `beside` (n, m)."""
     rest = np.diff(values, _ORDER)
     if beside is not None:
