@@ -6,9 +6,9 @@ For leak-free machines of each family: what passes the pump [L/min], how far tha
 of a block of the volume balance (fourth differences), and the leak from the plan's onset on that is found in 9 of 10
 records at 1 % by the best linear test, its onset known: ``(z_0.99 + z_0.9) / sqrt(s' C^-1 s)``, s what a step of 1
 L/min makes of the blocks, C their covariance without one. `law known`: C is that of the scatter and of the bench's own
-drifts of pump leakage, drawn anew. `twice integrated` and `integrated`: what the same drifts make of the test that takes
-them for such a walk, as strong as explains them best (likelihood restricted to what offset and slope leave). Blocks
-half a block later count as well, their scatter taken for independent. Medians over the machines; it takes 5 s a
+drifts of pump leakage, drawn anew. `twice integrated` and `integrated`: what the same drifts make of the test that
+takes them for such a walk, as strong as explains them best (likelihood restricted to what offset and slope leave).
+Blocks half a block later count as well, their scatter taken for independent. Medians over the machines; it takes 5 s a
 machine.
 """
 

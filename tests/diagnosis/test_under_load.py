@@ -64,9 +64,10 @@ def test_a_leak_far_below_the_drift_of_the_pump_is_found(rig: str, leak: float) 
     assert worn.onset_s == pytest.approx(60.0, abs=2.0)
 
 
-def test_a_stream_finds_it_as_well() -> None:
-    stream = SequentialBalance("thesis-closed-loop", alarms_per_hour=0.3)
-    worn = recorded("thesis-closed-loop", "0.002 L/min from 60 s")
+@pytest.mark.parametrize(("rig", "leak"), [("thesis-closed-loop", 0.002), ("single-rod-eha", 0.01)])
+def test_a_stream_finds_it_as_well(rig: str, leak: float) -> None:
+    stream = SequentialBalance(rig, alarms_per_hour=0.3)
+    worn = recorded(rig, f"{leak} L/min from 60 s")
     for start in range(0, 120, 5):
         state = stream.update(worn.between(start, start + 5))
     assert state.alarm is not None and state.alarm.onset_s == pytest.approx(60.0, abs=9.0)

@@ -3,8 +3,10 @@
 The series g_1..g_n (estimates of short blocks of a recording) is a smooth drift, noise, and perhaps size * S(t; onset,
 rise), a rise from 0 to 1 that begins at `onset`. The drift is a + b t and a walk, which is a random walk plus an
 integrated random walk (the local level and the local linear trend of structural time series: Harvey, Forecasting,
-structural time series models and the Kalman filter, 1989, ch. 2). Their strengths are unknown: likelihoods, restricted
-to what a and b leave (REML), are compared over a grid of strengths, the scale of the noise being profiled out.
+structural time series models and the Kalman filter, 1989, ch. 2), or, in quiet series, one that is integrated twice.
+Their strengths are unknown: likelihoods, restricted to what a and b leave (REML), are compared over a grid of
+strengths, the scale of the noise being profiled out. Where blocks overlap by half, every other one has an a and b of
+its own.
 
 The score is twice the logarithm of the ratio of two likelihoods: of the best step against the best of its rivals, which
 drift only, or drift and warm up exponentially, or swing at one period, or have one outlying block. Both sides choose

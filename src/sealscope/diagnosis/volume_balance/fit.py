@@ -565,6 +565,7 @@ def with_between(fit: BalanceFit, later: BalanceBlocks) -> BalanceFit:
     slope = (blocks.gram[:, I_AB, Y] - blocks.gram[:, I_AB][:, shared] @ fit.beta) / own
     left = _left(_displaced(_beyond(_beyond(blocks.gram, I_AB), I_ROOT), shared), fit.beta)
     keep = _moving(blocks) & (left <= _SPOILT**2 * fit.residual**2 * max(1, blocks.samples - 4))
+    keep &= (blocks.t > fit.blocks.t[0]) & (blocks.t < fit.blocks.t[-1])
     return replace(fit, between=Conductances(blocks.t[keep], -fit.sense * slope[keep]))
 
 
