@@ -104,7 +104,7 @@ def trouble(fit: BalanceFit) -> str | None:
     n = len(fit.blocks)
     if not np.isfinite(fit.residual) or not np.all(np.isfinite(fit.g)):
         return "the balance cannot be computed: values are beyond floating point"
-    if fit.share_left_out > _MOST_LEFT_OUT or len(fit) < FEWEST:
+    if fit.share_left_out > _MOST_LEFT_OUT or fit.count < FEWEST:
         return (
             f"position and angle do not belong together, or the machine stands, in {len(fit.left_out)} of "
             f"{n + len(fit.left_out)} blocks of {fit.blocks.seconds:.3g} s"

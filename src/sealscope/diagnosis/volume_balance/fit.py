@@ -76,6 +76,8 @@ _SWINGING = 0.05
 #: Either side of a single rod carries in turn where over this share of the squares of the integral of dp swings: 0.0015
 #: at most under a load that stands on one side, 0.027 and more without a load (development machines).
 _IN_TURN = 0.01
+#: Blocks between the others count where there are so many of them, over those.
+_MOST_BETWEEN = 0.5
 #: Slopes are not kept where conductances of a single rod scatter by over so many times what they do without; those of a
 #: double rod where they scatter by over this share; blocks that show it.
 _SCATTERS, _CALMER, _FEW = 2.0, 0.7, 4
@@ -143,8 +145,9 @@ class BalanceFit:
     swinging: BalanceFit | None = None
     between: Conductances | None = None
 
-    def __len__(self) -> int:
-        """Count the blocks that took part, those between them included."""
+    @property
+    def count(self) -> int:
+        """Number of blocks that took part, those between them included."""
         return len(self.blocks) + (0 if self.between is None else self.between.t.size)
 
     @property
@@ -566,6 +569,8 @@ def with_between(fit: BalanceFit, later: BalanceBlocks) -> BalanceFit:
     left = _left(_displaced(_beyond(_beyond(blocks.gram, I_AB), I_ROOT), shared), fit.beta)
     keep = _moving(blocks) & (left <= _SPOILT**2 * fit.residual**2 * max(1, blocks.samples - 4))
     keep &= (blocks.t > fit.blocks.t[0]) & (blocks.t < fit.blocks.t[-1])
+    if np.count_nonzero(keep) < _MOST_BETWEEN * len(fit.blocks):
+        return fit
     return replace(fit, between=Conductances(blocks.t[keep], -fit.sense * slope[keep]))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -74,7 +73,7 @@ def _searched(fit: BalanceFit) -> _Series:
     begins at its own part of a cycle, and has an offset and a drift of its own.
     """
     shared = _shared_errors(fit)
-    first = 1 if fit.keeps_slopes and len(fit) >= FEWEST + 2 else 0
+    first = 1 if fit.keeps_slopes and fit.count >= FEWEST + 2 else 0
     own = _Series(fit.blocks.t[first:], fit.g[first:], fit.sd[first:], None, halves=False)
     if shared is not None:
         own = own._replace(shared=shared[first:])
@@ -103,7 +102,7 @@ def scatter(values: Array, beside: Array | None = None) -> float:
     if beside is not None:
         columns = np.diff(beside, _ORDER, axis=0)
         rest = rest - columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]
-    return float(np.median(np.abs(rest))) / (_QUARTILE * math.sqrt(comb(2 * _ORDER, _ORDER)))
+    return float(np.median(np.abs(rest))) / (_QUARTILE * math.sqrt(math.comb(2 * _ORDER, _ORDER)))
 
 
 def _merged(series: _Series, every: int) -> _Series:
