@@ -10,6 +10,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from paho.mqtt.client import Client
@@ -107,7 +108,8 @@ class PostgreSQL:
         os.kill(int(first), kind)  # before the others are counted: it makes no more of them meanwhile
         made = subprocess.run(["pgrep", "-P", first], capture_output=True, text=True, check=False).stdout.split()
         for process in made:
-            os.kill(int(process), kind)
+            with suppress(ProcessLookupError):  # one that goes on may end before its turn
+                os.kill(int(process), kind)
 
     def hang(self) -> None:
         """Stop every process of the server: connections are accepted by the system, and nothing is answered."""
