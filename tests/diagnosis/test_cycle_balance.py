@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.diagnosis.volume_balance.over_cycles.detector import CycleBalance
+from sealscope.diagnosis.volume_balance.over_cycles.holds import hold_flows
 from sealscope.diagnosis.volume_balance.over_cycles.series import CycleFlows, cycle_flows
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
@@ -266,9 +267,10 @@ def test_says_why_it_cannot_tell(rig: str, command: str, load: str, why: str) ->
     assert why in evidence.reason
 
 
-@pytest.mark.parametrize(("leak", "verdict"), [("", "cannot tell"), ("0.05 L/min from 60 s", "leak")])
-def test_a_single_rod_that_rests_unloaded(leak: str, verdict: str) -> None:
-    """Its valves settle in one of several ways at each rest: only more than all that passed before is a leak."""
+@pytest.mark.parametrize("channels", [SEEN, (*SEEN, "theta", "x"), (*SEEN, "omega")])
+@pytest.mark.parametrize(("leak", "verdict"), [("", "no leak"), ("0.002 L/min from 60 s", "leak")])
+def test_a_single_rod_that_rests_unloaded(leak: str, verdict: str, channels: tuple[str, ...]) -> None:
+    """Its valves settle in one of several ways at each rest: what holds it there tells, not the whole cycle."""
     experiment = Experiment.of(
         rig=SINGLE,
         command="position trapezoid 45 mm within 1.1 s every 5.3 s",
@@ -277,12 +279,17 @@ def test_a_single_rod_that_rests_unloaded(leak: str, verdict: str) -> None:
         duration=SECONDS,
         seed=2,
     )
-    recording = simulate_with_truth(experiment).recording.only(SEEN)
-    evidence = CycleBalance(load_rig(SINGLE)).examine(recording, [], P)
-    assert cycle_flows(recording, load_rig(SINGLE)).settles
+    run = simulate_with_truth(experiment)
+    recording, rig = run.recording.only(channels), load_rig(SINGLE)
+    assert "no load stands on a single rod that rests" in cycle_flows(recording, rig)
+    held = hold_flows(recording, rig)
+    np.testing.assert_allclose((held.flow / held.dp)[held.t < 55.0], rig.pump.G_pump, rtol=0.15)
+    evidence = CycleBalance(rig).examine(recording, [], P)
     assert evidence.verdict == verdict
-    if not leak:
-        assert "rests without a load" in evidence.reason
+    assert "to hold the piston at rest" in evidence.reason
+    if leak:
+        assert evidence.onset_s == pytest.approx(60.0, abs=3.0)
+        assert evidence.leak_interval_lpm[0] < run.truth.mean_leak_lpm < evidence.leak_interval_lpm[1]
 
 
 def test_few_long_cycles_overlap() -> None:

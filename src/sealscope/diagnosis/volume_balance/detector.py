@@ -28,9 +28,10 @@ from sealscope.diagnosis.volume_balance.blocks import (
     cut_blocks,
     mean_pressures,
 )
-from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trouble
+from sealscope.diagnosis.volume_balance.evidence import SETTLING, judge, judge_level, trouble
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance, with_between
 from sealscope.diagnosis.volume_balance.onset import date_step
+from sealscope.diagnosis.volume_balance.over_cycles.detector import CycleBalance
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.quality import clipped
@@ -92,6 +93,8 @@ class VolumeBalance:
         fit, problem = self.fit(recording)
         if fit is None:
             return Evidence("cannot tell", problem)
+        if fit.settles and not CycleBalance(self.rig).examine(recording, (), false_alarm_probability).abstains:
+            return Evidence("cannot tell", f"the conductance over strokes depends on {SETTLING}: see the cycle balance")
         probability = share_of_each(false_alarm_probability, baseline)
         evidence = judge(
             fit,

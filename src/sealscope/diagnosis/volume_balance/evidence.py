@@ -80,6 +80,8 @@ _SLIPPED = 20.0
 _LOST = 0.6
 #: A transducer's zero drifts by less within a recording [Pa]: 1 psi.
 _SENSOR_DRIFT = 7e3
+#: What makes the conductance over strokes jump from rest to rest.
+SETTLING = "how the circuit of a single rod settles where it rests without a load"
 #: Share of a recording at its start in which the circuit may be filled; share of the pressure difference by which its
 #: size changes under a force that does.
 _FILLING, _UNSTEADY = 0.1, 0.1
@@ -158,7 +160,7 @@ def judge(
             risen = samples.dated(fit, risen)
         pressed = samples.pressed(risen.onset) if samples is not None and risen.rise == 0.0 else None
         leak = describe_leak(fit, risen, probability, pressed)
-        leak = leak if window else _above_zero(leak)
+        leak = _beyond_settling(leak, fit, risen) if window else _above_zero(leak)
         return _measured(replace(leak, passage=passage(fit, None, healthy)), fit)
     if window:
         return no_step(fit, step, None, 0.0)
@@ -177,6 +179,17 @@ def _above_zero(leak: Evidence) -> Evidence:
     if leak.verdict != "leak" or leak.leak_interval_lpm is None or leak.leak_interval_lpm[0] > 0.0:
         return leak
     reason = f"{leak.reason}; by the other law of a leak there may be none"
+    return replace(
+        _unsized(leak), verdict="cannot tell", reason=reason, cause=None, onset_s=None, onset_interval_s=None
+    )
+
+
+def _beyond_settling(leak: Evidence, fit: BalanceFit, risen: DriftStep) -> Evidence:
+    """Return the evidence of a leak, `cannot tell` where no more rises than passed before and the circuit settles."""
+    before = float(np.interp(risen.onset, fit.blocks.t, risen.level))
+    if leak.verdict != "leak" or not fit.settles or risen.size >= before:
+        return leak
+    reason = f"{leak.reason}; less than the {_flow_text(before, fit)} that passed before may come of {SETTLING}"
     return replace(
         _unsized(leak), verdict="cannot tell", reason=reason, cause=None, onset_s=None, onset_interval_s=None
     )
@@ -459,6 +472,8 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
     if _pump_share(high, fit) < -LEAK_WORTH_FINDING:
         verdict = "cannot tell"
         reason = "the balance gives a leak against the pressure: areas, displacement or the pressures' signs do not fit"
+        if _swings(fit):
+            reason = f"the balance gives a leak against the pressure; {_no_flow_text(fit)}"
     elif rise > _LARGE_DRIFT * max(high - 0.5 * rise, 0.0) and rise > 6.0 * float(np.median(fit.sd)):
         verdict = "cannot tell"
         reason = (

@@ -76,6 +76,8 @@ _SWINGING = 0.05
 #: Either side of a single rod carries in turn where over this share of the squares of the integral of dp swings: 0.0015
 #: at most under a load that stands on one side, 0.027 and more without a load (development machines).
 _IN_TURN = 0.01
+#: A machine rests where over this share of the time is in no block.
+_RESTS = 0.1
 #: Blocks between the others count where there are so many of them, over those.
 _MOST_BETWEEN = 0.5
 #: Slopes are not kept where conductances of a single rod scatter by over so many times what they do without; those of a
@@ -199,6 +201,12 @@ class BalanceFit:
         gram = self.blocks.gram
         steady = gram[:, I_AB, TIME] ** 2 / (gram[:, I_AB, I_AB] * gram[:, TIME, TIME])
         return bool(1.0 - np.median(steady) > _IN_TURN)
+
+    @property
+    def settles(self) -> bool:
+        """Whether it is a single rod that rests without a load, whose circuit may settle in another way each time."""
+        balanced = (len(self.blocks) + len(self.left_out)) * self.blocks.seconds
+        return self.changes_over and balanced < (1.0 - _RESTS) * (float(np.ptp(self.blocks.t)) + self.blocks.seconds)
 
     @property
     def lag(self) -> float:

@@ -26,6 +26,7 @@ from sealscope.diagnosis.verdict.evidence import (
     Passage,
     without_flow,
 )
+from sealscope.diagnosis.volume_balance.over_cycles.holds import hold_flows
 from sealscope.diagnosis.volume_balance.over_cycles.series import BLOCK, CycleFlows, cycle_flows, shaft_shown
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.motion import moves
@@ -51,8 +52,6 @@ _ZERO_DRIFT = 3.5e3
 _SURE = 3.0
 #: What goes to the outside, as a share of a leak, over which it is external, and under which it is not.
 _LOST = 0.5
-#: What makes the mean of an unloaded single rod jump from rest to rest.
-_SETTLES = "how the circuit of a single rod settles where it rests without a load"
 #: What no mean over a cycle shows.
 _WEIGHED: frozenset[Cause] = frozenset({"friction change"})
 
@@ -87,7 +86,7 @@ class CycleBalance:
 
         The level is the pump's own, of which each has its own.
         """
-        flows = cycle_flows(recording, self.rig)
+        flows = self.flows(recording)
         if isinstance(flows, str):
             return Evidence("cannot tell", flows)
         settled = slice(-flows.t.size // 3, None)  # by then, whatever the drive's state was at the start
@@ -111,18 +110,25 @@ class CycleBalance:
         smallest = findable_step(flows.t, G, unit, probability, step.noise, shared=shared, quiet=True, halves=halves)
         return _no_step(flows, step, smallest * size, figures)
 
+    def flows(self, recording: Recording) -> CycleFlows | str:
+        """Return the balance over cycles, or over the holds of a piston without a load, or why there is neither."""
+        flows = cycle_flows(recording, self.rig)
+        if not isinstance(flows, str):
+            return flows
+        held = hold_flows(recording, self.rig)
+        return f"{flows}; {held}" if isinstance(held, str) else held
+
     def _leak(self, flows: CycleFlows, step: DriftStep, level: float, figures: str) -> Evidence:
         late = flows.t > step.onset
         dp = float(np.mean(flows.size[late]))
         lpm, limits = _flow(flows, step, dp, level)
-        scale = math.hypot(_SCALE, _DRIVE_SCALE if flows.counted == "u" else 0.0)
+        scale = math.hypot(_SCALE, _DRIVE_SCALE if flows.counted == "u" else 0.0, flows.zero)
         limits = max(0.0, limits[0] - 1.96 * scale * lpm), limits[1] + 1.96 * scale * lpm
         lines = [np.where(late, value, 0.0) for value in (lpm, *limits)]
         lost, remark = self._outside(flows, step, lpm * LITRE_PER_MINUTE)
         leak = Evidence(
             "leak",
-            f"what the pump delivers over a cycle under the load rose by {lpm:.4f} L/min at {step.onset:.1f} s "
-            f"({figures}){remark}",
+            f"{_delivered(flows)} rose by {lpm:.4f} L/min at {step.onset:.1f} s ({figures}){remark}",
             step.score,
             step.threshold,
             step.onset,
@@ -135,16 +141,6 @@ class CycleBalance:
             share=flows.share,
             weighed=_WEIGHED,
         )
-        before = (level - step.size) * dp / LITRE_PER_MINUTE
-        if flows.settles and lpm < before:
-            return replace(
-                without_flow(
-                    leak,
-                    f"less than the {before:.2g} L/min that passed before may come of {_SETTLES}",
-                ),
-                verdict="cannot tell",
-                cause=None,
-            )
         if lost:
             return replace(
                 leak, verdict="cannot tell", cause="external leak", leak_lpm=None, leak_interval_lpm=None, course=None
@@ -177,6 +173,10 @@ class CycleBalance:
         return False, "; oil that leaves past a seal of the side that carries the load would look alike"
 
 
+def _delivered(flows: CycleFlows) -> str:
+    return f"what the pump delivers {'to hold the piston at rest' if flows.held else 'over a cycle under the load'}"
+
+
 def _flow(flows: CycleFlows, step: DriftStep, dp: float, level: float) -> tuple[float, tuple[float, float]]:
     """Return the flow of a step [L/min] and its 95 % interval, which holds what the blocks beside it say, too."""
     unit = dp / LITRE_PER_MINUTE
@@ -204,17 +204,15 @@ def _no_step(flows: CycleFlows, step: DriftStep, smallest: float, figures: str) 
     """Return the evidence where nothing stepped; `smallest` [m^3/s]: the step that would have shown."""
     share = smallest / flows.pumped
     reason = (
-        f"what the pump delivers over a cycle under the load did not rise within the recording ({figures}); a leak "
+        f"{_delivered(flows)} did not rise within the recording ({figures}); a leak "
         "from the start would be hidden, the smallest step that would have shown is "
         f"{smallest / LITRE_PER_MINUTE:.2g} L/min"
     )
     known = share <= LEAK_WORTH_FINDING
     if not known:
         reason += f", more than {LEAK_WORTH_FINDING:.0%} of the pump's flow, the smallest leak worth finding"
-    elif flows.settles:
-        reason += f", but for {_SETTLES}, which hides leaks as well"
     return Evidence(
-        "no leak" if known and not flows.settles else "cannot tell",
+        "no leak" if known else "cannot tell",
         reason,
         step.score,
         step.threshold,

@@ -46,6 +46,7 @@ _UNLOADED = (
     "no load stands on the piston: neither side has the higher pressure throughout, and what leaks to and fro within a "
     "cycle is in no mean"
 )
+_SETTLES = "no load stands on a single rod that rests: its circuit may settle in another way at each rest"
 #: A load that changes moves the mean of p_A - p_B over a cycle by this share of its size (rms over mean) or more:
 #: without a load it is 0.37 at most, where friction holds the piston at rest, 0.59 at least under the loads developed
 #: on. Knots of the drift of G beside which its changes are fitted; the most by which flows may scatter about that, as
@@ -66,10 +67,10 @@ class CycleFlows:
     difference in that sense; `size` (n,) [Pa]: mean of abs(p_A - p_B); `filled` (n,) [Pa]: mean of the other side's
     pressure, of both where the load changes, which falls where oil leaves; `pumped` [m^3/s]: mean size of the pump's
     flow; `shared` (n, m) [m^3/s]: errors of `flow` that all blocks share, as columns, None where there are none;
-    `share` of the recording's blocks that count; `counted`: the channel that shows the shaft; `settles`: whether it
-    is a single rod that rests unloaded, whose circuit may settle in another way at each rest; `halves`: whether blocks
-    overlap by half; `by_orifice`: where the
-    load changes, the mean flow of an orifice over that of a worn seal which shows alike, else None.
+    `share` of the recording's blocks that count; `counted`: the channel that shows the shaft; `halves`: whether blocks
+    overlap by half; `by_orifice`: where the load changes, the mean flow of an orifice over that of a worn seal which
+    shows alike, else None; `zero`: what zeros of the transducers are of the pressure difference, where they count;
+    `held`: only the time counts in which the piston is held at rest (`holds`).
     """
 
     t: Array
@@ -82,19 +83,26 @@ class CycleFlows:
     shared: Array | None
     share: float
     counted: str
-    settles: bool
     halves: bool
     by_orifice: float | None = None
+    zero: float = 0.0
+    held: bool = False
 
 
 def shaft_shown(recording: Recording) -> str | None:
     """Return the channel that shows the shaft: theta, omega or u, whichever is recorded and moves; None without one."""
     units = {"theta": "rad", "omega": "rad/s", "u": "V"}
-    return next((name for name, unit in units.items() if _shows(recording, name, unit)), None)
+    return next((name for name, unit in units.items() if shows(recording, name, unit)), None)
 
 
-def _shows(recording: Recording, name: str, unit: str) -> bool:
+def shows(recording: Recording, name: str, unit: str) -> bool:
+    """Return whether a channel is recorded in this unit, and moves."""
     return name in recording and recording.units[name] == unit and moves(recording[name])
+
+
+def starts_from_rest(speed: Array) -> bool:
+    """Return whether a shaft of this speed (n,) starts from rest, its drive's state with it."""
+    return bool(abs(speed[0]) <= _AT_REST * np.max(np.abs(speed)))
 
 
 def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
@@ -116,14 +124,15 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         return _UNLOADED
     if cycle is None:
         return "the duty does not repeat, so that the piston comes back at no known time"
-    rest = abs(speed[0]) <= _AT_REST * np.max(np.abs(speed))
-    settled = 0 if rest or counted != "u" else round(_SETTLED_CYCLES * cycle * rate)
+    settled = 0 if counted != "u" or starts_from_rest(speed) else round(_SETTLED_CYCLES * cycle * rate)
     cycle = 1.0 / fundamental(speed, recording.t, cycle)
     sense = 1.0 if float(np.dot(speed - speed.mean(), dp - dp.mean())) >= 0.0 else -1.0
     rests = float(np.mean(np.abs(speed) < _SLOW * np.abs(speed).max())) > _RESTS
+    if rig.cylinder.single_rod and lowest < _LOADED and rests:
+        return _SETTLES
     flow = drive.flow(recording["u"], sense * dp, rate, settled) if counted == "u" else drive.displacement * speed
     volume = drive.displacement * recording["theta"] if counted == "theta" else _integral(flow, rate)
-    if _shows(recording, "x", "m"):
+    if shows(recording, "x", "m"):
         x, area = recording["x"], rig.cylinder.A_A if side > 0.0 else rig.cylinder.A_B
         along = 1.0 if float(np.dot(speed - speed.mean(), np.gradient(x))) >= 0.0 else -1.0
         volume = volume - along * area * x
@@ -164,7 +173,6 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         shared=None,
         share=float(np.mean(used)),
         counted=counted,
-        settles=rig.cylinder.single_rod and lowest < _LOADED and rests,
         halves=halves,
     )
     if settled and drive.lag > 0.5 * cycle:
