@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.diagnose import Examination, diagnose
+from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.diagnosis.volume_balance.over_cycles.detector import CycleBalance
 from sealscope.diagnosis.volume_balance.over_cycles.holds import hold_flows
 from sealscope.diagnosis.volume_balance.over_cycles.series import CycleFlows, cycle_flows
+from sealscope.diagnosis.volume_balance.over_cycles.stretches import stretch_flows
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
@@ -290,6 +292,27 @@ def test_a_single_rod_that_rests_unloaded(leak: str, verdict: str, channels: tup
     if leak:
         assert evidence.onset_s == pytest.approx(60.0, abs=3.0)
         assert evidence.leak_interval_lpm[0] < run.truth.mean_leak_lpm < evidence.leak_interval_lpm[1]
+
+
+@pytest.mark.parametrize(("leak", "verdict"), [("", "no leak"), ("0.02 L/min from 60 s", "leak")])
+def test_a_single_rod_under_a_load_that_swings(leak: str, verdict: str) -> None:
+    """What the circuit passes as it changes over hid 0.05 L/min: the stretches between are balanced."""
+    words = {"rig": SINGLE, "command": "position 50 mm sin(1.5t)", "load": "5 kN sin(0.45t)", "controller": "pi"}
+    run = simulate_with_truth(Experiment.of(**words, leak=leak or (), duration=SECONDS, seed=4))
+    recording, rig = run.recording, load_rig(SINGLE)
+    flows = stretch_flows(recording, rig)
+    assert len(flows.t) > 16 and np.all(np.diff(flows.t) > 0.5 * flows.seconds)
+    np.testing.assert_allclose((flows.flow / flows.dp)[flows.t < 55.0], rig.pump.G_pump, rtol=0.1)
+    assert {1.0, -1.0} == set(np.sign(flows.dp))
+    evidence = CycleBalance(rig).examine(recording, [], P)
+    assert evidence.verdict == verdict
+    assert "while one side carries the load" in evidence.reason
+    assert VolumeBalance(rig).examine(recording, [], P).verdict == "cannot tell"
+    assert diagnose(recording, rig=SINGLE).verdict == verdict
+    if leak:
+        assert evidence.onset_s == pytest.approx(60.0, abs=4.0)
+        assert evidence.leak_interval_lpm[0] < run.truth.mean_leak_lpm < evidence.leak_interval_lpm[1]
+    assert "are needed where the load changes sides" in stretch_flows(recording.only(SEEN), rig)
 
 
 def test_few_long_cycles_overlap() -> None:

@@ -28,10 +28,11 @@ from sealscope.diagnosis.volume_balance.blocks import (
     cut_blocks,
     mean_pressures,
 )
-from sealscope.diagnosis.volume_balance.evidence import SETTLING, judge, judge_level, trouble
+from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trouble
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance, with_between
 from sealscope.diagnosis.volume_balance.onset import date_step
 from sealscope.diagnosis.volume_balance.over_cycles.detector import CycleBalance
+from sealscope.diagnosis.volume_balance.search import scatter
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.quality import clipped
@@ -42,6 +43,12 @@ if TYPE_CHECKING:
 
 #: Under a load blocks are whole cycles where there are so many: those half a block later are searched as well.
 FEWEST_CYCLES = 10
+#: ... and stretches without the changing over tell more where their conductances scatter by under this share.
+_CALMER = 0.25
+_CHANGES_OVER = (
+    "either side of the single rod carries in turn, and what passes as the circuit changes over is in no volume: the "
+    "cycle balance leaves it out"
+)
 #: Share of the recording for which the machine may stand at a time.
 _UNSEEN = 0.3
 #: Share of the samples that a pressure may be cut off.
@@ -93,8 +100,8 @@ class VolumeBalance:
         fit, problem = self.fit(recording)
         if fit is None:
             return Evidence("cannot tell", problem)
-        if fit.settles and not CycleBalance(self.rig).examine(recording, (), false_alarm_probability).abstains:
-            return Evidence("cannot tell", f"the conductance over strokes depends on {SETTLING}: see the cycle balance")
+        if fit.changes_over and self._yields(fit, recording, false_alarm_probability):
+            return Evidence("cannot tell", _CHANGES_OVER)
         probability = share_of_each(false_alarm_probability, baseline)
         evidence = judge(
             fit,
@@ -107,6 +114,14 @@ class VolumeBalance:
             evidence = judge_level(fit, [other for other in fits if other is not None], evidence, probability)
         blocks = np.arange(0, len(recording) + 1, block_samples(recording))
         return replace(evidence, share=1.0 - float(np.mean(touched(recording, blocks))))
+
+    def _yields(self, fit: BalanceFit, recording: Recording, probability: float) -> bool:
+        """Return whether the cycle balance leaves out what the circuit of a single rod passes as it changes over."""
+        other = CycleBalance(self.rig)
+        flows = other.flows(recording)
+        if isinstance(flows, str) or flows.over == "cycles" or other.examine(recording, (), probability).abstains:
+            return False
+        return fit.settles if flows.over == "holds" else scatter(flows.flow / flows.dp) < _CALMER * scatter(fit.g)
 
     def blocks(
         self, recording: Recording, length: int | None = None, names: Sequence[str] | None = None

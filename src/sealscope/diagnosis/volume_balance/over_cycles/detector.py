@@ -28,6 +28,7 @@ from sealscope.diagnosis.verdict.evidence import (
 )
 from sealscope.diagnosis.volume_balance.over_cycles.holds import hold_flows
 from sealscope.diagnosis.volume_balance.over_cycles.series import BLOCK, CycleFlows, cycle_flows, shaft_shown
+from sealscope.diagnosis.volume_balance.over_cycles.stretches import stretch_flows
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Recording
@@ -52,6 +53,11 @@ _ZERO_DRIFT = 3.5e3
 _SURE = 3.0
 #: What goes to the outside, as a share of a leak, over which it is external, and under which it is not.
 _LOST = 0.5
+_DURING = {
+    "cycles": "over a cycle under the load",
+    "holds": "to hold the piston at rest",
+    "stretches": "while one side carries the load",
+}
 #: What no mean over a cycle shows.
 _WEIGHED: frozenset[Cause] = frozenset({"friction change"})
 
@@ -111,12 +117,14 @@ class CycleBalance:
         return _no_step(flows, step, smallest * size, figures)
 
     def flows(self, recording: Recording) -> CycleFlows | str:
-        """Return the balance over cycles, or over the holds of a piston without a load, or why there is neither."""
-        flows = cycle_flows(recording, self.rig)
-        if not isinstance(flows, str):
-            return flows
-        held = hold_flows(recording, self.rig)
-        return f"{flows}; {held}" if isinstance(held, str) else held
+        """Return the balance over cycles, over holds of a piston, or over stretches, or why there is none of them."""
+        refused = []
+        for balanced in (cycle_flows, hold_flows, *([stretch_flows] if self.rig.cylinder.single_rod else [])):
+            flows = balanced(recording, self.rig)
+            if not isinstance(flows, str):
+                return flows
+            refused.append(flows)
+        return "; ".join(refused)
 
     def _leak(self, flows: CycleFlows, step: DriftStep, level: float, figures: str) -> Evidence:
         late = flows.t > step.onset
@@ -128,7 +136,8 @@ class CycleBalance:
         lost, remark = self._outside(flows, step, lpm * LITRE_PER_MINUTE)
         leak = Evidence(
             "leak",
-            f"{_delivered(flows)} rose by {lpm:.4f} L/min at {step.onset:.1f} s ({figures}){remark}",
+            f"what the pump delivers {_DURING[flows.over]} rose by {lpm:.4f} L/min at {step.onset:.1f} s "
+            f"({figures}){remark}",
             step.score,
             step.threshold,
             step.onset,
@@ -173,10 +182,6 @@ class CycleBalance:
         return False, "; oil that leaves past a seal of the side that carries the load would look alike"
 
 
-def _delivered(flows: CycleFlows) -> str:
-    return f"what the pump delivers {'to hold the piston at rest' if flows.held else 'over a cycle under the load'}"
-
-
 def _flow(flows: CycleFlows, step: DriftStep, dp: float, level: float) -> tuple[float, tuple[float, float]]:
     """Return the flow of a step [L/min] and its 95 % interval, which holds what the blocks beside it say, too."""
     unit = dp / LITRE_PER_MINUTE
@@ -204,7 +209,7 @@ def _no_step(flows: CycleFlows, step: DriftStep, smallest: float, figures: str) 
     """Return the evidence where nothing stepped; `smallest` [m^3/s]: the step that would have shown."""
     share = smallest / flows.pumped
     reason = (
-        f"{_delivered(flows)} did not rise within the recording ({figures}); a leak "
+        f"what the pump delivers {_DURING[flows.over]} did not rise within the recording ({figures}); a leak "
         "from the start would be hidden, the smallest step that would have shown is "
         f"{smallest / LITRE_PER_MINUTE:.2g} L/min"
     )

@@ -15,7 +15,7 @@ import numpy as np
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, MOST_BLOCKS
-from sealscope.diagnosis.volume_balance.over_cycles.series import CycleFlows, shaft_shown, shows, starts_from_rest
+from sealscope.diagnosis.volume_balance.over_cycles.series import ZERO, CycleFlows, shaft_shown, shows, starts_from_rest
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 _MEANS, _STILL, _SHORTEST, _COUNTS = 0.05, 0.05, 0.5, (0.25, 0.9)
 #: The pump holds the piston where it delivers over this share of what the piston takes as it creeps.
 _TURNS = 0.2
-#: Zero of a pressure difference as makers state it [Pa], 0.1 % of 20 MPa; least difference of a hold, rms, over it.
-_ZERO, _LEAST = 2e4, 2.5
+#: Least pressure difference of a hold, rms, over what zeros of the transducers make.
+_LEAST = 2.5
 
 
 class _Hold(NamedTuple):
@@ -69,7 +69,7 @@ def hold_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         return f"the piston is held at rest {len(holds)} times for {_SHORTEST:g} s or more, {FEWEST + 1} are needed"
     at, given, taken, drop, least = (np.array(column) for column in zip(*holds, strict=True))
     pressure = float(np.sqrt(np.mean(drop**2)))
-    if not pressure > _LEAST * _ZERO:
+    if not pressure > _LEAST * ZERO:
         return f"while the piston is held p_A - p_B is {pressure:.3g} Pa, which zeros of the transducers make as well"
     if not abs(float(given @ drop)) > _TURNS * abs(float(taken @ drop)):
         return "the piston creeps at rest, and the pump stands: no controller holds it"
@@ -97,8 +97,8 @@ def hold_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         counted=counted,
         halves=group == 2,
         by_orifice=float(np.sqrt(pressure) * np.mean(np.sqrt(np.abs(dp)))) / size,
-        zero=_ZERO / pressure,
-        held=True,
+        zero=ZERO / pressure,
+        over="holds",
     )
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -51,7 +51,9 @@ _SETTLES = "no load stands on a single rod that rests: its circuit may settle in
 #: without a load it is 0.37 at most, where friction holds the piston at rest, 0.59 at least under the loads developed
 #: on. Knots of the drift of G beside which its changes are fitted; the most by which flows may scatter about that, as
 #: a share.
-_STANDS, _KNOTS, _COMES_BACK = 0.45, 6, 0.01
+_STANDS, KNOTS, COMES_BACK = 0.45, 6, 0.01
+#: Zero of a pressure difference as makers state it [Pa]: 0.1 % of 20 MPa.
+ZERO = 2e4
 #: A recording starts from rest where its first command, or speed, is under this share of the largest.
 _AT_REST = 0.02
 #: Cycles over which the drive of a machine that starts in motion is taken to be settled.
@@ -70,7 +72,7 @@ class CycleFlows:
     `share` of the recording's blocks that count; `counted`: the channel that shows the shaft; `halves`: whether blocks
     overlap by half; `by_orifice`: where the load changes, the mean flow of an orifice over that of a worn seal which
     shows alike, else None; `zero`: what zeros of the transducers are of the pressure difference, where they count;
-    `held`: only the time counts in which the piston is held at rest (`holds`).
+    `over`: the time that counts, cycles, `holds` or `stretches`.
     """
 
     t: Array
@@ -86,7 +88,7 @@ class CycleFlows:
     halves: bool
     by_orifice: float | None = None
     zero: float = 0.0
-    held: bool = False
+    over: Literal["cycles", "holds", "stretches"] = "cycles"
 
 
 def shaft_shown(recording: Recording) -> str | None:
@@ -131,7 +133,7 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
     if rig.cylinder.single_rod and lowest < _LOADED and rests:
         return _SETTLES
     flow = drive.flow(recording["u"], sense * dp, rate, settled) if counted == "u" else drive.displacement * speed
-    volume = drive.displacement * recording["theta"] if counted == "theta" else _integral(flow, rate)
+    volume = drive.displacement * recording["theta"] if counted == "theta" else integral(flow, rate)
     if shows(recording, "x", "m"):
         x, area = recording["x"], rig.cylinder.A_A if side > 0.0 else rig.cylinder.A_B
         along = 1.0 if float(np.dot(speed - speed.mean(), np.gradient(x))) >= 0.0 else -1.0
@@ -154,9 +156,9 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
     if np.count_nonzero(used) < FEWEST:
         return f"samples are missing in {count - np.count_nonzero(used)} of {count} blocks of {length / rate:.3g} s"
 
-    def means(integral: Array) -> Array:
+    def means(whole: Array) -> Array:
         """Return the mean over each block that counts of what has this integral (m,), averaged about a block's ends."""
-        twice, places = _integral(integral, rate), np.arange(integral.size)
+        twice, places = integral(whole, rate), np.arange(whole.size)
         at_ends = (np.interp(ends + half, places, twice) - np.interp(ends - half, places, twice)) / (2.0 * half / rate)
         return np.asarray((at_ends[overlap:] - at_ends[:-overlap])[used] / (length / rate))
 
@@ -166,9 +168,9 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         t=float(recording.t[0]) + middles,
         seconds=length / rate,
         flow=side * sense * means(volume),
-        dp=side * means(_integral(dp, rate)),
-        size=means(_integral(np.abs(dp), rate)),
-        filled=means(_integral(other if not changes else 0.5 * (recording["p_A"] + recording["p_B"]), rate)),
+        dp=side * means(integral(dp, rate)),
+        size=means(integral(np.abs(dp), rate)),
+        filled=means(integral(other if not changes else 0.5 * (recording["p_A"] + recording["p_B"]), rate)),
         pumped=float(np.mean(np.abs(flow))),
         shared=None,
         share=float(np.mean(used)),
@@ -189,8 +191,8 @@ def _evened(flows: CycleFlows, dp: Array, moved: Array, rate: float) -> CycleFlo
     """
     if float(np.sqrt(np.mean(flows.dp**2))) < _STANDS * float(np.mean(flows.size)):
         return _UNLOADED
-    at = np.linspace(flows.t[0], flows.t[-1], _KNOTS)
-    drifting = np.stack([np.interp(flows.t, at, row) for row in np.eye(_KNOTS)], axis=1) * flows.dp[:, None]
+    at = np.linspace(flows.t[0], flows.t[-1], KNOTS)
+    drifting = np.stack([np.interp(flows.t, at, row) for row in np.eye(KNOTS)], axis=1) * flows.dp[:, None]
     fixed = np.stack([np.ones(flows.t.size), moved], axis=1)
     columns = np.concatenate([fixed, drifting] if flows.shared is None else [fixed, drifting, flows.shared], axis=1)
     columns_size = np.sqrt(np.mean(columns**2, axis=0)) + np.finfo(float).tiny
@@ -198,7 +200,7 @@ def _evened(flows: CycleFlows, dp: Array, moved: Array, rate: float) -> CycleFlo
     fitted, *_ = np.linalg.lstsq(scaled, flows.flow, rcond=None)
     left = flows.flow - scaled @ fitted
     deviation = float(np.sqrt(left @ left / max(1, left.size - columns.shape[1])))
-    if not deviation < _COMES_BACK * flows.pumped:
+    if not deviation < COMES_BACK * flows.pumped:
         return f"the piston does not come back after each stroke: flows scatter by {deviation / flows.pumped:.1%}"
     own = deviation * np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled)))[:2]
     errors = scaled[:, :2] * own
@@ -224,7 +226,7 @@ def _strokes(speed: Array, rate: float) -> float | None:
     return float(speed.size / rate / (best + 0.5 * (a - c) / (a - 2.0 * b + c)))
 
 
-def _integral(values: Array, rate: float) -> Array:
+def integral(values: Array, rate: float) -> Array:
     """Return the integral of values (m,) from the first sample on, by trapezia."""
     return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]))]) / rate
 
