@@ -58,8 +58,9 @@ _DURING = {
     "holds": "to hold the piston at rest",
     "stretches": "while one side carries the load",
 }
-#: What no mean over a cycle shows.
+#: What no mean over a cycle shows; nor is another duty seen by what is balanced without the strokes.
 _WEIGHED: frozenset[Cause] = frozenset({"friction change"})
+_ANY_DUTY: frozenset[Cause] = _WEIGHED | {"changed duty"}
 
 
 class CycleBalance:
@@ -95,15 +96,7 @@ class CycleBalance:
         flows = self.flows(recording)
         if isinstance(flows, str):
             return Evidence("cannot tell", flows)
-        settled = slice(-flows.t.size // 3, None)  # by then, whatever the drive's state was at the start
-        dp, size = flows.dp, float(np.mean(flows.size))
-        level = float(np.dot(flows.flow[settled], dp[settled]) / np.dot(dp[settled], dp[settled]))
-        if not level * float(np.sqrt(np.mean(dp**2))) > _DELIVERED * flows.pumped:
-            return Evidence(
-                "cannot tell",
-                "what the pump delivers over a cycle does not make good what leaks under the load: no controller "
-                "brings the piston back, or the circuit changes over between its sides",
-            )
+        dp, level, size = flows.dp, flows.level, float(np.mean(flows.size))
         known = np.maximum(np.abs(dp), _LEAST_PRESSURE * float(np.sqrt(np.mean(dp**2))))
         weak = np.median(known) / known if flows.by_orifice is not None else np.ones(dp.size)
         G, unit = flows.flow / np.copysign(known, dp), 1e-3 * level * weak
@@ -121,9 +114,15 @@ class CycleBalance:
         refused = []
         for balanced in (cycle_flows, hold_flows, *([stretch_flows] if self.rig.cylinder.single_rod else [])):
             flows = balanced(recording, self.rig)
-            if not isinstance(flows, str):
+            if isinstance(flows, str):
+                refused.append(flows)
+            elif flows.level * float(np.sqrt(np.mean(flows.dp**2))) > _DELIVERED * flows.pumped:
                 return flows
-            refused.append(flows)
+            else:
+                refused.append(
+                    f"what the pump delivers {_DURING[flows.over]} does not make good what leaks: no controller brings "
+                    "the piston back, or the circuit changes over between its sides"
+                )
         return "; ".join(refused)
 
     def _leak(self, flows: CycleFlows, step: DriftStep, level: float, figures: str) -> Evidence:
@@ -148,7 +147,7 @@ class CycleBalance:
             course=LeakCourse(flows.t, lines[0], lines[1], lines[2]),
             chance=step.chance,
             share=flows.share,
-            weighed=_WEIGHED,
+            weighed=_WEIGHED if flows.over == "cycles" else _ANY_DUTY,
         )
         if lost:
             return replace(

@@ -90,6 +90,12 @@ class CycleFlows:
     zero: float = 0.0
     over: Literal["cycles", "holds", "stretches"] = "cycles"
 
+    @property
+    def level(self) -> float:
+        """The conductance of the last third [m^3/(s Pa)]: by then, whatever the drive's state was at the start."""
+        flow, dp = self.flow[-self.t.size // 3 :], self.dp[-self.t.size // 3 :]
+        return float(np.dot(flow, dp) / np.dot(dp, dp))
+
 
 def shaft_shown(recording: Recording) -> str | None:
     """Return the channel that shows the shaft: theta, omega or u, whichever is recorded and moves; None without one."""
