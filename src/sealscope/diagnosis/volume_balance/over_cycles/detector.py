@@ -1,9 +1,10 @@
-"""Cycle balance: what the pump must deliver over a whole cycle so that a loaded piston comes back has leaked.
+"""Cycle balance: what the pump must deliver so that a loaded piston comes back, or stays, has leaked.
 
 A position loop hides a leak in its command, and there it shows: under a load that stands on one side the command's mean
 over a cycle is what pump and piston pass (`series`). Position and angle are not needed; friction, stiffness and mass
-are in no mean. What limits the search is the drift of the pump's own leakage, so that a leak is a step, or a growth,
-that no smooth drift explains (`changepoint.smooth_drift`).
+are in no mean. Without such a load it counts while the piston is held at rest (`holds`), or while one side of a single
+rod carries (`stretches`). What limits the search is the drift of the pump's own leakage, so that a leak is a step, or a
+growth, that no smooth drift explains (`changepoint.smooth_drift`).
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ _ANY_DUTY: frozenset[Cause] = _WEIGHED | {"changed duty"}
 
 
 class CycleBalance:
-    """Leakage under a load, from the command (or the shaft) and both chamber pressures."""
+    """Leakage under a load or at rest, from the command (or the shaft) and both chamber pressures."""
 
     name = "cycle balance"
     reads = ("u", "theta", "omega", "x", *CHAMBERS)
