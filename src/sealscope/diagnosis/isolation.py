@@ -111,7 +111,7 @@ class Signatures:
     power of its noise in one line of the spectrum, `lines` (b,) of each band; `motion`: where the strokes changed;
     `tilt` (n, 2) log power of the noise of p_A and p_B near half the rate over that at two thirds of it; `hum` (n, 2,
     h) log power in lines of mains frequencies over what lies beside them, `line` (n, 2, h) that in the lines alone,
-    `mains` (h,) [Hz]; `alike` (n - 1, 2) correlation of p_A - p_B in each block with that one and two blocks before
+    `mains` (h,) [Hz]; `alike` (n - 1, 3) correlation of p_A - p_B in each block with those before
     (`_alike`), None where the duty does not repeat; `together`: how p_A and p_B ring together; `scale` [Pa]: what steps
     of a chamber's mean are measured by, and `measure`, its name.
     """
@@ -286,9 +286,10 @@ def lag_step(seen: Signatures, onset: float) -> tuple[float, float]:
 
 
 def _alike(rows: Array) -> Array:
-    """Return the correlation (n - 1, 2) of each row but the first with that one, and two, before it.
+    """Return the correlation (n - 1, 3) of rows: with the one before, with two before, and of means before and after.
 
-    With the one before, of what is left of each beside its line: a load that swings slowly turns the line about.
+    But for two before, of what is left of each beside its line: a load that swings slowly turns the line about. What
+    it bends besides is in no mean.
     """
 
     def unit(rest: Array) -> Array:
@@ -297,9 +298,11 @@ def _alike(rows: Array) -> Array:
 
     rest = rows - rows.mean(axis=1, keepdims=True)
     line = np.arange(rows.shape[1]) - 0.5 * (rows.shape[1] - 1)
-    bent, rest = unit(rest - np.outer(rest @ line, line) / (line @ line)), unit(rest)
+    bent, rest = rest - np.outer(rest @ line, line) / (line @ line), unit(rest)
+    sums = np.cumsum(bent, axis=0)
+    means, bent = np.sum(unit(sums[:-1]) * unit(sums[-1] - sums[:-1]), axis=1), unit(bent)
     before = np.sum(bent[1:] * bent[:-1], axis=1)
-    return np.stack([before, np.append(1.0, np.sum(rest[2:] * rest[:-2], axis=1))], axis=1)
+    return np.stack([before, np.append(1.0, np.sum(rest[2:] * rest[:-2], axis=1)), means], axis=1)
 
 
 def other_cause(
@@ -330,8 +333,9 @@ def elsewhere(seen: Signatures) -> OtherCause | None:
     """Return whether p_A - p_B goes on in another sense or phase somewhere in a duty that repeats."""
     if seen.alike is None or not np.median(seen.alike[:, 0]) > SAME_PHASE:
         return None
-    worst = int(np.argmin(seen.alike[:, 0]))
-    if not seen.alike[worst, 0] < OTHER_PHASE:
+    either = np.maximum(seen.alike[:, 0], seen.alike[:, 2])
+    worst = int(np.argmin(either))
+    if not either[worst] < OTHER_PHASE:
         return None
     at = float(seen.t[worst + 1])
     if min(seen.alike[worst : worst + 2, 1]) < -OTHER_PHASE:
