@@ -13,6 +13,7 @@ from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.model import GAIN, STATES, DrivenModel, G, assumed_numbers, nominal
 from sealscope.diagnosis.pressure_model.track import Track, steps_in, track
+from sealscope.diagnosis.verdict.evidence import LEAK_WORTH_FINDING
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import COUNTS, Recording
@@ -141,6 +142,8 @@ def test_a_sound_machine_is_left_alone(command: str, detector: PressureModel) ->
     assert found.verdict == "no leak", found.reason
     assert found.leak_lpm is None
     assert found.onset_s is None
+    assert 0.0 < found.passage.findable_share < LEAK_WORTH_FINDING
+    assert found.passage.findable_lpm == detector.findable(recorded(2, command=command), P, 0.9)
 
 
 @pytest.mark.parametrize(

@@ -188,9 +188,13 @@ def passes(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
         return None
     pressure = f"at {number(own.pressure / 1e6, 2)} MPa"
     if own.lpm is None or own.interval_lpm is None:
-        text = f"pump and piston together {_percent(own.pump_share)} of the pump's flow {pressure}"
+        text = "not measured"
+        if own.pump_share is not None:
+            text = f"pump and piston together {_percent(own.pump_share)} of the pump's flow {pressure}"
         if own.findable_share is not None:
             text += f"; the smallest step that would have been found is {_percent(own.findable_share)}"
+            text += "" if own.pump_share is not None else " of the pump's flow"
+            text += "" if own.findable_lpm is None else f", {number(own.findable_lpm, 2)} L/min"
         return text
     low, high = own.interval_lpm
     if not high > 0.0:
@@ -215,7 +219,7 @@ def passes_in_short(diagnosis: Diagnosis) -> str | None:
     if own is None or diagnosis.verdict == "leak":
         return None
     if own.lpm is None or own.interval_lpm is None:
-        return f"passes {_percent(own.pump_share)} of the pump's flow"
+        return None if own.pump_share is None else f"passes {_percent(own.pump_share)} of the pump's flow"
     low, high = own.interval_lpm
     return f"passes {number(own.lpm, 2)} L/min" if low > 0.0 else f"passes at most {number(high, 2)} L/min"
 
