@@ -3,12 +3,13 @@
     python benchmarks/drift_bounds.py [--plan bench-load] [--machines 8] [--draws 3000] [--seed 1]
 
 For leak-free machines of each family: what passes the pump [L/min], how far that drifts within the record, the scatter
-of a block of the volume balance (fourth differences), and the leak from the plan's onset on that is found in 9 of 10
+of a block of the balance (fourth differences), and the leak from the plan's onset on that is found in 9 of 10
 records at 1 % by the best linear test, its onset known: ``(z_0.99 + z_0.9) / sqrt(s' C^-1 s)``, s what a step of 1
 L/min makes of the blocks, C their covariance without one. `law known`: C is that of the scatter and of the bench's own
 drifts of pump leakage, drawn anew. `twice integrated` and `integrated`: what the same drifts make of the test that
 takes them for such a walk, as strong as explains them best (likelihood restricted to what offset and slope leave).
-Blocks half a block later count as well, their scatter taken for independent. Medians over the machines; it takes 5 s a
+Blocks are of the volume balance where one side carries throughout, those half a block later as well, their scatter
+taken for independent; else holds or stretches of the cycle balance. Medians over the machines; it takes 5 s a
 machine.
 """
 
@@ -27,8 +28,10 @@ from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.diagnosis.volume_balance.over_cycles.detector import CycleBalance
 from sealscope.diagnosis.volume_balance.search import scatter
-from sealscope.recordings.recording import Array
+from sealscope.parameters import Rig
+from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
@@ -94,24 +97,36 @@ def likeliest(noise: Array, walk: Array, free: Array, series: Array) -> Array:
     return found
 
 
+def balanced(rig: Rig, recording: Recording) -> tuple[Array, float, Array] | None:
+    """Return middles of blocks (n,), the seconds of one, and conductances (m,) whose scatter is theirs.
+
+    Of the volume balance where one side carries throughout, else of holds or stretches of the cycle balance.
+    """
+    fit, _ = VolumeBalance(rig).fit(recording)
+    if fit is not None and fit.between is not None and not fit.changes_over:
+        return np.sort(np.concatenate([fit.blocks.t, fit.between.t])), fit.blocks.seconds, fit.g
+    flows = CycleBalance(rig).flows(recording)
+    return None if isinstance(flows, str) else (flows.t, flows.seconds, flows.flow / flows.dp)
+
+
 def bounds(plan: SimulatedPlan, family: str, machines: int, draws: int, seed: int) -> list[list[float]]:
     """Return for each machine level, drift, scatter, and the smallest leaks [L/min]."""
     courses = drifts(plan, family, draws)
-    balance, rows = VolumeBalance(plan.rig), []
+    rows = []
     own = replace(plan, seed=seed, factors={**plan.factors, FAMILY: (family,)})
     for case in [case for case in cases_of(own) if case.leak_lpm == 0 and not case.fault][:machines]:
         simulated = simulate_with_truth(unsized(own, case))
-        fit, _ = balance.fit(inspected(simulated.recording).part)
-        if fit is None or fit.between is None:
+        blocks = balanced(plan.rig, inspected(simulated.recording).part)
+        if blocks is None:
             continue
+        t, seconds, g = blocks
         outputs = simulated.truth.outputs
         dp = float(np.mean(np.abs(outputs["p_A"] - outputs["p_B"])))
         level = float(unsized(own, case).rig[PUMP]) * dp / LITRE_PER_MINUTE
-        noise = scatter(fit.g) * dp / LITRE_PER_MINUTE
-        t = np.sort(np.concatenate([fit.blocks.t, fit.between.t]))
-        drifting = level * means(courses, t, fit.blocks.seconds)
+        noise = scatter(g) * dp / LITRE_PER_MINUTE
+        drifting = level * means(courses, t, seconds)
         open_ = (np.arange(courses.shape[1]) / RATE >= plan.onset_s)[None].astype(float)
-        step = means(open_, t, fit.blocks.seconds)[0]
+        step = means(open_, t, seconds)[0]
         white = noise**2 * np.eye(t.size)
         offset, sloped = np.ones((t.size, 1)), np.stack([np.ones(t.size), t], axis=1)
         true = white + np.cov(drifting.T)
