@@ -28,7 +28,8 @@ from sealscope.diagnosis.verdict.evidence import (
     without_flow,
 )
 from sealscope.diagnosis.volume_balance.over_cycles.holds import hold_flows
-from sealscope.diagnosis.volume_balance.over_cycles.series import BLOCK, CycleFlows, cycle_flows, shaft_shown
+from sealscope.diagnosis.volume_balance.over_cycles.series import BLOCK, CycleFlows, cycle_flows
+from sealscope.diagnosis.volume_balance.over_cycles.shaft import shaft_shown
 from sealscope.diagnosis.volume_balance.over_cycles.stretches import stretch_flows
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.motion import moves

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.control.drive import Drive
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, MOST_BLOCKS
-from sealscope.diagnosis.volume_balance.over_cycles.series import ZERO, CycleFlows, shaft_shown, shows, starts_from_rest
+from sealscope.diagnosis.volume_balance.over_cycles.series import ZERO, CycleFlows
+from sealscope.diagnosis.volume_balance.over_cycles.shaft import Shaft, shows
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording
 
@@ -43,20 +43,16 @@ class _Hold(NamedTuple):
 
 def hold_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
     """Return the balance over holds of a recording with both chamber pressures and a `shaft_shown`, or why none is."""
-    counted, rate = shaft_shown(recording), recording.rate
-    if counted is None:
+    shaft, rate = Shaft.of(recording, rig), recording.rate
+    if shaft is None:
         return "the shaft is not shown"
-    drive, dp = Drive.of(rig), recording["p_A"] - recording["p_B"]
-    theta = recording["theta"] if counted == "theta" else None
-    speed = drive.omega_per_volt * recording["u"] if counted == "u" else recording["omega"] if theta is None else None
-    speed = np.gradient(recording["theta"]) * rate if speed is None else speed
-    sense = 1.0 if float(np.dot(speed - speed.mean(), dp - dp.mean())) >= 0.0 else -1.0
-    flow = drive.flow(recording["u"], sense * dp, rate) if counted == "u" else drive.displacement * speed
+    drive, dp, sense, flow = shaft.drive, shaft.dp, shaft.sense, shaft.flow(recording)
+    theta = recording["theta"] if shaft.shown == "theta" else None
     x = recording["x"] if shows(recording, "x", "m") else None
-    along = 1.0 if x is None or float(np.dot(speed - speed.mean(), np.gradient(x))) >= 0.0 else -1.0
+    along = 1.0 if x is None else shaft.along(x)
     lower = np.minimum(recording["p_A"], recording["p_B"])
     holds = []
-    for part in _held(speed if x is None else np.gradient(x) * rate, rate):
+    for part in _held(shaft.speed if x is None else np.gradient(x) * rate, rate):
         if touched(recording, np.array([part.start, part.stop]))[0]:
             continue
         delivered = float(np.mean(flow[part])) if theta is None else drive.displacement * _slope(theta[part], rate)
@@ -83,7 +79,6 @@ def hold_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
 
     size = float(np.mean(np.abs(dp)))
     t, pumped = sums(at) / group, float(np.mean(np.abs(flow)))
-    started = counted != "u" or starts_from_rest(speed)
     return CycleFlows(
         t=t,
         seconds=group * float(np.median(np.diff(at))),
@@ -92,9 +87,9 @@ def hold_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         size=np.full(first.size, size),
         filled=sums(least) / group,
         pumped=pumped,
-        shared=None if started else (pumped * np.exp(-(t - recording.t[0]) / drive.lag))[:, None],
+        shared=None if shaft.settled else (pumped * np.exp(-(t - recording.t[0]) / drive.lag))[:, None],
         share=1.0,
-        counted=counted,
+        counted=shaft.shown,
         halves=group == 2,
         by_orifice=float(np.sqrt(pressure) * np.mean(np.sqrt(np.abs(dp)))) / size,
         zero=ZERO / pressure,

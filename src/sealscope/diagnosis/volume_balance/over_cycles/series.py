@@ -15,16 +15,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sealscope.control.drive import Drive
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, MOST_BLOCKS
+from sealscope.diagnosis.volume_balance.over_cycles.shaft import Shaft, shows
 from sealscope.physics.leakage import orifice_over_laminar
 from sealscope.recordings.cycle import find_cycle, fundamental
 from sealscope.recordings.gaps import touched
-from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
@@ -54,8 +54,6 @@ _SETTLES = "no load stands on a single rod that rests: its circuit may settle in
 _STANDS, KNOTS, COMES_BACK = 0.45, 6, 0.01
 #: Zero of a pressure difference as makers state it [Pa]: 0.1 % of 20 MPa.
 ZERO = 2e4
-#: A recording starts from rest where its first command, or speed, is under this share of the largest.
-_AT_REST = 0.02
 #: Cycles over which the drive of a machine that starts in motion is taken to be settled.
 _SETTLED_CYCLES = 3
 
@@ -97,33 +95,12 @@ class CycleFlows:
         return float(np.dot(flow, dp) / np.dot(dp, dp))
 
 
-def shaft_shown(recording: Recording) -> str | None:
-    """Return the channel that shows the shaft: theta, omega or u, whichever is recorded and moves; None without one."""
-    units = {"theta": "rad", "omega": "rad/s", "u": "V"}
-    return next((name for name, unit in units.items() if shows(recording, name, unit)), None)
-
-
-def shows(recording: Recording, name: str, unit: str) -> bool:
-    """Return whether a channel is recorded in this unit, and moves."""
-    return name in recording and recording.units[name] == unit and moves(recording[name])
-
-
-def starts_from_rest(speed: Array) -> bool:
-    """Return whether a shaft of this speed (n,) starts from rest, its drive's state with it."""
-    return bool(abs(speed[0]) <= _AT_REST * np.max(np.abs(speed)))
-
-
 def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
     """Return the balance of a recording that has both chamber pressures and a `shaft_shown`, or why there is none."""
-    counted, cycle, rate = shaft_shown(recording), find_cycle(recording), recording.rate
-    if counted is None:
+    shaft, cycle, rate = Shaft.of(recording, rig), find_cycle(recording), recording.rate
+    if shaft is None:
         return "the shaft is not shown"
-    dp = recording["p_A"] - recording["p_B"]
-    drive = Drive.of(rig)
-    if counted == "u":
-        speed = drive.omega_per_volt * recording["u"]
-    else:
-        speed = np.gradient(recording["theta"]) * rate if counted == "theta" else recording["omega"]
+    dp, speed, drive = shaft.dp, shaft.speed, shaft.drive
     side = math.copysign(1.0, float(dp.mean()))  # which pressure is the higher
     lowest = _lowest(side * dp, rate)
     if changes := lowest <= 0.0 and not rig.cylinder.single_rod:
@@ -132,60 +109,88 @@ def cycle_flows(recording: Recording, rig: Rig) -> CycleFlows | str:
         return _UNLOADED
     if cycle is None:
         return "the duty does not repeat, so that the piston comes back at no known time"
-    settled = 0 if counted != "u" or starts_from_rest(speed) else round(_SETTLED_CYCLES * cycle * rate)
+    settled = 0 if shaft.settled else round(_SETTLED_CYCLES * cycle * rate)
     cycle = 1.0 / fundamental(speed, recording.t, cycle)
-    sense = 1.0 if float(np.dot(speed - speed.mean(), dp - dp.mean())) >= 0.0 else -1.0
     rests = float(np.mean(np.abs(speed) < _SLOW * np.abs(speed).max())) > _RESTS
     if rig.cylinder.single_rod and lowest < _LOADED and rests:
         return _SETTLES
-    flow = drive.flow(recording["u"], sense * dp, rate, settled) if counted == "u" else drive.displacement * speed
-    volume = drive.displacement * recording["theta"] if counted == "theta" else integral(flow, rate)
+    flow = shaft.flow(recording, settled)
+    volume = drive.displacement * recording["theta"] if shaft.shown == "theta" else integral(flow, rate)
     if shows(recording, "x", "m"):
-        x, area = recording["x"], rig.cylinder.A_A if side > 0.0 else rig.cylinder.A_B
-        along = 1.0 if float(np.dot(speed - speed.mean(), np.gradient(x))) >= 0.0 else -1.0
-        volume = volume - along * area * x
-    length, half = cycle * rate * max(1, round(BLOCK / cycle)), 0.5 * _AT_ENDS * cycle * rate
-    last = len(recording) - 1 - half
-    seconds = (last - max(_START, cycle) * rate) / rate
+        area = rig.cylinder.A_A if side > 0.0 else rig.cylinder.A_B
+        volume = volume - shaft.along(recording["x"]) * area * recording["x"]
     # blocks that overlap by half follow a drift more closely; not where each differs by what changes of the load store
-    halves = not changes and 2.0 * seconds * rate < MOST_BLOCKS * length
-    overlap = 2 if halves or seconds * rate < FEWEST * length else 1
-    count = int(overlap * (seconds * rate / length - 1.0) + 1e-6) + 1
-    if count < FEWEST:
-        return (
-            f"too short for a balance over cycles: {seconds:.4g} s after the start, {(FEWEST + 1) / 2:g} cycles of "
-            f"{length / rate:.3g} s are needed"
-        )
-    ends = last - length / overlap * np.arange(count + overlap - 1, -1, -1.0)
-    first, stop = ends[:-overlap], ends[overlap:]
-    used = ~np.array([touched(recording, np.array(pair, dtype=np.int64))[0] for pair in zip(first, stop, strict=True)])
-    if np.count_nonzero(used) < FEWEST:
-        return f"samples are missing in {count - np.count_nonzero(used)} of {count} blocks of {length / rate:.3g} s"
-
-    def means(whole: Array) -> Array:
-        """Return the mean over each block that counts of what has this integral (m,), averaged about a block's ends."""
-        twice, places = integral(whole, rate), np.arange(whole.size)
-        at_ends = (np.interp(ends + half, places, twice) - np.interp(ends - half, places, twice)) / (2.0 * half / rate)
-        return np.asarray((at_ends[overlap:] - at_ends[:-overlap])[used] / (length / rate))
-
-    middles = 0.5 * (first + stop)[used] / rate
+    blocks = _Blocks.of(recording, cycle, overlap=not changes)
+    if isinstance(blocks, str):
+        return blocks
     other = recording["p_B" if side > 0.0 else "p_A"]
     flows = CycleFlows(
-        t=float(recording.t[0]) + middles,
-        seconds=length / rate,
-        flow=side * sense * means(volume),
-        dp=side * means(integral(dp, rate)),
-        size=means(integral(np.abs(dp), rate)),
-        filled=means(integral(other if not changes else 0.5 * (recording["p_A"] + recording["p_B"]), rate)),
+        t=float(recording.t[0]) + blocks.middles,
+        seconds=blocks.length / rate,
+        flow=side * shaft.sense * blocks.means(volume),
+        dp=side * blocks.means(integral(dp, rate)),
+        size=blocks.means(integral(np.abs(dp), rate)),
+        filled=blocks.means(integral(other if not changes else 0.5 * (recording["p_A"] + recording["p_B"]), rate)),
         pumped=float(np.mean(np.abs(flow))),
         shared=None,
-        share=float(np.mean(used)),
-        counted=counted,
-        halves=halves,
+        share=float(np.mean(blocks.used)),
+        counted=shaft.shown,
+        halves=blocks.halves,
     )
     if settled and drive.lag > 0.5 * cycle:
-        flows = replace(flows, shared=(flows.pumped * np.exp(-middles / drive.lag))[:, None])
-    return _evened(flows, dp, means(dp), rate) if changes else flows
+        flows = replace(flows, shared=(flows.pumped * np.exp(-blocks.middles / drive.lag))[:, None])
+    return _evened(flows, dp, blocks.means(dp), rate) if changes else flows
+
+
+class _Blocks(NamedTuple):
+    """Blocks of whole cycles of a recording.
+
+    `ends` (n + overlap,): samples at which they begin and end, `overlap` apart for a block; `half`: samples about an
+    end over which readings are averaged; `length` of a block in samples; `used` (n,): which of them count; `halves`:
+    whether a recording that is longer has blocks that overlap by half.
+    """
+
+    ends: Array
+    overlap: int
+    half: float
+    length: float
+    used: NDArray[np.bool_]
+    halves: bool
+    rate: float
+
+    @classmethod
+    def of(cls, recording: Recording, cycle: float, overlap: bool) -> Self | str:
+        """Return the blocks of a recording whose cycle takes `cycle` s, or why there are too few."""
+        rate = recording.rate
+        length, half = cycle * rate * max(1, round(BLOCK / cycle)), 0.5 * _AT_ENDS * cycle * rate
+        last = len(recording) - 1 - half
+        seconds = (last - max(_START, cycle) * rate) / rate
+        halves = overlap and 2.0 * seconds * rate < MOST_BLOCKS * length
+        shift = 2 if halves or seconds * rate < FEWEST * length else 1
+        count = int(shift * (seconds * rate / length - 1.0) + 1e-6) + 1
+        if count < FEWEST:
+            return (
+                f"too short for a balance over cycles: {seconds:.4g} s after the start, {(FEWEST + 1) / 2:g} cycles of "
+                f"{length / rate:.3g} s are needed"
+            )
+        ends = last - length / shift * np.arange(count + shift - 1, -1, -1.0)
+        pairs = np.stack([ends[:-shift], ends[shift:]], axis=1).astype(np.int64)
+        used = ~np.array([touched(recording, pair)[0] for pair in pairs], dtype=bool)
+        if np.count_nonzero(used) < FEWEST:
+            return f"samples are missing in {count - np.count_nonzero(used)} of {count} blocks of {length / rate:.3g} s"
+        return cls(ends, shift, half, length, used, halves, rate)
+
+    @property
+    def middles(self) -> Array:
+        """Return the middles of the blocks that count [s], from the recording's start on."""
+        return np.asarray(0.5 * (self.ends[: -self.overlap] + self.ends[self.overlap :])[self.used] / self.rate)
+
+    def means(self, whole: Array) -> Array:
+        """Return the mean over each block that counts of what has this integral (m,), averaged about a block's ends."""
+        twice, places, half = integral(whole, self.rate), np.arange(whole.size), self.half
+        above, below = (np.interp(self.ends + shift, places, twice) for shift in (half, -half))
+        at_ends = (above - below) / (2.0 * half / self.rate)
+        return np.asarray((at_ends[self.overlap :] - at_ends[: -self.overlap])[self.used] / (self.length / self.rate))
 
 
 def _evened(flows: CycleFlows, dp: Array, moved: Array, rate: float) -> CycleFlows | str:

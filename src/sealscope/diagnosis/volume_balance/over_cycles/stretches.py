@@ -22,9 +22,8 @@ from sealscope.diagnosis.volume_balance.over_cycles.series import (
     ZERO,
     CycleFlows,
     integral,
-    shaft_shown,
-    shows,
 )
+from sealscope.diagnosis.volume_balance.over_cycles.shaft import shaft_shown, shows
 from sealscope.physics.leakage import orifice_over_laminar
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording
