@@ -8,8 +8,8 @@ records at 1 % by the best linear test, its onset known: ``(z_0.99 + z_0.9) / sq
 L/min makes of the blocks, C their covariance without one. `law known`: C is that of the scatter and of the bench's own
 drifts of pump leakage, drawn anew. `twice integrated` and `integrated`: what the same drifts make of the test that
 takes them for such a walk, as strong as explains them best (likelihood restricted to what offset and slope leave).
-Blocks are of the volume balance where one side carries throughout, those half a block later as well, their scatter
-taken for independent; else holds or stretches of the cycle balance. Medians over the machines; it takes 5 s a
+Blocks are of the volume balance, where one side carries throughout those half a block later as well, their scatter
+taken for independent; holds or stretches of the cycle balance where the circuit of a single rod changes over. Medians over the machines; it takes 5 s a
 machine.
 """
 
@@ -100,11 +100,12 @@ def likeliest(noise: Array, walk: Array, free: Array, series: Array) -> Array:
 def balanced(rig: Rig, recording: Recording) -> tuple[Array, float, Array] | None:
     """Return middles of blocks (n,), the seconds of one, and conductances (m,) whose scatter is theirs.
 
-    Of the volume balance where one side carries throughout, else of holds or stretches of the cycle balance.
+    Of the volume balance, or, where the circuit changes over, of holds or stretches of the cycle balance.
     """
     fit, _ = VolumeBalance(rig).fit(recording)
-    if fit is not None and fit.between is not None and not fit.changes_over:
-        return np.sort(np.concatenate([fit.blocks.t, fit.between.t])), fit.blocks.seconds, fit.g
+    if fit is not None and not fit.changes_over:
+        t = fit.blocks.t if fit.between is None else np.sort(np.concatenate([fit.blocks.t, fit.between.t]))
+        return t, fit.blocks.seconds, fit.g
     flows = CycleBalance(rig).flows(recording)
     return None if isinstance(flows, str) else (flows.t, flows.seconds, flows.flow / flows.dp)
 

@@ -121,7 +121,7 @@ def _stated(part: Recording, rig: Rig) -> _Stated:
     if unusable(balance, part) is None:
         fit, _ = balance.fit(part)
         if fit is not None:
-            own = balance_level(fit)
+            own = balance_level(fit, float(fit.leaning.mean()))  # beside others of the machine, whose scale errs alike
             total = Level(own.value + (fit.pump or 0.0), float(np.hypot(own.error, fit.pump_sd)))
             return _Stated("volume balance", total, states_flow(fit), fit.metres, abs(fit.scale))
     model = PressureModel(rig)

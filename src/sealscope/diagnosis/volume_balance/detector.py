@@ -157,10 +157,11 @@ class VolumeBalance:
         if whole == length:
             return length
         blocks = self.blocks(recording, whole, names)
-        # where rests are passed over, blocks are parts of a cycle
-        if blocks.samples != whole or not len(blocks) or not np.all(np.isfinite(blocks.gram)):
+        if not len(blocks) or not np.all(np.isfinite(blocks.gram)):
             return length
-        return whole if fit_balance(blocks, geometry=self.geometry).keeps_slopes else length
+        fit = fit_balance(blocks, geometry=self.geometry)
+        # where rests are passed over, blocks are parts of a cycle
+        return whole if fit.goes_together or (fit.keeps_slopes and blocks.samples == whole) else length
 
     def fit(self, recording: Recording) -> tuple[BalanceFit | None, str]:
         """Return the balance of a recording, or None and the reason why there is none."""
@@ -176,7 +177,8 @@ class VolumeBalance:
         if not np.all(np.isfinite(blocks.gram)):
             return None, "the balance cannot be computed: values are beyond floating point"
         fit = fit_balance(blocks, metres=recording.units["x"] == "m", geometry=self.geometry)
-        if fit.keeps_slopes and blocks.samples == length:  # where rests are passed over, what lies between is not known
+        # where rests are passed over and slopes are kept, what lies between is not known
+        if (fit.keeps_slopes and blocks.samples == length) or fit.goes_together:
             fit = with_between(fit, self.blocks(recording.samples(slice(length // 2, None)), length))
         problem = trouble(fit) or _unseen(recording, fit)
         return (fit, "") if problem is None else (None, problem)

@@ -224,12 +224,14 @@ def _levelled(
 def judge_level(fit: BalanceFit, baseline: Sequence[BalanceFit], within: Evidence, probability: float) -> Evidence:
     """Return the evidence of the conductance of the whole recording against that of leak-free recordings."""
     same = [other for other in baseline if abs(other.scale / fit.scale - 1.0) <= _SAME_MACHINE]
-    levels = [level(other) for other in same if other.sense == fit.sense]
+    same = [other for other in same if other.sense == fit.sense]
+    beside = float(np.mean([np.mean(other.leaning) for other in (fit, *same)]))
+    levels = [level(other, beside) for other in same]
     every = np.ones(len(fit.blocks), dtype=bool)
     unit = float(fit.unit_flow("laminar").mean())
     evidence = against_baseline(
         within,
-        level(fit),
+        level(fit, beside),
         levels,
         day_to_day(levels),
         probability,
@@ -262,13 +264,18 @@ def _normal_tail(score: float) -> float:
     return float(ndtr(-score))
 
 
-def level(fit: BalanceFit) -> Level:
-    """Return the mean conductance of the whole recording [m^3/(s Pa)], with the shared errors in its error."""
+def level(fit: BalanceFit, beside: float | None = None) -> Level:
+    """Return the mean conductance of the whole recording [m^3/(s Pa)], with the shared errors in its error.
+
+    `beside`: the mean `leaning` of the recordings with which it is compared, whose scales err alike; None: of none.
+    """
     weight = 1.0 / fit.sd**2
     weight = weight / weight.sum()
     mean = float(weight @ fit.g)
     common = weight @ fit.shared
-    return Level(mean, float(np.sqrt(np.sum((weight * fit.sd) ** 2) + common @ common + (_LEVEL * mean) ** 2)))
+    doubt = fit.doubt * (float(weight @ fit.leaning) - (beside or 0.0))
+    own = np.sum((weight * fit.sd) ** 2)
+    return Level(mean, float(np.sqrt(own + common @ common + doubt**2 + (_LEVEL * mean) ** 2)))
 
 
 def _geometry_agrees(fit: BalanceFit) -> bool:
@@ -331,7 +338,7 @@ def _measured(evidence: Evidence, fit: BalanceFit) -> Evidence:
     """Return the evidence with displacement over area as measured, over the assumed one, where it can be measured."""
     if _swings(fit):
         return evidence
-    half = 1.96 * fit.carrying * math.hypot(fit.scale_sd, _RELATIVE * fit.scale)
+    half = 1.96 * fit.carrying * math.hypot(fit.scale_sd, fit.doubt, _RELATIVE * fit.scale)
     ratio = fit.misfit
     return replace(evidence, ratio=ratio, ratio_interval=(ratio - half, ratio + half)) if fit.metres else evidence
 
@@ -537,7 +544,8 @@ def describe_leak(
         more = abs(orifice - laminar) * size
         over = _CHANGING_OVER if fit.changes_over else 0.0
         lift = law.mean * float(np.mean(np.abs(fit.blocks.lift[open_])))
-        half = step.quantile * math.hypot(size_sd, _RELATIVE * size, over * size, lift * size) * flow
+        counted = fit.doubt / abs(fit.scale)  # a loop makes good what leaks: the angle shows it, by the scale
+        half = step.quantile * math.hypot(size_sd, size * math.hypot(_RELATIVE, over, lift, counted)) * flow
         less, most = (law.mean - law.low, law.high - law.mean)[:: 1 if orifice > laminar else -1]
         lpm = size * flow
         interval = max(0.0, lpm - half - less * more), lpm + half + most * more
@@ -675,12 +683,15 @@ def _lost(fit: BalanceFit, step: DriftStep) -> float:
     """
     shape = shape_of(fit, step)
     close = np.abs(fit.blocks.t - step.onset - 0.5 * step.rise) < reach(fit) + 0.5 * step.rise
-    before, after = fit.slip[close & (shape == 0.0)], fit.slip[close & (shape == 1.0)]
+    first, last = close & (shape == 0.0), close & (shape == 1.0)
+    before, after = fit.slip[first], fit.slip[last]
     if min(before.size, after.size) < 3:
         return 0.0
+    leaning = fit.slip_leaning
+    moved = abs(float(np.mean(leaning[last]) - np.mean(leaning[first]))) * fit.doubt
     lost = abs(float(np.mean(after) - np.mean(before)))
     deviation = float(np.sqrt(np.var(before, ddof=1) / before.size + np.var(after, ddof=1) / after.size))
-    least = _LOST * step.size * float(fit.blocks.abs_dp.mean()) + 4.0 * deviation
+    least = _LOST * step.size * float(fit.blocks.abs_dp.mean()) + 4.0 * deviation + 2.0 * moved
     return lost if lost > least else 0.0
 
 
@@ -688,7 +699,7 @@ def _whole_course(fit: BalanceFit) -> LeakCourse:
     """Return what pump and piston together pass block by block; an interval holds what all blocks share, too."""
     flow = fit.unit_flow("laminar") / LITRE_PER_MINUTE
     g = fit.g + (fit.pump or 0.0)
-    shared = np.sum(fit.shared**2, axis=1)
+    shared = np.sum(fit.shared**2, axis=1) + (fit.doubt * fit.leaning) ** 2
     half = 1.96 * np.sqrt(fit.sd**2 + shared + fit.pump_sd**2 + (_LEVEL**2 + _UNKNOWN_LAW**2) * g**2) * flow
     return LeakCourse(fit.blocks.t, g * flow, g * flow - half, g * flow + half, whole=True)
 

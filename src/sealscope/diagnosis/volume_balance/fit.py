@@ -94,6 +94,9 @@ _LOADED, _OF_STROKES = 0.75, 0.7
 #: Zero of a pressure difference as makers state it [Pa]: 0.1 % of 20 MPa; and values of a block that are independent of
 #: each other, beyond what all share: what is left is no white noise.
 _ZERO, _INDEPENDENT = 2e4, 10.0
+#: Motion and the integral of dp go together where this share of the angle is beyond that integral; what is left of the
+#: balance then errs alike by this share of it (0.2 to 0.3 on machines developed on).
+_TOGETHER, _ALIKE = 0.05, 0.5
 #: Median of the size of a standard normal number.
 _QUARTILE = 0.6745
 #: Displacement over area may differ by this share from that of a stated machine before it is another one.
@@ -161,6 +164,39 @@ class BalanceFit:
     def keeps_slopes(self) -> bool:
         """Whether slopes are kept: conductances are known so well then that their drift is far above the noise."""
         return int(self.blocks.gram.shape[1]) > TIME
+
+    @property
+    def goes_together(self) -> bool:
+        """Whether motion and the integral of dp go together, so that a leak is told from the scale by reversals alone.
+
+        A piston that moves at one speed against dry friction turns both alike.
+        """
+        gram = self.blocks.gram
+        return _beyond_integral(gram) < _TOGETHER**2 * float(np.median(gram[:, THETA, THETA]))
+
+    @property
+    def doubt(self) -> float:
+        """Deviation of `scale` by what encoders and transducers do in every cycle where that tells it, else 0.
+
+        No mean over samples or blocks takes it out: ``c r sqrt(N/<theta, theta>)`` for residuals r of N samples, of the
+        angle what is beyond the integral of dp.
+        """
+        if not self.goes_together:
+            return 0.0
+        beyond = max(_beyond_integral(self.blocks.gram), np.finfo(float).tiny)
+        return _ALIKE * self.residual * float(np.sqrt(self.blocks.samples / beyond))
+
+    @property
+    def leaning(self) -> Array:
+        """By how much the conductance of a block (n,) changes with the scale [m^3/(s Pa)]."""
+        gram = self.blocks.gram
+        return np.asarray(self.sense * gram[:, I_AB, THETA] / np.maximum(gram[:, I_AB, I_AB], np.finfo(float).tiny))
+
+    @property
+    def slip_leaning(self) -> Array:
+        """By how much the `slip` of a block (n,) changes with the scale [m^3/s]."""
+        slope = self.blocks.slope
+        return np.asarray(self.sense * self.leaning * slope[:, I_AB] - slope[:, THETA])
 
     @property
     def weights(self) -> Array:
@@ -343,6 +379,11 @@ def _geometry(gram: Array, shared: list[int]) -> tuple[Array, Array]:
     fits = [_reweighted(laws, first, steady, precision) for first in laws]
     likeliest = min(fits, key=lambda fit: fit[2])
     return likeliest[:2]
+
+
+def _beyond_integral(gram: Array) -> float:
+    """Return the sum of squares that the integral of dp leaves of the angle, in the median of the blocks."""
+    return float(np.median(_beyond(gram, I_AB)[:, THETA, THETA]))
 
 
 def _steady_flow(gram: Array) -> float:
@@ -564,12 +605,13 @@ def _fitted(blocks: BalanceBlocks, metres: bool, geometry: Geometry, *, whole: b
 def with_between(fit: BalanceFit, later: BalanceBlocks) -> BalanceFit:
     """Return the fit with the conductances, by its coefficients, of `later` blocks: half a block after its own.
 
-    Only where slopes are kept: else it is what swings that tells a conductance, and half-way it is no other.
+    Only where slopes are kept, or motion and the integral of dp go together and blocks are cycles: else it is what
+    swings that tells a conductance, and half-way it is no other.
     """
-    if not fit.keeps_slopes or not len(later):
+    if not (fit.keeps_slopes or fit.goes_together) or not len(later):
         return fit
     whole = fit.swinging is not None
-    later = later.whole() if whole else later.with_slopes()
+    later = later.whole() if whole else later.with_slopes() if fit.keeps_slopes else later
     blocks = _turned(later, _turn(later.gram.shape[1], fit.side, fit._counted, whole))
     shared = list(fit.columns)
     own = np.maximum(blocks.gram[:, I_AB, I_AB], np.finfo(float).tiny)
@@ -663,6 +705,9 @@ def moved_share(fit: BalanceFit, column: int, onset: float, rise: float, *, with
     if column == THETA:  # where nearly all flow leaks, noise of dp, integrated, is no small part of the motion
         taken = fit.g**2 * _noise_of_integral(fit.blocks, fit.blocks.noise)
         deviation = np.hypot(deviation, np.sqrt(np.mean(taken[after]) / np.mean(own[after])))
+    else:
+        leaning = rest[:, column, THETA] / own
+        deviation = np.hypot(deviation, fit.doubt * (np.mean(leaning[after]) - np.mean(leaning[before])))
     size = max(abs(whole), np.finfo(float).tiny)
     freedom = int(before.sum() + after.sum()) - 2
     noise = _noise_of_integral(fit.blocks, fit.blocks.noise) * shown**2 / own

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import DriftStep
-from sealscope.diagnosis.volume_balance.blocks import I_AB, Geometry, balance_channels, volumes
+from sealscope.diagnosis.volume_balance.blocks import FLOW, I_AB, THETA, Geometry, balance_channels, volumes
 from sealscope.diagnosis.volume_balance.fit import BalanceFit
 from sealscope.recordings.recording import Array, Recording
 
@@ -25,6 +25,10 @@ _NEAREST, _FEWEST = 4, 3
 _SPAN = 3.84
 #: Noise is taken for alike over this share of a block at most.
 _LONGEST = 0.5
+#: What a leak leaves in samples over what is left beside it, where motion goes with the integral of dp.
+_LARGER = 4.0
+#: A pump stands under this share of its largest flow.
+_STANDS = 0.2
 
 
 def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: Geometry) -> DriftStep:
@@ -34,9 +38,10 @@ def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: 
 
         r(t) = a + b t - c dp - rise integral_tau^t dp dt + noise,
 
-    and tau is where the squares of the noise are least. Its interval is that of the likelihood, with so many samples
-    less as the noise's autocorrelation shows. A leak through an orifice is dated alike: what its law changes within a
-    stroke is small beside what opens.
+    with a share of the angle where the scale is in doubt (`BalanceFit.goes_together`), and tau is where the squares of
+    the noise are least. Its interval is that of the likelihood, with so many samples less as the noise's
+    autocorrelation shows. A leak through an orifice is dated alike: what its law changes within a stroke is small
+    beside what opens.
     """
     seconds = fit.blocks.seconds
     low, high = (bound + side * _REACH * seconds for bound, side in zip(step.onset_interval, (-1, 1), strict=True))
@@ -56,7 +61,10 @@ def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: 
     level = float(before.mean())
     opened = fit.sense * (float(after.mean()) - level) * columns[I_AB]
     left = fit.weights @ columns + fit.sense * level * columns[I_AB]
-    free, _ = np.linalg.qr(np.column_stack([np.ones(t.size), t - t.mean(), dp - dp.mean()]))
+    unknown = [np.ones(t.size), t - t.mean(), dp - dp.mean()]
+    if fit.goes_together:  # the scale is not known either
+        unknown.append(columns[THETA] - columns[THETA].mean())
+    free, _ = np.linalg.qr(np.column_stack(unknown))
 
     def noise(at: NDArray[np.signedinteger[Any]]) -> Array:
         values = left + (np.arange(t.size) >= at[:, None]) * (opened - opened[at, None])
@@ -75,6 +83,12 @@ def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: 
     span = _SPAN * _alike(noise(np.array([best]))[0], round(_LONGEST * seconds / between))
     fitting = at[squares - squares.min() <= span * squares.min() / t.size]
     first, last = max(0, int(fitting.min()) - every), min(t.size - 1, int(fitting.max()) + every)
+    if fit.goes_together:
+        # what sensors do in every stroke is no noise that a likelihood knows: the leak must be larger
+        if np.sum(noise(np.array([t.size - 1]))[0] ** 2) < _LARGER * squares.min():
+            return step
+        # without a load a leak that opens at rest shows with the next stroke
+        first, last = _with_rests(columns[FLOW], first, last)
     if t[last] - t[first] > step.onset_interval[1] - step.onset_interval[0]:
         return step
     onset = float(t[best])
@@ -84,6 +98,13 @@ def date_step(fit: BalanceFit, step: DriftStep, recording: Recording, geometry: 
         onset=onset,
         onset_interval=(float(t[first]), float(t[last])),
     )
+
+
+def _with_rests(flow: Array, first: int, last: int) -> tuple[int, int]:
+    """Return the samples from first to last, and those before and after at which a pump of this flow (n,) stands."""
+    turns = np.abs(flow) > _STANDS * np.max(np.abs(flow))
+    before, after = np.flatnonzero(turns[: first + 1]), np.flatnonzero(turns[last:])
+    return int(before[-1]) if before.size else 0, last + int(after[0]) if after.size else flow.size - 1
 
 
 def _alike(noise: Array, longest: int) -> float:

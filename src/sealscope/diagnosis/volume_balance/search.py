@@ -34,7 +34,8 @@ class _Series(NamedTuple):
 
 def search(fit: BalanceFit, probability: float, *, sign: int = 1) -> DriftStep:
     """Return the best rise (or fall, `sign` -1) of the conductance, with `level` at every block of the fit."""
-    series, quiet = _searched(fit), fit.keeps_slopes
+    series = _searched(fit)
+    quiet = fit.keeps_slopes or series.halves
     every = -(-series.t.size // MOST_BLOCKS)
     merged = series if every == 1 else _merged(series, every)
     t, g, sd, shared, halves = merged
@@ -62,18 +63,20 @@ def findable(fit: BalanceFit, probability: float, noise: float) -> float:
     series = _searched(fit)
     every = -(-series.t.size // MOST_BLOCKS)
     t, g, sd, shared, halves = series if every == 1 else _merged(series, every)
-    return findable_step(t, g, sd, probability, noise, shared=shared, quiet=fit.keeps_slopes, halves=halves)
+    quiet = fit.keeps_slopes or halves
+    return findable_step(t, g, sd, probability, noise, shared=shared, quiet=quiet, halves=halves)
 
 
 def _searched(fit: BalanceFit) -> _Series:
     """Return what is searched.
 
-    Where slopes are kept, it is without the first block, in which a machine that starts has no whole cycle, and with
-    the blocks between these, where they scatter alike: a smooth drift is followed twice as closely then. Either kind
-    begins at its own part of a cycle, and has an offset and a drift of its own.
+    Where slopes are kept, or the motion and the integral of dp go together, it is without the first block, in which a
+    machine that starts has no whole cycle. Where slopes are kept, it is with the blocks between these, where they
+    scatter alike: a smooth drift is followed twice as closely then. Either kind begins at its own part of a cycle, and
+    has an offset and a drift of its own.
     """
     shared = _shared_errors(fit)
-    first = 1 if fit.keeps_slopes and fit.count >= FEWEST + 2 else 0
+    first = 1 if (fit.keeps_slopes or fit.goes_together) and fit.count >= FEWEST + 2 else 0
     own = _Series(fit.blocks.t[first:], fit.g[first:], fit.sd[first:], None, halves=False)
     if shared is not None:
         own = own._replace(shared=shared[first:])
@@ -83,7 +86,7 @@ def _searched(fit: BalanceFit) -> _Series:
     t = np.concatenate([own.t, fit.between.t[later]])
     order = np.argsort(t)
     t, g = t[order], np.concatenate([own.g, fit.between.g[later]])[order]
-    place = np.round(2.0 * (t - t[0]) / fit.blocks.seconds)
+    place = np.round(2.0 * (t - t[0]) / float(np.median(np.diff(own.t))))
     alternating = (-1.0) ** place
     offsets = np.stack([alternating, alternating * place], axis=1)
     if t.size > MOST_BLOCKS or not (own.t.size < FEWEST or scatter(g, offsets) <= _AS_WELL * scatter(own.g)):
@@ -124,8 +127,9 @@ def _shared_errors(fit: BalanceFit) -> Array | None:
 
     None where they are one constant, or grow evenly, as with a duty that repeats.
     """
+    shared = np.column_stack([fit.shared, fit.doubt * fit.leaning]) if fit.doubt else fit.shared
     u = fit.blocks.t - fit.blocks.t.mean()
-    rest = fit.shared - fit.shared.mean(axis=0)
+    rest = shared - shared.mean(axis=0)
     rest = rest - np.outer(u, u @ rest) / max(float(u @ u), np.finfo(float).tiny)
     size = float(np.sqrt(np.sum(rest**2, axis=1).mean()))
-    return fit.shared if size > _DIFFERENT * float(np.median(fit.sd)) else None
+    return shared if size > _DIFFERENT * float(np.median(fit.sd)) else None
