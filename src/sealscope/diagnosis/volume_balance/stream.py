@@ -29,7 +29,14 @@ from sealscope.diagnosis.volume_balance.blocks import (
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.diagnosis.volume_balance.evidence import judge, total_lpm, trouble
 from sealscope.diagnosis.volume_balance.fit import fit_balance, with_between
-from sealscope.diagnosis.volume_balance.live import LEARN_SECONDS, BalanceState, JoinedSamples, check_stream, replaces
+from sealscope.diagnosis.volume_balance.live import (
+    LEARN_SECONDS,
+    BalanceState,
+    JoinedSamples,
+    WindowStream,
+    check_stream,
+    replaces,
+)
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 
@@ -44,7 +51,9 @@ _CHANNELS = ("u", "x", "theta", "omega", "p_A", "p_B", "p_1", "p_2")
 class SequentialBalance:
     """Volume balance of a live machine, which names onset and L/min of a leak.
 
-    It needs both chamber pressures, the piston's position and the pump's angle or speed.
+    It needs both chamber pressures, the piston's position and the pump's angle or speed. Behind a servo valve it needs
+    the command and the pressures of supply and return besides, and no angle; a window of whole cycles is looked at anew
+    after each.
 
     Parameters
     ----------
@@ -95,6 +104,10 @@ class SequentialBalance:
         check_stream(alarms_per_hour, window, block_seconds)
         self.alarms_per_hour, self.window, self.block_seconds = alarms_per_hour, window, block_seconds
         self._detector = VolumeBalance(load_rig(rig))
+        behind_valve = self._detector.rig.valve.spool == "present"
+        self._windows = (
+            WindowStream(self._detector, VolumeBalance.reads, alarms_per_hour, window) if behind_valve else None
+        )
         self._samples = JoinedSamples(_CHANNELS)
         self._length = 0
         self._used: tuple[str, ...] = ()
@@ -106,6 +119,10 @@ class SequentialBalance:
 
     def acknowledge(self) -> None:
         """Take the alarm back, and forget the blocks before now: the machine was repaired, or the leak accepted."""
+        if self._windows is not None:
+            self._windows.acknowledge()
+            self.state = self._windows.state
+            return
         self._window = self._between = None
         waiting = Evidence("cannot tell", "waits for blocks after the alarm was acknowledged")
         self.state = BalanceState(self.state.t, self.state.blocks, self.state.refused, waiting, None, None)
@@ -128,6 +145,9 @@ class SequentialBalance:
         InputError
             Where channels, units or rate are not those of the stream's beginning.
         """
+        if self._windows is not None:
+            self.state = self._windows.update(samples)
+            return self.state
         if not self._samples.begun and (missing := channels_needed(samples)) is not None:
             raise InputError(f"a stream for the volume balance {missing}")
         joined = self._samples.joined(samples)
