@@ -70,10 +70,10 @@ def findable(fit: BalanceFit, probability: float, noise: float) -> float:
 def _searched(fit: BalanceFit) -> _Series:
     """Return what is searched.
 
-    Where slopes are kept, or the motion and the integral of dp go together, it is without the first block, in which a
-    machine that starts has no whole cycle. Where slopes are kept, it is with the blocks between these, where they
-    scatter alike: a smooth drift is followed twice as closely then. Either kind begins at its own part of a cycle, and
-    has an offset and a drift of its own.
+    Where slopes are kept, or motion and the integral of dp go together, it is without the first block, in which a
+    machine that starts has no whole cycle, and with the blocks between these, where they scatter alike: a smooth drift
+    is followed twice as closely then. Either kind begins at its own part of a cycle, and has an offset and a drift of
+    its own.
     """
     shared = _shared_errors(fit)
     first = 1 if (fit.keeps_slopes or fit.goes_together) and fit.count >= FEWEST + 2 else 0
