@@ -12,7 +12,7 @@ from sealscope.diagnosis.changepoint.tails import largest_normal, seed_of
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.model import GAIN, STATES, DrivenModel, G, assumed_numbers, nominal
-from sealscope.diagnosis.pressure_model.track import Track, steps_in, track
+from sealscope.diagnosis.pressure_model.track import HOLE, WORN_SEAL, PossibleLeak, Track, steps_in, track
 from sealscope.diagnosis.verdict.evidence import LEAK_WORTH_FINDING
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.cycle import find_cycle
@@ -327,6 +327,30 @@ def test_a_rise_that_a_closer_look_does_not_confirm_is_no_leak(
     assert evidence.verdict == "cannot tell"
     assert evidence.reason.endswith("but followed with a leak from then on, the record shows none")
     assert evidence.leak_lpm is None
+
+
+@pytest.mark.parametrize(("orifice", "cost", "verdict"), [(-1.0, 1.0, "cannot tell"), (-1.0, 60.0, "leak")])
+def test_each_law_that_explains_a_rise_must_find_a_leak(
+    orifice: float,
+    cost: float,
+    verdict: str,
+    detector: PressureModel,
+    worn: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that explains it far worse has no say; else flows of -0.008 L/min were stated as leaks."""
+    followed = detector.follow(worn)
+    assert isinstance(followed, Followed)
+    step = int(np.argmax(followed.steps.z))
+    size, deviation = float(followed.steps.size[step]), float(followed.steps.deviation[step])
+    laws = (
+        PossibleLeak(WORN_SEAL, step, size, deviation, 0.0),
+        PossibleLeak(HOLE, step, orifice * size * 2e2, deviation * 2e2, cost),
+    )
+    monkeypatch.setattr(detector, "follow", lambda _: replace(followed, leaks=laws))
+    evidence = detector.examine(worn, (), P)
+    assert evidence.verdict == verdict
+    assert (evidence.leak_lpm is None) == (verdict == "cannot tell")
 
 
 def test_a_fit_far_beyond_the_rigs_stiffness_is_refused(thesis: Rig, sound: Recording) -> None:

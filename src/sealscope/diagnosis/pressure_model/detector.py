@@ -251,8 +251,8 @@ def _flow(
 ) -> tuple[float, tuple[float, float], str, bool]:
     """Return the mean flow [L/min] of a rise after a block, its 95 % interval, and the law in words where it is known.
 
-    Last, whether a leak of either law is above zero by itself: blocks that the model follows badly may rise together,
-    and the record followed with a leak from then on shows none.
+    Last, whether a leak by each of these laws is above zero by itself: blocks that the model follows badly may rise
+    together, and the record followed with a leak from then on shows none.
 
     Where several laws explain the record, the flow is the mean of theirs and the interval holds what any says.
     `scatter` of the blocks over their stated deviation; `unsure` [m^3/(s Pa)]: deviation of G that no scatter shows.
@@ -282,7 +282,7 @@ def _flow(
         float(np.mean([lpm for lpm, *_ in stated])),
         (min(low for _, low, _ in stated), max(high for *_, high in stated)),
         law,
-        any(leak.size > 1.96 * scatter * leak.deviation for leak in likely),
+        all(leak.size > 1.96 * scatter * leak.deviation for leak in likely),
     )
 
 
