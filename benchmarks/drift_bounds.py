@@ -9,8 +9,8 @@ L/min makes of the blocks, C their covariance without one. `law known`: C is tha
 drifts of pump leakage, drawn anew. `twice integrated` and `integrated`: what the same drifts make of the test that
 takes them for such a walk, as strong as explains them best (likelihood restricted to what offset and slope leave).
 Blocks are of the volume balance, where one side carries throughout those half a block later as well, their scatter
-taken for independent; holds or stretches of the cycle balance where the circuit of a single rod changes over. Medians over the machines; it takes 5 s a
-machine.
+taken for independent; holds or stretches of the cycle balance where the circuit of a single rod changes over. Medians
+over the machines; it takes 5 s a machine.
 """
 
 from __future__ import annotations
