@@ -165,3 +165,30 @@ def test_a_large_leak_is_still_a_leak_where_the_pump_is_seen() -> None:
     own = examine(leaking.only(["u", "x", "p_A", "p_B"]), [], 0.01)
     assert (own.verdict, own.cause) == ("cannot tell", None)
     assert "or by a leak that takes as much" in own.reason
+
+
+PROGRAM = "6 periods of 5 sin(2t), 12 periods of 3 sin(4t)"
+
+
+def test_a_program_of_duties_is_one_machine_s_and_hides_no_leak() -> None:
+    """Each duty comes again: the pressures' phase is no other recording's, and no duty changed with the leak.
+
+    Seen are command and pressures, and all channels; rig given, onset not given.
+    """
+    sound, leaking = (
+        simulate(command=PROGRAM, duration=150.0, leak=leak, seed=5) for leak in (None, "0.01 L/min from 75 s")
+    )
+    for recording in (sound, leaking):
+        near = [change.recurs for change in duty_changes(recording) if 60.0 < change.t < 100.0]
+        assert near and all(near)
+        for view in (recording, recording.only(["u", "p_A", "p_B"])):
+            found = diagnose(view, quick=True)
+            assert found.verdict == ("leak" if recording is leaking else "no leak")
+
+
+def test_a_duty_that_comes_once_does_not_recur() -> None:
+    for after in ((55.0, 50.0, 0.5), (40.0, 50.0, 0.9)):
+        assert [change.recurs for change in duty_changes(made(PLAIN, after))] == [False]
+    once = simulate(command="36 periods of 5 sin(3t), 72 periods of 3 sin(4t)", duration=150.0, seed=5)
+    changes = duty_changes(once.only(["u", "p_A", "p_B"]))
+    assert changes and not any(change.recurs for change in changes)

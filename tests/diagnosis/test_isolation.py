@@ -136,6 +136,33 @@ def test_what_steps_plainly_anywhere_is_the_cause_of_a_change_of_the_spectrum() 
     assert isolated(unnamed, steady) is unnamed
 
 
+def test_another_phase_is_another_recording_unless_the_one_before_comes_again() -> None:
+    """Quarters of a cycle are cut out at 60 s, and at 90 s what is left of the cycle, or not."""
+    recording = made(duration=150.0)
+    quarter = round(0.125 * np.pi * RATE)
+
+    def cut(*quarters: int) -> Recording:
+        kept = np.ones(len(recording), dtype=bool)
+        for at, count in zip((60.0, 90.0), quarters, strict=True):
+            kept[round(at * RATE) :][: count * quarter] = False
+        channels = {name: values[kept] for name, values in recording.channels.items()}
+        return replace(recording, t=recording.t[: kept.sum()], channels=channels)
+
+    causes = {}
+    for quarters in ((0, 0), (1, 0), (3, 0), (2, 0), (1, 3), (3, 1), (2, 2)):
+        other = elsewhere(signatures(cut(*quarters)))
+        causes[quarters] = None if other is None else other.cause
+    assert causes == {
+        (0, 0): None,
+        (1, 0): "changed duty",
+        (3, 0): "changed duty",
+        (2, 0): "sensor fault",
+        (1, 3): None,
+        (3, 1): None,
+        (2, 2): "sensor fault",
+    }
+
+
 def test_a_step_elsewhere_is_not_the_cause() -> None:
     """Beyond its reach the step takes no part; within it, the onset may be off by some seconds."""
     recording = made(mean_A=8e3, duration=240.0)

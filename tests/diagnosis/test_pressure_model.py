@@ -287,7 +287,7 @@ def _refused(recording: Recording, how: str) -> Recording:
         ("no command", "no u"),
         ("counts", "unit of pressure"),
         ("command in counts", "command in V"),
-        ("100 Hz", "250 Hz"),
+        ("100 Hz", "180 Hz"),
         ("short", "40 s"),
         ("constant command", "u is constant"),
     ],

@@ -64,8 +64,9 @@ FILTERED, HUMS, HUMS_BOTH = 0.5, 1.2, 0.7
 #: ... and of a hum line itself: half of that over what lies beside it.
 HUMS_OWN = 0.6
 #: A sure step anywhere in the recording; blocks of one duty correlate by more than the one, of another phase by less
-#: than the other.
+#: than the other. One of before that correlates so with one of after comes again: in programs of duties by 0.99.
 SURE_ANYWHERE, SAME_PHASE, OTHER_PHASE = 6.0, 0.7, 0.35
+AGAIN = 0.9
 #: Where the chambers ring [Hz]; longest delay of one channel that is looked for [s], the least that matters, and how
 #: sure it must be.
 RINGING, LAGS, LEAST_LAG, LAGGED = (20.0, 150.0), 8e-3, 1e-3, 0.5
@@ -111,7 +112,7 @@ class Signatures:
     power of its noise in one line of the spectrum, `lines` (b,) of each band; `motion`: where the strokes changed;
     `tilt` (n, 2) log power of the noise of p_A and p_B near half the rate over that at two thirds of it; `hum` (n, 2,
     h) log power in lines of mains frequencies over what lies beside them, `line` (n, 2, h) that in the lines alone,
-    `mains` (h,) [Hz]; `alike` (n - 1, 3) correlation of p_A - p_B in each block with those before
+    `mains` (h,) [Hz]; `alike` (n - 1, 4) correlation of p_A - p_B in each block with those before
     (`_alike`), None where the duty does not repeat; `together`: how p_A and p_B ring together; `scale` [Pa]: what steps
     of a chamber's mean are measured by, and `measure`, its name.
     """
@@ -286,10 +287,10 @@ def lag_step(seen: Signatures, onset: float) -> tuple[float, float]:
 
 
 def _alike(rows: Array) -> Array:
-    """Return the correlation (n - 1, 3) of rows: with the one before, with two before, and of means before and after.
+    """Return the correlation (n - 1, 4) of rows: with the one before, with two before, of means before and after, most.
 
     But for two before, of what is left of each beside its line: a load that swings slowly turns the line about. What
-    it bends besides is in no mean.
+    it bends besides is in no mean. `most`: the largest of a row that lies two or more before with any as far after.
     """
 
     def unit(rest: Array) -> Array:
@@ -302,7 +303,10 @@ def _alike(rows: Array) -> Array:
     sums = np.cumsum(bent, axis=0)
     means, bent = np.sum(unit(sums[:-1]) * unit(sums[-1] - sums[:-1]), axis=1), unit(bent)
     before = np.sum(bent[1:] * bent[:-1], axis=1)
-    return np.stack([before, np.append(1.0, np.sum(rest[2:] * rest[:-2], axis=1)), means], axis=1)
+    # of rows i < w and j > w + 1 about the gap after row w, which leaves out the row that it may lie in
+    among = np.maximum.accumulate(np.maximum.accumulate(bent @ bent.T, axis=0)[:, ::-1], axis=1)[:, ::-1]
+    most = np.concatenate([[-1.0], np.diagonal(among, 3), [-1.0]]) if len(rows) > 3 else np.full(len(rows) - 1, -1.0)
+    return np.stack([before, np.append(1.0, np.sum(rest[2:] * rest[:-2], axis=1)), means, most], axis=1)
 
 
 def other_cause(
@@ -340,6 +344,11 @@ def elsewhere(seen: Signatures) -> OtherCause | None:
     at = float(seen.t[worst + 1])
     if min(seen.alike[worst : worst + 2, 1]) < -OTHER_PHASE:
         return OtherCause("sensor fault", f"near {at:.0f} s p_A - p_B changes its sign, as if p_A and p_B were swapped")
+    either = np.where(seen.alike[:, 3] > AGAIN, 1.0, either)
+    worst = int(np.argmin(either))
+    if not either[worst] < OTHER_PHASE:
+        return None
+    at = float(seen.t[worst + 1])
     return OtherCause("changed duty", f"near {at:.0f} s p_A - p_B goes on in another phase, as of another recording")
 
 
@@ -349,7 +358,8 @@ def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] =
     A sensor's filter that changed counts wherever it happened: both sides of any onset are not read alike. For evidence
     that names no cause, which comes from the spectrum alone, so does hum, and whatever else stepped plainly
     (`unasked`); a model of the machine leaves that out but at the onset. A duty that goes on in another phase or sense
-    counts against all. Evidence without an onset comes from the comparison with a baseline, of the signatures `known`:
+    counts against all; one that changes to and fro, of which either side of the onset has all, not against a model of
+    the machine. Evidence without an onset comes from the comparison with a baseline, of the signatures `known`:
     there counts what differs from all of it.
     """
     if evidence.verdict != "leak" or evidence.cause not in (None, *LEAKS):
@@ -361,7 +371,10 @@ def isolated(evidence: Evidence, seen: Signatures, known: Sequence[Signatures] =
         if other is not None and other.cause in evidence.weighed:
             other = None
         if other is None and evidence.detector != BALANCED:
-            other = other_cause(seen, evidence.onset_s, weighed=evidence.weighed) or _readings(
+            asked = seen
+            if evidence.cause is not None:
+                asked = replace(seen, motion=tuple(change for change in seen.motion if not change.recurs))
+            other = other_cause(asked, evidence.onset_s, weighed=evidence.weighed) or _readings(
                 seen, evidence.onset_s if evidence.cause is not None else None, "friction change" in evidence.weighed
             )
         if other is None and evidence.cause is None:

@@ -64,9 +64,13 @@ class MotionDifference:
 
 @dataclass(frozen=True)
 class StrokeChange(MotionDifference):
-    """Where a duty changes within a recording: also at `t` [s]."""
+    """Where a duty changes within a recording: also at `t` [s].
+
+    `recurs`: the machine did so before as it does after, and will again as it did before.
+    """
 
     t: float
+    recurs: bool = False
 
 
 def motion_of(recording: Recording) -> Motion | None:
@@ -227,5 +231,20 @@ def _duty_changes(recording: Recording) -> tuple[StrokeChange, ...]:
         ]
         what, before, after = _text(quantity, sides[1], sides[0], units)
         at = float(start[edge])
-        changes.append(StrokeChange(f"{what} changed from {before} to {after} at {at:.0f} s", certain, at))
+        recurs = all(_recurs(values, edge, window) for name, values in levels.items() if name.endswith(quantity))
+        changes.append(StrokeChange(f"{what} changed from {before} to {after} at {at:.0f} s", certain, at, recurs))
     return tuple(sorted(changes, key=lambda change: change.t))
+
+
+def _recurs(values: Array, edge: int, window: int) -> bool:
+    """Return whether `values` (n,) were before an edge as in the window after it, and are after it as in that before.
+
+    Each for a window of strokes in sequence, whose own deviations from that mean count.
+    """
+    rows = np.lib.stride_tricks.sliding_window_view(values, window)
+    early, late = rows[: max(0, edge - 2 * window + 1)], rows[edge + window :]
+    before, after = values[edge - window : edge], values[edge : edge + window]
+    return all(
+        len(there) > 0 and float(np.abs(there - own.mean()).mean(axis=1).min()) < LEAST_CHANGE + float(own.std())
+        for there, own in ((early, after), (late, before))
+    )
