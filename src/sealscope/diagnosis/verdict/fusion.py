@@ -47,10 +47,10 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
         reasons += lent
     else:
         fused = replace(judge, onset_s=None, onset_interval_s=None)
-        blind = next((own for own in others if _blind(own)), None)
-        if judge.verdict == "no leak" and judge.detector == LEAST_SPECIFIC and blind is not None:
+        doubt = next((own for own in others if _doubts(own, judge)), None)
+        if judge.verdict == "no leak" and doubt is not None:
             fused = replace(fused, verdict="cannot tell", cause=judge.cause)
-            reasons.append(f"{blind.detector}: {blind.reason}")
+            reasons.append(f"{doubt.detector}: {doubt.reason}")
         naming = next((own for own in others if _other_cause(own)), None)
         if judge.cause is None and naming is not None:
             fused = replace(fused, cause=naming.cause)
@@ -70,13 +70,16 @@ def judges(evidence: Evidence) -> bool:
     return evidence.usable and not evidence.abstains
 
 
-def _blind(evidence: Evidence) -> bool:
-    """Whether a detector would not have seen a leak worth finding, or saw a change that it has no name for."""
-    if not evidence.abstains:
+def _doubts(evidence: Evidence, judge: Evidence) -> bool:
+    """Whether a detector that abstains saw a change without a name, or would not have seen a leak worth finding.
+
+    The most specific doubts any judge by what it saw, the others the least specific one.
+    """
+    if not evidence.abstains or (judge.detector != LEAST_SPECIFIC and evidence.detector != ORDER[0]):
         return False
-    passage = evidence.passage
-    unseen = passage is not None and (passage.findable_share or 0.0) > LEAK_WORTH_FINDING
-    return unseen or any(part.verdict == "cannot tell" and part.alarmed for part in evidence.parts)
+    saw = any(part.verdict == "cannot tell" and part.alarmed for part in evidence.parts)
+    unseen = evidence.passage is not None and (evidence.passage.findable_share or 0.0) > LEAK_WORTH_FINDING
+    return saw or (unseen and judge.detector == LEAST_SPECIFIC)
 
 
 def _doubted(judge: Evidence, others: Sequence[Evidence]) -> Evidence:

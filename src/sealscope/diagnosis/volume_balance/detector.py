@@ -30,6 +30,7 @@ from sealscope.diagnosis.volume_balance.blocks import (
 )
 from sealscope.diagnosis.volume_balance.evidence import judge, judge_level, trouble
 from sealscope.diagnosis.volume_balance.fit import BalanceFit, fit_balance, with_between
+from sealscope.diagnosis.volume_balance.growth import viscous_loss
 from sealscope.diagnosis.volume_balance.onset import date_step
 from sealscope.diagnosis.volume_balance.over_cycles.detector import CycleBalance
 from sealscope.diagnosis.volume_balance.search import scatter
@@ -51,6 +52,8 @@ _CHANGES_OVER = (
 )
 #: Share of the recording for which the machine may stand at a time.
 _UNSEEN = 0.3
+#: Blocks in which friction is told from speed are whole cycles of about so long [s].
+_FRICTION_SECONDS = 6.0
 #: Share of the samples that a pressure may be cut off.
 _CLIPPED = 0.005
 
@@ -201,6 +204,19 @@ class _BehindTheFit:
         return mean_pressures(
             {name: self.recording[name] for name in names}, self.recording.t >= onset, self.recording.rate
         )
+
+    def thinned(self) -> tuple[float, float] | None:
+        """Return the share of its viscous friction that the machine lost, and its deviation; None: not known."""
+        rig, recording = self.detector.rig, self.recording
+        if not rig.states("friction.F_v") or rig.friction.F_v <= 0.0:
+            return None
+        geometry = self.detector.geometry
+        turning = recording["omega"] if "omega" in recording else np.gradient(recording["theta"]) * recording.rate
+        speed = geometry.displacement / geometry.area * turning
+        force = geometry.area * (recording["p_A"] - recording["p_B"])
+        block = block_samples(recording, _FRICTION_SECONDS)
+        lost = viscous_loss(force, speed, recording.rate, block)
+        return None if lost is None else (lost[0] / rig.friction.F_v, lost[1] / rig.friction.F_v)
 
     def levelled(self, zero: float) -> tuple[BalanceFit, _BehindTheFit] | None:
         """Return the fit of the recording with `zero` [Pa] added to p_A, and that recording."""

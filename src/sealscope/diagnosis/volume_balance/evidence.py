@@ -32,7 +32,7 @@ from sealscope.diagnosis.volume_balance.fit import (
     loaded,
     swings,
 )
-from sealscope.diagnosis.volume_balance.growth import grown
+from sealscope.diagnosis.volume_balance.growth import Oil, grown, oil_of
 from sealscope.diagnosis.volume_balance.law import (
     ONE_SIDED,
     OrificeShare,
@@ -89,6 +89,8 @@ _FILLING, _UNSTEADY = 0.1, 0.1
 _WHOLE = 0.6
 #: A drift over this share of the conductance at the start is more than warm oil does within a recording.
 _LARGE_DRIFT = 0.5
+#: ... where it is also over so many deviations of a block.
+_SMOOTH = 6.0
 #: Under a force that swings, what blocks miss recurs with the beat of force and strokes: heights scatter by so many
 #: times what their blocks state (development records).
 _BEATS = 1.5
@@ -137,6 +139,10 @@ class Samples(Protocol):
         """Return the fit, and its samples, with `zero` [Pa] added to p_A - p_B; None where there is none."""
         ...
 
+    def thinned(self) -> tuple[float, float] | None:
+        """Return the share of its viscous friction that the machine lost, and its deviation; None: not known."""
+        ...
+
 
 def judge(
     fit: BalanceFit,
@@ -153,10 +159,11 @@ def judge(
     [m^3/(s Pa)], None where not known.
     """
     step = search(fit, probability)
-    risen = _risen(fit, step, probability)
+    oil: Oil = "unknown" if samples is None or not _drifts(fit, step) else oil_of(fit, samples.thinned())
+    risen = _risen(fit, step, probability, oil)
     if risen is not None:
         if samples is not None:
-            fit, risen, samples = _levelled(fit, risen, samples, probability)
+            fit, risen, samples = _levelled(fit, risen, samples, probability, oil)
             risen = samples.dated(fit, risen)
         pressed = samples.pressed(risen.onset) if samples is not None and risen.rise == 0.0 else None
         leak = describe_leak(fit, risen, probability, pressed)
@@ -165,7 +172,7 @@ def judge(
     if window:
         return no_step(fit, step, None, 0.0)
     smallest = findable(fit, probability, step.noise)
-    evidence = no_step(fit, step, search(fit, probability, sign=-1), smallest)
+    evidence = no_step(fit, step, search(fit, probability, sign=-1), smallest, oil)
     course = _whole_course(fit) if states_flow(fit) else None
     evidence = replace(evidence, passage=passage(fit, smallest, healthy), refuses=_refused(fit), course=course)
     return _measured(_from_the_start(evidence, fit, probability), fit)
@@ -199,16 +206,23 @@ def _unsized(evidence: Evidence) -> Evidence:
     return replace(evidence, leak_lpm=None, leak_interval_lpm=None, course=None, relative=None)
 
 
-def _risen(fit: BalanceFit, step: DriftStep, probability: float) -> DriftStep | None:
+def _drifts(fit: BalanceFit, step: DriftStep) -> bool:
+    """Return whether the conductance rises smoothly by more than oil does that keeps its temperature."""
+    own, rise = level(fit), float(step.level[-1] - step.level[0])
+    start = own.value + 1.96 * own.error - 0.5 * rise
+    return rise > _LARGE_DRIFT * max(start, 0.0) and rise > _SMOOTH * float(np.median(fit.sd))
+
+
+def _risen(fit: BalanceFit, step: DriftStep, probability: float, oil: Oil) -> DriftStep | None:
     """Return the growth of the conductance, else its step, None where neither is an alarm."""
-    growth = grown(fit, probability)
+    growth = None if oil == "thinner" else grown(fit, probability)
     if growth is not None and not (step.alarm and step.size > _WHOLE * growth.size):
         return growth
     return step if step.alarm else None
 
 
 def _levelled(
-    fit: BalanceFit, risen: DriftStep, samples: Samples, probability: float
+    fit: BalanceFit, risen: DriftStep, samples: Samples, probability: float, oil: Oil
 ) -> tuple[BalanceFit, DriftStep, Samples]:
     """Return fit, rise and samples with the zero of p_A - p_B that the leak itself shows, where it still rises then."""
     zero = zero_error(fit, risen)
@@ -217,7 +231,7 @@ def _levelled(
         return fit, risen, samples
     if np.array_equal(again[0].blocks.t, fit.blocks.t) and np.all(np.abs(again[0].g - fit.g) < _SAME * fit.sd):
         return again[0], risen, again[1]
-    rise = _risen(again[0], search(again[0], probability), probability)
+    rise = _risen(again[0], search(again[0], probability), probability, oil)
     return (fit, risen, samples) if rise is None else (again[0], rise, again[1])
 
 
@@ -463,15 +477,18 @@ def _passes_text(passes: Passage) -> str:
     return f"pump and piston together pass {flow} at {passes.pressure / 1e6:.2g} MPa"
 
 
-def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: float) -> Evidence:
+def no_step(
+    fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: float, oil: Oil = "unknown"
+) -> Evidence:
     """Return the evidence where no rise of the conductance stands out from its drift.
 
     `smallest`: the smallest step of the conductance that would have stood out, 0 where it is not asked for.
     """
     own = level(fit)
     high = own.value + 1.96 * own.error
-    rise = float(step.level[-1] - step.level[0])
+    rise, scatter = float(step.level[-1] - step.level[0]), float(np.median(fit.sd))
     verdict: Verdict = "no leak"
+    parts = [_part(step)]
     reason = (
         "no change within this recording: the leakage conductance does not rise beyond its smooth drift "
         f"({_figures(step)})"
@@ -481,12 +498,15 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
         reason = "the balance gives a leak against the pressure: areas, displacement or the pressures' signs do not fit"
         if _swings(fit):
             reason = f"the balance gives a leak against the pressure; {_no_flow_text(fit)}"
-    elif rise > _LARGE_DRIFT * max(high - 0.5 * rise, 0.0) and rise > 6.0 * float(np.median(fit.sd)):
+    elif oil != "thinner" and _drifts(fit, step):
         verdict = "cannot tell"
         reason = (
             f"the conductance rises smoothly by {_flow_text(rise, fit)} over the recording, more than oil that "
             f"warms up explains: a growing leak would look alike ({_figures(step)})"
         )
+        if oil == "as thick":
+            reason += "; friction shows that the oil keeps its viscosity: a leak grows, or the pump warms alone"
+            parts.append(Evidence("cannot tell", "", rise / scatter, _SMOOTH, detector="growth of the conductance"))
     elif _pump_share(smallest, fit) > LEAK_WORTH_FINDING:
         verdict = "cannot tell"
         reason += (
@@ -502,6 +522,8 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
             verdict = "cannot tell"
             reason += "; or it rises: where either side carries in turn, the sense of the pressures is not surely told"
     if verdict == "no leak":
+        if oil == "thinner":
+            reason += f"; it drifts by {_flow_text(rise, fit)} as the oil becomes thinner, which friction shows, too"
         reason += f"; {_passes_text(passage(fit, smallest, None))}"
         if fit.pump is not None:
             reason += f", the pump {_flow_text(fit.pump, fit)} of it"
@@ -513,7 +535,7 @@ def no_step(fit: BalanceFit, step: DriftStep, fall: DriftStep | None, smallest: 
         if smallest > 0.0:
             reason += f"; the smallest step that would have shown is {_flow_text(smallest, fit)}"
     return Evidence(
-        verdict, reason + _left_out_text(fit), step.score, step.threshold, parts=(_part(step),), chance=step.chance
+        verdict, reason + _left_out_text(fit), step.score, step.threshold, parts=tuple(parts), chance=step.chance
     )
 
 
