@@ -213,7 +213,8 @@ class _BehindTheFit:
         geometry = self.detector.geometry
         turning = recording["omega"] if "omega" in recording else np.gradient(recording["theta"]) * recording.rate
         speed = geometry.displacement / geometry.area * turning
-        force = geometry.area * (recording["p_A"] - recording["p_B"])
+        larger = 1.0 + geometry.asymmetry
+        force = geometry.area * (larger * recording["p_A"] - (2.0 - larger) * recording["p_B"])
         block = block_samples(recording, _FRICTION_SECONDS)
         lost = viscous_loss(force, speed, recording.rate, block)
         return None if lost is None else (lost[0] / rig.friction.F_v, lost[1] / rig.friction.F_v)
