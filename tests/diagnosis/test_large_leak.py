@@ -4,6 +4,8 @@ one: a machine that is another one from half on, with a slower drive, other fric
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,6 +17,9 @@ from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
+from sealscope.diagnosis.pressure_model.large import _onset
+from sealscope.diagnosis.pressure_model.model import DrivenModel
+from sealscope.diagnosis.pressure_model.track import WORN_SEAL, PossibleLeak, Track
 from sealscope.parameters import load_rig
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Recording
@@ -148,3 +153,23 @@ def test_friction_that_sticks_under_a_controller_is_no_large_leak(tmp_path: Path
     judged = PressureModel(rig).examine(seen, [], 0.01)
     assert judged.verdict == "no leak", judged.reason
     assert "predicted from sample to sample" in judged.reason
+
+
+def test_the_onset_is_that_of_the_leak_where_without_it_the_model_diverges() -> None:
+    """No sample was likely then, and the first of none was asked for."""
+    n, start = 1200, 700
+    dp = np.zeros(n)
+
+    class Diverging:
+        rate = 500.0
+
+        def run(self, sets: np.ndarray, segment: np.ndarray) -> np.ndarray:
+            """Return a sound machine that diverges, and a leaking one that is off until the leak opens."""
+            return np.array([np.where(np.arange(n) < start, 0.0, np.nan), np.where(np.arange(n) < start, 1.0, 0.0)])
+
+    edges = np.arange(0, n + 1, 200)
+    followed = SimpleNamespace(path=np.ones((edges.size - 1, 13)), variance=1.0)
+    leak = PossibleLeak(WORN_SEAL, 3, 1e-12, 1e-13, 0.0)
+    onset, limits = _onset(cast("DrivenModel", Diverging()), dp, edges, cast("Track", followed), leak)
+    assert onset == start
+    assert limits[0] <= start <= limits[1]

@@ -105,6 +105,25 @@ def test_a_sound_machine_that_rests_is_followed_and_has_no_leak() -> None:
     assert diagnose(sound, rig=RIG, quick=True).verdict == "no leak"
 
 
+def test_a_machine_that_rings_by_itself_as_its_oil_warms_is_followed_and_its_leak_sized() -> None:
+    """Friction then falls with speed; of the ringing the model explained 55 % under the command alone."""
+    experiment = Experiment.of(
+        rig="thesis",
+        command="6 sin(1.5t)",
+        fault="oil +25 K growing from 0 s to 60 s",
+        leak="0.01 L/min from 60 s",
+        duration=120.0,
+        seed=5,
+    )
+    record = simulate_with_truth(experiment).recording.only(("u", "p_A", "p_B"))
+    evidence = PressureModel(load_rig("thesis")).examine(record, [], 0.01)
+    assert evidence.verdict == "leak", evidence.reason
+    assert "predicted from sample to sample" in evidence.reason
+    assert evidence.onset_s == pytest.approx(60.0, abs=5.0)
+    low, high = evidence.leak_interval_lpm or (np.nan, np.nan)
+    assert low < 0.01 < high
+
+
 @pytest.mark.slow
 def test_the_level_of_a_led_model_is_not_compared() -> None:
     """Its G depends on how far it is led."""

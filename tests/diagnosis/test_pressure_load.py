@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.pressure_model.detector import PressureModel
-from sealscope.diagnosis.pressure_model.load import SWINGS, carried_by_load, swing
+from sealscope.diagnosis.pressure_model.load import FED, SWINGS, carried_by_load, swing
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
@@ -44,9 +44,21 @@ def test_a_force_that_swings_is_told_from_friction(stroke: float, share: float, 
 def test_without_a_force_and_under_a_steady_one_nothing_is_taken(stroke: float) -> None:
     u, friction, steady = strokes(stroke, 1.0, 0.0, 8e5)
     for dp in (friction, friction + steady):
-        assert swing(dp, RATE, 2.0 * np.pi / stroke) < 0.5 * SWINGS
+        assert swing(dp, RATE, 2.0 * np.pi / stroke) < 0.5 * FED
         assert carried_by_load(u, dp, RATE, 2.0 * np.pi / stroke) is None
     assert carried_by_load(u, friction + strokes(stroke, 0.3, 1e6)[2], RATE, None) is None
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(1.5, 4.0), st.floats(0.02, 0.08), st.floats(6e4, 2e5))
+def test_of_a_slow_force_nothing_of_the_strokes_is_taken_with_it(stroke: float, rate: float, size: float) -> None:
+    """What friction does at single reversals shakes the ringing there: sound machines had a z of 3.6 to 6.7."""
+    u, friction, force = strokes(stroke, rate, size)
+    knocks = np.random.default_rng(5).standard_normal(200).repeat(int(0.1 * RATE))[: u.size]
+    knocks = 2e4 * np.pad(knocks, (0, u.size - knocks.size)) * (np.abs(u) < 0.2)
+    carried = carried_by_load(u, friction + force + knocks, RATE, 2.0 * np.pi / stroke)
+    assert carried is not None
+    assert np.std(np.diff(carried)) * RATE < 1.5 * rate * size
 
 
 def recorded(command: str, load: str, leak: str = "") -> Recording:
@@ -65,6 +77,34 @@ def test_under_a_force_that_swings_a_leak_is_found_from_pressures() -> None:
     assert (found.verdict, found.cause) == ("leak", "piston or pump leak")
     assert found.leak_interval_lpm is not None
     assert found.leak_interval_lpm[0] < 0.0042 < found.leak_interval_lpm[1]
+
+
+@pytest.mark.parametrize(
+    ("command", "load", "leak", "verdict"),
+    [
+        ("7 sin(4t)", "12 N sin(0.15t)", "", "no leak"),
+        ("7 sin(4t)", "12 N sin(0.15t)", "0.0042 L/min from 60 s", "leak"),
+        pytest.param("5 sin(2t)", "6 N sin(0.2t)", "0.0042 L/min from 60 s", "leak", marks=pytest.mark.slow),
+        pytest.param("7 sin(4t)", "12 N sin(0.15t)", "0.05 L/min from 60 s", "leak", marks=pytest.mark.slow),
+    ],
+)
+def test_a_weak_force_in_an_open_loop_is_followed_and_a_leak_under_it_sized(
+    command: str, load: str, leak: str, verdict: str
+) -> None:
+    """A force of a fifth of the friction made its parameters wander 1.8 to 8 times: `cannot tell`, with a leak or not.
+
+    With the force alone 0.05 L/min comes out as 0.028 (0.017 to 0.043); without it, it holds.
+    """
+    experiment = Experiment.of(rig="thesis", command=command, load=load, leak=leak or (), duration=SECONDS, seed=5)
+    simulated = simulate_with_truth(experiment)
+    record = simulated.recording.only(SEEN)
+    cycle = 2.0 * np.pi / float(command.split("(")[1][:-2])
+    assert FED < swing(record["p_A"] - record["p_B"], RATE, cycle) < SWINGS
+    judged = PressureModel(load_rig("thesis")).examine(record, [], 0.01)
+    assert judged.verdict == verdict, judged.reason
+    if leak:
+        assert judged.leak_interval_lpm is not None
+        assert judged.leak_interval_lpm[0] < simulated.truth.mean_leak_lpm < judged.leak_interval_lpm[1]
 
 
 def test_in_an_open_loop_a_leak_under_a_force_that_swings_is_not_sized() -> None:

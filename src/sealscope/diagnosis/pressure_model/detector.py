@@ -277,7 +277,7 @@ def _flow(
         blind = unsure * float(np.mean(np.abs(drop))) / leak.law.flow(drop)
         reach = 1.96 * math.hypot(scatter * leak.deviation, FLOW_SCALE * leak.size, blind)
         stated.append((leak.size * unit, max(0.0, (leak.size - reach) * unit), (leak.size + reach) * unit))
-    pure = [leak.law for leak in likely if leak.law in LAWS]
+    pure = [law for law in LAWS if any(leak.law is law for leak in likely)]
     law = "" if len(pure) > 1 or len(leaks) == 1 else f", as of {(pure or [likely[0].law])[0].name}"
     return (
         float(np.mean([lpm for lpm, *_ in stated])),

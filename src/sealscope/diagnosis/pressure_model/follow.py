@@ -26,7 +26,7 @@ from sealscope.diagnosis.pressure_model.fit import (
 )
 from sealscope.diagnosis.pressure_model.interference import advanced, lines_in, skew
 from sealscope.diagnosis.pressure_model.large import WORSE, LargeLeak, large_leak
-from sealscope.diagnosis.pressure_model.load import carried_by_load
+from sealscope.diagnosis.pressure_model.load import SWINGS, carried_by_load, swing
 from sealscope.diagnosis.pressure_model.model import (
     F_C,
     F_V,
@@ -156,6 +156,10 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
     centre[G] = max(centre[G], USUAL_G)
     carried = None if numbers.valved or cycle is None else carried_by_load(u, dp, rate, cycle)
     model = plain = DrivenModel.of(u, rate, numbers, p_A + p_B, carried)
+    # what leaks under a force moves the strokes, which the force then seems to do: under a weak one sizes are those
+    # without it
+    weak = carried is not None and swing(dp, rate, cycle) < SWINGS
+    unfed = DrivenModel.of(u, rate, numbers, p_A + p_B) if weak else None
     span = BLOCK if cycle is None else cycle
     if model.numbers.valved and (at := stalled(dp, model.supply, rate)) is not None:
         return (
@@ -194,17 +198,18 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
     skip = int(FIRST * rate)
     look, large = _tracked(model, dp, edges, theta, skip, seen, None if humming else shown), None
     if isinstance(look, str) or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
-        large = _large(plain, raw, edges, seen, prior)
+        large = _large(unfed or plain, raw, edges, seen, prior)
         if large is not None and large.stated and large.sized and large.excess <= unruly:
             return _beside(large, model, edges, length, share)
     # where the model follows beside a large leak, or beside another machine in its place, that is its word
     weighed = large is not None and large.sized and large.excess <= unruly
+    sizing = unfed and unfed.with_travel(guess)
     if not isinstance(look, str):
-        look = _looked_again(look, model, dp, edges, theta, skip, seen)
-        if look.excess > unruly and not weighed and not numbers.valved:
-            led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, length, share)
-            if led is not None and (led.large is not None or led.excess <= unruly):
-                return led
+        look = _looked_again(look, model, dp, edges, theta, skip, seen, sizing)
+    if (isinstance(look, str) or look.excess > unruly) and not weighed and not numbers.valved:
+        led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, length, share)
+        if led is not None and (led.large is not None or led.excess <= unruly):
+            return led
     if large is not None and large.stated:
         return _beside(large, model, edges, length, share)
     if isinstance(look, str):
@@ -217,7 +222,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
             again = _tracked(model, dp, edges, other, skip, seen)
             if isinstance(again, str):
                 continue
-            again = _looked_again(again, model, dp, edges, other, skip, seen)
+            again = _looked_again(again, model, dp, edges, other, skip, seen, sizing)
             if again.excess < look.excess - 0.05:
                 theta, look = other, again
     stiffness = float(np.mean(look.track.path[:, K])) / centre[K]
@@ -368,31 +373,50 @@ def _looked_again(
     theta: Array,
     skip: int,
     seen: NDArray[np.bool_],
+    sizing: DrivenModel | None = None,
 ) -> _Look:
     """Return the look with the leaks that may be the largest of its steps.
 
     Where G seems to rise the blocks are linearised once more with that rise allowed, by either law: under the usual
     leash a leak pulls friction and gain off their values, which makes it smaller than it is. Sizes and the scatter
     beside the leak are taken from there; z, which a second look at what was chosen for being large would raise, is not.
+    `sizing`: another model in which that is done as well: what either says may be.
     """
     followed, steps = look.track, look.steps
     after = int(np.argmax(steps.z))
     if steps.z[after] < _CLEAR:
         return look
+    fits = [_risen(model, dp, edges, theta, followed.start, skip, seen, after, followed)]
+    if sizing is not None:
+        fits.append(_risen(sizing, dp, edges, theta, _starts(sizing, theta)[-1], skip, seen, after, followed.path))
+    leaks = sorted((leak for fit in fits for leak, *_ in fit), key=lambda leak: leak.cost)
+    excess = min(look.excess, *(beside for _, _, beside in fits[0]))
+    likelier = min(fits[0], key=lambda each: each[0].cost)[1]
+    return _Look(followed, steps, tuple(leaks), excess, likelier)
+
+
+def _risen(
+    model: DrivenModel,
+    dp: Array,
+    edges: NDArray[np.int64],
+    theta: Array,
+    start: Array,
+    skip: int,
+    seen: NDArray[np.bool_],
+    after: int,
+    begin: Track | Array,
+) -> list[tuple[PossibleLeak, Track, float]]:
+    """Return a leak of either law after a block, the record followed with it, and its excess; costs from the least."""
     speed = model.speed_amplitude(theta)
-    start = followed.start
-    risen = [track(model, dp, edges, theta, start, skip, (law, after), followed, seen=seen) for law in LAWS]
-    variance = min(fresh.variance for fresh in risen)
-    leaks, excess = [], look.excess
-    for law, fresh in zip(LAWS, risen, strict=True):
-        again = steps_in(fresh, theta, speed, law=law)
-        cost = fresh.misfit / variance + fresh.strain
-        leaks.append(PossibleLeak(law, after, float(again.size[after]), float(again.deviation[after]), cost))
-        excess = min(excess, excess_of(again))
-    costs = [leak.cost for leak in leaks]
-    return _Look(
-        followed, steps, tuple(sorted(leaks, key=lambda leak: leak.cost)), excess, risen[int(np.argmin(costs))]
-    )
+    tracks = [track(model, dp, edges, theta, start, skip, (law, after), begin, seen=seen) for law in LAWS]
+    variance = min(each.variance for each in tracks)
+    costs = [each.misfit / variance + each.strain for each in tracks]
+    risen = []
+    for law, each, cost in zip(LAWS, tracks, costs, strict=True):
+        again = steps_in(each, theta, speed, law=law)
+        leak = PossibleLeak(law, after, float(again.size[after]), float(again.deviation[after]), cost - min(costs))
+        risen.append((leak, each, excess_of(again)))
+    return risen
 
 
 def _friction(theta: Array, model: DrivenModel, speed: float) -> float:

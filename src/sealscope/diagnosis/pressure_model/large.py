@@ -208,7 +208,7 @@ def _ladder(
         sets = np.tile(theta, (sizes.size, 1))
         for k, share in law.parts:
             sets[:, k] += share * sizes
-        squares = np.minimum(np.nan_to_num((dp - model.run(sets)) ** 2, nan=_DIVERGED), _DIVERGED)
+        squares = _squares(dp - model.run(sets))
         misfit = np.add.reduceat(squares, edges[:-1], axis=1)
         misfit[:, -1] -= squares[:, edges[-1] :].sum(axis=1)
         misfit = misfit * seen
@@ -222,6 +222,11 @@ def _ladder(
     if chosen == 0.0 or not sound - least > max(_FALL * sound, _FALL_COST * noise_variance(dp)):
         return None
     return block, {law: each[2] for law, each in best.items()}
+
+
+def _squares(apart: Array) -> Array:
+    """Return the squares of what is left of dp, those of a model that diverges large and finite."""
+    return np.asarray(np.minimum(np.nan_to_num(apart**2, nan=_DIVERGED), _DIVERGED))
 
 
 def _flows(model: DrivenModel, dp: Array, theta: Array) -> dict[Law, float]:
@@ -341,8 +346,7 @@ def _onset(
     for k, share in leak.law.parts:
         leaking[leak.after :, k] += share * leak.size
     first, last = int(edges[leak.after]), int(edges[min(leak.after + 3, blocks)])
-    apart = (dp - model.run(np.array([sound, leaking]), segment)) ** 2
-    apart = apart[:, first:last]
+    apart = _squares((dp - model.run(np.array([sound, leaking]), segment))[:, first:last])
     costs = np.append(0.0, np.cumsum(apart[0] - apart[1])) / followed.variance
     best = int(np.argmin(costs))
     likely = np.flatnonzero(costs <= costs[best] + _LIKELY)
