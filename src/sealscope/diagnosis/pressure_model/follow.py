@@ -143,8 +143,9 @@ def _windows(model: DrivenModel, dp: Array, theta: Array, cycle: float) -> tuple
 def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = np.inf) -> Followed | str:
     """Fit and follow the chamber pressures and the command of a record, or return the reason why that is not possible.
 
-    `cycle` [s]: length of the duty's cycle, None where it does not repeat; a record whose parameters wander `unruly`
-    times as much as a healthy machine's is followed by a model that is led by its readings, by default none.
+    `cycle` [s]: length of the duty's cycle, None where it does not repeat; a record that is hardly explained, or whose
+    parameters wander `unruly` times as much as a healthy machine's, is followed by a model that is led by its readings,
+    by default none.
     """
     u, p_A, p_B, rate = recording["u"], recording["p_A"], recording["p_B"], recording.rate
     numbers = assumed_numbers(rig)
@@ -156,8 +157,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
     centre[G] = max(centre[G], USUAL_G)
     carried = None if numbers.valved or cycle is None else carried_by_load(u, dp, rate, cycle)
     model = plain = DrivenModel.of(u, rate, numbers, p_A + p_B, carried)
-    # what leaks under a force moves the strokes, which the force then seems to do: under a weak one sizes are those
-    # without it
+    # what leaks under a force moves the strokes, which the force then seems to do: under a weak one a leak is sized
+    # without it, too
     weak = carried is not None and swing(dp, rate, cycle) < SWINGS
     unfed = DrivenModel.of(u, rate, numbers, p_A + p_B) if weak else None
     span = BLOCK if cycle is None else cycle
@@ -206,7 +207,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
     sizing = unfed and unfed.with_travel(guess)
     if not isinstance(look, str):
         look = _looked_again(look, model, dp, edges, theta, skip, seen, sizing)
-    if (isinstance(look, str) or look.excess > unruly) and not weighed and not numbers.valved:
+    astray = np.isfinite(unruly) if isinstance(look, str) else look.excess > unruly
+    if astray and not weighed and not numbers.valved:
         led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, length, share)
         if led is not None and (led.large is not None or led.excess <= unruly):
             return led
