@@ -124,6 +124,36 @@ def test_a_machine_that_rings_by_itself_as_its_oil_warms_is_followed_and_its_lea
     assert low < 0.01 < high
 
 
+@pytest.mark.parametrize(
+    ("leak", "verdict"), [("", "no leak"), pytest.param("0.01 L/min from 60 s", "leak", marks=pytest.mark.slow)]
+)
+def test_oil_that_warms_makes_parameters_drift_and_neither_a_leak_nor_a_record_that_cannot_be_followed(
+    leak: str, verdict: str
+) -> None:
+    """Friction and stiffness fall by a tenth and more: the leak ended as a friction change, `cannot tell`."""
+    experiment = Experiment.of(
+        rig="thesis",
+        command="7 sin(4t)",
+        fault="oil +30 K growing from 0 s to 120 s",
+        leak=leak or (),
+        duration=120.0,
+        seed=5,
+    )
+    simulated = simulate_with_truth(experiment)
+    record = simulated.recording.only(("u", "p_A", "p_B"))
+    model = PressureModel(load_rig("thesis"))
+    followed = model.follow(record)
+    assert not isinstance(followed, str)
+    assert followed.warming
+    assert followed.friction_change < -0.1
+    assert followed.stiffness_change < -0.04
+    evidence = model.examine(record, [], 0.01)
+    assert evidence.verdict == verdict, evidence.reason
+    if leak:
+        low, high = evidence.leak_interval_lpm or (np.nan, np.nan)
+        assert low < simulated.truth.mean_leak_lpm < high
+
+
 @pytest.mark.slow
 def test_the_level_of_a_led_model_is_not_compared() -> None:
     """Its G depends on how far it is led."""

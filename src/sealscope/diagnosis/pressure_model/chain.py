@@ -76,3 +76,36 @@ class Chain:
         if sign <= 0:
             raise np.linalg.LinAlgError("the precision matrix is not positive definite")
         return float(2.0 * np.sum(np.log(factor[0])) + core)
+
+
+class Drifting:
+    """A chain whose parameters drift besides, along given courses by amounts that are the whole record's.
+
+    The amounts are standard normal and eliminated: all that is asked is of the chain and its drift together.
+
+    Parameters
+    ----------
+    chain : Chain
+        The chain without a drift.
+    N : (b, p, p) array
+        Information of each block.
+    courses : (b, p, q) array
+        What a unit of each amount adds; over the blocks each course has the mean 0, so that no anchor sees it.
+    """
+
+    def __init__(self, chain: Chain, N: Array, courses: Array) -> None:
+        size = courses.shape[-1]
+        self._chain, self._courses = chain, courses.reshape(-1, size)
+        self._seen = (N @ courses).reshape(-1, size)
+        self._shared = chain.solve(self._seen)
+        self._own = np.eye(size) + self._courses.T @ self._seen - self._seen.T @ self._shared
+
+    def solve(self, right: Array) -> Array:
+        """Return what `Chain.solve` returns, of chain and drift together."""
+        wandered = self._chain.solve(right)
+        amounts = np.linalg.solve(self._own, self._courses.T @ right - self._seen.T @ wandered)
+        return wandered + (self._courses - self._shared) @ amounts
+
+    def log_determinant(self) -> float:
+        """Return log det of the precision of wandering and amounts."""
+        return self._chain.log_determinant() + float(np.linalg.slogdet(self._own)[1])

@@ -60,6 +60,9 @@ BLOCK, SHORTER, FIRST = 6.0, 4.9, 3.0
 #: The window begins at this share of the record: what a start leaves behind has decayed there.
 _WINDOW_AT = 0.55
 _EARLY = 4
+#: Friction and stiffness that fall by more than these shares from the first third to the last are those of oil that
+#: warms.
+THINNER = (-0.1, -0.04)
 #: A rise of G worth another look.
 _CLEAR = 2.7
 #: A rise of G so clear that it may be too large for linear blocks.
@@ -73,7 +76,8 @@ _AS_GOOD = 1e-3
 class _Look(NamedTuple):
     """A record followed from one first fit; `excess`: chi square over its degrees of freedom, beside the best leak.
 
-    `risen`: the track with the likelier of `leaks` allowed, None without one.
+    `risen`: the track with the likelier of `leaks` allowed, None without one; `warming`: whether its parameters may
+    drift as in oil that warms.
     """
 
     track: Track
@@ -81,6 +85,7 @@ class _Look(NamedTuple):
     leaks: tuple[PossibleLeak, ...]
     excess: float
     risen: Track | None = None
+    warming: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +99,7 @@ class Followed:
     `large`: a leak that linear blocks did not reach, beside which all this is then taken; `change`: what looks like
     one, but another machine from then on explains the record as well; `predicted` (n,): p_A - p_B [Pa] as a model that
     is led by its readings predicts it, None where the model follows under the command alone; `pumped` [m^3/s]: the
-    pump's mean flow.
+    pump's mean flow; `warming`: whether its parameters may drift as in oil that warms.
     """
 
     theta: Array
@@ -113,6 +118,7 @@ class Followed:
     large: LargeLeak | None = None
     change: LargeLeak | None = None
     predicted: Array | None = None
+    warming: bool = False
 
     @property
     def another(self) -> bool:
@@ -197,8 +203,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
         return f"too short: {counted.size} whole blocks of {length:.3g} s, {FEWEST_BLOCKS} are needed"
     edges, seen = edges[counted[0] : counted[-1] + 2], seen[counted[0] : counted[-1] + 1]
     skip = int(FIRST * rate)
-    look, large = _tracked(model, dp, edges, theta, skip, seen, None if humming else shown), None
-    if isinstance(look, str) or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
+    look, large = _tracked(model, dp, edges, theta, skip, seen, unruly, None if humming else shown), None
+    if isinstance(look, str) or look.warming or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
         large = _large(unfed or plain, raw, edges, seen, prior)
         if large is not None and large.stated and large.sized and large.excess <= unruly:
             return _beside(large, model, edges, length, share)
@@ -209,7 +215,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
         look = _looked_again(look, model, dp, edges, theta, skip, seen, sizing)
     astray = np.isfinite(unruly) if isinstance(look, str) else look.excess > unruly
     if astray and not weighed and not numbers.valved:
-        led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, length, share)
+        led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, unruly, length, share)
         if led is not None and (led.large is not None or led.excess <= unruly):
             return led
     if large is not None and large.stated:
@@ -221,7 +227,7 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
             other, dearer = refit(long, first, prior)
             if dearer > cost * (1.0 + _AS_GOOD):
                 continue
-            again = _tracked(model, dp, edges, other, skip, seen)
+            again = _tracked(model, dp, edges, other, skip, seen, unruly)
             if isinstance(again, str):
                 continue
             again = _looked_again(again, model, dp, edges, other, skip, seen, sizing)
@@ -245,6 +251,7 @@ def _led(
     span: float,
     skip: int,
     seen: NDArray[np.bool_],
+    unruly: float,
     seconds: float,
     share: float,
 ) -> Followed | None:
@@ -259,7 +266,7 @@ def _led(
         theta, cost, _ = fit(long, short, prior, guess)
     except FloatingPointError:
         return None
-    look = _tracked(model, dp, edges, theta, skip, seen) if np.isfinite(cost) else DIVERGED
+    look = _tracked(model, dp, edges, theta, skip, seen, unruly) if np.isfinite(cost) else DIVERGED
     if isinstance(look, str):
         return None
     look, large = _looked_again(look, model, dp, edges, theta, skip, seen), None
@@ -291,10 +298,8 @@ def _seen_so(
     large: LargeLeak | None = None,
 ) -> Followed:
     """Return the record as a look sees it."""
-    followed, speed = look.track, model.speed_amplitude(theta)
-    third = max(1, len(followed.path) // 3)
-    early, late = followed.path[:third].mean(axis=0), followed.path[-third:].mean(axis=0)
-    friction = _friction(late, model, speed) / _friction(early, model, speed) - 1.0
+    followed = look.track
+    friction, stiffness = _changes(followed, model, model.speed_amplitude(theta))
     return Followed(
         theta,
         followed.path,
@@ -305,11 +310,12 @@ def _seen_so(
         seconds,
         Level(float(look.steps.level.mean()), float(look.steps.level_deviation.mean())),
         friction,
-        float(late[K] / early[K] - 1.0),
+        stiffness,
         float(np.std(model.u[: -1 : 2 * model.every])),
         float(model.piston_speed(theta[GAIN] * np.mean(np.abs(model.u)))) * model.numbers.A_A,
         share,
         large,
+        warming=look.warming,
     )
 
 
@@ -341,11 +347,13 @@ def _tracked(
     theta: Array,
     skip: int,
     seen: NDArray[np.bool_],
+    unruly: float,
     shown: Array | None = None,
 ) -> _Look | str:
     """Follow the record from a first fit, and estimate the steps of G in it.
 
-    `shown` (n,): what the model shows with that fit from rest.
+    Where its parameters wander `unruly` times as much as a healthy machine's they may drift as in oil that warms, if
+    they then do not. `shown` (n,): what the model shows with that fit from rest.
     """
     try:
         followed = min(
@@ -363,8 +371,16 @@ def _tracked(
             f"the model of the rig explains {100.0 * explained:.0f} % of the pressure difference, "
             f"{100.0 * EXPLAINED:.0f} % are needed; another --rig may describe this machine"
         )
-    steps = steps_in(followed, theta, model.speed_amplitude(theta))
-    return _Look(followed, steps, (), excess_of(steps))
+    speed = model.speed_amplitude(theta)
+    steps = steps_in(followed, theta, speed)
+    look = _Look(followed, steps, (), excess_of(steps))
+    friction, stiffness = _changes(followed, model, speed)
+    thinner = friction < THINNER[0] and stiffness < THINNER[1]
+    if (thinner or look.excess > unruly) and not model.numbers.valved:
+        steps = steps_in(followed, theta, speed, warming=True)
+        if excess_of(steps) <= max(unruly, look.excess if thinner else 0.0):
+            return _Look(followed, steps, (), excess_of(steps), warming=True)
+    return look
 
 
 def _looked_again(
@@ -388,13 +404,15 @@ def _looked_again(
     after = int(np.argmax(steps.z))
     if steps.z[after] < _CLEAR:
         return look
-    fits = [_risen(model, dp, edges, theta, followed.start, skip, seen, after, followed)]
+    warming = look.warming
+    fits = [_risen(model, dp, edges, theta, followed.start, skip, seen, after, followed, warming)]
     if sizing is not None:
-        fits.append(_risen(sizing, dp, edges, theta, _starts(sizing, theta)[-1], skip, seen, after, followed.path))
+        start = _starts(sizing, theta)[-1]
+        fits.append(_risen(sizing, dp, edges, theta, start, skip, seen, after, followed.path, warming))
     leaks = sorted((leak for fit in fits for leak, *_ in fit), key=lambda leak: leak.cost)
     excess = min(look.excess, *(beside for _, _, beside in fits[0]))
     likelier = min(fits[0], key=lambda each: each[0].cost)[1]
-    return _Look(followed, steps, tuple(leaks), excess, likelier)
+    return _Look(followed, steps, tuple(leaks), excess, likelier, warming)
 
 
 def _risen(
@@ -407,6 +425,7 @@ def _risen(
     seen: NDArray[np.bool_],
     after: int,
     begin: Track | Array,
+    warming: bool,
 ) -> list[tuple[PossibleLeak, Track, float]]:
     """Return a leak of either law after a block, the record followed with it, and its excess; costs from the least."""
     speed = model.speed_amplitude(theta)
@@ -415,10 +434,17 @@ def _risen(
     costs = [each.misfit / variance + each.strain for each in tracks]
     risen = []
     for law, each, cost in zip(LAWS, tracks, costs, strict=True):
-        again = steps_in(each, theta, speed, law=law)
+        again = steps_in(each, theta, speed, law=law, warming=warming)
         leak = PossibleLeak(law, after, float(again.size[after]), float(again.deviation[after]), cost - min(costs))
         risen.append((leak, each, excess_of(again)))
     return risen
+
+
+def _changes(followed: Track, model: DrivenModel, speed: float) -> tuple[float, float]:
+    """Return how far friction in mid-stroke and stiffness changed from the first to the last third, as shares."""
+    third = max(1, len(followed.path) // 3)
+    early, late = followed.path[:third].mean(axis=0), followed.path[-third:].mean(axis=0)
+    return _friction(late, model, speed) / _friction(early, model, speed) - 1.0, float(late[K] / early[K] - 1.0)
 
 
 def _friction(theta: Array, model: DrivenModel, speed: float) -> float:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.pressure_model.chain import Chain
+from sealscope.diagnosis.pressure_model.chain import Chain, Drifting
 from sealscope.diagnosis.pressure_model.fit import steps_of
 from sealscope.diagnosis.pressure_model.model import (
     BIAS,
@@ -51,6 +51,10 @@ _WANDER_BIAS = 0.003
 #: Where the record's mean parameters may be, around the first fit (standard deviations as above).
 ANCHOR = {GAIN: 0.02, K: 0.1, F_C: 0.1, F_V: 0.15, K_BRK: 0.1, C_C: 0.15}
 ANCHOR_REST = {LEAD: 5e-4, G: 1.5e-12, F_CFR: 5e-7, STROKE: 0.3, OFFSET: 0.2}
+#: How far oil that warms takes them from the first block to the last (standard deviation, over a course that is even,
+#: half of it besides over one that bends): shares, and G in m^3/(s Pa).
+DRIFT = {K: 0.1, F_C: 0.15, F_V: 0.4, K_BRK: 0.1, C_C: 0.1}
+DRIFT_REST = {G: 3e-13}
 _PASSES = 10
 #: Blocks are stuck whose residual is by so many of its deviations larger than the others', or before or after which
 #: the stiffness leaps by so many deviations of its walk: they are set between their neighbours, at one of these biases
@@ -184,6 +188,20 @@ def wandering(theta: Array, seconds: float, speed: float) -> Array:
 def wander(theta: Array, units: Array, seconds: float, speed: float) -> Array:
     """Return the standard deviation (p,) of the walk from block to block, in `units`."""
     return np.append(wandering(theta, seconds, speed), 1500.0 * np.sqrt(seconds / _WANDER_SECONDS)) / units
+
+
+def drift_courses(theta: Array, units: Array, blocks: int) -> Array:
+    """Return what oil that warms adds to the parameters (b, p, q), in `units`.
+
+    Each drifts over an even course and over one that bends.
+    """
+    deviation = np.append(_deviations(theta, DRIFT, DRIFT_REST), 0.0) / units
+    drifting = np.flatnonzero(deviation)
+    tau = np.linspace(-0.5, 0.5, blocks)
+    shapes = np.column_stack([tau, 0.5 * 6.0 * (tau**2 - np.mean(tau**2))])
+    courses = np.zeros((blocks, units.size, drifting.size, 2))
+    courses[:, drifting, np.arange(drifting.size)] = deviation[drifting, None] * shapes[:, None]
+    return courses.reshape(blocks, units.size, -1)
 
 
 def _anchor(theta: Array, units: Array) -> Array:
@@ -507,11 +525,12 @@ def steps_in(
     scales: Sequence[float] = SCALES,
     law: Law = WORN_SEAL,
     beside: PossibleLeak | None = None,
+    warming: bool = False,
 ) -> ConductanceSteps:
     """Estimate a step of a leak of a law after each block.
 
-    Everything else is free to wander as far as the likelihood chooses. `beside` a leak of the same law, which is taken
-    away first, the steps are further ones.
+    Everything else is free to wander as far as the likelihood chooses, and to drift as in oil that warms where
+    `warming`. `beside` a leak of the same law, which is taken away first, the steps are further ones.
     """
     anchor, centre = np.split(followed.anchor, 2)
     walk = np.tile(wander(theta, followed.units, followed.seconds, speed), (len(followed.N) - 1, 1))
@@ -522,9 +541,11 @@ def steps_in(
         r, rise_right = r - size[:, None] * rise.cross, rise_right - size * rise.own
     right = right_sides(r, anchor, centre).reshape(-1, 1)
     blocks = len(followed.N)
-    best: tuple[float, float, Chain, float] | None = None
+    best: tuple[float, float, Chain | Drifting, float] | None = None
+    courses = drift_courses(theta, followed.units, blocks)
     for scale in scales:
-        chain = Chain(followed.N, scale * walk, anchor)
+        wandering_only = Chain(followed.N, scale * walk, anchor)
+        chain = Drifting(wandering_only, followed.N, courses) if warming else wandering_only
         fit = float(np.vdot(right, chain.solve(right)))
         likelihood = fit - chain.log_determinant()
         likelihood -= 2.0 * np.sum(np.log(scale * walk))
