@@ -12,7 +12,16 @@ from sealscope.diagnosis.changepoint.tails import largest_normal, seed_of
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.model import GAIN, STATES, DrivenModel, G, assumed_numbers, nominal
-from sealscope.diagnosis.pressure_model.track import HOLE, WORN_SEAL, PossibleLeak, Track, steps_in, track
+from sealscope.diagnosis.pressure_model.track import (
+    HOLE,
+    WORN_SEAL,
+    ConductanceSteps,
+    PossibleLeak,
+    Track,
+    excess_of,
+    steps_in,
+    track,
+)
 from sealscope.diagnosis.verdict.evidence import LEAK_WORTH_FINDING
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.cycle import find_cycle
@@ -359,3 +368,14 @@ def test_a_fit_far_beyond_the_rigs_stiffness_is_refused(thesis: Rig, sound: Reco
     assert evidence.verdict == "cannot tell"
     assert "2.1 times as stiff" in evidence.reason
     assert evidence.score is None
+
+
+def test_a_step_that_explains_more_than_there_is_leaves_nothing_followed() -> None:
+    """Blocks far from the model left a chi square below zero, which passed for a record that is followed."""
+
+    def steps(chi_square: float) -> ConductanceSteps:
+        none = np.zeros(1)
+        return ConductanceSteps(none, none, np.array([25.0]), np.eye(1), none, none, 1.0, (chi_square, 100.0))
+
+    assert excess_of(steps(900.0)) == pytest.approx(2.75)
+    assert excess_of(steps(200.0)) == np.inf

@@ -352,8 +352,9 @@ def _tracked(
 ) -> _Look | str:
     """Follow the record from a first fit, and estimate the steps of G in it.
 
-    Where its parameters wander `unruly` times as much as a healthy machine's they may drift as in oil that warms, if
-    they then do not. `shown` (n,): what the model shows with that fit from rest.
+    Where friction and stiffness fall all may drift as in oil that warms, and so may the parameters of a model that is
+    led, which wander `unruly` times as much as a healthy machine's and then do not. `shown` (n,): what the model shows
+    with that fit from rest.
     """
     try:
         followed = min(
@@ -376,7 +377,9 @@ def _tracked(
     look = _Look(followed, steps, (), excess_of(steps))
     friction, stiffness = _changes(followed, model, speed)
     thinner = friction < THINNER[0] and stiffness < THINNER[1]
-    if (thinner or look.excess > unruly) and not model.numbers.valved:
+    # what the command leads may have lost the phase of the ringing, which looks like a drift as well
+    drifts = thinner or (look.excess > unruly and model.correction > 0.0)
+    if drifts and not model.numbers.valved:
         steps = steps_in(followed, theta, speed, warming=True)
         if excess_of(steps) <= max(unruly, look.excess if thinner else 0.0):
             return _Look(followed, steps, (), excess_of(steps), warming=True)

@@ -513,9 +513,14 @@ class ConductanceSteps:
 
 
 def excess_of(steps: ConductanceSteps) -> float:
-    """Return the chi square of the blocks over its degrees of freedom, beside the best step (Birge's ratio)."""
+    """Return the chi square of the blocks over its degrees of freedom, beside the best step (Birge's ratio).
+
+    Where blocks are so far from the model that nothing is left of its digits, and no step can explain more than there
+    is, the ratio is infinite: nothing is followed there.
+    """
     chi_square, freedom = steps.excess
-    return float((chi_square - np.max(np.abs(steps.z)) ** 2) / freedom)
+    ratio = float((chi_square - np.max(np.abs(steps.z)) ** 2) / freedom)
+    return ratio if ratio >= 0.0 else np.inf
 
 
 def steps_in(
