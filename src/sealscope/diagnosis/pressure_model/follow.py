@@ -77,7 +77,7 @@ class _Look(NamedTuple):
     """A record followed from one first fit; `excess`: chi square over its degrees of freedom, beside the best leak.
 
     `risen`: the track with the likelier of `leaks` allowed, None without one; `warming`: whether its parameters may
-    drift as in oil that warms.
+    drift as in oil that warms; `lost`: whether with a leak allowed blocks are too far from the model to be linear.
     """
 
     track: Track
@@ -86,6 +86,7 @@ class _Look(NamedTuple):
     excess: float
     risen: Track | None = None
     warming: bool = False
+    lost: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +215,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
     if not isinstance(look, str):
         look = _looked_again(look, model, dp, edges, theta, skip, seen, sizing)
     astray = np.isfinite(unruly) if isinstance(look, str) else look.excess > unruly
+    # beside a leak too large for any block to be linear it is the large one's word, too
+    weighed = weighed or (large is not None and large.stated and not isinstance(look, str) and look.lost)
     if astray and not weighed and not numbers.valved:
         led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, unruly, length, share)
         if led is not None and (led.large is not None or led.excess <= unruly):
@@ -413,9 +416,10 @@ def _looked_again(
         start = _starts(sizing, theta)[-1]
         fits.append(_risen(sizing, dp, edges, theta, start, skip, seen, after, followed.path, warming))
     leaks = sorted((leak for fit in fits for leak, *_ in fit), key=lambda leak: leak.cost)
-    excess = min(look.excess, *(beside for _, _, beside in fits[0]))
+    beside = [excess for *_, excess in fits[0]]
+    excess, lost = min(look.excess, *beside), bool(np.any(np.isinf(beside)))
     likelier = min(fits[0], key=lambda each: each[0].cost)[1]
-    return _Look(followed, steps, tuple(leaks), excess, likelier, warming)
+    return _Look(followed, steps, tuple(leaks), excess, likelier, warming, lost)
 
 
 def _risen(
