@@ -61,7 +61,7 @@ BLOCK, SHORTER, FIRST = 6.0, 4.9, 3.0
 _WINDOW_AT = 0.55
 _EARLY = 4
 #: Friction and stiffness that fall by more than these shares from the first third to the last are those of oil that
-#: warms.
+#: warms: 0.05 and 0.03 at most on 16 machines of the bench that do not warm, with a leak or without.
 THINNER = (-0.1, -0.04)
 #: A rise of G worth another look.
 _CLEAR = 2.7

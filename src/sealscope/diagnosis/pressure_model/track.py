@@ -547,10 +547,10 @@ def steps_in(
     right = right_sides(r, anchor, centre).reshape(-1, 1)
     blocks = len(followed.N)
     best: tuple[float, float, Chain | Drifting, float] | None = None
-    courses = drift_courses(theta, followed.units, blocks)
+    courses = drift_courses(theta, followed.units, blocks) if warming else None
     for scale in scales:
         wandering_only = Chain(followed.N, scale * walk, anchor)
-        chain = Drifting(wandering_only, followed.N, courses) if warming else wandering_only
+        chain = wandering_only if courses is None else Drifting(wandering_only, followed.N, courses)
         fit = float(np.vdot(right, chain.solve(right)))
         likelihood = fit - chain.log_determinant()
         likelihood -= 2.0 * np.sum(np.log(scale * walk))
