@@ -37,9 +37,10 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.pressure_model.follow import Followed
     from sealscope.parameters import Rig
 
-#: Shortest record [s], lowest rate [Hz] that shows the ringing (60 to 80 Hz, 40 with hoses) as no other frequency, and
-#: fewest blocks on either side of a step. At 100 Hz 17 of 24 intervals of 0.1 L/min held, at 167 Hz 21 of 24.
-SHORTEST, SLOWEST_RATE, LEAST = 40.0, 180.0, 3
+#: Shortest record [s], lowest rate [Hz] the model was judged at (100 Hz, by a clock that is off), and fewest blocks on
+#: either side of a step. The model rings between the samples, so that a ringing of 60 to 80 Hz is followed below its
+#: own rate of samples, too (docs/decisions/0060-hundred-hertz.md).
+SHORTEST, SLOWEST_RATE, LEAST = 40.0, 95.0, 3
 #: Scatter of the blocks beyond the wandering, as chi square over its degrees of freedom: three deviations above 1, to
 #: which the level of a record can be compared, and the most for which a wider error makes up.
 STEADY, UNRULY = 1.2, 1.5
@@ -117,7 +118,7 @@ class PressureModel:
         if recording.units["u"] != "V":
             return f"needs the command in V, got {recording.units['u']}"
         if recording.rate < SLOWEST_RATE:
-            return f"needs a rate of {SLOWEST_RATE:g} Hz or more to see the ringing, got {recording.rate:g} Hz"
+            return f"needs a rate of {SLOWEST_RATE:g} Hz or more, got {recording.rate:g} Hz"
         if recording.duration < SHORTEST:
             return f"needs {SHORTEST:g} s or more, got {recording.duration:.4g} s"
         for name in ("u", *CHAMBERS):
