@@ -18,7 +18,7 @@ from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.large import _onset
-from sealscope.diagnosis.pressure_model.model import DrivenModel
+from sealscope.diagnosis.pressure_model.model import PARAMETERS, DrivenModel
 from sealscope.diagnosis.pressure_model.track import WORN_SEAL, PossibleLeak, Track
 from sealscope.parameters import load_rig
 from sealscope.recordings.cycle import find_cycle
@@ -168,7 +168,7 @@ def test_the_onset_is_that_of_the_leak_where_without_it_the_model_diverges() -> 
             return np.array([np.where(np.arange(n) < start, 0.0, np.nan), np.where(np.arange(n) < start, 1.0, 0.0)])
 
     edges = np.arange(0, n + 1, 200)
-    followed = SimpleNamespace(path=np.ones((edges.size - 1, 13)), variance=1.0)
+    followed = SimpleNamespace(path=np.ones((edges.size - 1, len(PARAMETERS))), variance=1.0)
     leak = PossibleLeak(WORN_SEAL, 3, 1e-12, 1e-13, 0.0)
     onset, limits = _onset(cast("DrivenModel", Diverging()), dp, edges, cast("Track", followed), leak)
     assert onset == start

@@ -13,7 +13,9 @@ from sealscope.diagnosis.pressure_model.model import (
     F_V,
     GAIN,
     OFFSET,
+    PARAMETERS,
     RUNS,
+    SIDE,
     STATES,
     STROKE,
     DrivenModel,
@@ -41,7 +43,7 @@ def thesis() -> Rig:
 
 
 def truth_of(rig: Rig) -> np.ndarray:
-    """The parameters (13,) of the machine of `recorded`, where nothing else is said."""
+    """The parameters (14,) of the machine of `recorded`, where nothing else is said."""
     theta = nominal(rig.with_overrides({"fluid.p_charge": P_CHARGE}))
     theta[G] = G_PUMP
     return theta
@@ -79,7 +81,7 @@ def test_the_reduced_rig_shows_what_the_whole_rig_shows(command: str, thesis: Ri
 
 def test_stiffness_follows_the_volumes_of_both_chambers() -> None:
     """K (1/V_A + 1/V_B) over 2 K / V, with V_A = V + A x and V_B = V - A x; none of it where the share is nought."""
-    theta = [0.0] * 13
+    theta = [0.0] * len(PARAMETERS)
     theta[OFFSET] = 0.1
     for place in (-0.6, -0.3, 0.0, 0.25, 0.5):
         theta[STROKE] = 0.0
@@ -107,7 +109,8 @@ def test_long_strokes_show_what_the_whole_rig_shows(thesis: Rig) -> None:
     centred = place - np.polynomial.Polynomial.fit(np.arange(x.size), place, 1)(np.arange(x.size))
     assert np.sqrt(np.mean((model.travel[:-1:4] - centred) ** 2)) < 0.01 * np.std(place)
     theta[OFFSET] = float(np.mean(place - model.travel[:-1:4]))
-    sets = np.array([theta, theta * (np.arange(13) != STROKE), theta * (np.arange(13) != F_CFR)])
+    sets = np.tile(theta, (3, 1))
+    sets[1, STROKE] = sets[2, F_CFR] = 0.0
     shown, true = model.run(sets)[:, 500:], (p_A - p_B)[500:]
     misfits = np.sqrt(np.mean((shown - true) ** 2, axis=1))
     assert misfits[0] < 700.0
@@ -116,6 +119,22 @@ def test_long_strokes_show_what_the_whole_rig_shows(thesis: Rig) -> None:
     shares = np.sum(added * (true - shown[1:]), axis=1) / np.sum(added**2, axis=1)
     assert shares == pytest.approx([1.0, 1.0], abs=0.1)
     assert np.sqrt(np.mean(added[1] ** 2)) > 100.0
+
+
+def test_one_sided_friction_shows_what_the_whole_rig_shows(thesis: Rig) -> None:
+    """Friction of the way back 0.7 times that of the way out: within what both sides alike come to (see above)."""
+    backward = 0.7
+    u, true = true_difference(friction__backward=backward)
+    theta = truth_of(thesis)
+    theta[SIDE] = (1.0 - backward) / (1.0 + backward)
+    theta[[F_C, F_V, F_CFR]] *= 0.5 * (1.0 + backward)
+    model = DrivenModel.of(u, 500.0, assumed_numbers(thesis))
+    sets = np.tile(theta, (2, 1))
+    sets[1, SIDE] = 0.0
+    shown = model.run(sets)
+    misfits = np.sqrt(np.mean((shown - true) ** 2, axis=1))
+    assert misfits[0] < 200.0
+    assert misfits[1] > 20.0 * misfits[0]
 
 
 def _steady(thesis: Rig, every: int, seconds: float = 1.0) -> np.ndarray:
@@ -142,7 +161,7 @@ def test_lanes_are_runs_of_their_own(thesis: Rig) -> None:
     u, _ = true_difference()
     model = DrivenModel.of(u[:3000], 500.0, assumed_numbers(thesis))
     random = np.random.default_rng(4)
-    sets = truth_of(thesis) * random.uniform(0.8, 1.2, (RUNS + 3, 13))
+    sets = truth_of(thesis) * random.uniform(0.8, 1.2, (RUNS + 3, len(PARAMETERS)))
     together = model.run(sets)
     for one, theta in zip(together, sets, strict=True):
         np.testing.assert_array_equal(one, model.run(theta[None])[0])
@@ -214,4 +233,10 @@ def test_the_fit_finds_a_machine_far_from_the_rig_that_is_assumed(
     assert theta[K] == pytest.approx(values["fluid__K_oil"], rel=0.01)
     coulomb = values["friction__F_pr"] + 2.0 * P_CHARGE * values["friction__F_cfr"]
     assert theta[F_C] + theta[F_V] * v == pytest.approx(coulomb + values["friction__F_v"] * v, rel=0.04)
+    assert theta[G] == pytest.approx(G_PUMP, abs=3e-13)
+
+
+def test_friction_that_is_larger_one_way_is_found(thesis: Rig) -> None:
+    theta = followed(thesis, recorded(4, friction__backward=0.7)).path.mean(axis=0)
+    assert theta[SIDE] == pytest.approx(0.3 / 1.7, abs=0.02)
     assert theta[G] == pytest.approx(G_PUMP, abs=3e-13)

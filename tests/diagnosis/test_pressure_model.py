@@ -65,7 +65,7 @@ def followed(rig: Rig, recording: Recording) -> Followed:
 
 
 def truth_of(rig: Rig) -> np.ndarray:
-    """The parameters (13,) of the machine of `recorded`, where nothing else is said."""
+    """The parameters (14,) of the machine of `recorded`, where nothing else is said."""
     theta = nominal(rig.with_overrides({"fluid.p_charge": P_CHARGE}))
     theta[G] = G_PUMP
     return theta

@@ -24,6 +24,8 @@ from sealscope.diagnosis.pressure_model.model import (
     LEAD,
     OFFSET,
     PARAMETERS,
+    RUNS,
+    SIDE,
     SLOW_WIDTH,
     SOUND,
     STATES,
@@ -36,11 +38,13 @@ from sealscope.diagnosis.pressure_model.model import (
 from sealscope.recordings.recording import Array
 
 #: Prior standard deviations: of the logarithm of gain, K, F_C, F_v, K_brk, C_c and F_cfr; of lead [s], G [m^3/(s Pa)],
-#: the stroke's share and offset.
+#: the stroke's share and offset, the friction's side.
 PRIOR = {GAIN: 1.0, K: 0.3, F_C: 0.3, F_V: 0.3, K_BRK: 0.3, C_C: 0.3, F_CFR: 0.5}
-PRIOR_LEAD, PRIOR_G, PRIOR_STROKE, PRIOR_OFFSET = 5e-4, 1.2e-12, 0.5, 0.2
+PRIOR_LEAD, PRIOR_G, PRIOR_STROKE, PRIOR_OFFSET, PRIOR_SIDE = 5e-4, 1.2e-12, 0.5, 0.2, 0.15
 #: How far friction may depend on the pressures where a rig knows nothing of it [N/Pa].
 LEAST_F_CFR = 5e-7
+#: No friction is larger one way than the other by more than this share of the mean of both.
+LARGEST_SIDE = 0.7
 #: What the pump alone may let pass where a rig knows nothing of it [m^3/(s Pa)].
 USUAL_G = 4e-13
 #: Length of the window, and of a shorter one for the starts: so many cycles, at least and at most so many seconds.
@@ -65,7 +69,7 @@ _NEAR, _SAME = 50.0, 0.01
 
 
 def steps_of(theta: Array) -> Array:
-    """Return the steps (13,) of the forward differences, small against the data's errors and large against rounding.
+    """Return the steps (14,) of the forward differences, small against the data's errors and large against rounding.
 
     Single precision leaves 0.1 Pa; of 10^5 Pa most steps move 10 to 100 Pa.
     """
@@ -83,6 +87,7 @@ def steps_of(theta: Array) -> Array:
             2e-7,
             2e-2,
             2e-3,
+            1e-3,
             5e-12,
         ]
     )
@@ -90,7 +95,10 @@ def steps_of(theta: Array) -> Array:
 
 def _valid(theta: Array) -> bool:
     return bool(
-        np.all(np.isfinite(theta)) and min(theta[GAIN], theta[K], theta[F_C], theta[C_C]) > 0.0 and theta[K_BRK] > 1.0
+        np.all(np.isfinite(theta))
+        and min(theta[GAIN], theta[K], theta[F_C], theta[C_C]) > 0.0
+        and theta[K_BRK] > 1.0
+        and abs(theta[SIDE]) < LARGEST_SIDE
     )
 
 
@@ -116,7 +124,7 @@ class Window:
         return np.asarray(dp - dp.mean(axis=-1, keepdims=True))
 
     def runs(self, thetas: Array) -> Array:
-        """Return what the model shows in the window for parameter sets (runs, 13), as `slow` leaves it."""
+        """Return what the model shows in the window for parameter sets (runs, 14), as `slow` leaves it."""
         start = np.zeros((len(thetas), STATES))
         start[:, 0] = self.model.carried[0]
         start[:, 4] = self.integral * thetas[:, GAIN]
@@ -136,7 +144,7 @@ def noise_variance(dp: Array) -> float:
 
 
 def window_at(model: DrivenModel, dp: Array, theta: Array, first: int, length: int) -> Window:
-    """Return the window of `length` samples from `first` on; the model comes to it with parameters `theta` (13,)."""
+    """Return the window of `length` samples from `first` on; the model comes to it with parameters `theta` (14,)."""
     state = np.zeros((1, STATES))
     state[:, 0] = model.carried[0]
     if first > 0:
@@ -149,7 +157,7 @@ def window_at(model: DrivenModel, dp: Array, theta: Array, first: int, length: i
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A normal prior: centre and standard deviation (13,) of each parameter."""
+    """A normal prior: centre and standard deviation (14,) of each parameter."""
 
     centre: Array
     deviation: Array
@@ -164,7 +172,7 @@ def prior_of(centre: Array) -> Prior:
     """Return how far a machine may be from the assumed rig."""
     deviation = np.array([PRIOR.get(k, 0.0) * centre[k] for k in range(len(PARAMETERS))])
     deviation[LEAD], deviation[G], deviation[BIAS] = PRIOR_LEAD, PRIOR_G, 0.1 * centre[GAIN]
-    deviation[STROKE], deviation[OFFSET] = PRIOR_STROKE, PRIOR_OFFSET
+    deviation[STROKE], deviation[OFFSET], deviation[SIDE] = PRIOR_STROKE, PRIOR_OFFSET, PRIOR_SIDE
     deviation[F_CFR] = max(deviation[F_CFR], LEAST_F_CFR)
     return Prior(centre, deviation)
 
@@ -172,7 +180,7 @@ def prior_of(centre: Array) -> Prior:
 def minimise(
     window: Window, thetas: Array, prior: Prior, free: Sequence[int], most: int, enough: float
 ) -> tuple[Array, Array]:
-    """Minimise the cost over the free parameters by Levenberg-Marquardt from several starts (m, 13) side by side.
+    """Minimise the cost over the free parameters by Levenberg-Marquardt from several starts (m, 14) side by side.
 
     Returns the sets that are reached, cheapest first, and their costs (m,). A start is left where the linear model
     promises less than `enough` of cost, or a step gains less.
@@ -231,7 +239,9 @@ def minimise(
             break
 
         # a whole step is looked at with its slopes, as it is taken nearly always; the last one needs none
-        tries = {start: damped(thetas[start], systems[start], _FEWER_DAMPINGS) for start in active}
+        # (a start that is alone looks closer where the whole step is not the best, and its runs fill one register)
+        dampings = _FEWER_DAMPINGS[: None if len(active) > 1 else RUNS - len(free)]
+        tries = {start: damped(thetas[start], systems[start], dampings) for start in active}
         final = turn + 1 == most
         parts = [tries[start] if final else np.vstack([tries[start], stepped(tries[start][0])]) for start in active]
         tried = dict(zip(active, run(parts), strict=True))
@@ -260,7 +270,7 @@ def minimise(
 
 
 def first_guess(short: Window, prior: Prior) -> Array:
-    """Return parameters (13,) of which gain, lead, bias and friction fit the slow part of the pressure.
+    """Return parameters (14,) of which gain, lead, bias and friction fit the slow part of the pressure.
 
     The others are the prior's.
     """
@@ -283,7 +293,7 @@ def long_strokes(model: DrivenModel) -> bool:
 
 
 def fit(window: Window, short: Window, prior: Prior, guess: Array) -> tuple[Array, float, list[Array]]:
-    """Return the parameters (13,) of the best fit, its cost per sample, and other starts.
+    """Return the parameters (14,) of the best fit, its cost per sample, and other starts.
 
     The other starts are for a record that the model does not follow from the first; `short`: part of the window, for
     the many starts about the first `guess`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -31,6 +32,7 @@ from sealscope.diagnosis.pressure_model.model import (
     F_C,
     F_V,
     GAIN,
+    SOUND,
     STATES,
     DrivenModel,
     G,
@@ -65,12 +67,16 @@ _EARLY = 4
 THINNER = (-0.1, -0.04)
 #: A rise of G worth another look.
 _CLEAR = 2.7
+#: ... and one that no other minimum of the blocks takes away.
+_EVIDENT = 8.0
 #: A rise of G so clear that it may be too large for linear blocks.
 _STRONG = 15.0
 #: A record that the model follows so badly is tried again from other first fits.
 RESTLESS = 1.15
 #: ... of which one is as good whose cost is higher by no more than this share.
 _AS_GOOD = 1e-3
+#: A model that is led predicts next samples with any oil: its stiffness is within so many prior deviations.
+_OIL = 4.0
 
 
 class _Look(NamedTuple):
@@ -93,7 +99,7 @@ class _Look(NamedTuple):
 class Followed:
     """A record as the model sees it.
 
-    `theta` (13,): first fit; `path` (b, 13); `steps` of G; `leaks` that explain its largest, the likelier first;
+    `theta` (14,): first fit; `path` (b, 14); `steps` of G; `leaks` that explain its largest, the likelier first;
     `excess`: chi square a degree of freedom of what scatters beside it; `edges` (b + 1,) [samples] from the first
     sample; `seconds` of a block; `level` [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to
     the last third, as shares; `share` of the blocks that have no missing samples and count;
@@ -262,14 +268,17 @@ def _led(
 
     A machine that rings by itself, or breaks away from a rest, keeps no phase that the command sets: to follow it under
     the command alone all parameters must wander. Predicted from one sample to the next, the record is followed by those
-    of a machine (the prediction-error method: L. Ljung, System Identification, 2nd ed., 1999, ch. 7).
+    of a machine (the prediction-error method: L. Ljung, System Identification, 2nd ed., 1999, ch. 7). None where it is
+    not followed, or only by a machine whose oil is not the rig's.
     """
     long, short = _windows(model, dp, guess, span)
     try:
         theta, cost, _ = fit(long, short, prior, guess)
     except FloatingPointError:
         return None
-    look = _tracked(model, dp, edges, theta, skip, seen, unruly) if np.isfinite(cost) else DIVERGED
+    if not np.isfinite(cost) or abs(math.log(theta[K] / prior.centre[K])) > _OIL * PRIOR[K]:
+        return None
+    look = _tracked(model, dp, edges, theta, skip, seen, unruly)
     if isinstance(look, str):
         return None
     look, large = _looked_again(look, model, dp, edges, theta, skip, seen), None
@@ -404,7 +413,8 @@ def _looked_again(
     Where G seems to rise the blocks are linearised once more with that rise allowed, by either law: under the usual
     leash a leak pulls friction and gain off their values, which makes it smaller than it is. Sizes and the scatter
     beside the leak are taken from there; z, which a second look at what was chosen for being large would raise, is not.
-    `sizing`: another model in which that is done as well: what either says may be.
+    Nothing rose where the blocks, begun at those that the leak led to, explain the record as well without one: blocks
+    may stop in different minima. `sizing`: another model in which leaks are looked for: what either says may be.
     """
     followed, steps = look.track, look.steps
     after = int(np.argmax(steps.z))
@@ -419,6 +429,14 @@ def _looked_again(
     beside = [excess for *_, excess in fits[0]]
     excess, lost = min(look.excess, *beside), bool(np.any(np.isinf(beside)))
     likelier = min(fits[0], key=lambda each: each[0].cost)[1]
+    if steps.z[after] < _EVIDENT:
+        sound = likelier.path.copy()
+        sound[:, SOUND:] = theta[SOUND:]
+        other = track(model, dp, edges, theta, followed.start, skip, begin=sound, seen=seen)
+        if (other.misfit - followed.misfit) / followed.variance + other.strain <= followed.strain:
+            flat = steps_in(other, theta, model.speed_amplitude(theta), warming=warming)
+            if np.max(flat.z) < _CLEAR:
+                return _Look(other, flat, (), excess_of(flat), warming=warming)
     return _Look(followed, steps, tuple(leaks), excess, likelier, warming, lost)
 
 

@@ -81,7 +81,7 @@ _LIKELY, _TRANSIENT = 20.0, 0.5
 class LargeLeak:
     """A record with a leak, about which its blocks are linear.
 
-    `theta` (13,): the sound machine; `track`; `steps` beside the leak; `leaks` by either law and by both, the likelier
+    `theta` (14,): the sound machine; `track`; `steps` beside the leak; `leaks` by either law and by both, the likelier
     first; `z` of the leak; `better`: cost of another machine less that of the leak; `onset`, its `limits` [samples];
     `excess`: chi square a degree of freedom of what scatters beside the leak; `sized`: whether the model follows the
     machine so well that the sizes of the leaks mean something; `explained`: as `better`, to another machine with any
@@ -248,7 +248,7 @@ def _refitted(model: DrivenModel, dp: Array, until: int, theta: Array, prior: Pr
 class _Leaking(NamedTuple):
     """A leak fitted to what comes after: its size, 0 where it fits with none.
 
-    `theta` (13,): the machine with it, `sound` (13,): without; `cost` of the fit.
+    `theta` (14,): the machine with it, `sound` (14,): without; `cost` of the fit.
     """
 
     law: Law
@@ -260,7 +260,7 @@ class _Leaking(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _After:
-    """What comes after a leak: a window of it and a shorter one, the machine `theta` (13,) from before, its `wander`.
+    """What comes after a leak: a window of it and a shorter one, the machine `theta` (14,) from before, its `wander`.
 
     Costs are minus twice the log likelihood.
     """

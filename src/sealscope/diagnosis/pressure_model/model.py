@@ -23,7 +23,7 @@ from sealscope.diagnosis.pressure_model.behind_valve import flow_per_volt, rates
 from sealscope.parameters import Rig
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
-from sealscope.physics.lanes import SINGLE_WIDTH, load, store
+from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
 from sealscope.physics.leakage import piston_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
@@ -34,17 +34,22 @@ from sealscope.recordings.recording import Array
 #: [rad/s] (behind a servo valve flows instead of speeds, [m^3/(s V)] and [m^3/s]), stiffness of the oil [Pa],
 #: conductance past the piston and the pump [m^3/(s Pa)], Coulomb friction [N], viscous friction [N s/m], breakaway over
 #: Coulomb friction [1], decay of the breakaway [s/m]; Coulomb friction per pressure [N/Pa]; share of the stiffness that
-#: follows the stroke [1], mid-stroke's offset as a share of V [1]; coefficient of an orifice past the piston
-#: [m^3/(s Pa^0.5)], which a sound machine does not have.
-PARAMETERS = ("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c", "F_cfr", "stroke", "offset", "orifice")
-GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C, F_CFR, STROKE, OFFSET, ORIFICE = range(len(PARAMETERS))
+#: follows the stroke [1], mid-stroke's offset as a share of V [1]; share by which friction is larger on the way out,
+#: and smaller on the way back [1]; coefficient of an orifice past the piston [m^3/(s Pa^0.5)], which a sound machine
+#: does not have.
+PARAMETERS = (
+    *("gain", "lead", "bias", "K", "G", "F_C", "F_v", "K_brk", "C_c", "F_cfr", "stroke", "offset", "side"),
+    "orifice",
+)
+GAIN, LEAD, BIAS, K, G, F_C, F_V, K_BRK, C_C, F_CFR, STROKE, OFFSET, SIDE, ORIFICE = range(len(PARAMETERS))
 #: The parameters that a machine without an orifice past the piston has.
 SOUND = ORIFICE
+_WIDTH = len(PARAMETERS)
 #: Runs that one call makes side by side: in single precision, which is within some Pa of doubles.
 RUNS = SINGLE_WIDTH
 STATES = 5
 State = tuple[float, float, float, float, float]
-Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
+Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float, float]
 #: Samples that are turned from lanes into runs at a time.
 _TURNED = 1024
 #: Largest share of V that a stroke takes away, squared.
@@ -76,7 +81,7 @@ def assumed_numbers(rig: Rig) -> RigNumbers:
 
 
 def nominal(rig: Rig) -> Array:
-    """Return the parameters (13,) that a rig has about its charge pressure with no leak past the piston."""
+    """Return the parameters (14,) that a rig has about its charge pressure with no leak past the piston."""
     friction = rig.friction
     coulomb = coulomb_friction(
         rig.fluid.p_charge,
@@ -98,6 +103,7 @@ def nominal(rig: Rig) -> Array:
             friction.C_c,
             friction.F_cfr,
             0.5,
+            0.0,
             0.0,
             0.0,
         ]
@@ -128,6 +134,7 @@ def reduced_rates(
     """
     dp, v, omega, i, integral = y
     friction = stribeck_friction(v, coulomb, theta[K_BRK], theta[C_C], theta[F_V], m.v_th, False)
+    friction = friction * select(v < 0.0, 1.0 - theta[SIDE], 1.0 + theta[SIDE])
     past = m.A_A * v + piston_leakage(dp, theta[G], theta[ORIFICE], m.dp_0)
     spin = theta[GAIN] * u + theta[BIAS]
     if len(m.valved) > 0:
@@ -180,7 +187,7 @@ def pressure_differences(
     steps of h [s], `every` to a sample. `inputs`: (2 every n + 1, 5) at every half step: command [V], its derivative
     [V/s], the piston's place as A x / V, p_A + p_B from their mean [Pa], a servo valve's supply [Pa] or, without one,
     the load [N]; `theta`:
-    (segments, 13, lanes) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, lanes) at the first
+    (segments, 14, lanes) parameters, `segment` (n,) which of them holds at a sample; `state`: (5, lanes) at the first
     sample, in place. With a `correction` dp, once written, is led towards its `readings` (n,) [Pa] by that share of the
     difference.
     """
@@ -189,7 +196,7 @@ def pressure_differences(
         store(out, sample, y[1] if speeds else y[0])
         if correction > 0.0:
             y = (y[0] + correction * (readings[sample] - y[0]), y[1], y[2], y[3], y[4])
-        row = 13 * segment[sample]
+        row = _WIDTH * segment[sample]
         lead = load(theta, row + LEAD)
         now = (
             load(theta, row + GAIN),
@@ -204,6 +211,7 @@ def pressure_differences(
             load(theta, row + F_CFR),
             load(theta, row + STROKE),
             load(theta, row + OFFSET),
+            load(theta, row + SIDE),
             load(theta, row + ORIFICE),
         )
         for step in range(every):
@@ -269,7 +277,7 @@ class DrivenModel:
         return DrivenModel(inputs, h, every, numbers)
 
     def with_travel(self, theta: Array) -> DrivenModel:
-        """Return the model with the piston's place that it shows itself for parameters `theta` (13,).
+        """Return the model with the piston's place that it shows itself for parameters `theta` (14,).
 
         Mean and trend of the place are removed: mid-stroke is not known, and a piston that stays in its cylinder has no
         trend for long. Behind a valve the trend is kept: what the valve passes at no command moves the piston on.
@@ -320,7 +328,7 @@ class DrivenModel:
         return replace(self, inputs=np.ascontiguousarray(self.inputs[::2]), h=2.0 * self.h, every=self.every // 2)
 
     def coarse(self, theta: Array) -> DrivenModel:
-        """Return the model in steps twice as long, itself where that would be too long for parameters `theta` (13,).
+        """Return the model in steps twice as long, itself where that would be too long for parameters `theta` (14,).
 
         On the thesis's rig at 500 Hz its frequency of ringing is 0.5 % lower and its damping 1.6 1/s larger: good for
         slopes and first looks, at half the time.
@@ -346,7 +354,7 @@ class DrivenModel:
     def led(self, readings: Array, theta: Array) -> DrivenModel:
         """Return the model led by readings of dp (n,) [Pa]: what it shows is predicted from the samples before.
 
-        Their mean becomes that of what parameters `theta` (13,) show under the command alone.
+        Their mean becomes that of what parameters `theta` (14,) show under the command alone.
         """
         readings = readings - float(np.mean(readings - self.run(theta[None])[0]))
         return replace(self, readings=readings, correction=-math.expm1(-2.0 / (MEMORY * self.rate)))
@@ -365,7 +373,7 @@ class DrivenModel:
     ) -> Array:
         """Return dp [Pa], or v [m/s] if `speeds`, (runs, n) of parameter sets `thetas`.
 
-        `thetas` (runs, 13), or (runs, segments, 13) with `segment` (n,), which of them holds at a sample; `start`
+        `thetas` (runs, 14), or (runs, segments, 14) with `segment` (n,), which of them holds at a sample; `start`
         (runs, 5): the state at the first sample, at rest under the load by default, which becomes the last.
         """
         sets = thetas[:, None, :] if thetas.ndim == 2 else thetas

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.pressure_model.chain import Chain, Drifting
-from sealscope.diagnosis.pressure_model.fit import steps_of
+from sealscope.diagnosis.pressure_model.fit import LARGEST_SIDE, steps_of
 from sealscope.diagnosis.pressure_model.model import (
     BIAS,
     C_C,
@@ -33,6 +33,7 @@ from sealscope.diagnosis.pressure_model.model import (
     LEAD,
     OFFSET,
     ORIFICE,
+    SIDE,
     SOUND,
     STROKE,
     DrivenModel,
@@ -44,13 +45,13 @@ from sealscope.recordings.recording import Array
 DIVERGED = "the model of the rig diverges"
 #: How far each parameter may wander in 90 s (standard deviation): shares of its value, lead in s, G in m^3/(s Pa).
 WANDER = {GAIN: 2e-3, K: 0.03, F_C: 0.06, F_V: 0.06, K_BRK: 0.02, C_C: 0.02}
-WANDER_REST = {LEAD: 1e-4, G: 3e-14, F_CFR: 2e-8, STROKE: 0.02, OFFSET: 0.05}
+WANDER_REST = {LEAD: 1e-4, G: 3e-14, F_CFR: 2e-8, STROKE: 0.02, OFFSET: 0.05, SIDE: 0.01}
 _WANDER_SECONDS = 90.0
 #: The bias of the speed settles within a minute of a start: this share of the command's speed in 6 s.
 _WANDER_BIAS = 0.003
 #: Where the record's mean parameters may be, around the first fit (standard deviations as above).
 ANCHOR = {GAIN: 0.02, K: 0.1, F_C: 0.1, F_V: 0.15, K_BRK: 0.1, C_C: 0.15}
-ANCHOR_REST = {LEAD: 5e-4, G: 1.5e-12, F_CFR: 5e-7, STROKE: 0.3, OFFSET: 0.2}
+ANCHOR_REST = {LEAD: 5e-4, G: 1.5e-12, F_CFR: 5e-7, STROKE: 0.3, OFFSET: 0.2, SIDE: 0.1}
 #: How far oil that warms takes them from the first block to the last (standard deviation, over a course that is even,
 #: half of it besides over one that bends): shares, and G in m^3/(s Pa).
 DRIFT = {K: 0.1, F_C: 0.15, F_V: 0.4, K_BRK: 0.1, C_C: 0.1}
@@ -62,7 +63,7 @@ _PASSES = 10
 _STUCK, _LEAPS, _BIASES = 3.0, 1.7, np.array([0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, 2.0])
 #: Shares of a Gauss-Newton step that are looked at first, those that are tried side by side where the whole one is not
 #: the best of these, and the fall of the cost to go on for.
-_FIRST_SHARES = (1.0, 0.7, 0.4)
+_FIRST_SHARES = (1.0, 0.5)
 _SHARES = np.array([1.0, 0.85, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 1.2, 1.4])
 _ENOUGH = 4.0
 #: Slopes of coarse steps do as long as a step gains this share of what they promise.
@@ -124,7 +125,7 @@ class Rise:
 class Track:
     """Parameters of a record, followed.
 
-    Blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 13) about which the model is linear; `N` (b, p, p),
+    Blocks between `edges` (b + 1,) [samples]; parameters `path` (b, 14) about which the model is linear; `N` (b, p, p),
     `r` (b, p) information in units of `units` (p,), the last a constant of dp; `N_all`, `r_all` with that on an
     orifice; `variance` [Pa^2] of the residual and of each block's (b,); `misfit` [Pa^2]: sum of squares of what is left
     of dp; `strain`: chi square of the wandering; `start` (5,): the state at the first sample.
@@ -146,9 +147,9 @@ class Track:
     start: Array
 
     def fall(self, at: Array, further: Array) -> float:
-        """Return by how much the misfit [its variance] falls from parameters `at` (b, 13) [units] to `further` ones.
+        """Return by how much the misfit [its variance] falls from parameters `at` (b, 14) [units] to `further` ones.
 
-        `further` (b, 14): the steps to those [units], and of the constant of dp.
+        `further` (b, 15): the steps to those [units], and of the constant of dp.
         """
         slope = self.r_all - np.einsum("bij,bj->bi", self.N_all[:, :, :-1], at)
         fallen = 2.0 * further * slope - further * np.einsum("bij,bj->bi", self.N_all, further)
@@ -164,7 +165,7 @@ class Track:
 
 
 def _in_units(law: Law, theta: Array) -> tuple[Array, float]:
-    """Return what a leak raises (14,), in units of the parameters, and the size of the leak that raises so much."""
+    """Return what a leak raises (15,), in units of the parameters, and the size of the leak that raises so much."""
     h = steps_of(theta)
     at = np.zeros(SIZE + 1)
     unit = float(h[law.parts[0][0]])
@@ -178,7 +179,7 @@ def _deviations(theta: Array, shares: dict[int, float], rest: dict[int, float]) 
 
 
 def wandering(theta: Array, seconds: float, speed: float) -> Array:
-    """Return the standard deviation (12,) by which the parameters of a sound machine wander in so many seconds."""
+    """Return the standard deviation (13,) by which the parameters of a sound machine wander in so many seconds."""
     walk = _deviations(theta, WANDER, WANDER_REST)
     walk *= np.sqrt(seconds / _WANDER_SECONDS)
     walk[BIAS] = _WANDER_BIAS * speed * np.sqrt(seconds / 6.0)
@@ -232,10 +233,10 @@ def track(
     size: float = 0.0,
     shown: Array | None = None,
 ) -> Track:
-    """Follow the parameters from the first fit `theta` (13,) through blocks between `edges` of the whole record.
+    """Follow the parameters from the first fit `theta` (14,) through blocks between `edges` of the whole record.
 
     `start` (5,): the model's state at the first sample; `rise`: the law of a leak of the size that suits, and after
-    which block it is open; `begin`: a path (b, 13) to begin at, or a track of the same blocks that is linear about its
+    which block it is open; `begin`: a path (b, 14) to begin at, or a track of the same blocks that is linear about its
     own, the first fit by default; `seen` (b,): blocks that count (default: all), through the others the parameters
     wander unseen; `shown` (n,): what the model shows where it begins. Blocks are linearised about their own parameters,
     until these stand still, by slopes of coarse steps until the last time. The trend of the speed's bias within a block
@@ -292,9 +293,9 @@ def track(
         trend[here] = np.linspace(-1.0, 1.0, here.stop - here.start)
 
     def linear(shown: Array, moved: Array, at: Array, strained: float) -> Track:
-        """Return the blocks, linear about the path `at` (b, 13), where the model shows (n,) [Pa].
+        """Return the blocks, linear about the path `at` (b, 14), where the model shows (n,) [Pa].
 
-        `moved` (14, n): what it shows there, in steps of slopes, and for a unit more of each parameter; `strained`: chi
+        `moved` (15, n): what it shows there, in steps of slopes, and for a unit more of each parameter; `strained`: chi
         square of the wandering.
         """
         np.subtract(moved[1:], moved[0], out=rows[: h.size])
@@ -326,12 +327,12 @@ def track(
     lack: Array | float = 0.0
 
     def sets(shares: Sequence[float] | Array, move: Array, grown: float) -> Array:
-        """Return the parameters (runs, b, 13) at those shares of a move and of what the leak grows with it."""
+        """Return the parameters (runs, b, 14) at those shares of a move and of what the leak grows with it."""
         each = np.asarray(shares)[:, None, None]
         return np.asarray(path + each * move + (size + each * grown) * risen)
 
     def looked(at: Array, others: Array) -> tuple[Array, Array]:
-        """Return what the model shows at `at` (b, 13) and for a step of each parameter, and at `others`."""
+        """Return what the model shows at `at` (b, 14) and for a step of each parameter, and at `others`."""
         slopes = np.tile(at, (h.size + 1, 1, 1))
         for k in range(h.size):
             slopes[k + 1, :, k] += h[k]
@@ -434,8 +435,8 @@ def _with_rise(chain: Chain, right: Array, rise: Rise, first: int) -> tuple[Arra
 def _normal(rows: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Array, Array]:
     """Return the normal equations of each block between `limits`.
 
-    They are N (b, 14, 14) and r (b, 14) of the model that is linear about `at` (b, 13) [units], the last a constant
-    of dp, and the sum of squares (b,) that nothing which wanders explains. `rows` (16, n): what a unit more of each
+    They are N (b, 15, 15) and r (b, 15) of the model that is linear about `at` (b, 14) [units], the last a constant
+    of dp, and the sum of squares (b,) that nothing which wanders explains. `rows` (17, n): what a unit more of each
     parameter adds to dp, the constant, the trend of the speed's bias, which is eliminated, and dp less the model's.
     """
     size = len(rows) - 2
@@ -475,6 +476,7 @@ def _held(path: Array, theta: Array) -> Array:
     for k in (GAIN, K, F_C, C_C):
         path[:, k] = np.clip(path[:, k], 0.3 * theta[k], 3.0 * theta[k])
     path[:, K_BRK] = np.maximum(path[:, K_BRK], 1.05)
+    path[:, SIDE] = np.clip(path[:, SIDE], -LARGEST_SIDE, LARGEST_SIDE)
     return path
 
 
