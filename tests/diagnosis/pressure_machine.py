@@ -9,7 +9,8 @@ from functools import lru_cache
 import numpy as np
 
 from sealscope.diagnosis.pressure_model.model import ORIFICE, G
-from sealscope.diagnosis.pressure_model.track import Track, wander
+from sealscope.diagnosis.pressure_model.tracking.track import Track
+from sealscope.diagnosis.pressure_model.tracking.wander import wander
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.changes import Linear, ParameterDrift
 from sealscope.simulation.commands import Command, Recorded
@@ -112,13 +113,12 @@ def of_linear_model(
 ) -> Track:
     """A track as its own linear model draws it: parameters walk as expected of them from the anchored fit, each block's
     right side has the noise of its information; `step` of G [m^3/(s Pa)] after a block."""
-    anchor, centre = np.split(like.anchor, 2)
     walk = wander(theta, like.units, like.seconds, speed)
     blocks, size = like.r.shape
     path = np.cumsum(np.vstack([np.zeros(size), walk * random.standard_normal((blocks - 1, size))]), axis=0)
-    known = anchor > 0
-    mean = centre.copy()
-    mean[known] += random.standard_normal(int(known.sum())) / np.sqrt(anchor[known])
+    known = like.anchor > 0
+    mean = like.centre.copy()
+    mean[known] += random.standard_normal(int(known.sum())) / np.sqrt(like.anchor[known])
     path += mean - path.mean(axis=0)
     path[after:, G] += step / like.units[G]
     r = np.empty_like(like.r)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.pressure_model.chain import Chain, Drifting
+from sealscope.diagnosis.pressure_model.tracking.chain import Chain, Drifting
 
 
 def dense(N: np.ndarray, walk: np.ndarray, anchor: np.ndarray) -> np.ndarray:

@@ -19,7 +19,9 @@ from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.large import _onset
 from sealscope.diagnosis.pressure_model.model import PARAMETERS, DrivenModel
-from sealscope.diagnosis.pressure_model.track import WORN_SEAL, PossibleLeak, Track
+from sealscope.diagnosis.pressure_model.tracking.laws import WORN_SEAL
+from sealscope.diagnosis.pressure_model.tracking.steps import PossibleLeak
+from sealscope.diagnosis.pressure_model.tracking.track import Track
 from sealscope.parameters import load_rig
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Recording

@@ -12,16 +12,10 @@ from sealscope.diagnosis.changepoint.tails import largest_normal, seed_of
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.model import GAIN, STATES, DrivenModel, G, assumed_numbers, nominal
-from sealscope.diagnosis.pressure_model.track import (
-    HOLE,
-    WORN_SEAL,
-    ConductanceSteps,
-    PossibleLeak,
-    Track,
-    excess_of,
-    steps_in,
-    track,
-)
+from sealscope.diagnosis.pressure_model.tracking.blocks import Blocks
+from sealscope.diagnosis.pressure_model.tracking.laws import HOLE, WORN_SEAL
+from sealscope.diagnosis.pressure_model.tracking.steps import ConductanceSteps, PossibleLeak, excess_of, steps_in
+from sealscope.diagnosis.pressure_model.tracking.track import Track, track
 from sealscope.diagnosis.verdict.evidence import LEAK_WORTH_FINDING
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.cycle import find_cycle
@@ -81,7 +75,7 @@ def linear(thesis: Rig, sound: Recording) -> tuple[Track, np.ndarray, float]:
     edges = np.round(np.arange(3.0, 120.0, 2.0 * np.pi) * 500.0).astype(np.int64)
     dp = sound["p_A"] - sound["p_B"]
     model = DrivenModel.of(sound["u"], 500.0, assumed_numbers(thesis))
-    found = track(model, dp, edges, theta, np.zeros(STATES), 1500)
+    found = track(Blocks(model, dp, edges, np.ones(edges.size - 1, dtype=bool)), theta, np.zeros(STATES))
     return found, theta, float(np.sqrt(2.0) * theta[GAIN] * np.std(sound["u"]))
 
 

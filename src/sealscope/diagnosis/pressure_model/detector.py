@@ -262,7 +262,8 @@ def _flow(
     Where several laws explain the record, the flow is the mean of theirs and the interval holds what any says.
     `scatter` of the blocks over their stated deviation; `unsure` [m^3/(s Pa)]: deviation of G that no scatter shows.
     """
-    from sealscope.diagnosis.pressure_model.track import LAWS, WORN_SEAL, PossibleLeak
+    from sealscope.diagnosis.pressure_model.tracking.laws import LAWS, WORN_SEAL
+    from sealscope.diagnosis.pressure_model.tracking.steps import PossibleLeak
 
     steps = followed.steps
     leaks = followed.leaks or (

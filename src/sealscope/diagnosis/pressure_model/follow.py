@@ -40,16 +40,10 @@ from sealscope.diagnosis.pressure_model.model import (
     assumed_numbers,
     nominal,
 )
-from sealscope.diagnosis.pressure_model.track import (
-    DIVERGED,
-    LAWS,
-    ConductanceSteps,
-    PossibleLeak,
-    Track,
-    excess_of,
-    steps_in,
-    track,
-)
+from sealscope.diagnosis.pressure_model.tracking.blocks import Blocks
+from sealscope.diagnosis.pressure_model.tracking.laws import LAWS
+from sealscope.diagnosis.pressure_model.tracking.steps import ConductanceSteps, PossibleLeak, excess_of, steps_in
+from sealscope.diagnosis.pressure_model.tracking.track import DIVERGED, Track, track
 from sealscope.parameters import Rig
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording
@@ -101,7 +95,7 @@ class Followed:
 
     `theta` (14,): first fit; `path` (b, 14); `steps` of G; `leaks` that explain its largest, the likelier first;
     `excess`: chi square a degree of freedom of what scatters beside it; `edges` (b + 1,) [samples] from the first
-    sample; `seconds` of a block; `level` [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to
+    sample; `level` [m^3/(s Pa)]: mean G; `friction_change`, `stiffness_change`: from the first to
     the last third, as shares; `share` of the blocks that have no missing samples and count;
     `large`: a leak that linear blocks did not reach, beside which all this is then taken; `change`: what looks like
     one, but another machine from then on explains the record as well; `predicted` (n,): p_A - p_B [Pa] as a model that
@@ -115,13 +109,12 @@ class Followed:
     leaks: tuple[PossibleLeak, ...]
     excess: float
     edges: NDArray[np.int64]
-    seconds: float
     level: Level
     friction_change: float
     stiffness_change: float
     command_rms: float
     pumped: float
-    share: float
+    share: float = 1.0
     large: LargeLeak | None = None
     change: LargeLeak | None = None
     predicted: Array | None = None
@@ -200,35 +193,29 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
         dp = dp - hum
         long, short = _windows(model, dp, theta, span)
         theta, cost = refit(long, theta, prior)
-    lengths = [max(1, int(np.ceil(least / span - 1e-9))) * span for least in (BLOCK, SHORTER)]
-    length = lengths[dp.size / rate - FIRST < FEWEST_BLOCKS * lengths[0]]
-    edges = np.round(np.arange(FIRST, dp.size / rate, length) * rate).astype(np.int64)
-    seen = ~touched(recording, edges)
-    share = float(np.mean(seen)) if seen.size else 0.0
-    counted = np.flatnonzero(seen)
-    if counted.size < 3 or counted[-1] - counted[0] + 1 < FEWEST_BLOCKS:
-        return f"too short: {counted.size} whole blocks of {length:.3g} s, {FEWEST_BLOCKS} are needed"
-    edges, seen = edges[counted[0] : counted[-1] + 2], seen[counted[0] : counted[-1] + 1]
-    skip = int(FIRST * rate)
-    look, large = _tracked(model, dp, edges, theta, skip, seen, unruly, None if humming else shown), None
+    cut = _cut(recording, model, dp, span)
+    if isinstance(cut, str):
+        return cut
+    blocks, share = cut
+    look, large = _tracked(blocks, theta, unruly, None if humming else shown), None
     if isinstance(look, str) or look.warming or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
-        large = _large(unfed or plain, raw, edges, seen, prior)
+        large = _large(replace(blocks, model=unfed or plain, dp=raw), prior)
         if large is not None and large.stated and large.sized and large.excess <= unruly:
-            return _beside(large, model, edges, length, share)
+            return replace(_beside(large, blocks), share=share)
     # where the model follows beside a large leak, or beside another machine in its place, that is its word
     weighed = large is not None and large.sized and large.excess <= unruly
-    sizing = unfed and unfed.with_travel(guess)
+    sizing = None if unfed is None else replace(blocks, model=unfed.with_travel(guess))
     if not isinstance(look, str):
-        look = _looked_again(look, model, dp, edges, theta, skip, seen, sizing)
+        look = _looked_again(look, blocks, theta, sizing)
     astray = np.isfinite(unruly) if isinstance(look, str) else look.excess > unruly
     # beside a leak too large for any block to be linear it is the large one's word, too
     weighed = weighed or (large is not None and large.stated and not isinstance(look, str) and look.lost)
     if astray and not weighed and not numbers.valved:
-        led = _led(model.led(dp, guess), dp, edges, guess, prior, span, skip, seen, unruly, length, share)
+        led = _led(replace(blocks, model=model.led(dp, guess)), guess, prior, span, unruly)
         if led is not None and (led.large is not None or led.excess <= unruly):
-            return led
+            return replace(led, share=share)
     if large is not None and large.stated:
-        return _beside(large, model, edges, length, share)
+        return replace(_beside(large, blocks), share=share)
     if isinstance(look, str):
         return look
     if look.excess > RESTLESS:
@@ -236,10 +223,10 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
             other, dearer = refit(long, first, prior)
             if dearer > cost * (1.0 + _AS_GOOD):
                 continue
-            again = _tracked(model, dp, edges, other, skip, seen, unruly)
+            again = _tracked(blocks, other, unruly)
             if isinstance(again, str):
                 continue
-            again = _looked_again(again, model, dp, edges, other, skip, seen, sizing)
+            again = _looked_again(again, blocks, other, sizing)
             if again.excess < look.excess - 0.05:
                 theta, look = other, again
     stiffness = float(np.mean(look.track.path[:, K])) / centre[K]
@@ -248,22 +235,24 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
             f"the rig does not describe this machine: its oil would be {stiffness:.2g} times as stiff as the rig's; "
             "the fit has a ring too many in each reversal, or another --rig describes it"
         )
-    return replace(_seen_so(look, theta, model, edges, length, share), change=large)
+    return replace(_seen_so(look, theta, blocks), change=large, share=share)
 
 
-def _led(
-    model: DrivenModel,
-    dp: Array,
-    edges: NDArray[np.int64],
-    guess: Array,
-    prior: Prior,
-    span: float,
-    skip: int,
-    seen: NDArray[np.bool_],
-    unruly: float,
-    seconds: float,
-    share: float,
-) -> Followed | None:
+def _cut(recording: Recording, model: DrivenModel, dp: Array, span: float) -> tuple[Blocks, float] | str:
+    """Return the record in blocks of whole spans [s], and the share of them that count; or why there are too few."""
+    rate = recording.rate
+    lengths = [max(1, int(np.ceil(least / span - 1e-9))) * span for least in (BLOCK, SHORTER)]
+    length = lengths[dp.size / rate - FIRST < FEWEST_BLOCKS * lengths[0]]
+    edges = np.round(np.arange(FIRST, dp.size / rate, length) * rate).astype(np.int64)
+    seen = ~touched(recording, edges)
+    counted = np.flatnonzero(seen)
+    if counted.size < 3 or counted[-1] - counted[0] + 1 < FEWEST_BLOCKS:
+        return f"too short: {counted.size} whole blocks of {length:.3g} s, {FEWEST_BLOCKS} are needed"
+    first, end = counted[0], counted[-1] + 1
+    return Blocks(model, dp, edges[first : end + 1], seen[first:end]), float(np.mean(seen))
+
+
+def _led(blocks: Blocks, guess: Array, prior: Prior, span: float, unruly: float) -> Followed | None:
     """Return the record as a model that is led by its readings sees it, None where it does not follow either.
 
     A machine that rings by itself, or breaks away from a rest, keeps no phase that the command sets: to follow it under
@@ -271,46 +260,36 @@ def _led(
     of a machine (the prediction-error method: L. Ljung, System Identification, 2nd ed., 1999, ch. 7). None where it is
     not followed, or only by a machine whose oil is not the rig's.
     """
-    long, short = _windows(model, dp, guess, span)
+    long, short = _windows(blocks.model, blocks.dp, guess, span)
     try:
         theta, cost, _ = fit(long, short, prior, guess)
     except FloatingPointError:
         return None
     if not np.isfinite(cost) or abs(math.log(theta[K] / prior.centre[K])) > _OIL * PRIOR[K]:
         return None
-    look = _tracked(model, dp, edges, theta, skip, seen, unruly)
+    look = _tracked(blocks, theta, unruly)
     if isinstance(look, str):
         return None
-    look, large = _looked_again(look, model, dp, edges, theta, skip, seen), None
+    look, large = _looked_again(look, blocks, theta), None
     if np.max(look.steps.z) > _STRONG:
-        large = _large(model, dp, edges, seen, prior)
+        large = _large(blocks, prior)
         if large is not None and large.stated and large.sized:
-            followed = _beside(large, model, edges, seconds, share)
-            return replace(followed, predicted=_predicted(model, dp, edges, large.track))
+            return replace(_beside(large, blocks), predicted=_predicted(blocks, large.track))
     # beside a leak friction and stiffness are those with the leak allowed: without it they take its part
     beside = look.track if look.risen is None else look.risen
-    followed = _seen_so(look._replace(track=beside), theta, model, edges, seconds, share)
-    return replace(followed, change=large, predicted=_predicted(model, dp, edges, beside))
+    followed = _seen_so(look._replace(track=beside), theta, blocks)
+    return replace(followed, change=large, predicted=_predicted(blocks, beside))
 
 
-def _predicted(model: DrivenModel, dp: Array, edges: NDArray[np.int64], followed: Track) -> Array:
+def _predicted(blocks: Blocks, followed: Track) -> Array:
     """Return what a model that is led by its readings predicts of dp (n,) [Pa], with the mean of the readings."""
-    segment = np.clip(np.searchsorted(edges, np.arange(dp.size), side="right") - 1, 0, edges.size - 2)
-    shown = model.run(followed.path[None], segment.astype(np.int64), followed.start[None].copy())[0]
-    return np.asarray(shown + np.mean(dp - shown))
+    shown = blocks.run(followed.path[None], followed.start)[0]
+    return np.asarray(shown + np.mean(blocks.dp - shown))
 
 
-def _seen_so(
-    look: _Look,
-    theta: Array,
-    model: DrivenModel,
-    edges: NDArray[np.int64],
-    seconds: float,
-    share: float,
-    large: LargeLeak | None = None,
-) -> Followed:
+def _seen_so(look: _Look, theta: Array, blocks: Blocks) -> Followed:
     """Return the record as a look sees it."""
-    followed = look.track
+    followed, model = look.track, blocks.model
     friction, stiffness = _changes(followed, model, model.speed_amplitude(theta))
     return Followed(
         theta,
@@ -318,23 +297,20 @@ def _seen_so(
         look.steps,
         look.leaks,
         look.excess,
-        edges,
-        seconds,
+        blocks.edges,
         Level(float(look.steps.level.mean()), float(look.steps.level_deviation.mean())),
         friction,
         stiffness,
         float(np.std(model.u[: -1 : 2 * model.every])),
         float(model.piston_speed(theta[GAIN] * np.mean(np.abs(model.u)))) * model.numbers.A_A,
-        share,
-        large,
         warming=look.warming,
     )
 
 
-def _beside(large: LargeLeak, model: DrivenModel, edges: NDArray[np.int64], seconds: float, share: float) -> Followed:
+def _beside(large: LargeLeak, blocks: Blocks) -> Followed:
     """Return the record beside a large leak."""
     look = _Look(large.track, large.steps, large.leaks, large.excess)
-    return _seen_so(look, large.theta, model, edges, seconds, share, large)
+    return replace(_seen_so(look, large.theta, blocks), large=large)
 
 
 def _same_sense(u: Array, dp: Array) -> bool:
@@ -342,43 +318,30 @@ def _same_sense(u: Array, dp: Array) -> bool:
     return float(np.dot(u - u.mean(), dp - dp.mean())) >= 0.0
 
 
-def _large(
-    model: DrivenModel, dp: Array, edges: NDArray[np.int64], seen: NDArray[np.bool_], prior: Prior
-) -> LargeLeak | None:
+def _large(blocks: Blocks, prior: Prior) -> LargeLeak | None:
     """Return the leak that linear blocks do not reach, None where there is none or the model diverges."""
     try:
-        return large_leak(model, dp, edges, seen, prior)
+        return large_leak(blocks, prior)
     except FloatingPointError:
         return None
 
 
-def _tracked(
-    model: DrivenModel,
-    dp: Array,
-    edges: NDArray[np.int64],
-    theta: Array,
-    skip: int,
-    seen: NDArray[np.bool_],
-    unruly: float,
-    shown: Array | None = None,
-) -> _Look | str:
+def _tracked(blocks: Blocks, theta: Array, unruly: float, shown: Array | None = None) -> _Look | str:
     """Follow the record from a first fit, and estimate the steps of G in it.
 
     Where friction and stiffness fall all may drift as in oil that warms, and so may the parameters of a model that is
     led, which wander `unruly` times as much as a healthy machine's and then do not. `shown` (n,): what the model shows
     with that fit from rest.
     """
+    model = blocks.model
     try:
         followed = min(
-            (
-                track(model, dp, edges, theta, start, skip, seen=seen, shown=None if np.any(start) else shown)
-                for start in _starts(model, theta)
-            ),
+            (track(blocks, theta, start, shown=None if np.any(start) else shown) for start in _starts(model, theta)),
             key=lambda each: float(each.block_variance[:_EARLY].mean()),
         )
     except FloatingPointError:
         return DIVERGED
-    explained = 1.0 - followed.variance / float(np.var(dp - model.carried))
+    explained = 1.0 - followed.variance / float(np.var(blocks.dp - model.carried))
     if not explained >= EXPLAINED:
         return (
             f"the model of the rig explains {100.0 * explained:.0f} % of the pressure difference, "
@@ -398,33 +361,22 @@ def _tracked(
     return look
 
 
-def _looked_again(
-    look: _Look,
-    model: DrivenModel,
-    dp: Array,
-    edges: NDArray[np.int64],
-    theta: Array,
-    skip: int,
-    seen: NDArray[np.bool_],
-    sizing: DrivenModel | None = None,
-) -> _Look:
+def _looked_again(look: _Look, blocks: Blocks, theta: Array, sizing: Blocks | None = None) -> _Look:
     """Return the look with the leaks that may be the largest of its steps.
 
     Where G seems to rise the blocks are linearised once more with that rise allowed, by either law: under the usual
     leash a leak pulls friction and gain off their values, which makes it smaller than it is. Sizes and the scatter
     beside the leak are taken from there; z, which a second look at what was chosen for being large would raise, is not.
     Nothing rose where the blocks, begun at those that the leak led to, explain the record as well without one: blocks
-    may stop in different minima. `sizing`: another model in which leaks are looked for: what either says may be.
+    may stop in different minima. `sizing`: with another model in which leaks are looked for: what either says may be.
     """
-    followed, steps = look.track, look.steps
+    followed, steps, warming = look.track, look.steps, look.warming
     after = int(np.argmax(steps.z))
     if steps.z[after] < _CLEAR:
         return look
-    warming = look.warming
-    fits = [_risen(model, dp, edges, theta, followed.start, skip, seen, after, followed, warming)]
+    fits = [_risen(blocks, theta, followed.start, after, followed, warming)]
     if sizing is not None:
-        start = _starts(sizing, theta)[-1]
-        fits.append(_risen(sizing, dp, edges, theta, start, skip, seen, after, followed.path, warming))
+        fits.append(_risen(sizing, theta, _starts(sizing.model, theta)[-1], after, followed.path, warming))
     leaks = sorted((leak for fit in fits for leak, *_ in fit), key=lambda leak: leak.cost)
     beside = [excess for *_, excess in fits[0]]
     excess, lost = min(look.excess, *beside), bool(np.any(np.isinf(beside)))
@@ -432,29 +384,20 @@ def _looked_again(
     if steps.z[after] < _EVIDENT:
         sound = likelier.path.copy()
         sound[:, SOUND:] = theta[SOUND:]
-        other = track(model, dp, edges, theta, followed.start, skip, begin=sound, seen=seen)
+        other = track(blocks, theta, followed.start, begin=sound)
         if (other.misfit - followed.misfit) / followed.variance + other.strain <= followed.strain:
-            flat = steps_in(other, theta, model.speed_amplitude(theta), warming=warming)
+            flat = steps_in(other, theta, blocks.model.speed_amplitude(theta), warming=warming)
             if np.max(flat.z) < _CLEAR:
                 return _Look(other, flat, (), excess_of(flat), warming=warming)
     return _Look(followed, steps, tuple(leaks), excess, likelier, warming, lost)
 
 
 def _risen(
-    model: DrivenModel,
-    dp: Array,
-    edges: NDArray[np.int64],
-    theta: Array,
-    start: Array,
-    skip: int,
-    seen: NDArray[np.bool_],
-    after: int,
-    begin: Track | Array,
-    warming: bool,
+    blocks: Blocks, theta: Array, start: Array, after: int, begin: Track | Array, warming: bool
 ) -> list[tuple[PossibleLeak, Track, float]]:
     """Return a leak of either law after a block, the record followed with it, and its excess; costs from the least."""
-    speed = model.speed_amplitude(theta)
-    tracks = [track(model, dp, edges, theta, start, skip, (law, after), begin, seen=seen) for law in LAWS]
+    speed = blocks.model.speed_amplitude(theta)
+    tracks = [track(blocks, theta, start, (law, after), begin) for law in LAWS]
     variance = min(each.variance for each in tracks)
     costs = [each.misfit / variance + each.strain for each in tracks]
     risen = []

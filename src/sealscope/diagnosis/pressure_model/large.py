@@ -12,11 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.diagnosis.pressure_model.fit import (
     LONG_WINDOW,
@@ -32,18 +31,11 @@ from sealscope.diagnosis.pressure_model.fit import (
     window_at,
 )
 from sealscope.diagnosis.pressure_model.model import GAIN, ORIFICE, SOUND, STATES, DrivenModel, G, K
-from sealscope.diagnosis.pressure_model.track import (
-    HOLE,
-    WORN_SEAL,
-    ConductanceSteps,
-    Law,
-    PossibleLeak,
-    Track,
-    excess_of,
-    steps_in,
-    track,
-    wandering,
-)
+from sealscope.diagnosis.pressure_model.tracking.blocks import Blocks
+from sealscope.diagnosis.pressure_model.tracking.laws import HOLE, WORN_SEAL, Law
+from sealscope.diagnosis.pressure_model.tracking.steps import ConductanceSteps, PossibleLeak, excess_of, steps_in
+from sealscope.diagnosis.pressure_model.tracking.track import Track, track
+from sealscope.diagnosis.pressure_model.tracking.wander import wandering
 from sealscope.recordings.recording import Array
 
 #: Blocks at the beginning that are taken to be sound, and the fewest after the leak.
@@ -107,31 +99,26 @@ class LargeLeak:
         return self.better > BETTER if self.sized else self.better > _PLAIN * self.z**2 and self.share > _MUCH
 
 
-def large_leak(
-    model: DrivenModel, dp: Array, edges: NDArray[np.int64], seen: NDArray[np.bool_], prior: Prior
-) -> LargeLeak | None:
-    """Return the leak that begins within a record, None where none explains it.
+def large_leak(blocks: Blocks, prior: Prior) -> LargeLeak | None:
+    """Return the leak that begins within a record, None where none explains it; `prior` of the machine.
 
     Whether it, or another machine, explains the record better is for the caller to ask (`LargeLeak.better`).
-
-    dp (n,) [Pa]; blocks between `edges` (b + 1,) [samples], of which those `seen` (b,) count; `prior` of the machine.
     """
-    blocks = seen.size
-    if blocks < 2 * _SOUND_BLOCKS + 1 or not np.all(seen[:_SOUND_BLOCKS]):
+    model, dp, edges, seen = blocks.model, blocks.dp, blocks.edges, blocks.seen
+    if blocks.count < 2 * _SOUND_BLOCKS + 1 or not np.all(seen[:_SOUND_BLOCKS]):
         return None
     window = window_at(model, dp, prior.centre, 0, int(edges[_SOUND_BLOCKS]))
     guess = first_guess(window, prior)
     model = model.with_travel(guess)
+    blocks = replace(blocks, model=model)
     window = window_at(model, dp, guess, 0, int(edges[_SOUND_BLOCKS]))
     theta, *_ = fit(window, window, prior, guess)
-    tried = _ladder(
-        model, dp, edges, theta, seen, {law: _SHARES * flow for law, flow in _flows(model, dp, theta).items()}
-    )
+    tried = _ladder(blocks, theta, {law: _SHARES * flow for law, flow in _flows(model, dp, theta).items()})
     if tried is None:
         return None
     block, best = tried
     theta, usual = _refitted(model, dp, int(edges[max(block - 1, _SOUND_BLOCKS)]), theta, prior)
-    tried = _ladder(model, dp, edges, theta, seen, {law: _NEAR * size for law, size in best.items()})
+    tried = _ladder(blocks, theta, {law: _NEAR * size for law, size in best.items()})
     if tried is None:
         return None
     block, best = tried
@@ -141,14 +128,14 @@ def large_leak(
     if mixture is not None:
         fitted.append(after.leaking(mixture, 0.5 * best[WORN_SEAL], [each.theta for each in fitted]))
     fitted = [each for each in fitted if each.size > 0.0]
-    counted = seen & (np.arange(blocks) != block)
+    but_that = replace(blocks, seen=seen & (np.arange(blocks.count) != block))
     followed = []
     for leaking in fitted:
-        path = np.tile(theta, (blocks, 1))
+        path = np.tile(theta, (blocks.count, 1))
         path[block:] = leaking.sound
         rise, start = (leaking.law, block - 1), np.zeros(STATES)
         with suppress(FloatingPointError):  # of a leak that is none of this machine the model may diverge
-            there = track(model, dp, edges, theta, start, int(edges[0]), rise, path, seen=counted, size=leaking.size)
+            there = track(but_that, theta, start, rise, path, size=leaking.size)
             followed.append((leaking, there))
     if not followed:
         return None
@@ -170,10 +157,10 @@ def large_leak(
         return None
     another, any_drive = after.another()
     better = another - cost
-    onset, limits = _onset(model, dp, edges, there, likely)
+    onset, limits = _onset(blocks, there, likely)
     sized = excess <= _LARGEST_EXCESS and cost <= _AS_BEFORE * usual * after.window.dp.size
     if not sized:  # what the model misses moves the onset, too: it is in these blocks
-        limits = min(limits[0], int(edges[block - 1])), max(limits[1], int(edges[min(block + 2, blocks)]))
+        limits = min(limits[0], int(edges[block - 1])), max(limits[1], int(edges[min(block + 2, blocks.count)]))
     return LargeLeak(
         theta,
         there,
@@ -190,14 +177,7 @@ def large_leak(
     )
 
 
-def _ladder(
-    model: DrivenModel,
-    dp: Array,
-    edges: NDArray[np.int64],
-    theta: Array,
-    seen: NDArray[np.bool_],
-    tried: Mapping[Law, Array],
-) -> tuple[int, dict[Law, float]] | None:
+def _ladder(blocks: Blocks, theta: Array, tried: Mapping[Law, Array]) -> tuple[int, dict[Law, float]] | None:
     """Return the block in which a leak begins, and its size by either law; None where no leak explains the record.
 
     `tried`: sizes of each law, the first of them 0.
@@ -208,18 +188,16 @@ def _ladder(
         sets = np.tile(theta, (sizes.size, 1))
         for k, share in law.parts:
             sets[:, k] += share * sizes
-        squares = _squares(dp - model.run(sets))
-        misfit = np.add.reduceat(squares, edges[:-1], axis=1)
-        misfit[:, -1] -= squares[:, edges[-1] :].sum(axis=1)
-        misfit = misfit * seen
+        squares = _squares(blocks.dp - blocks.model.run(sets))
+        misfit = np.add.reduceat(squares[:, : blocks.edges[-1]], blocks.edges[:-1], axis=1) * blocks.seen
         sound = float(misfit[0].sum())
-        for block in range(_SOUND_BLOCKS, seen.size - _SOUND_BLOCKS):
+        for block in range(_SOUND_BLOCKS, blocks.count - _SOUND_BLOCKS):
             rest = misfit[0, :block].sum() + misfit[:, block].min() + misfit[:, block + 1 :].sum(axis=1)
             at = int(np.argmin(rest))
             if law not in best or rest[at] < best[law][0]:
                 best[law] = float(rest[at]), block, float(sizes[at])
     least, block, chosen = min(best.values())
-    if chosen == 0.0 or not sound - least > max(_FALL * sound, _FALL_COST * noise_variance(dp)):
+    if chosen == 0.0 or not sound - least > max(_FALL * sound, _FALL_COST * noise_variance(blocks.dp)):
         return None
     return block, {law: each[2] for law, each in best.items()}
 
@@ -333,22 +311,18 @@ class _After:
         return float(min(*costs, *minimise(self.window, starts, prior, held, 20, 1.0)[1])), free
 
 
-def _onset(
-    model: DrivenModel, dp: Array, edges: NDArray[np.int64], followed: Track, leak: PossibleLeak
-) -> tuple[int, tuple[int, int]]:
+def _onset(blocks: Blocks, followed: Track, leak: PossibleLeak) -> tuple[int, tuple[int, int]]:
     """Return the sample from which the leaking machine explains dp better than the sound one, and its limits."""
-    blocks = edges.size - 1
-    segment = np.clip(np.searchsorted(edges, np.arange(dp.size), side="right") - 1, 0, blocks - 1).astype(np.int64)
     sound = followed.path.copy()
     for k, share in leak.law.parts:
         sound[leak.after + 1 :, k] -= share * leak.size
     leaking = sound.copy()
     for k, share in leak.law.parts:
         leaking[leak.after :, k] += share * leak.size
-    first, last = int(edges[leak.after]), int(edges[min(leak.after + 3, blocks)])
-    apart = _squares((dp - model.run(np.array([sound, leaking]), segment))[:, first:last])
+    first, last = int(blocks.edges[leak.after]), int(blocks.edges[min(leak.after + 3, blocks.count)])
+    apart = _squares((blocks.dp - blocks.run(np.array([sound, leaking])))[:, first:last])
     costs = np.append(0.0, np.cumsum(apart[0] - apart[1])) / followed.variance
     best = int(np.argmin(costs))
     likely = np.flatnonzero(costs <= costs[best] + _LIKELY)
-    margin = int(_TRANSIENT * model.rate)
-    return first + best, (max(first + int(likely[0]) - margin, 0), min(first + int(likely[-1]) + margin, dp.size - 1))
+    margin, end = int(_TRANSIENT * blocks.model.rate), blocks.dp.size - 1
+    return first + best, (max(first + int(likely[0]) - margin, 0), min(first + int(likely[-1]) + margin, end))
