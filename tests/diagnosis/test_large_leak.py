@@ -19,6 +19,7 @@ from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.diagnosis.pressure_model.follow import Followed, follow
 from sealscope.diagnosis.pressure_model.large import _onset
 from sealscope.diagnosis.pressure_model.model import PARAMETERS, DrivenModel
+from sealscope.diagnosis.pressure_model.tracking.blocks import Blocks
 from sealscope.diagnosis.pressure_model.tracking.laws import WORN_SEAL
 from sealscope.diagnosis.pressure_model.tracking.steps import PossibleLeak
 from sealscope.diagnosis.pressure_model.tracking.track import Track
@@ -159,19 +160,20 @@ def test_friction_that_sticks_under_a_controller_is_no_large_leak(tmp_path: Path
 
 def test_the_onset_is_that_of_the_leak_where_without_it_the_model_diverges() -> None:
     """No sample was likely then, and the first of none was asked for."""
-    n, start = 1200, 700
+    n, opens = 1200, 700
     dp = np.zeros(n)
 
     class Diverging:
         rate = 500.0
 
-        def run(self, sets: np.ndarray, segment: np.ndarray) -> np.ndarray:
+        def run(self, sets: np.ndarray, segment: np.ndarray, start: np.ndarray | None) -> np.ndarray:
             """Return a sound machine that diverges, and a leaking one that is off until the leak opens."""
-            return np.array([np.where(np.arange(n) < start, 0.0, np.nan), np.where(np.arange(n) < start, 1.0, 0.0)])
+            return np.array([np.where(np.arange(n) < opens, 0.0, np.nan), np.where(np.arange(n) < opens, 1.0, 0.0)])
 
     edges = np.arange(0, n + 1, 200)
-    followed = SimpleNamespace(path=np.ones((edges.size - 1, len(PARAMETERS))), variance=1.0)
+    blocks = Blocks(cast("DrivenModel", Diverging()), dp, edges, np.ones(edges.size - 1, dtype=bool))
+    followed = SimpleNamespace(path=np.ones((blocks.count, len(PARAMETERS))), variance=1.0)
     leak = PossibleLeak(WORN_SEAL, 3, 1e-12, 1e-13, 0.0)
-    onset, limits = _onset(cast("DrivenModel", Diverging()), dp, edges, cast("Track", followed), leak)
-    assert onset == start
-    assert limits[0] <= start <= limits[1]
+    onset, limits = _onset(blocks, cast("Track", followed), leak)
+    assert onset == opens
+    assert limits[0] <= opens <= limits[1]
