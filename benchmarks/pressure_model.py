@@ -6,6 +6,7 @@
     python benchmarks/pressure_model.py quick --newtons 5 28 --machines 48 --seed 64 --leaks 0
     python benchmarks/pressure_model.py warm --machines 16 --seed 61
     python benchmarks/pressure_model.py warm --machines 24 --seed 66
+    python benchmarks/pressure_model.py warm --machines 40 --seed 72
     python benchmarks/pressure_model.py one-sided --machines 40 --seed 65 --leaks 0 0.0042
     python benchmarks/pressure_model.py plain --machines 120 --seed 71 --leaks 0
     python benchmarks/pressure_model.py plain --machines 40 --seed 70 --leaks 0 0.0042 0.1
@@ -18,7 +19,7 @@ that ramps, or swings at 0.015 to 0.06 rad/s; `quick`: at 0.1 to 0.6 rad/s; `war
 60 to 180 s; `one-sided`: friction of the way back 0.6 to 1.6 times that of the way out; `plain`: nothing of these.
 `--rate` is that of the recording [Hz], 500 where it is not given; `--family`: a development family of
 `bench-strangers`. The detector knows the rig as designed, and neither onset, force nor temperature; it was developed on
-these machines (docs/decisions/0058 to 0061). A record takes 2 to 15 s of a core.
+these machines (docs/decisions/0058 to 0062). A record takes 2 to 15 s of a core.
 """
 
 from __future__ import annotations

@@ -42,7 +42,8 @@ from sealscope.diagnosis.pressure_model.model import (
 )
 from sealscope.diagnosis.pressure_model.tracking.blocks import Blocks
 from sealscope.diagnosis.pressure_model.tracking.laws import LAWS
-from sealscope.diagnosis.pressure_model.tracking.steps import ConductanceSteps, PossibleLeak, excess_of, steps_in
+from sealscope.diagnosis.pressure_model.tracking.noise import steps_beside_noise
+from sealscope.diagnosis.pressure_model.tracking.steps import ConductanceSteps, PossibleLeak, excess_of
 from sealscope.diagnosis.pressure_model.tracking.track import DIVERGED, Track, track
 from sealscope.parameters import Rig
 from sealscope.recordings.gaps import touched
@@ -198,7 +199,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
         return cut
     blocks, share = cut
     look, large = _tracked(blocks, theta, unruly, None if humming else shown), None
-    if isinstance(look, str) or look.warming or look.excess > RESTLESS or np.max(look.steps.z) > _STRONG:
+    doubtful = isinstance(look, str) or look.excess > RESTLESS or bool(np.max(look.steps.z) > _STRONG)
+    if isinstance(look, str) or look.warming or doubtful:
         large = _large(replace(blocks, model=unfed or plain, dp=raw), prior)
         if large is not None and large.stated and large.sized and large.excess <= unruly:
             return replace(_beside(large, blocks), share=share)
@@ -214,7 +216,8 @@ def follow(rig: Rig, recording: Recording, cycle: float | None, unruly: float = 
         led = _led(replace(blocks, model=model.led(dp, guess)), guess, prior, span, unruly)
         if led is not None and (led.large is not None or led.excess <= unruly):
             return replace(led, share=share)
-    if large is not None and large.stated:
+    # in oil that warms, where nothing else asked for a large leak, it must be sized, too
+    if large is not None and large.stated and (large.sized or doubtful):
         return replace(_beside(large, blocks), share=share)
     if isinstance(look, str):
         return look
@@ -347,15 +350,15 @@ def _tracked(blocks: Blocks, theta: Array, unruly: float, shown: Array | None = 
             f"the model of the rig explains {100.0 * explained:.0f} % of the pressure difference, "
             f"{100.0 * EXPLAINED:.0f} % are needed; another --rig may describe this machine"
         )
-    speed = model.speed_amplitude(theta)
-    steps = steps_in(followed, theta, speed)
+    steps = steps_beside_noise(blocks, theta, followed)
     look = _Look(followed, steps, (), excess_of(steps))
-    friction, stiffness = _changes(followed, model, speed)
+    friction, stiffness = _changes(followed, model, model.speed_amplitude(theta))
     thinner = friction < THINNER[0] and stiffness < THINNER[1]
     # what the command leads may have lost the phase of the ringing, which looks like a drift as well
     drifts = thinner or (look.excess > unruly and model.correction > 0.0)
     if drifts and not model.numbers.valved:
-        steps = steps_in(followed, theta, speed, warming=True)
+        followed = track(blocks, theta, followed.start, begin=followed, warming=True)
+        steps = steps_beside_noise(blocks, theta, followed, warming=True)
         if excess_of(steps) <= max(unruly, look.excess if thinner else 0.0):
             return _Look(followed, steps, (), excess_of(steps), warming=True)
     return look
@@ -384,9 +387,9 @@ def _looked_again(look: _Look, blocks: Blocks, theta: Array, sizing: Blocks | No
     if steps.z[after] < _EVIDENT:
         sound = likelier.path.copy()
         sound[:, SOUND:] = theta[SOUND:]
-        other = track(blocks, theta, followed.start, begin=sound)
+        other = track(blocks, theta, followed.start, begin=sound, warming=warming)
         if (other.misfit - followed.misfit) / followed.variance + other.strain <= followed.strain:
-            flat = steps_in(other, theta, blocks.model.speed_amplitude(theta), warming=warming)
+            flat = steps_beside_noise(blocks, theta, other, warming=warming)
             if np.max(flat.z) < _CLEAR:
                 return _Look(other, flat, (), excess_of(flat), warming=warming)
     return _Look(followed, steps, tuple(leaks), excess, likelier, warming, lost)
@@ -396,13 +399,12 @@ def _risen(
     blocks: Blocks, theta: Array, start: Array, after: int, begin: Track | Array, warming: bool
 ) -> list[tuple[PossibleLeak, Track, float]]:
     """Return a leak of either law after a block, the record followed with it, and its excess; costs from the least."""
-    speed = blocks.model.speed_amplitude(theta)
-    tracks = [track(blocks, theta, start, (law, after), begin) for law in LAWS]
+    tracks = [track(blocks, theta, start, (law, after), begin, warming=warming) for law in LAWS]
     variance = min(each.variance for each in tracks)
     costs = [each.misfit / variance + each.strain for each in tracks]
     risen = []
     for law, each, cost in zip(LAWS, tracks, costs, strict=True):
-        again = steps_in(each, theta, speed, law=law, warming=warming)
+        again = steps_beside_noise(blocks, theta, each, law, warming=warming)
         leak = PossibleLeak(law, after, float(again.size[after]), float(again.deviation[after]), cost - min(costs))
         risen.append((leak, each, excess_of(again)))
     return risen

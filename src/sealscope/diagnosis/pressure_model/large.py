@@ -33,7 +33,8 @@ from sealscope.diagnosis.pressure_model.fit import (
 from sealscope.diagnosis.pressure_model.model import GAIN, ORIFICE, SOUND, STATES, DrivenModel, G, K
 from sealscope.diagnosis.pressure_model.tracking.blocks import Blocks
 from sealscope.diagnosis.pressure_model.tracking.laws import HOLE, WORN_SEAL, Law
-from sealscope.diagnosis.pressure_model.tracking.steps import ConductanceSteps, PossibleLeak, excess_of, steps_in
+from sealscope.diagnosis.pressure_model.tracking.noise import steps_beside_noise
+from sealscope.diagnosis.pressure_model.tracking.steps import ConductanceSteps, PossibleLeak, excess_of
 from sealscope.diagnosis.pressure_model.tracking.track import Track, track
 from sealscope.diagnosis.pressure_model.tracking.wander import wandering
 from sealscope.recordings.recording import Array
@@ -140,16 +141,15 @@ def large_leak(blocks: Blocks, prior: Prior) -> LargeLeak | None:
     if not followed:
         return None
     variance = min(each.variance for _, each in followed)
-    speed = model.speed_amplitude(theta)
     looks = []
     for leaking, each in followed:
-        steps = steps_in(each, theta, speed, law=leaking.law)
+        steps = steps_beside_noise(but_that, theta, each, leaking.law)
         cost = each.misfit / variance + each.strain
         size, deviation = float(steps.size[block - 1]), float(steps.deviation[block - 1])
         looks.append((PossibleLeak(leaking.law, block - 1, size, deviation, cost), each, leaking.cost))
     looks.sort(key=lambda look: look[0].cost)
     likely, there, cost = looks[0]
-    steps = steps_in(there, theta, speed, law=likely.law, beside=likely)
+    steps = steps_beside_noise(but_that, theta, there, likely.law, likely)
     excess = excess_of(steps)
     sound = after.sound()
     z = float(np.sqrt(max(0.0, sound - cost)))
@@ -280,8 +280,8 @@ class _After:
         for k, _ in law.parts:
             sound[k] = self.theta[k]
         size = float(risen[law.parts[0][0]])
-        if law.laminar and law.orifice:
-            law = Law(1.0, float(risen[ORIFICE] / risen[G]))
+        if law.laminar and law.orifice and size > 0.0:
+            law = Law(1.0, float(risen[ORIFICE] / size))
             size = size if law.orifice > 0.0 else 0.0
         return _Leaking(law, size, sound, theta, float(costs[0]))
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.pressure_model.fit import LARGEST_SIDE, steps_of
 from sealscope.diagnosis.pressure_model.model import BIAS, C_C, F_C, GAIN, K_BRK, ORIFICE, SIDE, SOUND, K
 from sealscope.diagnosis.pressure_model.tracking.blocks import Blocks
-from sealscope.diagnosis.pressure_model.tracking.chain import Chain
+from sealscope.diagnosis.pressure_model.tracking.chain import Chain, Drifting
 from sealscope.diagnosis.pressure_model.tracking.laws import Law
-from sealscope.diagnosis.pressure_model.tracking.wander import SIZE, WANDER_BIAS, anchor_weight, wander
+from sealscope.diagnosis.pressure_model.tracking.wander import SIZE, WANDER_BIAS, anchor_weight, drift_courses, wander
 from sealscope.recordings.recording import Array
 
 DIVERGED = "the model of the rig diverges"
@@ -41,7 +41,7 @@ _KEPT = 0.5
 #: is left in a block is small and the model is linear over it.
 _LEASHES = (0.1, 0.3, 1.0)
 #: Rows of the normal equations of what wanders: all but the orifice.
-_WANDERING = np.delete(np.arange(SIZE + 1), ORIFICE)
+WANDERING = np.delete(np.arange(SIZE + 1), ORIFICE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class Track:
         """Return what a leak of a law does."""
         at, unit = _in_units(law, self.path[0])
         along = self.N_all @ at
-        return Rise(along[:, _WANDERING], along @ at, self.r_all @ at, unit)
+        return Rise(along[:, WANDERING], along @ at, self.r_all @ at, unit)
 
 
 def _in_units(law: Law, theta: Array) -> tuple[Array, float]:
@@ -118,16 +118,18 @@ def right_sides(r: Array, anchor: Array, centre: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Following:
+class Following:
     """What stays the same while a record is followed.
 
-    The first fit `theta` (14,), the state (5,) at the first sample, and after which block a leak of which law is open.
+    The first fit `theta` (14,), the state (5,) at the first sample, after which block a leak of which law is open, and
+    whether the parameters may drift as in oil that warms.
     """
 
     blocks: Blocks
     theta: Array
     start: Array
     rise: tuple[Law, int] | None
+    warming: bool
 
     @cached_property
     def coarse(self) -> Blocks:
@@ -191,12 +193,22 @@ class _Following:
         """Scratch (17, n): slopes, a constant, the trend of the speed's bias, and what is left of dp."""
         return np.ones((SIZE + 3, self.blocks.dp.size))
 
+    @cached_property
+    def courses(self) -> Array:
+        """What oil that warms adds (b, p, q) to the parameters [units]."""
+        return drift_courses(self.theta, self.units, self.blocks.count)
+
     def strain(self, path: Array, leash: float) -> float:
-        """Return the chi square of the wandering, which may be `leash` times the usual."""
-        at = path[:, :SOUND] / self.h[:SOUND]
-        steps = np.diff(at, axis=0) / (leash * self.walk)[:, :-1]
+        """Return the chi square of the wandering, which may be `leash` times the usual, and of the drift."""
+        at, walk = path[:, :SOUND] / self.h[:SOUND], (leash * self.walk)[:, :-1]
+        steps = (np.diff(at, axis=0) / walk).ravel()
         off = at.mean(axis=0) - self.centre[:-1]
-        return float(np.sum(steps**2)) + float(self.anchor[:-1] @ off**2)
+        strain = float(steps @ steps) + float(self.anchor[:-1] @ off**2)
+        if self.warming:
+            drift = (np.diff(self.courses[:, :-1], axis=0) / walk[:, :, None]).reshape(steps.size, -1)
+            shared = drift.T @ steps
+            strain -= float(shared @ np.linalg.solve(np.eye(shared.size) + drift.T @ drift, shared))
+        return strain
 
     def linear(self, shown: Array, moved: Array, at: Array, strain: float) -> Track:
         """Return the blocks, linear about the path `at` (b, 14), where the model shows (n,) [Pa].
@@ -214,8 +226,8 @@ class _Following:
             raise FloatingPointError(DIVERGED)
         return Track(
             at,
-            N[:, _WANDERING[:, None], _WANDERING] / variance,
-            r[:, _WANDERING] / variance,
+            N[:, WANDERING[:, None], WANDERING] / variance,
+            r[:, WANDERING] / variance,
             N / variance,
             r / variance,
             self.units,
@@ -242,7 +254,8 @@ class _Following:
 
         The leak's size is in steps of its slope, and not negative.
         """
-        chain = Chain(linear.N, leash * self.walk, self.anchor)
+        wandering = Chain(linear.N, leash * self.walk, self.anchor)
+        chain = Drifting(wandering, linear.N, self.courses) if self.warming else wandering
         right, size = right_sides(linear.r, self.anchor, self.centre).reshape(-1, 1), 0.0
         if self.rise is None:
             solution = chain.solve(right)
@@ -285,17 +298,18 @@ def track(
     *,
     size: float = 0.0,
     shown: Array | None = None,
+    warming: bool = False,
 ) -> Track:
     """Follow the parameters from the first fit `theta` (14,) through the blocks of a record.
 
     `start` (5,): the model's state at the first sample; `rise`: the law of a leak of the size that suits, and after
     which block it is open; `begin`: a path (b, 14) to begin at, or a track of the same blocks that is linear about its
     own, the first fit by default; through blocks that do not count the parameters wander unseen; `size` to begin with;
-    `shown` (n,): what the model shows where it begins. Blocks are linearised about their own parameters, until these
-    stand still, by slopes of coarse steps until the last time. The trend of the speed's bias within a block is
-    eliminated.
+    `shown` (n,): what the model shows where it begins; `warming`: they may drift besides, as in oil that warms. Blocks
+    are linearised about their own parameters, until these stand still, by slopes of coarse steps until the last time.
+    The trend of the speed's bias within a block is eliminated.
     """
-    following = _Following(blocks, theta, start, rise)
+    following = Following(blocks, theta, start, rise, warming)
     risen, strain = following.risen, following.strain
     if rise is not None:
         size /= _in_units(rise[0], theta)[1]
@@ -381,7 +395,7 @@ def track(
         last = number + _PASSES
 
 
-def _with_rise(chain: Chain, right: Array, rise: Rise, first: int) -> tuple[Array, float]:
+def _with_rise(chain: Chain | Drifting, right: Array, rise: Rise, first: int) -> tuple[Array, float]:
     """Return the solution with a rise in all blocks from the `first` on as one more unknown, and that rise."""
     cross = rise.cross.copy()
     cross[:first] = 0.0
@@ -406,9 +420,9 @@ def _normal(rows: Array, limits: Sequence[slice], at: Array) -> tuple[Array, Arr
     trend = products[:, size]
     products -= trend[:, :, None] * trend[:, None, :] / trend[:, size, None, None]
     H, g = products[:, :size, :size], products[:, :size, -1]
-    own = g[:, _WANDERING]
+    own = g[:, WANDERING]
     try:
-        inverse = np.linalg.pinv(H[:, _WANDERING[:, None], _WANDERING], rcond=1e-12, hermitian=True)
+        inverse = np.linalg.pinv(H[:, WANDERING[:, None], WANDERING], rcond=1e-12, hermitian=True)
     except np.linalg.LinAlgError:  # numbers that are nearly too large
         raise FloatingPointError(DIVERGED) from None
     squares = products[:, -1, -1] - np.einsum("bi,bij,bj->b", own, inverse, own)
