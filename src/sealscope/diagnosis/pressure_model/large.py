@@ -113,12 +113,14 @@ def large_leak(blocks: Blocks, prior: Prior) -> LargeLeak | None:
     model = model.with_travel(guess)
     blocks = replace(blocks, model=model)
     window = window_at(model, dp, guess, 0, int(edges[_SOUND_BLOCKS]))
-    theta, *_ = fit(window, window, prior, guess)
+    theta, _, anew = fit(window, window, prior, guess)
     tried = _ladder(blocks, theta, {law: _SHARES * flow for law, flow in _flows(model, dp, theta).items()})
     if tried is None:
         return None
     block, best = tried
-    theta, usual = _refitted(model, dp, int(edges[max(block - 1, _SOUND_BLOCKS)]), theta, prior)
+    # of the few blocks at the beginning, which may ring alike with another oil, other minima are begun at, too
+    refits = [_refitted(model, dp, int(edges[max(block - 1, _SOUND_BLOCKS)]), each, prior) for each in (theta, *anew)]
+    theta, usual = min(refits, key=lambda each: each[1])
     tried = _ladder(blocks, theta, {law: _NEAR * size for law, size in best.items()})
     if tried is None:
         return None
@@ -135,15 +137,15 @@ def large_leak(blocks: Blocks, prior: Prior) -> LargeLeak | None:
         path = np.tile(theta, (blocks.count, 1))
         path[block:] = leaking.sound
         rise, start = (leaking.law, block - 1), np.zeros(STATES)
-        with suppress(FloatingPointError):  # of a leak that is none of this machine the model may diverge
+        # of a leak that is none of this machine the model may diverge, or its blocks tell nothing
+        with suppress(FloatingPointError, np.linalg.LinAlgError):
             there = track(but_that, theta, start, rise, path, size=leaking.size)
-            followed.append((leaking, there))
+            followed.append((leaking, there, steps_beside_noise(but_that, theta, there, leaking.law)))
     if not followed:
         return None
-    variance = min(each.variance for _, each in followed)
+    variance = min(each.variance for _, each, _ in followed)
     looks = []
-    for leaking, each in followed:
-        steps = steps_beside_noise(but_that, theta, each, leaking.law)
+    for leaking, each, steps in followed:
         cost = each.misfit / variance + each.strain
         size, deviation = float(steps.size[block - 1]), float(steps.deviation[block - 1])
         looks.append((PossibleLeak(leaking.law, block - 1, size, deviation, cost), each, leaking.cost))
