@@ -137,6 +137,7 @@ def test_rows_keep_what_was_stated_and_come_back_from_disk(plan, done):
     assert CaseRow.from_dict(line).statements == {}
 
 
+@pytest.mark.slow
 def test_the_fused_verdict_is_that_of_diagnose(plan, done):
     for row in read_rows(done).values():
         recording = read(done / "recordings" / f"{row.id}.nc")
@@ -204,6 +205,7 @@ def test_what_it_adds_up_to(plan, done):
         assert words in page
 
 
+@pytest.mark.slow
 def test_a_calibration_of_a_view_is_used_through_it(plan, done, tmp_path):
     """The watcher calls it friction when it sees pressures alone, so it has no score to calibrate; d3 has."""
     text = PLAN.replace('"watcher, calibrated @ pressures"', '"rms change, calibrated @ pressures"')
@@ -246,6 +248,7 @@ def test_rows_of_an_older_form_are_refused(plan, done):
         campaign.run(plan, done, jobs=1)
 
 
+@pytest.mark.slow
 def test_detectors_may_assume_another_rig(plan, done, tmp_path):
     text = PLAN.replace("seed = 3", 'seed = 3\nassume_set = { "pump.q_b" = 1e-7 }').replace("count = 6", "count = 4")
     (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
@@ -304,6 +307,7 @@ def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, told):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
     text = PLAN.replace("seed = 3", 'seed = 3\nchannels = ["p_A", "p_B"]').replace("count = 6", "count = 4")
     (tmp_path / "seen.toml").write_text(text, encoding="utf-8")

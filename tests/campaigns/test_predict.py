@@ -68,6 +68,7 @@ def test_throttles_are_told_in_words(rig: Rig) -> None:
     assert closing_text(rig.with_overrides({"closed_A": 0.25})) == "25 % at A, 50 % at B"
 
 
+@pytest.mark.slow
 def test_prediction_agrees_with_recordings_made_afresh(rig: Rig) -> None:
     """Mean and scatter of the change, leak-free and leaky, against 40 whole simulated recordings of each."""
     experiment = experiment_for(rig, "7 sin(4t)", 20.0)
@@ -194,6 +195,7 @@ def test_text_says_what_was_asked_and_the_best_command(made: PredictionReport) -
     assert all(len(line) <= 160 for line in text.splitlines())
 
 
+@pytest.mark.slow
 def test_same_seed_same_plan(rig: Rig) -> None:
     experiment = experiment_for(rig, "3 sin(4t)", 20.0)
     one, other, third = (predict(experiment, DetectionTarget(seed=seed), commands=()).as_dict() for seed in (1, 1, 2))
@@ -265,6 +267,7 @@ def test_a_wrong_call_is_one_clear_line(words: list[str], complaint: str) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_prediction_agrees_with_a_campaigns_a90(rig: Rig) -> None:
     """300 leak-free records set the threshold, 4 x 60 leaky ones the curve through hits and misses."""
     detector = FELL

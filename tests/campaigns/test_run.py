@@ -66,6 +66,7 @@ def wait_for_rows(folder, count, process):
     pytest.fail("no rows within two minutes")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
 def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
     plan, expected = once
@@ -130,6 +131,7 @@ def test_an_interrupt_ends_it_and_keeps_the_rows(tiny, tmp_path):
     assert store.progress_of(load_plan(tiny), tmp_path / "stopped").done >= 3
 
 
+@pytest.mark.slow
 def test_on_a_cluster_the_same_bytes(once, tmp_path):
     distributed = pytest.importorskip("distributed")
     plan, expected = once
@@ -180,6 +182,7 @@ def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     assert campaign.run(plan, tmp_path / "bad", jobs=1, retry=True).failed == 0
 
 
+@pytest.mark.slow
 def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent)
     die_on_one = import_module("dying_task").die_on_one

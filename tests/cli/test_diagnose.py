@@ -216,6 +216,7 @@ def in_one_session(strokes: Path, folder: Path) -> tuple[list[Path], list[Path]]
     return copies["leak"], copies["healthy"]
 
 
+@pytest.mark.slow
 def test_foreign_logs_without_times_may_be_of_another_day(call, strokes):
     files = sorted(strokes.glob("leak_*")) + sorted(strokes.glob("healthy_*"))[:4]
     done = call("diagnose", *files, "--baseline", *sorted(strokes.glob("healthy_*")), *FOREIGN, "--format", "jsonl")
@@ -254,7 +255,7 @@ def test_a_foreign_log_without_a_rate_takes_its_time_column_and_without_a_map_is
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/real/vtnsi_actuator is absent")
-@pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [12, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_every_real_stroke_gets_a_verdict(call, every):
     healthy, worn = (sorted((REAL / name).glob("*.txt")) for name in ("act_1_healthy", "act_4_seal_defect"))
     worn = worn[::every]

@@ -94,6 +94,7 @@ def test_a_campaign_over_recordings_goes_on(batch, call, monkeypatch, tmp_path):
 ODD = os.fsdecode(b"odd\xff\x1b[31m.nc")
 
 
+@pytest.mark.slow
 def test_odd_names_of_files(batch, shell, call):
     """Bytes that are no UTF-8, and a terminal's escape."""
     shutil.copy(batch / "good.nc", batch / ODD)

@@ -68,7 +68,7 @@ def test_pump_share_and_creep_are_those_of_the_machine(foreign: Recording) -> No
     assert found.creep_mm_per_min[0] == pytest.approx(flow(foreign) / LPM / AREA * 6.0e4, rel=0.05)
 
 
-@pytest.mark.parametrize("ratio", [0.5, 1.4])
+@pytest.mark.parametrize("ratio", [0.5, pytest.param(1.4, marks=pytest.mark.slow)])
 def test_area_or_displacement_alone_gives_the_flow_whatever_the_other_is(ratio: float) -> None:
     recording = machine(1, G=step(0.0, LEAK), ratio=ratio)
     by_area = diagnose(recording, rig=stated(area=f"{AREA} m^2"))

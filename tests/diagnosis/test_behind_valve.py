@@ -156,6 +156,7 @@ def test_what_else_changes_is_no_leak_to_the_balance_behind_a_valve(fault: str) 
     assert balance.examined(balanced(fault=fault), RIG, 0.01).verdict != "leak"
 
 
+@pytest.mark.slow
 def test_a_stream_behind_a_valve_is_that_balance_on_its_window() -> None:
     """Whatever the portions; an alarm soon after the onset, none of a sound machine, and what is missing is said."""
     leaking, hourly = balanced(100.0, leak="0.02 L/min from 70 s"), 0.4

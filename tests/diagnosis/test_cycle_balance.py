@@ -269,7 +269,14 @@ def test_says_why_it_cannot_tell(rig: str, command: str, load: str, why: str) ->
     assert why in evidence.reason
 
 
-@pytest.mark.parametrize("channels", [SEEN, (*SEEN, "theta", "x"), (*SEEN, "omega")])
+@pytest.mark.parametrize(
+    "channels",
+    [
+        SEEN,
+        pytest.param((*SEEN, "theta", "x"), marks=pytest.mark.slow),
+        pytest.param((*SEEN, "omega"), marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize(("leak", "verdict"), [("", "no leak"), ("0.002 L/min from 60 s", "leak")])
 def test_a_single_rod_that_rests_unloaded(leak: str, verdict: str, channels: tuple[str, ...]) -> None:
     """Its valves settle in one of several ways at each rest: what holds it there tells, not the whole cycle."""

@@ -60,7 +60,7 @@ def test_oil_that_leaves_is_named() -> None:
     assert (said.verdict, said.cause) == ("cannot tell", "external leak")
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.lists(st.integers(1, 9000), min_size=1, max_size=5))
 def test_portions_do_not_matter(portions: list[int]) -> None:
     portions = [max(size, 400) for size in portions]

@@ -148,6 +148,7 @@ def joined(second: str, leak: str | None = None, *, throttled: bool = False) -> 
     return Recording(t, channels, CHANNEL_UNITS, runs[0].rate)
 
 
+@pytest.mark.slow
 def test_joined_runs_of_other_strokes_are_not_a_leak() -> None:
     healthy = joined("2 sin(4t)", throttled=True)
     own = detectors()["rms change"](load_rig("thesis")).examine(healthy, [], 0.01)
@@ -170,6 +171,7 @@ def test_a_large_leak_is_still_a_leak_where_the_pump_is_seen() -> None:
 PROGRAM = "6 periods of 5 sin(2t), 12 periods of 3 sin(4t)"
 
 
+@pytest.mark.slow
 def test_a_program_of_duties_is_one_machine_s_and_hides_no_leak() -> None:
     """Each duty comes again: the pressures' phase is no other recording's, and no duty changed with the leak.
 

@@ -128,6 +128,7 @@ def test_a_stream_finds_it_too(command: str) -> None:
         assert (state.alarm is not None) == bool(leak)
 
 
+@pytest.mark.slow
 def test_levels_are_compared_as_far_as_their_scales_err_alike() -> None:
     """Of one machine under one duty they do; alone a level is known to within its whole doubt."""
     fit = fitted(recorded(OFTEN))

@@ -117,7 +117,7 @@ def test_false_alarms_come_at_the_stated_rate(phi):
         (0.9, 120, 1.2),
     ],
 )
-@pytest.mark.parametrize(("run_length", "decisions"), [(3e3, 500), (3e5, 4000)])
+@pytest.mark.parametrize(("run_length", "decisions"), [(3e3, 500), pytest.param(3e5, 4000, marks=pytest.mark.long)])
 def test_average_run_length_on_autocorrelated_series(phi, learn, most, run_length, decisions):
     """AR(1) with normal innovations, level, scale and phi learned: the stated rate at most after 120 decisions (and
     counting error), more after 30, where phi is known badly."""
@@ -231,6 +231,7 @@ def test_memory_is_flat():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_memory_is_flat_over_a_week():
     fleet = Fleet(500.0, 8)
     block = np.random.default_rng(0).normal(size=(2, 8, 50_000))  # 100 s

@@ -53,7 +53,9 @@ def test_what_changed_in_the_readings_is_no_leak(kind: str, sound: Recording) ->
     assert diagnosis.cause == "sensor fault"
 
 
-@pytest.mark.parametrize("names", [CHAMBERS, ("u", *CHAMBERS), ("u", *CHAMBERS, "x", "theta")])
+@pytest.mark.parametrize(
+    "names", [CHAMBERS, pytest.param(("u", *CHAMBERS), marks=pytest.mark.slow), ("u", *CHAMBERS, "x", "theta")]
+)
 def test_swapped_chambers_are_no_leak_and_nothing_is_written(names: tuple[str, ...], sound: Recording, capfd) -> None:  # type: ignore[no-untyped-def]
     """Models of the machine diverge on such a recording: that is no message for the terminal."""
     diagnosis = diagnose(swapped(sound.only(names)))

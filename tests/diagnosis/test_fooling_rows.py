@@ -64,6 +64,7 @@ def test_rows_that_fooled(name: str, fooling, sound: Recording, records) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_no_row_is_a_leak_and_garbage_is_no_verdict(fooling, sound: Recording, records) -> None:  # type: ignore[no-untyped-def]
     other = records(3, duration=120.0, throttled=True)
     names = [name for name, row in fooling.ROWS.items() if row.group not in ("machine", "baseline")]

@@ -121,6 +121,7 @@ def test_a_figure_that_is_refused_is_not_lent() -> None:
     assert fused(volume_balance=replace(LEAK, refuses=frozenset({"leak_lpm"})), observer=lent).course is None
 
 
+@pytest.mark.slow
 def test_no_flow_is_stated_of_a_machine_with_another_geometry() -> None:
     """0.03 L/min past a pump of 3.9 instead of 4.9 cm^3/rev: the pressure model lent 0.0086 (0.0061 to 0.0111)."""
     recording = simulate(
@@ -204,6 +205,7 @@ def test_the_verdict_is_one_detector_s_own(data: st.DataObject) -> None:
         assert found.onset_s is None
 
 
+@pytest.mark.slow
 def test_all_detectors_together_on_the_thesis_s_smallest_leak(records) -> None:  # type: ignore[no-untyped-def]
     """0.0042 L/min from second 90 is found and dated; without it there is none. Seen through any channels."""
     leaky, sound = records(0, leak="0.0042 L/min from 90 s", throttled=True), records(50, throttled=True)

@@ -52,6 +52,7 @@ def test_a_leak_within_the_recording_is_stated_whatever_the_baseline(leaky: Reco
     assert "no baseline recording can be used: the same samples as the recording itself" in found.reason
 
 
+@pytest.mark.slow
 def test_copies_count_once_for_every_detector(healthy: list[Recording]) -> None:
     """Three copies have no scatter of their own: for the observer they were three baselines."""
     recording, leak_free = healthy[:2]

@@ -361,7 +361,7 @@ def test_air_is_asked_for_beside_a_large_leak_too() -> None:
 @pytest.mark.parametrize(
     ("words", "cause"),
     [
-        ("rod seal A 0.01 L/min", "external leak"),
+        pytest.param("rod seal A 0.01 L/min", "external leak", marks=pytest.mark.slow),
         ("friction +20 %", "friction change"),
         pytest.param("air 1 %", "air in the oil", marks=pytest.mark.slow),
         ("sensor p_A offset 5 psi", "sensor fault"),

@@ -94,6 +94,7 @@ def test_another_machine_from_half_on_is_no_leak(change: dict[str, float], detec
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_large_leak_of_a_machine_with_bristles_is_found_and_not_sized(detector: PressureModel) -> None:
     """LuGre's friction, which the model does not have: soft bristles give way as oil does that is a tenth as stiff. The
     leak shows, its flow does not. A drive that loses two fifths is no leak."""
@@ -155,6 +156,7 @@ count = 6
 """
 
 
+@pytest.mark.slow
 def test_friction_that_sticks_under_a_controller_is_no_large_leak(tmp_path: Path) -> None:
     """Under the command alone the model does not follow this sound machine, and a small leak explained 4 % of that."""
     path = tmp_path / "plan.toml"

@@ -72,6 +72,8 @@ def test_a_led_model_forgets_a_wrong_start_within_some_periods(share: float) -> 
     assert np.abs(off[int(0.15 * RATE) : int(0.3 * RATE)]).max() < 0.01 * share * 1e5
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_leak_of_a_machine_that_rests_is_found_from_pressures() -> None:
     """Under the command alone the parameters wander 5 times as much as those of a healthy machine may."""
     leak = recorded("0.0042 L/min from 60 s")
@@ -105,6 +107,7 @@ def test_a_sound_machine_that_rests_is_followed_and_has_no_leak() -> None:
     assert diagnose(sound, rig=RIG, quick=True).verdict == "no leak"
 
 
+@pytest.mark.slow
 def test_a_machine_that_rings_by_itself_as_its_oil_warms_is_followed_and_its_leak_sized() -> None:
     """Friction then falls with speed; of the ringing the model explained 55 % under the command alone."""
     experiment = Experiment.of(
@@ -125,7 +128,8 @@ def test_a_machine_that_rings_by_itself_as_its_oil_warms_is_followed_and_its_lea
 
 
 @pytest.mark.parametrize(
-    ("leak", "verdict"), [("", "no leak"), pytest.param("0.01 L/min from 60 s", "leak", marks=pytest.mark.slow)]
+    ("leak", "verdict"),
+    [("", "no leak"), pytest.param("0.01 L/min from 60 s", "leak", marks=[pytest.mark.slow, pytest.mark.long])],
 )
 def test_oil_that_warms_makes_parameters_drift_and_neither_a_leak_nor_a_record_that_cannot_be_followed(
     leak: str, verdict: str
@@ -155,6 +159,7 @@ def test_oil_that_warms_makes_parameters_drift_and_neither_a_leak_nor_a_record_t
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_level_of_a_led_model_is_not_compared() -> None:
     """Its G depends on how far it is led."""
     leak = recorded("0.0042 L/min from 60 s")

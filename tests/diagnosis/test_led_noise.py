@@ -103,11 +103,9 @@ def test_the_strain_of_a_path_is_the_least_over_all_drifts_of_oil_that_warms(qui
 @pytest.mark.parametrize(
     ("number", "fault"),
     [
-        (
-            7,
-            "oil +23 K growing from 0 s to 106 s",
-        ),  # hardly rings while it is cold
-        (13, "oil +16 K growing from 0 s to 176 s"),  # a leak without a size outweighed the rest
+        (7, "oil +23 K growing from 0 s to 106 s"),  # hardly rings while it is cold
+        # a leak without a size outweighed the rest
+        pytest.param(13, "oil +16 K growing from 0 s to 176 s", marks=pytest.mark.slow),
     ],
 )
 def test_sound_machines_of_the_bench_in_oil_that_warms(number: int, fault: str) -> None:

@@ -46,7 +46,7 @@ GAPS: dict[str, Callable[[Recording], Recording]] = {
     ("gap", "view"),
     [
         *((gap, "pressures") for gap in GAPS),
-        ("one sample before the onset", "command"),
+        pytest.param("one sample before the onset", "command", marks=pytest.mark.slow),
         *(pytest.param(gap, "all", marks=pytest.mark.slow) for gap in GAPS),
     ],
 )

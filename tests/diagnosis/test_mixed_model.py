@@ -72,7 +72,7 @@ def test_one_recording_rests_on_the_prior() -> None:
     assert np.all(other.half_width(2.0) > 0.8)
 
 
-@pytest.mark.parametrize("known", [3, 6, 40])
+@pytest.mark.parametrize("known", [pytest.param(3, marks=pytest.mark.slow), 6, 40])
 def test_later_recordings_of_a_session_that_drifts_hold_the_probability(known: int) -> None:
     """Sessions drawn from the model's own law: 1 % of later recordings lie beyond, at any distance in time."""
     random = np.random.default_rng(known)
@@ -89,6 +89,7 @@ def test_later_recordings_of_a_session_that_drifts_hold_the_probability(known: i
     assert widths[0] < widths[1] < widths[2]
 
 
+@pytest.mark.slow
 def test_another_specimen_is_not_beyond_one_session() -> None:
     """Sessions that differ by 35 % as specimens do: none of 400 is beyond one session, 1 % beyond five of them."""
     random = np.random.default_rng(5)

@@ -145,6 +145,7 @@ def test_a_probability_no_threshold_can_be_set_for(probability: float, sound: Re
         diagnose(sound, false_alarm_probability=probability)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())

@@ -145,6 +145,7 @@ def test_a_large_force_is_followed() -> None:
     assert judged.verdict == "no leak", judged.reason
 
 
+@pytest.mark.slow
 def test_a_force_too_quick_to_follow_is_named_and_no_smaller_method_calls_the_machine_sound() -> None:
     judged = diagnose(recorded("position 40 mm sin(1.57t)", "1 kN sin(1.1t)"), rig=RIG)
     assert judged.verdict == "cannot tell"

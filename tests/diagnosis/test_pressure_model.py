@@ -159,7 +159,9 @@ def test_drifts_of_a_sound_machine_are_no_leak(drift: tuple[str, float], seed: i
     assert found.cause is None
 
 
-@pytest.mark.parametrize("share", [-30, 20, 30])
+@pytest.mark.parametrize(
+    "share", [pytest.param(-30, marks=pytest.mark.slow), 20, pytest.param(30, marks=pytest.mark.slow)]
+)
 def test_a_step_of_the_friction_is_called_one(share: int, detector: PressureModel) -> None:
     found = detector.examine(recorded(2, fault=f"friction {share:+d} % from {ONSET:g} s"), [], P)
     assert found.verdict in ("no leak", "cannot tell")

@@ -54,7 +54,7 @@ def test_direction_is_that_of_the_angle(healthy: list[Recording], defective: lis
             assert operating_point(stroke).direction == np.sign(turned)
 
 
-@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [6, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_defective_against_healthy(healthy: list[Recording], defective: list[Recording], every: int) -> None:
     """30 of 30 differ from the healthy ones, and none is called a leak.
 
@@ -101,10 +101,10 @@ def without_time(stroke: Recording) -> Recording:
 @pytest.mark.parametrize(
     ("name", "times", "every"),
     [
-        (SESSIONS[1], True, 3),
-        pytest.param(SESSIONS[0], False, 2, marks=pytest.mark.slow),
-        pytest.param(SESSIONS[1], False, 2, marks=pytest.mark.slow),
-        pytest.param(SESSIONS[0], True, 2, marks=pytest.mark.slow),
+        pytest.param(SESSIONS[1], True, 3, marks=pytest.mark.slow),
+        pytest.param(SESSIONS[0], False, 2, marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param(SESSIONS[1], False, 2, marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param(SESSIONS[0], True, 2, marks=[pytest.mark.slow, pytest.mark.long]),
     ],
 )
 def test_later_strokes_of_a_session_are_no_leak(
@@ -117,7 +117,7 @@ def test_later_strokes_of_a_session_are_no_leak(
     assert (verdicts["no leak"] > 10) == times  # nothing is said to be healthy where the session is not known
 
 
-@pytest.mark.parametrize("times", [True, False])
+@pytest.mark.parametrize("times", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_another_healthy_specimen_is_no_leak(times: bool, sessions: dict[str, list[Recording]]) -> None:
     """75 % of the strokes of one specimen were `leak` against the other, with no word of another machine."""
     for name, other in (SESSIONS, SESSIONS[::-1]):
@@ -150,6 +150,7 @@ def test_a_change_within_a_session_is_found(
     assert gain > 1.0 or verdicts["leak"] == 0
 
 
+@pytest.mark.slow
 def test_healthy_against_its_own_other_half(healthy: list[Recording]) -> None:
     """Pairs of strokes (one of each direction) in turn: none of 30 alarms at 1 %."""
     halves = [[one for k, one in enumerate(healthy) if (k // 2) % 2 == half] for half in (0, 1)]
@@ -164,6 +165,7 @@ def test_healthy_with_one_left_out(healthy: list[Recording]) -> None:
     assert sum(verdicts.values()) == 30
 
 
+@pytest.mark.slow
 def test_opposite_directions_are_never_compared(healthy: list[Recording], defective: list[Recording]) -> None:
     for direction in (-1, 1):
         opposite = [one for one in healthy if operating_point(one).direction == -direction]
@@ -184,7 +186,7 @@ def test_a_single_stroke_is_too_short_to_be_its_own_baseline(defective: list[Rec
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["session_act_1_healthy", "session_act_2_healthy"])
-@pytest.mark.parametrize("count", [12, 20])
+@pytest.mark.parametrize("count", [pytest.param(12, marks=pytest.mark.long), 20])
 def test_few_strokes_calibrate_every_detector(name: str, count: int, tmp_path: Path) -> None:
     """Five strokes a direction were too few, and 107 left every stroke `cannot tell`."""
     strokes = [read(path, channel_map=MAP, rate=1000) for path in files(name)]

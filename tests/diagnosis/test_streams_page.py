@@ -30,6 +30,7 @@ def test_the_watched_machine_is_saved_and_continued(
     assert low <= 0.0042 <= high
 
 
+@pytest.mark.slow
 def test_a_machine_without_a_position_is_watched_too(capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(EXAMPLES[1], PAGE.name, "exec"), {"__name__": "page"})
     said = re.fullmatch(r"by pressures: [\d.]+ L/min \(([\d.]+) to ([\d.]+)\) since (\d+) s\n", capsys.readouterr().out)

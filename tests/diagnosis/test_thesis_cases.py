@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("rms_change_alone")
 
 def few_and_all(few: int, count: int) -> pytest.MarkDecorator:
     """The first `few` of `count` seeds by default, all of them among the slow tests."""
-    return pytest.mark.parametrize("count", [few, pytest.param(count, marks=pytest.mark.slow)])
+    return pytest.mark.parametrize("count", [few, pytest.param(count, marks=[pytest.mark.slow, pytest.mark.long])])
 
 
 def altered(recording: Recording, p_A: np.ndarray, p_B: np.ndarray) -> Recording:
@@ -82,6 +82,7 @@ def test_a_step_of_the_noise_is_no_leak(kind: str, count: int, records) -> None:
         assert "the noise (d1) changed" in found.reason
 
 
+@pytest.mark.slow
 def test_a_leak_is_found_beyond_a_step_of_the_noise(records) -> None:  # type: ignore[no-untyped-def]
     found = []
     for seed in range(6):

@@ -138,6 +138,7 @@ def plant(tmp_path_factory):
     return path
 
 
+@pytest.mark.long
 def test_a_foreign_unit_is_recorded_and_diagnosed(plant, tmp_path):
     maps = [word for channel, name in MAP.items() for word in ("--map", f"{channel}={name}")]
     common = ("--fmu", plant, "--command", "2 sin(3t)", "--duration", "120", *maps)

@@ -19,6 +19,7 @@ def test_mutated_recordings(kind: str, tmp_path: Path, capfd: pytest.CaptureFixt
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", RECORDINGS)
 def test_many_mutated_recordings(kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     count = attack(kind, tmp_path, range(10**6, 10**6 + 600))

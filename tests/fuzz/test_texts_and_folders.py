@@ -35,6 +35,7 @@ def test_hostile_inputs(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", TARGETS)
 def test_many_hostile_inputs(
     kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

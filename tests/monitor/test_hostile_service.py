@@ -181,6 +181,7 @@ def test_hostile_messages_are_counted_and_change_no_row(tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
 def test_a_hundred_thousand_hostile_messages_leave_no_memory_behind(tmp_path: Path):
     """In a process of its own: what other tests leave to be freed is not the service's."""

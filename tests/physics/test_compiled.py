@@ -149,7 +149,7 @@ def test_the_folders_of_compiled_code_are_the_user_s_alone(copy, tmp_path):
     assert not Path(ask(copy, SMALL, tmp_path / "open")[2]).is_relative_to(tmp_path / "open")
 
 
-@pytest.mark.parametrize(("suffix", "left"), [("nbi", 7), ("nbc", 0)])
+@pytest.mark.parametrize(("suffix", "left"), [pytest.param("nbi", 7, marks=pytest.mark.slow), ("nbc", 0)])
 def test_a_cut_off_file_of_the_cache_is_a_miss(copy, tmp_path, suffix, left):
     before = ask(copy, SMALL, tmp_path)
     files = [path for path in Path(before[2]).rglob(f"*.{suffix}") if "leakage_series" in path.name]

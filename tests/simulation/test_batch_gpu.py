@@ -46,6 +46,7 @@ def assert_same(found, expected, tolerance):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_simulated_gpu_finds_what_the_processor_finds(tmp_path):
     """Kernels, layout, chunks, noise, filters and sizing; each thread in plain Python, with the laws' own source."""
     if importlib.util.find_spec("numba.cuda.simulator") is None:

@@ -162,6 +162,7 @@ def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) ->
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_thesis_s_rule_fires_like_a_coin_where_nothing_leaks() -> None:
     context = Made({}, None)
     items = {item.id: item for item in appendix_c.ITEMS}

@@ -277,7 +277,9 @@ def test_an_interrupt_leaves_what_was_finished(fakes: Path, tmp_path: Path) -> N
     assert worked(tmp_path) == ["t-1", "t-2", "t-3"]
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT] if hasattr(signal, "SIGKILL") else [])
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)] if hasattr(signal, "SIGKILL") else []
+)
 def test_a_killed_call_is_taken_up_where_it_stopped(fakes: Path, tmp_path: Path, how: int) -> None:
     names = [f"t-{number}" for number in range(8)]
     script = tmp_path / "call.py"
