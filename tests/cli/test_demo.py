@@ -63,6 +63,7 @@ def test_a_second_run_gives_the_same_bytes_and_the_same_words(first, folder, cal
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_another_seed_is_another_recording_with_the_same_verdict(first, folder, call):
     other = call("demo", "-o", folder / "other", "--seed", 2)
     assert other.status == 0

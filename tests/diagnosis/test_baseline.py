@@ -54,7 +54,7 @@ def test_a_sound_one_is_no_leak_beside_sound_ones(count: int, records, sound_one
     assert [one.verdict for one in found] == ["no leak"] * 8
 
 
-@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_more_noise_than_in_the_baseline_is_no_leak(count: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     alarms = 0
     for seed in range(12):

@@ -177,7 +177,7 @@ def swinging(leak: str = "", command: str = "position 40 mm sin(1.6t)", load: st
 
 
 @pytest.mark.parametrize("load", ["700 N sin(0.35t)", "trapezoid 800 N within 0.7 s every 7.5 s"])
-@pytest.mark.parametrize("leak", ["0.0042", "0.05"])
+@pytest.mark.parametrize("leak", ["0.0042", pytest.param("0.05", marks=pytest.mark.slow)])
 def test_a_leak_under_a_load_that_changes(load: str, leak: str) -> None:
     made = swinging(f"{leak} L/min from 60 s", load=load)
     verdict = diagnose(made.recording.only(SEEN), rig=DOUBLE, quick=True)

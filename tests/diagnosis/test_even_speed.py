@@ -100,7 +100,7 @@ def test_a_sound_machine_is_no_leak_and_its_level_is_not_known(command: str) -> 
 
 
 @pytest.mark.parametrize("command", [OFTEN, SELDOM])
-@pytest.mark.parametrize("leak", [0.0003, 0.0042, 0.05])
+@pytest.mark.parametrize("leak", [0.0003, pytest.param(0.0042, marks=pytest.mark.slow), 0.05])
 def test_a_leak_is_dated_and_sized(command: str, leak: float) -> None:
     made = run(command, f"{leak} L/min from 60 s")
     evidence = VolumeBalance(load_rig(RIG)).examine(made.recording, (), P)

@@ -39,7 +39,9 @@ def leaking(lpm: float, command: str) -> Recording:
 @pytest.mark.parametrize(
     "detector",
     [
-        name if name in ("volume balance", "cycle balance") else pytest.param(name, marks=pytest.mark.slow)
+        name
+        if name in ("volume balance", "cycle balance")
+        else pytest.param(name, marks=[pytest.mark.slow, *[pytest.mark.long] * (name == "pressure model")])
         for name in detectors()
     ],
 )

@@ -152,7 +152,7 @@ def test_a_sound_machine_is_left_alone(command: str, detector: PressureModel) ->
 @pytest.mark.parametrize(
     "drift", [("friction", 0.08), ("friction", -0.08), ("fluid.K_oil", 0.03), ("fluid.K_oil", -0.03)]
 )
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_drifts_of_a_sound_machine_are_no_leak(drift: tuple[str, float], seed: int, detector: PressureModel) -> None:
     found = detector.examine(recorded(seed, drift=drift), [], P)
     assert found.verdict == "no leak", found.reason
@@ -229,7 +229,7 @@ def test_a_hundred_hertz_show_a_larger_leak(detector: PressureModel, sound: Reco
     assert sound.verdict == "no leak", sound.reason
 
 
-@pytest.mark.parametrize("factor", [0.9, 1.1])
+@pytest.mark.parametrize("factor", [pytest.param(0.9, marks=pytest.mark.slow), 1.1])
 @pytest.mark.parametrize(
     "names",
     [("fluid.K_oil",), FRICTION, ("cylinder.A_A", "cylinder.A_B"), ("pump.q_b",)],

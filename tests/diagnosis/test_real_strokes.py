@@ -117,6 +117,7 @@ def test_later_strokes_of_a_session_are_no_leak(
     assert (verdicts["no leak"] > 10) == times  # nothing is said to be healthy where the session is not known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_another_healthy_specimen_is_no_leak(times: bool, sessions: dict[str, list[Recording]]) -> None:
     """75 % of the strokes of one specimen were `leak` against the other, with no word of another machine."""
@@ -137,7 +138,7 @@ def test_a_defective_seal_is_not_called_healthy(
     assert verdicts == {"cannot tell": 10}
 
 
-@pytest.mark.parametrize(("gain", "share"), [(1.0, 0.0), (1.1, 0.9), (1.3, 0.9)])
+@pytest.mark.parametrize(("gain", "share"), [(1.0, 0.0), (1.1, 0.9), pytest.param(1.3, 0.9, marks=pytest.mark.slow)])
 def test_a_change_within_a_session_is_found(
     gain: float, share: float, sessions: dict[str, list[Recording]], strokes: ModuleType
 ) -> None:
@@ -185,7 +186,9 @@ def test_a_single_stroke_is_too_short_to_be_its_own_baseline(defective: list[Rec
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["session_act_1_healthy", "session_act_2_healthy"])
+@pytest.mark.parametrize(
+    "name", ["session_act_1_healthy", pytest.param("session_act_2_healthy", marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize("count", [pytest.param(12, marks=pytest.mark.long), 20])
 def test_few_strokes_calibrate_every_detector(name: str, count: int, tmp_path: Path) -> None:
     """Five strokes a direction were too few, and 107 left every stroke `cannot tell`."""

@@ -188,6 +188,7 @@ def test_a_stream_must_stay_what_it_was() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_false_alarms_per_hour_are_at_most_the_stated_ones() -> None:
     """Eight sound machines with a pump that wanders, some five minutes each, at a rate that allows 4 alarms in all."""
     alarms, hours, rate = 0, 0.0, 6.0

@@ -53,7 +53,15 @@ def in_python(formulation, recording):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("formulation", "version"), [("volume", 2), ("volume", 3), ("speed", 3), ("command", 2)])
+@pytest.mark.parametrize(
+    ("formulation", "version"),
+    [
+        ("volume", 2),
+        pytest.param("volume", 3, marks=pytest.mark.long),
+        pytest.param("speed", 3, marks=pytest.mark.long),
+        ("command", 2),
+    ],
+)
 def test_a_soft_sensor_says_what_the_observer_says(formulation, version, recording, tmp_path):
     pytest.importorskip("fmpy", reason="FMPy runs the units: pip install 'sealscope[fmu]'")
     from fmpy.validation import validate_fmu

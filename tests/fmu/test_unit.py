@@ -29,7 +29,10 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("units")
 
 
-@pytest.fixture(scope="module", params=["thesis", "single-rod-eha", "throttled"])
+@pytest.fixture(
+    scope="module",
+    params=["thesis", *(pytest.param(name, marks=pytest.mark.long) for name in ("single-rod-eha", "throttled"))],
+)
 def rig(request):
     if request.param == "throttled":
         return ss.load_rig("thesis").with_overrides({"line.orifices": "present", "line.closed_A": 0.5})

@@ -90,7 +90,7 @@ def test_an_actuator_without_a_position_is_stored_alike_whatever_the_restarts(tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2, 6))
+@pytest.mark.parametrize("seed", [2, 3, *(pytest.param(seed, marks=pytest.mark.long) for seed in (4, 5))])
 def test_many_kills_change_no_row(undisturbed, tmp_path, seed):
     settings = settings_in(tmp_path)
     lines = tmp_path / "lines.jsonl"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,7 +29,9 @@ def simulated(**values: object) -> Recording:
     return ss.simulate(command="5 sin(2t)", seed=1, set={"pump.G_pump": 2e-13}, **values).only(CHANNELS)
 
 
-WORN = simulated(duration=LENGTH, leak=f"{LEAK} L/min from {OPENS} s")
+@cache
+def worn() -> Recording:
+    return simulated(duration=LENGTH, leak=f"{LEAK} L/min from {OPENS} s")
 
 
 def run(recording: Recording, size: int, watch: Watch | None = None) -> tuple[Watch, list[BlockEstimate]]:
@@ -40,17 +43,21 @@ def run(recording: Recording, size: int, watch: Watch | None = None) -> tuple[Wa
     return watch, estimates
 
 
-WHOLE = run(WORN, len(WORN))
+@cache
+def whole() -> tuple[Watch, list[BlockEstimate]]:
+    return run(worn(), len(worn()))
+
+
 #: Seconds of sound running, after which the baseline is known, and the state then.
 SOUND = 500.0
 
 
 def part(first: float, last: float) -> Recording:
-    return WORN.samples(slice(round(first * 500.0), round(last * 500.0)))
+    return worn().samples(slice(round(first * 500.0), round(last * 500.0)))
 
 
 def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
-    watch, estimates = WHOLE
+    watch, estimates = whole()
     assert watch.by == "pressures"
     assert watch.leak is not None and watch.baseline is not None
     assert OPENS < watch.leak.raised_s < OPENS + 120.0
@@ -76,11 +83,11 @@ def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
 )
 @given(size=st.integers(1_000, 60_000), stop=st.integers(3_000, 350_000))
 def test_cuts_and_restarts_change_nothing(size: int, stop: int):
-    first, before = run(WORN.samples(slice(0, stop)), size)
+    first, before = run(worn().samples(slice(0, stop)), size)
     again = Watch.from_state(json.loads(json.dumps(first.state(), allow_nan=False)))
-    _, after = run(WORN.samples(slice(stop, len(WORN))), size, again)
-    assert before + after == WHOLE[1]
-    assert json.dumps(again.state()) == json.dumps(WHOLE[0].state())
+    _, after = run(worn().samples(slice(stop, len(worn()))), size, again)
+    assert before + after == whole()[1]
+    assert json.dumps(again.state()) == json.dumps(whole()[0].state())
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +157,7 @@ def test_oil_that_warms_is_no_leak():
 
 @pytest.mark.parametrize("damage", ["machine", "observer", "recent", "drive"])
 def test_a_damaged_state_is_refused_in_one_line(damage: str):
-    state = WHOLE[0].state()
+    state = whole()[0].state()
     pressures = {**state["estimators"]["pressures"], damage: {"x": 1}}
     with pytest.raises(InputError) as raised:
         Watch.from_state({**state, "estimators": {"pressures": pressures}})

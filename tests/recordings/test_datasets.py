@@ -204,6 +204,7 @@ def test_the_real_strokes():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/real is absent")
 def test_all_real_strokes():
     read = list(datasets.read("vtnsi-actuator", REAL))

@@ -113,6 +113,7 @@ def test_the_identified_rig_meets_the_leak_free_columns_within_a_quarter() -> No
 
 @needs_sheet
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_sign_of_d3_on_p_A_is_predicted_from_leak_free_data() -> None:
     """At least 39 of 41, with leak columns that the fit never saw."""
     sheet, _ = read_sheet(DATA)
