@@ -255,7 +255,9 @@ def test_a_foreign_log_without_a_rate_takes_its_time_column_and_without_a_map_is
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/real/vtnsi_actuator is absent")
-@pytest.mark.parametrize("every", [12, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize(
+    "every", [pytest.param(12, marks=pytest.mark.slow), pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_every_real_stroke_gets_a_verdict(call, every):
     healthy, worn = (sorted((REAL / name).glob("*.txt")) for name in ("act_1_healthy", "act_4_seal_defect"))
     worn = worn[::every]

@@ -127,9 +127,10 @@ def test_a_machine_that_rings_by_itself_as_its_oil_warms_is_followed_and_its_lea
     assert low < 0.01 < high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("leak", "verdict"),
-    [("", "no leak"), pytest.param("0.01 L/min from 60 s", "leak", marks=[pytest.mark.slow, pytest.mark.long])],
+    [("", "no leak"), pytest.param("0.01 L/min from 60 s", "leak", marks=pytest.mark.long)],
 )
 def test_oil_that_warms_makes_parameters_drift_and_neither_a_leak_nor_a_record_that_cannot_be_followed(
     leak: str, verdict: str

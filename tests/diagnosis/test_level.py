@@ -39,7 +39,10 @@ def test_the_stated_probability_holds(count: int, error: float) -> None:
 
 
 @pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("scatter, most", [(0.3, 0.01), pytest.param(1.0, 0.01, marks=pytest.mark.slow), (2.0, 0.05)])
+@pytest.mark.parametrize(
+    "scatter, most",
+    [pytest.param(0.3, 0.01, marks=pytest.mark.slow), pytest.param(1.0, 0.01, marks=pytest.mark.slow), (2.0, 0.05)],
+)
 def test_of_machines_unlike_the_prior(count: int, scatter: float, most: float) -> None:
     """A scatter of up to the prior's alarms no more than stated; twice as much (one in eleven) somewhat more."""
     assert false_alarms(count, np.full(1500, scatter), 0.02)[0.01] < most + 0.006

@@ -118,7 +118,7 @@ def test_later_strokes_of_a_session_are_no_leak(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("times", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [True, False])
 def test_another_healthy_specimen_is_no_leak(times: bool, sessions: dict[str, list[Recording]]) -> None:
     """75 % of the strokes of one specimen were `leak` against the other, with no word of another machine."""
     for name, other in (SESSIONS, SESSIONS[::-1]):
@@ -129,6 +129,7 @@ def test_another_healthy_specimen_is_no_leak(times: bool, sessions: dict[str, li
             assert any(reason in found.reason for reason in ("another machine", "cannot be trusted", "pressure level"))
 
 
+@pytest.mark.slow
 def test_a_defective_seal_is_not_called_healthy(
     defective: list[Recording], sessions: dict[str, list[Recording]]
 ) -> None:
@@ -138,7 +139,8 @@ def test_a_defective_seal_is_not_called_healthy(
     assert verdicts == {"cannot tell": 10}
 
 
-@pytest.mark.parametrize(("gain", "share"), [(1.0, 0.0), (1.1, 0.9), pytest.param(1.3, 0.9, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("gain", "share"), [(1.0, 0.0), (1.1, 0.9), (1.3, 0.9)])
 def test_a_change_within_a_session_is_found(
     gain: float, share: float, sessions: dict[str, list[Recording]], strokes: ModuleType
 ) -> None:

@@ -112,7 +112,16 @@ def test_a_cache_folder_that_cannot_be_written_is_no_error(copy, tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners and modes of folders")
-@pytest.mark.parametrize("whose", ["another user's", "open to all", "kernels open to all", "a link", "kernels a link"])
+@pytest.mark.parametrize(
+    "whose",
+    [
+        "another user's",
+        "open to all",
+        pytest.param("kernels open to all", marks=pytest.mark.slow),
+        "a link",
+        pytest.param("kernels a link", marks=pytest.mark.slow),
+    ],
+)
 def test_no_compiled_code_is_loaded_from_a_folder_that_others_can_write(copy, tmp_path, whose):
     temporary, home = tmp_path / "tmp", tmp_path / "home"
     temporary.mkdir()
@@ -160,6 +169,7 @@ def test_a_cut_off_file_of_the_cache_is_a_miss(copy, tmp_path, suffix, left):
     assert ask(copy, SMALL, tmp_path) == (before[0], 1, before[2])
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_no_error(copy, tmp_path):
     pytest.importorskip("resource")
     full = "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
@@ -174,6 +184,7 @@ def test_an_empty_cache_folder_turns_caching_off(copy):
     assert (hits, folder) == (0, "None")
 
 
+@pytest.mark.slow
 def test_only_so_many_generations_are_kept(copy, tmp_path):
     cache = tmp_path / "cache"
     for name in "abcdef":
