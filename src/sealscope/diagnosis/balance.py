@@ -1,0 +1,146 @@
+"""Blocks of a balance from samples: of a recording, whole, or of a stream, piece by piece, by the same sums."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import SUPPORT, Blocks, Columns, Weighting
+from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE, Equation, Signals, equations
+from sealscope.diagnosis.weak_form import SPAN, STRIDE, rows, stride_samples
+from sealscope.recordings.recording import Array, Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Longest and shortest block, and how many a recording has where it is long enough for these [s].
+LONGEST, SHORTEST, WANTED = 3.0, 0.5, 20
+
+
+class BlockStream:
+    """Blocks of a stream of samples; the same for pieces of any size.
+
+    Parameters
+    ----------
+    balances : sequence of Equation
+        The machine's balances (`terms.equations`).
+    rate : float
+        Sampling rate [Hz].
+    seconds : float
+        Length of a block [s], rounded to whole strides of the weak form.
+    support : int, optional
+        Blocks at the beginning whose rows are weighted together; by default all that are pushed at first.
+    """
+
+    def __init__(
+        self, balances: Sequence[Equation], rate: float, seconds: float = LONGEST, support: int | None = SUPPORT
+    ) -> None:
+        self.columns = tuple(Columns(balance) for balance in balances)
+        self._balances, self._rate = balances, rate
+        self._stride = stride_samples(rate)
+        self._strides = max(SPAN, round(seconds / STRIDE))
+        self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
+        self._weighting, self._support = Weighting(self.columns), support
+        self._samples: dict[str, Array] = {}
+        self._first = 0  # index, in the stream, of the first sample that is kept
+        self._done = 0  # blocks that are closed
+        self._zeros: dict[str, float] | None = None
+
+    def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
+        """Take the next samples, each channel of the same length; return the blocks they complete, None for none.
+
+        A missing sample is NaN. `last`: nothing follows, so that what remains is closed as well.
+        """
+        for name, values in samples.items():
+            before = self._samples.get(name)
+            self._samples[name] = values if before is None else np.concatenate([before, values])
+        have = self._first + len(next(iter(self._samples.values()), ()))
+        length = self._strides * self._stride
+        beyond = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
+        count = max(0, (have - beyond) // length)
+        if count <= self._done or (not last and self._done == 0 and count < (self._support or 1)):
+            return None
+        blocks = self._close(self._done, count)
+        self._done = count
+        keep = max(0, count * length - self._margin)
+        self._samples = {name: values[keep - self._first :] for name, values in self._samples.items()}
+        self._first = keep
+        return blocks
+
+    def _close(self, first: int, end: int) -> Blocks:
+        """Return blocks `first` to `end`."""
+        length = self._strides * self._stride
+        start = first * length
+        begin = max(self._first, start - self._margin)
+        stop = end * length + (SPAN - 1) * self._stride + 1
+        reach = stop + self._margin - self._first
+        cut = {name: values[begin - self._first : reach] for name, values in self._samples.items()}
+        if self._zeros is None:
+            early = slice(0, (self._support or end) * length)
+            self._zeros = {name: _zero(cut[name][early]) for name in ("p_A", "p_B") if name in cut}
+        signals = Signals(cut, self._rate, self._zeros)
+        inner = slice(start - begin, stop - 1 - begin)
+        values: list[list[Array]] = []
+        whole = np.ones((end - first) * self._strides, dtype=bool)
+        cut_rows = []
+        for balance in self._balances:
+            columns = [*(term.increments(signals) for term in balance.terms), balance.left(signals)]
+            cut_rows.append(rows([column[inner] for column in columns], self._rate, start / self._rate))
+            whole &= cut_rows[-1].whole
+        cuts = np.arange(self._strides, len(whole), self._strides)
+        kept = np.split(whole, cuts)
+        for own in cut_rows:
+            values.append([block[keep] for block, keep in zip(np.split(own.values, cuts), kept, strict=True)])
+        gram, weights = self._weigh(values, first)
+        times = cut_rows[0].time.reshape(end - first, self._strides)
+        return Blocks(times[:, 0], times[:, -1], gram, weights, self._means(signals, inner, end - first))
+
+    def _weigh(self, values: Sequence[Sequence[Array]], first: int) -> tuple[Array, Array]:
+        """Return Gram matrices and weights of blocks, those that support a stream together, then one by one."""
+        count = len(values[0])
+        together = min(self._support or count, count) if first == 0 else 1
+        parts, at = [], 0
+        while at < count:
+            parts.append(self._weighting.close([own[at : at + together] for own in values]))
+            at, together = at + together, 1
+        return np.concatenate([gram for gram, _ in parts]), np.concatenate([rows for _, rows in parts])
+
+    def _means(self, signals: Signals, inner: slice, count: int) -> Array:
+        """Return the means of abs(p_A - p_B), of its root and of the left side's rate over each block."""
+        size = np.abs(signals.pressure_difference)
+        rate = np.abs(self._balances[0].left(signals)) * self._rate
+        length = self._strides * self._stride
+        cut = [of[inner][: count * length].reshape(count, length) for of in (size, np.sqrt(size), rate)]
+        missing = np.isnan(cut[0]) | np.isnan(cut[2])
+        number = np.maximum((~missing).sum(axis=1), 1)
+        return np.column_stack([np.where(missing, 0.0, of).sum(axis=1) / number for of in cut])
+
+
+def _zero(pressure: Array) -> float:
+    """Return what makes a gauge pressure absolute: the atmosphere, or more where the sensor's zero is surely too low."""
+    finite = pressure[np.isfinite(pressure)]
+    lowest = float(np.min(finite)) if finite.size else 0.0
+    return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
+
+
+def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ...]] | None:
+    """Return the blocks of a recording and where their columns stand; None where its channels allow no balance."""
+    names = [name for name in recording.channels if name in _READ]
+    balances = equations(rig, frozenset(names))
+    if not balances:
+        return None
+    needed = {"x", "p_A", "p_B", *(name for balance in balances for term in balance.terms for name in term.needs)}
+    needed |= {next(name for name in ("theta", "omega", "u") if name in names)}
+    samples = {name: recording[name] for name in names if name in needed}
+    if recording.bridged is not None:
+        samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
+    stream = BlockStream(
+        balances, recording.rate, min(LONGEST, max(SHORTEST, recording.duration / WANTED)), support=None
+    )
+    blocks = stream.push(samples, last=True)
+    return None if blocks is None else (blocks.merged(), stream.columns)
+
+
+_READ = ("u", "omega", "theta", "x", "p_1", "p_2", "p_A", "p_B")

@@ -1,0 +1,350 @@
+"""Information in blocks: what a stretch of a recording says of the coefficients of a balance, and how it is added up.
+
+A block keeps, of the rows within it, the Gram matrix of all columns (terms and left side). Blocks add: the sum of their
+matrices is that of their union, so that a stream and a whole recording are handled alike, and a recording of hours
+costs no more than one of minutes. Rows are weighted once, when their block is closed (`Weighting`).
+
+For one coefficient g, a number for each block, everything else is eliminated (`information`). The other coefficients
+are a level with a slow drift, c_j(t) = sum_p c_jp P_p(t), whose size is believed within a width (`terms.toml`):
+
+    Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2,
+
+with the sums N_k of d^2 and n_k of d y, B_k of d o, M of o o' (plus the beliefs) and m of o y over the rows of block k
+(d the column of g, o the others with their drifts, y the left side); the likelihood of g is exp(eta' g - g' Lambda g/2).
+
+Source: P. J. Huber, Ann. Math. Statist. 35 (1964) 73 (weights).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.terms import LEAK, Equation, Prior, priors
+from sealscope.diagnosis.weak_form import SPAN, test_function
+from sealscope.recordings.recording import Array
+
+#: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
+HUBER = 1.345
+#: Blocks whose rows are weighted together at the beginning, and that stand for what is known later.
+SUPPORT = 5
+#: Most blocks that are handled at once; neighbours are added up beyond.
+MOST_BLOCKS = 240
+#: Degree of the drifts.
+DRIFT_DEGREE = 2
+#: Ratios of the variance that goes with the flow to that which does not, which are tried.
+RATIOS = (0.0, *(10.0 ** np.arange(-1.0, 5.1, 0.5)))
+#: Standard deviations of the scale of motion between blocks that are tried, and none.
+SCALES = np.concatenate([[0.0], 10.0 ** np.linspace(-5.0, 0.0, 41)])
+_RIDGE = 1e-10  # of a matrix whose diagonal is 1
+_TURNS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Consecutive blocks of a recording.
+
+    Parameters
+    ----------
+    start, end : array of float, shape (K,)
+        Times of the first and the last row of each block [s].
+    gram : array of float, shape (K, E, m, m)
+        Sums of the products, over the rows' variances, of the m columns over the rows of each of E equations, the left side last.
+    rows : array of float, shape (K,)
+        Number of rows that no missing sample touches.
+    means : array of float, shape (K, 3)
+        Means of abs(p_A - p_B) [Pa], of its root, and of the size of the left side's rate [m^3/s].
+    """
+
+    start: Array
+    end: Array
+    gram: Array
+    rows: Array
+    means: Array
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    @property
+    def time(self) -> Array:
+        """Middle of each block [s]."""
+        return 0.5 * (self.start + self.end)
+
+    def merged(self, most: int = MOST_BLOCKS) -> Blocks:
+        """Return at most so many blocks, neighbours added up."""
+        each = -(-len(self) // most)
+        if each <= 1:
+            return self
+        first = np.arange(0, len(self), each)
+        last = np.append(first[1:], len(self)) - 1
+        rows = np.add.reduceat(self.rows, first)
+        weighted = np.add.reduceat(self.means * self.rows[:, None], first, axis=0)
+        return Blocks(
+            self.start[first],
+            self.end[last],
+            np.add.reduceat(self.gram, first, axis=0),
+            rows,
+            weighted / np.maximum(rows, 1.0)[:, None],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Blocks]) -> Blocks:
+        """Return blocks one after the other."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+
+class Information(NamedTuple):
+    """What K blocks say of one coefficient, one number g_k a block: likelihood exp(vector g - g precision g / 2).
+
+    `time` (K,) [s], `precision` (K, K), `vector` (K,).
+    """
+
+    time: Array
+    precision: Array
+    vector: Array
+
+
+class Columns:
+    """Where the columns of a balance stand in its Gram matrices, and what is believed of them."""
+
+    def __init__(self, equation: Equation) -> None:
+        self.names = tuple(term.name for term in equation.terms)
+        self.left = len(self.names)
+        self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
+        self.leak = self.names.index(LEAK)
+        beliefs: Mapping[str, Prior] = priors()["drift"]
+        self.drift = np.array([beliefs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
+        differs = priors()["between"]
+        self.between = np.array([differs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
+        self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
+        self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in ("leak", "bias"))
+
+
+class Weighting:
+    """Closes blocks: weighs the rows of each by what the block and those before it say, and keeps their sums."""
+
+    def __init__(self, columns: Sequence[Columns]) -> None:
+        self._columns = columns
+        self._known: list[Array | None] = [None] * len(columns)
+        self._count = 0
+
+    def close(self, values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
+        """Return the Gram matrices (K, E, m, m) and the sums of weights (K,) of K blocks that are weighted together.
+
+        `values`: of each equation, the rows (r, m) of each block.
+        """
+        grams = []
+        rows = np.array([len(block) for block in values[0]], dtype=float)
+        self._count += len(rows)
+        share = min(1.0, SUPPORT / self._count)
+        for e, columns in enumerate(self._columns):
+            before = self._known[e]
+            weights = _weights(np.concatenate(values[e]), columns, before)
+            pairs = zip(values[e], np.split(weights, np.cumsum(rows[:-1]).astype(int)), strict=True)
+            grams.append(np.array([(block * w[:, None]).T @ block for block, w in pairs]))
+            # what stands for the blocks before is worth SUPPORT blocks, however many these were
+            known = _supported(grams[-1].sum(axis=0), columns) * (SUPPORT / len(rows))
+            self._known[e] = known if before is None else (1.0 - share) * before + share * known
+        return np.stack(grams, axis=1), rows
+
+
+def _supported(gram: Array, columns: Columns) -> Array:
+    """Return what a Gram matrix says of the columns that change slowly, whatever leak and zero of the flow are."""
+    slow = [*columns.support, columns.left]
+    fast = [k for k in columns.nuisance if k not in columns.support]
+    inner = gram[np.ix_(fast, fast)]
+    cross = gram[np.ix_(slow, fast)]
+    reduced = np.zeros_like(gram)
+    reduced[np.ix_(slow, slow)] = gram[np.ix_(slow, slow)] - cross @ solve(inner, cross.T)
+    return reduced
+
+
+def _weights(values: Array, columns: Columns, known: Array | None) -> Array:
+    """Return Huber's weight of each row, from a fit to the rows and what is known."""
+    weights = np.ones(len(values))
+    if not len(values):
+        return weights
+    chosen = list(columns.nuisance)
+    x, y = values[:, chosen], values[:, columns.left]
+    prior = 0.0 if known is None else known[np.ix_(chosen, chosen)]
+    lead = 0.0 if known is None else known[chosen, columns.left]
+    for _ in range(_TURNS):
+        weighted = x * weights[:, None]
+        residual = np.abs(y - x @ solve(weighted.T @ x + prior, weighted.T @ y + lead))
+        scale = 1.4826 * np.median(residual)
+        if not scale > 0.0:
+            return np.ones(len(values))
+        weights = np.minimum(1.0, HUBER * scale / np.maximum(residual, np.finfo(float).tiny))
+    return weights
+
+
+def solve(matrix: Array, right: Array) -> Array:
+    """Return matrix^-1 right of a symmetric matrix >= 0; directions that nothing is known of are left at zero."""
+    size = np.sqrt(np.diag(matrix))
+    size = np.where(size > 0.0, size, 1.0)
+    scaled = matrix / np.outer(size, size)
+    scaled[np.diag_indices_from(scaled)] += _RIDGE
+    shaped = right / (size if right.ndim == 1 else size[:, None])
+    solved = np.linalg.solve(scaled, shaped)
+    return np.asarray(solved / (size if right.ndim == 1 else size[:, None]))
+
+
+def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces: int | None = None) -> Information:
+    """Return what the blocks say of the coefficient of one column, all other coefficients eliminated.
+
+    `test`: index of the column, the left side's for a change of scale; `replaces`: a column that is left out for it.
+    """
+    count = len(blocks)
+    precision, vector = np.zeros((count, count)), np.zeros(count)
+    for e, own in enumerate(columns):
+        others = [k for k in own.nuisance if k not in (test, replaces)]
+        part, lead = _eliminated(blocks.gram[:, e], blocks, own, test, others)
+        precision += part
+        vector += lead
+    return Information(blocks.time, precision, vector)
+
+
+def overlap(rate: float = 1000.0) -> float:
+    """Return the long-run variance of white noise in the rows over their variance: overlapping rows repeat each other.
+
+    The sum of the test function's correlations with its neighbours.
+    """
+    phi = test_function(rate).ravel()
+    stride = len(phi) // SPAN
+    energy = float(phi @ phi)
+    return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
+
+
+def _drifts(blocks: Blocks) -> tuple[Array, float]:
+    """Return the drifts' shapes over the blocks, shape (K, DRIFT_DEGREE + 1), and the recording's length in minutes."""
+    minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
+    tau = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0
+    return np.polynomial.legendre.legvander(tau, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
+
+
+class _Normal(NamedTuple):
+    """Sums over the blocks, other columns with each of their drifts in turn (size of them, c): `cross` (c, c), `left`
+    (c,), with the tested column in each block `along` (K, c); of that column `energy` (K,) and `lead` (K,), its product
+    with the left side; `square`: of the left side.
+    """
+
+    cross: Array
+    left: Array
+    along: Array
+    energy: Array
+    lead: Array
+    square: float
+
+
+def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int) -> _Normal:
+    size = len(others) * powers.shape[1]
+    cross = np.einsum("kij,kp,kq->ipjq", gram[:, others][:, :, others], powers, powers, optimize=True)
+    return _Normal(
+        cross.reshape(size, size),
+        np.einsum("ki,kp->ip", gram[:, others, left], powers).ravel(),
+        np.einsum("ki,kp->kip", gram[:, others, test], powers).reshape(len(gram), size),
+        gram[:, test, test],
+        gram[:, test, left],
+        float(gram[:, left, left].sum()),
+    )
+
+
+def _fitted(normal: _Normal, width: Array, degrees: int, rows: float) -> tuple[Array, Array, float]:
+    """Return the other coefficients with their drifts (c,), what is believed of the drifts, a precision (c,), and the
+    variance of a row, inflated for the overlap of the rows; the tested column's coefficient is free in each block.
+    """
+    energy = np.maximum(normal.energy, np.finfo(float).tiny)
+    cross = normal.cross - (normal.along / energy[:, None]).T @ normal.along
+    left = normal.left - normal.along.T @ (normal.lead / energy)
+    square = normal.square - float((normal.lead**2 / energy).sum())
+    variance, least = square / rows, 1e-14 * normal.square / rows
+    for _ in range(_TURNS):
+        belief = np.zeros((len(width), degrees))
+        with np.errstate(divide="ignore", over="ignore"):
+            belief[:, 1:] = (overlap() * variance / width**2)[:, None]
+        # a coefficient that is zero drifts by nothing
+        precision = np.minimum(belief.ravel(), 1e9 * np.diag(normal.cross))
+        coefficients = solve(cross + np.diag(precision), left)
+        variance = max(square - float(left @ coefficients), least) / rows
+    return coefficients, precision, max(overlap() * variance, np.finfo(float).tiny)
+
+
+class _Fit(NamedTuple):
+    """Sums (K, m, m) with the scale of motion of each block set aside, what is believed of the drifts (c,), and the
+    variance of a row.
+    """
+
+    gram: Array
+    normal: _Normal
+    belief: Array
+    variance: float
+
+
+def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int]) -> _Fit:
+    """Return the fit of one equation, the tested column's coefficient free in each block."""
+    powers, minutes = _drifts(blocks)
+    rows, degrees = max(float(blocks.rows.sum()), 1.0), powers.shape[1]
+    total = gram.sum(axis=0)
+    level = solve(total[np.ix_(others, others)], total[others, columns.left])
+    width = np.abs(level) * columns.drift[others] * minutes
+    normal = _normal(gram, powers, others, test, columns.left)
+    coefficients, _, variance = _fitted(normal, width, degrees, rows)
+    of_block = np.zeros((len(blocks), gram.shape[1]))
+    of_block[:, others] = powers @ coefficients.reshape(len(others), degrees).T
+    of_block[:, test] = (normal.lead - normal.along @ coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)
+    gram = _downdated(gram, _scale(gram, of_block, variance, columns), of_block, variance, columns)
+    normal = _normal(gram, powers, others, test, columns.left)
+    _, belief, variance = _fitted(normal, width, degrees, rows)
+    return _Fit(gram, normal, belief, variance)
+
+
+def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int]) -> tuple[Array, Array]:
+    """Return precision (K, K) and vector (K,) of one equation."""
+    _, normal, belief, variance = _fit(gram, blocks, columns, test, others)
+    solved = solve(normal.cross + np.diag(belief), np.column_stack([normal.along.T, normal.left]))
+    precision = (np.diag(normal.energy) - normal.along @ solved[:, :-1]) / variance
+    vector = (normal.lead - normal.along @ solved[:, -1]) / variance
+    return 0.5 * (precision + precision.T), vector
+
+
+def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
+    """Return a recording's sums (E, m, m), over the rows' variance, the scale of motion of each block set aside."""
+    sums = []
+    for e, own in enumerate(columns):
+        others = [k for k in own.nuisance if k != own.leak]
+        fit = _fit(blocks.gram[:, e], blocks, own, own.leak, others)
+        sums.append(fit.gram.sum(axis=0) / fit.variance)
+    return np.array(sums)
+
+
+def _scale(gram: Array, coefficients: Array, variance: float, columns: Columns) -> float:
+    """Return the standard deviation of the scale of motion between blocks, of the largest likelihood, beside what the
+    tested coefficient takes of each block.
+    """
+    motion, square = _motion(gram, coefficients, columns)
+    left = motion[:, columns.left] - np.einsum("km,km->k", motion, coefficients)
+    moving = square > 0.0
+    if np.count_nonzero(moving) < 2:
+        return 0.0
+    error, own = variance / square[moving], left[moving] / square[moving]
+    spread = error + SCALES[:, None] ** 2
+    likelihood = -0.5 * (np.log(spread) + own**2 / spread).sum(axis=1)
+    return float(SCALES[int(likelihood.argmax())])
+
+
+def _motion(gram: Array, coefficients: Array, columns: Columns) -> tuple[Array, Array]:
+    """Return the sums of the fitted motion with each column (K, m), and with itself (K,)."""
+    chosen = list(columns.motion)
+    sums = np.einsum("kmi,ki->km", gram[:, :, chosen], coefficients[:, chosen])
+    return sums, np.einsum("ki,ki->k", sums[:, chosen], coefficients[:, chosen])
+
+
+def _downdated(gram: Array, scale: float, coefficients: Array, variance: float, columns: Columns) -> Array:
+    """Return the sums with the scale of motion of each block, known to `scale`, set aside."""
+    if not scale > 0.0:
+        return gram
+    sums, square = _motion(gram, coefficients, columns)
+    return np.asarray(gram - sums[:, :, None] * sums[:, None, :] / (square + variance / scale**2)[:, None, None])

@@ -1,0 +1,253 @@
+"""Did a coefficient step within a recording? The likelihood ratio over all onsets, beside a random walk.
+
+Of one coefficient g, a number for each of K blocks, the blocks say `Information`(Lambda, eta). In any healthy machine g
+has a level, a slope and a random walk; with a leak also a step from its onset on:
+
+    g = F a + w + delta s(onset),    z = Lambda^(-1/2) eta ~ N(Lambda^(1/2) g, kappa I),    cov w = kappa q min(k, l),
+
+kappa the inflation of the noise for what the rows' correlation adds. F is projected out; (q, kappa) are estimated with
+the step and without it; one eigenproblem serves all onsets and all q. The score is twice the logarithm of the ratio of
+the likelihoods, for steps > 0. An onset within a block is a part of a step there.
+
+Its chance under the null follows from geometry, without a simulation: for a given q the whitened z is uniform on a
+sphere in n = K - 2 dimensions, steps over all onsets form a curve of length L on it, and the chance that z lies within
+the angle of its best onset, cos^2 = 1 - exp(-score/n), of that curve is that of a tube about it,
+
+    P = I_{1-c^2}((n - 1)/2, 1/2) / 2 + L / (2 pi) (1 - c^2)^((n - 2)/2),    c = cos.
+
+Sources: H. Hotelling, Amer. J. Math. 61 (1939) 440; M. Knowles and D. Siegmund, Int. Statist. Rev. 57 (1989) 205
+(tubes); R. B. Davies, Biometrika 74 (1987) 33 (a parameter present under the alternative only).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import Information
+from sealscope.recordings.recording import Array
+
+#: Fewest blocks: a level, a slope, a step and its deviation leave nothing below.
+FEWEST = 5
+#: Parts of a block in which an onset is looked for, and blocks at either end in which none is.
+PARTS, EDGE = 5, 2
+#: Sizes of the random walk that are tried: q over the noise, and none.
+WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])
+_RANK = 1e-9  # directions that carry less of the largest precision carry nothing
+
+
+class Interval(NamedTuple):
+    """An estimate with its interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class StepTest:
+    """The test of a step of one coefficient over all onsets; made by `step_test`.
+
+    Parameters
+    ----------
+    score : float
+        Twice the logarithm of the likelihood ratio of the best step > 0.
+    chance : float
+        Probability that a coefficient without a step scores as high.
+    best : int
+        Index of the most likely onset.
+    onsets : array of float, shape (o,)
+        Onsets that were tried [s].
+    likelihood : array of float, shape (o,)
+        Log-likelihood of a step at each, its size and the walk's fitted.
+    size, deviation : array of float, shape (o,)
+        Step at each onset and its standard deviation, for the walk without a step.
+    fitted : tuple of two floats
+        Step at the best onset and its standard deviation, for the walk beside it.
+    walk, noise : tuple of two floats
+        q and kappa without a step and with the best one.
+    law : NullLaw
+        Distribution of the score under the null.
+    """
+
+    score: float
+    chance: float
+    best: int
+    onsets: Array
+    likelihood: Array
+    size: Array
+    deviation: Array
+    fitted: tuple[float, float]
+    walk: tuple[float, float]
+    noise: tuple[float, float]
+    law: NullLaw
+
+    @cached_property
+    def weights(self) -> Array:
+        """Probability of each onset, given that there is a step."""
+        weights = np.exp(self.likelihood - self.likelihood.max())
+        return np.asarray(weights / weights.sum())
+
+    def onset(self, probability: float = 0.95) -> Interval:
+        """Return the most likely onset [s] and the interval that holds it with a probability."""
+        ends = np.interp([0.5 - 0.5 * probability, 0.5 + 0.5 * probability], np.cumsum(self.weights), self.onsets)
+        best = float(self.onsets[self.best])
+        step = float(self.onsets[1] - self.onsets[0]) if len(self.onsets) > 1 else 0.0
+        return Interval(best, min(float(ends[0]), best) - 0.5 * step, max(float(ends[1]), best) + 0.5 * step)
+
+    def bound(self, probability: float = 0.95) -> float:
+        """Return the step that is exceeded with probability 1 - `probability`, given that there is a step > 0."""
+        from scipy.special import ndtr
+
+        deviation = np.maximum(self.deviation, np.finfo(float).tiny)
+        weights = self.weights
+        above = weights * ndtr(self.size / deviation)
+        low, high = 0.0, float(np.max(self.size + 12.0 * deviation))
+        if not above.sum() > 0.0 or not high > 0.0:
+            return max(high, 0.0)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            beyond = float((weights * ndtr((self.size - middle) / deviation)).sum())
+            low, high = (middle, high) if beyond > (1.0 - probability) * above.sum() else (low, middle)
+        return high
+
+    def threshold(self, chance: float) -> float:
+        """Return the score that a coefficient without a step exceeds with a probability."""
+        low, high = 0.0, 1e4
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.law.chance(middle) > chance else (low, middle)
+        return high
+
+
+class Course(NamedTuple):
+    """A coefficient over the blocks: `mean` (K,) and `covariance` (K, K) given the blocks and the model of `step_test`."""
+
+    mean: Array
+    covariance: Array
+
+    def over(self, weights: Array) -> Interval:
+        """Return the weighted mean of the coefficient with its 95 % interval, weights (K,) of sum 1."""
+        value = float(weights @ self.mean)
+        half = 1.96 * float(np.sqrt(max(weights @ self.covariance @ weights, 0.0)))
+        return Interval(value, value - half, value + half)
+
+
+def course(information: Information, test: StepTest | None, step: bool) -> Course:
+    """Return the coefficient over the blocks: level, slope and random walk, with the best step or without one."""
+    count = len(information.time)
+    index = np.arange(count) - 0.5 * (count - 1)
+    noise = 1.0 if test is None else test.noise[step]
+    design = [np.ones(count)]
+    if count >= FEWEST:
+        design.append(index / max(count, 1))
+    if step and test is not None:
+        design.append(np.clip((information.time - test.onsets[test.best]) / _spacing(information.time) + 0.5, 0.0, 1.0))
+    fixed = len(design)
+    walk = 0.0 if test is None else test.walk[step]
+    if walk > 0.0:
+        design += list(np.sqrt(walk) * np.tril(np.ones((count, count))).T)
+    basis = np.column_stack(design)
+    precision = basis.T @ information.precision @ basis / noise
+    precision[np.arange(fixed, basis.shape[1]), np.arange(fixed, basis.shape[1])] += 1.0 / noise
+    inverse = _inverse(precision)
+    mean = basis @ (inverse @ (basis.T @ information.vector / noise))
+    return Course(mean, basis @ inverse @ basis.T)
+
+
+def _spacing(time: Array) -> float:
+    return float(time[1] - time[0]) if len(time) > 1 else 1.0
+
+
+def _inverse(matrix: Array) -> Array:
+    size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    return np.asarray(np.linalg.pinv(matrix / np.outer(size, size), hermitian=True) / np.outer(size, size))
+
+
+class NullLaw(NamedTuple):
+    """The null distribution of the score: dimensions and the curve's length."""
+
+    dimensions: int
+    length: float
+
+    def chance(self, score: float) -> float:
+        """Return the probability of a higher score."""
+        from scipy.special import betainc
+
+        n = self.dimensions
+        away = float(np.exp(-max(score, 0.0) / n))  # 1 - cos^2
+        tube = self.length / (2.0 * np.pi) * away ** (0.5 * (n - 2))
+        return min(1.0, 0.5 * float(betainc(0.5 * (n - 1), 0.5, away)) + tube)
+
+
+def step_test(information: Information) -> StepTest | None:
+    """Return the test of a step; None where too few blocks say anything."""
+    time, precision, vector = information
+    count = len(time)
+    values, vectors = np.linalg.eigh(precision)
+    kept = values > _RANK * max(float(values[-1]), 0.0)
+    if count < FEWEST or np.count_nonzero(kept) < FEWEST:
+        return None
+    root = np.sqrt(values[kept])
+    design = (vectors[:, kept] * root).T
+    z = (vectors[:, kept].T @ vector) / root
+    index = np.arange(count)
+    trend = np.column_stack([np.ones(count), index - index.mean()])
+    free = np.linalg.qr(design @ trend, mode="complete")[0][:, 2:].T
+    inner, outer = free @ design, np.minimum.outer(index, index) + 1.0
+    covariance = inner @ outer @ inner.T
+    unit = len(free) / max(float(np.trace(covariance)), np.finfo(float).tiny)
+    eigen, basis = np.linalg.eigh(unit * covariance)
+    at = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
+    steps = np.clip(index[:, None] + 1.0 - at, 0.0, 1.0)
+    return _scan(basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0), _onset_times(time, at), unit)
+
+
+def _onset_times(time: Array, at: Array) -> Array:
+    """Return the times of onsets given in blocks from the beginning of the first."""
+    edges = np.concatenate(
+        [[1.5 * time[0] - 0.5 * time[1]], 0.5 * (time[1:] + time[:-1]), [1.5 * time[-1] - 0.5 * time[-2]]]
+    )
+    return np.interp(at, np.arange(len(edges)), edges)
+
+
+def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float) -> StepTest:
+    """Return the test from z (n,), steps (n, o) and the walk's eigenvalues (n,), times `unit`, in its eigenvectors."""
+    n = len(z)
+    weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
+    total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
+    along, square = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
+    determinant = np.log(weight).sum(axis=1)
+    without = 0.5 * determinant - 0.5 * n * np.log(total / n)
+    rest = np.maximum(total[:, None] - np.maximum(along, 0.0) ** 2 / square, 1e-12 * total[:, None])
+    beside = 0.5 * determinant[:, None] - 0.5 * n * np.log(rest / n)
+    plain = int(without.argmax())
+    walk, best = np.unravel_index(int(beside.argmax()), beside.shape)
+    score = 2.0 * float(beside[walk, best] - without[plain])
+    law = max((_law(weight[k], steps) for k in (plain, walk)), key=lambda own: own.length)
+    noise = float(rest[walk, best]) / n
+    fitted = float(along[walk, best] / square[walk, best]), float(np.sqrt(noise / square[walk, best]))
+    size = along[plain] / square[plain]
+    return StepTest(
+        score=score,
+        chance=law.chance(score),
+        best=int(best),
+        onsets=onsets,
+        likelihood=beside.max(axis=0),
+        size=size,
+        deviation=np.sqrt(np.maximum(total[plain] - along[plain] ** 2 / square[plain], 0.0) / n / square[plain]),
+        fitted=fitted,
+        walk=(unit * float(WALKS[plain]), unit * float(WALKS[walk])),
+        noise=(float(total[plain]) / n, noise),
+        law=law,
+    )
+
+
+def _law(weight: Array, steps: Array) -> NullLaw:
+    whitened = np.sqrt(weight)[:, None] * steps
+    whitened /= np.maximum(np.linalg.norm(whitened, axis=0), np.finfo(float).tiny)
+    cosines = np.clip((whitened[:, 1:] * whitened[:, :-1]).sum(axis=0), -1.0, 1.0)
+    return NullLaw(len(steps), float(np.arccos(cosines).sum()))

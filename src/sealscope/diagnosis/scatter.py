@@ -1,0 +1,95 @@
+"""Is it more than in the baseline? A recording's leakage against the scatter between healthy recordings.
+
+The sums of the baseline's recordings are added up and give the coefficients of all terms; what a recording's own rows
+leave of them along the leak's column, its own zero of the flow set aside, is its rise. The rise of each healthy
+recording against the others measures how recordings differ; whatever the model does not describe is in it, once.
+
+    t = rise / (s sqrt(1 + 1/n)),    s^2 = (nu_0 s_0^2 + sum_j r_j^2 ((n - 1)/n)^2) / (nu_0 + n - 1),
+
+Student's t with nu_0 + n - 1 degrees of freedom: r_j is the rise of recording j of n against the n - 1 others, s_0 and
+nu_0 what is believed of the scatter beforehand (`terms.toml`).
+
+Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), section 3.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import Blocks, Columns, solve, total
+from sealscope.diagnosis.terms import priors
+from sealscope.recordings.recording import Array
+
+
+class Rise(NamedTuple):
+    """The leak's coefficient beyond the baseline's: `value` and its `deviation`, with `freedom` degrees of freedom."""
+
+    value: float
+    deviation: float
+    freedom: float
+
+    @property
+    def score(self) -> float:
+        """Student's t of the rise."""
+        return self.value / self.deviation
+
+    @property
+    def chance(self) -> float:
+        """Probability that a healthy recording scores as high."""
+        from scipy.special import stdtr
+
+        return float(stdtr(self.freedom, -self.score))
+
+    def threshold(self, chance: float) -> float:
+        """Return the score that a healthy recording exceeds with a probability."""
+        from scipy.special import stdtrit
+
+        return float(stdtrit(self.freedom, 1.0 - chance))
+
+    def interval(self, probability: float = 0.95) -> tuple[float, float]:
+        """Return the interval of the rise that holds with a probability."""
+        half = self.threshold(0.5 - 0.5 * probability) * self.deviation
+        return self.value - half, self.value + half
+
+
+def rise(judged: Blocks, baseline: Sequence[Blocks], columns: Sequence[Columns]) -> Rise:
+    """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine."""
+    sums = [total(own, columns) for own in baseline]
+    value = _rise(total(judged, columns), sum(sums), columns)
+    beliefs, count = priors()["scatter"], len(sums)
+    flow, pressure = (float(np.average(judged.means[:, k], weights=np.maximum(judged.rows, 1e-9))) for k in (2, 0))
+    believed = beliefs["leak"].value * flow / pressure if pressure > 0.0 else 0.0
+    squares = beliefs["freedom"].value * believed**2
+    freedom = beliefs["freedom"].value + count - 1
+    if count > 1:
+        everything = sum(sums)
+        apart = np.array([_rise(own, everything - own, columns) for own in sums])
+        squares += float(np.sum(apart**2)) * ((count - 1) / count) ** 2
+    deviation = np.sqrt(squares / freedom * (1.0 + 1.0 / count))
+    return Rise(value, max(float(deviation), np.finfo(float).tiny), freedom)
+
+
+def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
+    """Return the rise of the leak's coefficient in one recording's sums (E, m, m) beyond those of others.
+
+    The recording's other coefficients differ from theirs by what is believed of recordings of one machine.
+    """
+    precision, vector = 0.0, 0.0
+    for e, column in enumerate(columns):
+        chosen = list(column.nuisance)
+        coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
+        left = own[e][:, column.left] - own[e][:, chosen] @ coefficients
+        others = [k for k in chosen if k != column.leak]
+        size = np.abs(coefficients[[chosen.index(k) for k in others]])
+        with np.errstate(divide="ignore", over="ignore"):
+            belief = 1.0 / (size * column.between[others]) ** 2
+        matrix = own[e][np.ix_(others, others)]
+        matrix = matrix + np.diag(np.minimum(belief, 1e9 * np.diag(matrix)))
+        along = own[e][others, column.leak]
+        solved = solve(matrix, np.column_stack([along, left[others]]))
+        precision += float(own[e][column.leak, column.leak] - along @ solved[:, 0])
+        vector += float(left[column.leak] - along @ solved[:, 1])
+    return vector / precision if precision > 0.0 else 0.0

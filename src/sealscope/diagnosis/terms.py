@@ -1,0 +1,369 @@
+"""The terms of a machine's volume balance, as rows of data.
+
+A balance is linear in what is not known of the machine. For a pump-controlled cylinder
+
+    D dtheta = sum_j c_j f_j dg_j + G (p_A - p_B) dt,
+
+with the pump's displacement D [m^3/rad], the leakage conductance G [m^3/(s Pa)] and a coefficient c_j for each term;
+f_j and g_j are functions of the recorded channels. A term gives its increment f_j dg_j over each sampling interval, so
+that nothing is differentiated (`weak_form`). Behind a servo valve each chamber has a balance of its own, whose left
+side is what the piston displaces and whose terms are the orifice flows of the valve's edges; G is the same in both.
+
+What is believed of a term is in `terms.toml`: how fast its coefficient may drift, each with unit and source.
+
+Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of the edges).
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from functools import cache, cached_property
+from importlib.resources import files
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.recordings.recording import Array
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Pressure of the surroundings [Pa], by which a gauge pressure is less than the absolute one.
+ATMOSPHERE = 101325.0
+#: The least absolute pressure that the terms of air are computed for [Pa]; oil boils, and they say nothing, below it.
+LEAST_ABSOLUTE = 2e4
+#: Half the time over which the direction of motion is taken [s]: a few counts of an encoder at slow motion.
+HALF_DIFFERENCE = 0.025
+
+
+class Prior(NamedTuple):
+    """A belief: value, unit and source, as `terms.toml` states it."""
+
+    value: float
+    unit: str
+    source: str
+
+
+@cache
+def priors() -> Mapping[str, Mapping[str, Prior]]:
+    """Return what is believed of the terms, and between recordings, by table and name."""
+    tree = tomllib.loads((files("sealscope.diagnosis") / "terms.toml").read_text("utf-8"))
+    return {table: {name: Prior(**row) for name, row in rows.items()} for table, rows in tree.items()}
+
+
+class Signals:
+    """Samples of the channels that terms read, with what several terms share.
+
+    Parameters
+    ----------
+    channels : mapping of str to array_like of float, shape (n,)
+        Values in SI units.
+    rate : float
+        Sampling rate [Hz].
+    zeros : mapping of str to float
+        What is added to a gauge pressure to make it an absolute one [Pa], by the channel's name.
+    """
+
+    def __init__(self, channels: Mapping[str, Array], rate: float, zeros: Mapping[str, float]) -> None:
+        self._channels, self.rate, self._zeros = channels, rate, zeros
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._channels
+
+    def __getitem__(self, name: str) -> Array:
+        return self._channels[name]
+
+    def step(self, name: str) -> Array:
+        """Return the increments of a channel, shape (n - 1,)."""
+        return np.diff(self._channels[name])
+
+    def mean(self, name: str) -> Array:
+        """Return the means of neighbouring samples, shape (n - 1,)."""
+        return _middle(self._channels[name])
+
+    @cached_property
+    def dt(self) -> Array:
+        """Sampling interval [s] of each increment, shape (n - 1,)."""
+        return np.full(len(next(iter(self._channels.values()))) - 1, 1.0 / self.rate)
+
+    @cached_property
+    def pressure_difference(self) -> Array:
+        """p_A - p_B [Pa] in the middle of each interval."""
+        return self.mean("p_A") - self.mean("p_B")
+
+    @cached_property
+    def absolute(self) -> Mapping[str, Array]:
+        """Absolute pressure [Pa] of each chamber, at least `LEAST_ABSOLUTE`."""
+        return {
+            name: np.maximum(self._channels[name] + self._zeros.get(name, ATMOSPHERE), LEAST_ABSOLUTE)
+            for name in ("p_A", "p_B")
+        }
+
+    @cached_property
+    def outward(self) -> Array:
+        """1 where the piston moves towards B or rests, else 0, at each sample, by a central difference."""
+        half = max(1, round(HALF_DIFFERENCE * self.rate))
+        padded = np.pad(self._channels["x"], half, mode="edge")
+        return (padded[2 * half :] >= padded[: -2 * half]).astype(float)
+
+    @cached_property
+    def carried_by_A(self) -> Array:
+        """1 where p_A > p_B, else 0, at each sample."""
+        return (self._channels["p_A"] > self._channels["p_B"]).astype(float)
+
+    def moved(self, outward: bool, by_A: bool) -> Array:
+        """Return the increments of x of one direction while one side carries the pressure [m]."""
+        way = self.outward if outward else 1.0 - self.outward
+        side = self.carried_by_A if by_A else 1.0 - self.carried_by_A
+        return _middle(way * side) * self.step("x")
+
+    def acceleration_step(self) -> Array:
+        """Return the increments of the piston's speed [m/s], by which a delay between channels shows."""
+        return np.gradient(np.diff(self._channels["x"]) * self.rate)
+
+
+def _middle(values: Array) -> Array:
+    return 0.5 * (values[1:] + values[:-1])
+
+
+class Term(NamedTuple):
+    """A term of a balance: a row of data.
+
+    `increments` gives f dg over each sampling interval, shape (n - 1,); `unit` is that of its coefficient; `cause` is
+    what a step of the coefficient means; `nuisance`: the coefficient is unknown in any machine and drifts as `drift`
+    allows (a table of `terms.toml`), else it is zero unless that cause is present; `needs`: channels.
+    """
+
+    name: str
+    formula: str
+    unit: str
+    increments: Callable[[Signals], Array]
+    cause: Cause
+    drift: str = ""
+    nuisance: bool = True
+    needs: tuple[str, ...] = ()
+
+
+class Equation(NamedTuple):
+    """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last."""
+
+    name: str
+    left: Callable[[Signals], Array]
+    terms: tuple[Term, ...]
+
+
+#: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
+LEAK, ORIFICE = "leak", "leak through an orifice"
+
+_LEAKS = (
+    Term(
+        LEAK,
+        "(p_A - p_B) dt",
+        "m^3/(s Pa)",
+        lambda s: s.pressure_difference * s.dt,
+        "piston or pump leak",
+        "leak",
+        needs=("p_A", "p_B"),
+    ),
+    Term(
+        ORIFICE,
+        "sign(p_A - p_B) sqrt(abs(p_A - p_B)) dt",
+        "m^3/(s Pa^0.5)",
+        lambda s: np.sign(s.pressure_difference) * np.sqrt(np.abs(s.pressure_difference)) * s.dt,
+        "piston or pump leak",
+        nuisance=False,
+        needs=("p_A", "p_B"),
+    ),
+)
+
+
+def _moved(outward: bool, by_A: bool) -> Term:
+    way, side = ("out", "in")[not outward], "AB"[not by_A]
+    return Term(
+        f"motion {way}, {side} carries",
+        f"dx, v {'>=' if outward else '<'} 0, p_{side} the larger",
+        "m^2",
+        lambda s: s.moved(outward, by_A),
+        "sensor fault",
+        "motion",
+        needs=("x",),
+    )
+
+
+def _of_side(side: str) -> tuple[Term, ...]:
+    name = f"p_{side}"
+    return (
+        Term(
+            f"compliance {side}",
+            f"dp_{side}",
+            "m^3/Pa",
+            lambda s: s.step(name),
+            "air in the oil",
+            "compliance",
+            needs=(name,),
+        ),
+        Term(
+            f"compliance {side} over the stroke",
+            f"x dp_{side}",
+            "m^2/Pa",
+            lambda s: s.mean("x") * s.step(name),
+            "air in the oil",
+            "compliance",
+            needs=(name, "x"),
+        ),
+        Term(
+            f"free air {side}",
+            f"d(1/p_{side})",
+            "m^3 Pa",
+            lambda s: np.diff(1.0 / s.absolute[name]),
+            "air in the oil",
+            "air",
+            needs=(name,),
+        ),
+        Term(
+            f"dissolving air {side}",
+            f"d(log p_{side})",
+            "m^3",
+            lambda s: np.diff(np.log(s.absolute[name])),
+            "air in the oil",
+            "air",
+            needs=(name,),
+        ),
+    )
+
+
+def _lost_outside(side: str) -> Term:
+    name = f"p_{side}"
+    return Term(
+        f"external leak {side}",
+        f"p_{side} dt",
+        "m^3/(s Pa)",
+        lambda s: s.mean(name) * s.dt,
+        "external leak",
+        nuisance=False,
+        needs=(name,),
+    )
+
+
+_LAG = Term("lag", "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
+_BIAS = Term("bias", "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
+_PUMP = Term(
+    "pump leak",
+    "(p_1 - p_2) dt",
+    "m^3/(s Pa)",
+    lambda s: (s.mean("p_1") - s.mean("p_2")) * s.dt,
+    "pump leak",
+    "leak",
+    needs=("p_1", "p_2"),
+)
+
+_CYLINDER = (
+    *(_moved(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+    *_of_side("A"),
+    *_of_side("B"),
+    _LAG,
+    _BIAS,
+    _PUMP,
+    _lost_outside("A"),
+    _lost_outside("B"),
+    *_LEAKS,
+)
+
+
+def _edge(side: str, rising: bool) -> Term:
+    """Return the flow that one edge of the valve lets into (or out of) a chamber, over its gain."""
+    name, other = f"p_{side}", "p_1" if rising else "p_2"
+    opens = 1.0 if (side == "A") == rising else -1.0
+
+    def increments(s: Signals) -> Array:
+        drop = (s.mean(other) - s.mean(name)) if rising else (s.mean(name) - s.mean(other))
+        opening = np.maximum(opens * s.mean("u"), 0.0)
+        return opening * np.sign(drop) * np.sqrt(np.abs(drop)) * s.dt
+
+    way = "p_1 - p_" + side if rising else f"p_{side} - p_2"
+    return Term(
+        f"edge {'P' if rising else side} to {side if rising else 'T'}",
+        f"u_{'+' if opens > 0 else '-'} sqrt({way}) dt",
+        "m^3/(s V Pa^0.5)",
+        increments,
+        "sensor fault",
+        "edge",
+        needs=("u", name, other),
+    )
+
+
+def _overlap(side: str, rising: bool) -> Term:
+    """Return what an edge passes beside its gain: overlap, underlap and wear, open while the command opens it."""
+    name, other = f"p_{side}", "p_1" if rising else "p_2"
+    opens = 1.0 if (side == "A") == rising else -1.0
+
+    def increments(s: Signals) -> Array:
+        drop = (s.mean(other) - s.mean(name)) if rising else (s.mean(name) - s.mean(other))
+        return (opens * s.mean("u") > 0.0) * np.sign(drop) * np.sqrt(np.abs(drop)) * s.dt
+
+    way = "p_1 - p_" + side if rising else f"p_{side} - p_2"
+    return Term(
+        f"overlap {'P' if rising else side} to {side if rising else 'T'}",
+        f"[u {'>' if opens > 0 else '<'} 0] sqrt({way}) dt",
+        "m^3/(s Pa^0.5)",
+        increments,
+        "sensor fault",
+        "edge",
+        needs=("u", name, other),
+    )
+
+
+def _late(term: Term) -> Term:
+    return term._replace(
+        name=f"{term.name}, late",
+        formula=f"d({term.formula})",
+        unit="m^3/(V Pa^0.5)",
+        increments=lambda s: np.gradient(term.increments(s)),
+    )
+
+
+def _chamber(side: str, area: float) -> Equation:
+    """Return the balance of one chamber behind a valve: what the piston displaces is what its edges pass."""
+    edges = (_edge(side, True), _edge(side, False))
+    compliance = _of_side(side)
+    return Equation(
+        f"chamber {side}",
+        lambda s: -area * s.step("x"),
+        (*edges, *(_late(edge) for edge in edges), _overlap(side, True), _overlap(side, False), *compliance, *_LEAKS),
+    )
+
+
+def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
+    """Return the balances of a machine that its recorded channels allow, empty where they allow none.
+
+    Behind a servo valve that of each chamber; else that of the cylinder, with the pump's angle, its speed or, for want
+    of both, the command as the source of its flow.
+    """
+    if rig.valve.spool == "present":
+        if not {"x", "u", "p_1", "p_2"} <= channels:
+            return ()
+        sides = [side for side in "AB" if f"p_{side}" in channels]
+        balances = [_chamber(side, rig.cylinder.A_A if side == "A" else rig.cylinder.A_B) for side in sides]
+        return tuple(_with_channels(balance, channels) for balance in balances) if len(sides) == 2 else ()
+    left = pump_volume(rig, channels)
+    if left is None or not {"x", "p_A", "p_B"} <= channels:
+        return ()
+    return (_with_channels(Equation("cylinder", left, _CYLINDER), channels),)
+
+
+def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
+    """Return what gives the increments of the volume that the pump delivers [m^3]; None where nothing recorded does."""
+    displacement = rig.pump.q_b / (2.0 * np.pi)
+    if "theta" in channels:
+        return lambda s: displacement * s.step("theta")
+    if "omega" in channels:
+        return lambda s: displacement * s.mean("omega") * s.dt
+    if "u" in channels:
+        return lambda s: displacement * rig.motor.omega_per_volt * s.mean("u") * s.dt
+    return None
+
+
+def _with_channels(equation: Equation, channels: frozenset[str]) -> Equation:
+    return equation._replace(terms=tuple(term for term in equation.terms if channels.issuperset(term.needs)))

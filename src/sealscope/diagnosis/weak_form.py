@@ -1,0 +1,91 @@
+"""The weak form of a balance: rows of a linear regression from the samples, without a derivative and without a cycle.
+
+A balance  dl = sum_j c_j f_j dg_j  is multiplied by test functions of compact support and integrated,
+
+    integral of phi_i dl = sum_j c_j integral of phi_i f_j dg_j,    phi_i(t) = (1 - s^2)^4 / norm,  s = (t - t_i) / h,
+
+one row for each test function, over the increments of each sampling interval. That is summation by parts of the form in
+which every derivative stands on phi. phi and its first three derivatives vanish at its ends, so that noise and what a
+row cuts off do not matter. Rows are `STRIDE` apart and overlap; any rate serves, and ten seconds are a short recording.
+
+Sources: M. Shinbrot, Trans. ASME 79 (1957) 547 (modulating functions); H. A. Preisig and D. W. T. Rippin, Computers and
+Chemical Engineering 17 (1993) 1; D. A. Messenger and D. M. Bortz, Multiscale Model. Simul. 19 (2021) 1474 (weak form).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.recordings.recording import Array
+
+#: Distance of neighbouring test functions [s], and how many of these distances a test function spans.
+STRIDE = 0.125
+SPAN = 4
+
+
+class Rows(NamedTuple):
+    """Rows of a regression: `time` (r,) of each test function's middle [s], `values` (r, c), one a column, over the
+    test function's integral, so that a row is a mean rate; `whole` (r,): no sample it rests on is missing.
+    """
+
+    time: Array
+    values: Array
+    whole: NDArray[np.bool_]
+
+
+def stride_samples(rate: float) -> int:
+    """Return the samples between neighbouring test functions."""
+    return max(1, round(STRIDE * rate))
+
+
+@lru_cache(maxsize=8)
+def test_function(rate: float) -> Array:
+    """Return phi at the middle of each sampling interval of its support [1/s], shape (SPAN, stride)."""
+    stride = stride_samples(rate)
+    s = (np.arange(SPAN * stride) + 0.5) * 2.0 / (SPAN * stride) - 1.0
+    phi = (1.0 - s * s) ** 4
+    return np.asarray(phi * (rate / phi.sum())).reshape(SPAN, stride)
+
+
+def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
+    """Return the rows of increments over sampling intervals.
+
+    Parameters
+    ----------
+    increments : sequence of c arrays of float, shape (n,)
+        Increments of each column over each sampling interval; NaN where a sample is missing.
+    rate : float
+        Sampling rate [Hz].
+    start : float
+        Time of the first sample [s].
+
+    Returns
+    -------
+    Rows
+        Every test function whose support lies within the samples: n // stride - SPAN + 1 rows.
+    """
+    phi = test_function(rate)
+    stride = phi.shape[1]
+    pieces = len(increments[0]) // stride
+    count = max(0, pieces - SPAN + 1)
+    values = np.zeros((count, len(increments)))
+    missing = np.zeros(pieces, dtype=bool)
+    for column, own in enumerate(increments):
+        cut = own[: pieces * stride].reshape(pieces, stride)
+        parts = cut @ phi.T
+        lost = np.isnan(parts[:, 0])
+        if lost.any():
+            missing |= lost
+            parts[lost] = 0.0
+        for piece in range(SPAN):
+            values[:, column] += parts[piece : piece + count, piece]
+    touched = np.zeros(count, dtype=bool)
+    for piece in range(SPAN):
+        touched |= missing[piece : piece + count]
+    time = start + (np.arange(count) + 0.5 * SPAN) * stride / rate
+    return Rows(time, values, ~touched)
