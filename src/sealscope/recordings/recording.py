@@ -172,6 +172,12 @@ class Recording:
         """Number of samples over the nominal rate [s]."""
         return self.t.size / self.rate
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Names of the recorded pressures, positions and speeds of its file that no channel is made of."""
+        names = self.provenance.get("unused", ())
+        return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+
     def between(self, start: float, stop: float) -> Recording:
         """Return the samples with start <= t < stop [s]."""
         return self._cut((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")

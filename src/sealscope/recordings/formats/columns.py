@@ -5,15 +5,27 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from typing import Literal
 
+import numpy as np
+
 from sealscope.calls import nearest
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED, Array
+from sealscope.recordings.formats.headings.formula import Formula
 from sealscope.recordings.formats.headings.labels import Label, square_brackets
-from sealscope.recordings.formats.headings.proposal import TURNS, is_time, map_options, proposed_map, unit_of_time
+from sealscope.recordings.formats.headings.proposal import (
+    TURNS,
+    ends_in,
+    is_recorded,
+    is_time,
+    map_options,
+    proposed_map,
+    split_unit,
+    unit_of_time,
+)
 from sealscope.recordings.formats.headings.split_time import below_seconds, parts_of_time
 from sealscope.units import same_dimension, to_si
 
@@ -52,25 +64,63 @@ REST = "*"
 
 
 @dataclass(frozen=True)
+class Source:
+    """What a channel is made of: `constant` plus the sum of columns times `factors`, by their numbers, in `unit`."""
+
+    factors: Mapping[int, float]
+    unit: str | None
+    constant: float = 0.0
+
+    @classmethod
+    def of(cls, column: int, unit: str | None) -> Source:
+        """Return the source that is a column itself."""
+        return cls({column: 1.0}, unit)
+
+    @property
+    def column(self) -> int:
+        """The first column."""
+        return next(iter(self.factors))
+
+    @property
+    def is_column(self) -> bool:
+        """Whether it is a column as it stands."""
+        return self.constant == 0.0 and [*self.factors.values()] == [1.0]
+
+    def values(self, columns: Mapping[int, Array]) -> Array:
+        """Return the samples (n,) in `unit`: those of the only column itself, where it is one."""
+        if self.is_column:
+            return columns[self.column]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.constant + np.sum([factor * columns[i] for i, factor in self.factors.items()], axis=0)
+
+
+@dataclass(frozen=True)
 class ColumnMap:
-    """What to load of a table: the number of the time column and its label, name -> (column, unit) of each channel.
+    """What to load of a table: the number of the time column and its label, name -> source of each channel.
 
     `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day, or
     the time column itself where a date is taken for it; `names`: channel -> label of its column, where the file calls
     it otherwise; `rate`: of the samples [Hz], as the caller or the file says, or None;
     `parts`: part of the time -> its column, where several columns hold the time;
-    `missing`: mapped channels whose column is not there, where some may be.
+    `missing`: mapped channels whose column is not there, where some may be; `unused`: recorded pressures, positions and
+    speeds that no channel is made of.
     """
 
     time: int | None
     time_label: Label | None
-    channels: Mapping[str, tuple[int, str]]
+    channels: Mapping[str, Source]
     notes: tuple[str, ...] = ()
     date: int | None = None
     names: Mapping[str, str] = field(default_factory=dict)
     rate: float | None = None
     parts: Mapping[str, int] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
+
+    @property
+    def channel_of(self) -> dict[int, str]:
+        """Column -> a channel that is made of it."""
+        return {column: name for name, source in self.channels.items() for column in source.factors}
 
     @property
     def columns(self) -> list[tuple[int, bool]]:
@@ -78,7 +128,7 @@ class ColumnMap:
 
         A column of hours is the time and a part of it.
         """
-        read = {column for column, _ in self.channels.values()} | (set(self.parts.values()) - {self.time})
+        read = {*self.channel_of} | (set(self.parts.values()) - {self.time})
         channels = [(column, False) for column in sorted(read)]
         return channels if self.time is None else [*channels, (self.time, True)]
 
@@ -139,14 +189,18 @@ def listed(names: Iterable[str], most: int = 12) -> str:
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"
 
 
-def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | None:
-    """Return the column called `name`: as written, else whatever its case, else by its number as in `#4`, from 1."""
+def _find(labels: Sequence[Label], name: str, what: str, place: str, *, mapped: bool = False) -> int | None:
+    """Return the column called `name`: as written, else whatever its case, else by its number as in `#4`, from 1.
+
+    A `mapped` one may also be called by the last words of its name: `ch2`, `Pa`.
+    """
     folded = name.casefold()
     for matches in (
         [i for i, label in enumerate(labels) if label.whole == name],
         [i for i, label in enumerate(labels) if label.name == name],
         [i for i, label in enumerate(labels) if label.called and label.called == name],
         [i for i, label in enumerate(labels) if folded in (label.whole.casefold(), label.name.casefold())],
+        [i for i, label in enumerate(labels) if mapped and ends_in(label.name, name)],
     ):
         if len(matches) > 1:
             numbers = " and ".join(str(i + 1) for i in matches)
@@ -162,27 +216,59 @@ def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | No
 
 
 def _inside(labels: Sequence[Label], channel: str) -> int | None:
-    """Return the only column that bears a channel's name between points, strokes or brackets: `Rig.Cyl.p_A`."""
+    """Return the only column that bears a channel's name between points, strokes or brackets, or before a unit.
+
+    `Rig.Cyl.p_A [bar]`, `p_A_bar`.
+    """
     unit = CHANNEL_UNITS[channel]
     matches = [
         i
         for i, label in enumerate(labels)
         if channel in _PARTS.split(label.name) and label.unit is not None and same_dimension(label.unit, unit)
+        or split_unit(label.name)[0] == channel and _unit_of(label, channel) is not None
     ]
     return matches[0] if len(matches) == 1 else None
 
 
-def _mapped(labels: Sequence[Label], channel: str, foreign: str, place: str) -> tuple[int, str | None]:
+def _mapped(labels: Sequence[Label], channel: str, foreign: str, place: str) -> Source:
+    """Return what a map's text stands for: a column, a column and its unit, or a formula.
+
+    A unit of the text goes before that of the column's heading, and this before the ending of the column's name.
+    """
     what = f"{foreign}, mapped to {channel},"
-    column = _find(labels, foreign, what, place)
-    if column is not None:
-        return column, labels[column].unit
-    name, unit = square_brackets(foreign)
-    column = None if unit is None else _find(labels, name, what, place)
-    if column is None:
-        have = listed(label.whole for label in labels)
-        raise UnreadableFile(f"{what} must be a column, got columns {have} ({place})")
-    return column, unit
+    blank = foreign.rpartition(" ")
+    for name, unit in ((foreign, None), square_brackets(foreign), (blank[0], blank[2])):
+        column = _find(labels, name, what, place) if name else None
+        if column is not None:
+            return Source.of(column, _unit_of(labels[column], channel) if unit is None else unit)
+    try:
+        formula = Formula.parse(foreign)
+    except InputError as error:
+        if any(sign in foreign for sign in "*+"):
+            raise UnreadableFile(f"{error} ({place})") from None
+        raise _no_column(labels, what, place) from None
+    factors: dict[int, float] = {}
+    for name, factor in formula.factors.items():
+        column = _find(labels, name, f"{name} of {what}", place, mapped=True)
+        if column is None:
+            raise _no_column(labels, what if name == foreign else f"{name} of {what}", place)
+        factors[column] = factors.get(column, 0.0) + factor
+    units = {_unit_of(labels[column], channel) for column in factors}
+    if formula.unit is None and len(units) > 1:
+        raise UnreadableFile(f"{what} must state its unit, got columns in different ones ({place})")
+    return Source(factors, units.pop() if formula.unit is None else formula.unit, formula.constant)
+
+
+def _no_column(labels: Sequence[Label], what: str, place: str) -> UnreadableFile:
+    have = listed(label.whole for label in labels)
+    return UnreadableFile(f"{what} must be a column, got columns {have} ({place})")
+
+
+def _unit_of(label: Label, channel: str) -> str | None:
+    """Return a column's unit, by its heading or by the ending of its name where the channel may have it."""
+    ending = split_unit(label.name)[1] if label.unit is None else None
+    fits = ending is not None and same_dimension(ending, "s" if channel == "t" else CHANNEL_UNITS[channel])
+    return ending if fits else label.unit
 
 
 def _checked_unit(channel: str, unit: str | None, what: str, place: str) -> tuple[str, str | None]:
@@ -237,32 +323,38 @@ def choose_columns(
     """
     missing: list[str] = []
     notes: list[str] = []
-    channels: dict[str, tuple[int, str]] = {}
+    channels: dict[str, Source] = {}
+    formulas: dict[str, str] = {}
     stated = stated_columns(channel_map)
     columns = _completed(labels, stated, place) if by_names(channel_map) else stated
     time: int | None = None
     time_label: Label | None = None
     for channel, foreign in columns.items():
         try:
-            column, unit = _mapped(labels, channel, foreign, place)
+            source = _mapped(labels, channel, foreign, place)
         except UnreadableFile:
             if not some:
                 raise
             missing.append(channel)
             continue
-        whole = labels[column].whole
+        whole = labels[source.column].whole if source.is_column else foreign
         if channel == "t":
-            time, time_label = column, Label(whole, whole, unit)
+            if not source.is_column:
+                raise UnreadableFile(f"t must be a column and its unit, such as t=time ms, got {foreign} ({place})")
+            time, time_label = source.column, Label(whole, whole, source.unit)
             continue
-        unit, note = _checked_unit(channel, unit, f"column {whole}, read as {channel},", place)
-        channels[channel] = column, unit
-        notes.append(note or f"column {whole} read as {channel} in {unit}")
+        kind = "column" if source.is_column else "formula"
+        unit, note = _checked_unit(channel, source.unit, f"{kind} {whole}, read as {channel},", place)
+        channels[channel] = replace(source, unit=unit)
+        if not source.is_column:
+            formulas[channel] = whole
+        notes.append(note or f"{kind} {whole} read as {channel} in {unit}")
     for channel in (channel for channel in CHANNEL_UNITS if channel not in missing):
         own = None if channel in channels else _find(labels, channel, f"channel {channel}", place)
         own = _inside(labels, channel) if own is None and channel not in channels else own
-        if own is not None and own != time and own not in {column for column, _ in channels.values()}:
-            unit, note = _checked_unit(channel, labels[own].unit, f"column {labels[own].whole}", place)
-            channels[channel] = own, unit
+        if own is not None and own != time and all(own not in source.factors for source in channels.values()):
+            unit, note = _checked_unit(channel, _unit_of(labels[own], channel), f"column {labels[own].whole}", place)
+            channels[channel] = Source.of(own, unit)
             notes += [note] if note else []
     if time is None:
         time = _find_time(labels, place)
@@ -272,7 +364,7 @@ def choose_columns(
             time_label = Label(label.whole, label.name, unit)
     parts: dict[str, int] = {}
     if rate is None:
-        taken = [column for column, _ in channels.values()]
+        taken = [column for source in channels.values() for column in source.factors]
         time, time_label, parts = _split(labels, time, time_label, taken, stated_rate is not None)
     have = listed(label.whole for label in labels)
     if not channels:
@@ -287,7 +379,7 @@ def choose_columns(
                 f"a recording must have a time column such as t [s] or be given a rate, got columns {have} ({place})"
             )
         notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
-    used = {column for column, _ in channels.values()} | {time} | set(parts.values())
+    used = {column for source in channels.values() for column in source.factors} | {time} | set(parts.values())
     dates = [i for i, label in enumerate(labels) if label.name.casefold() in _DATE_NAMES and i not in used]
     date = dates[0] if dates and time is not None else None
     if rate is not None and time_label is not None:
@@ -298,14 +390,16 @@ def choose_columns(
         guesses = {name: column for name, column in proposed_map(labels).items() if name not in {*channels, "t"}}
         hint = f"; --map auto would also read {map_options(guesses)}" if guesses else ""
         notes.append(f"{UNUSED}: {listed(ignored, 40)}{hint}")
-    order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel][0])}
-    names = {channel: labels[column].whole for channel, (column, _) in order.items() if labels[column].name != channel}
+    order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel].column)}
+    labelled = {channel: labels[source.column] for channel, source in order.items()}
+    names = {channel: label.whole for channel, label in labelled.items() if label.name != channel} | formulas
+    unused = tuple(label.whole for i, label in enumerate(labels) if i not in {*used, date} and is_recorded(label))
     own_rate = stated_rate if rate is None else rate
     if time is None:
         date = None
     elif "t" not in columns and not parts and labels[time].name.casefold() in _DATE_NAMES:
         date = time
-    return ColumnMap(time, time_label, order, tuple(notes), date, names, own_rate, parts, tuple(missing))
+    return ColumnMap(time, time_label, order, tuple(notes), date, names, own_rate, parts, tuple(missing), unused)
 
 
 def _completed(labels: Sequence[Label], stated: Mapping[str, str], place: str) -> dict[str, str]:
@@ -313,7 +407,7 @@ def _completed(labels: Sequence[Label], stated: Mapping[str, str], place: str) -
     taken = set()
     for channel, foreign in stated.items():
         with suppress(UnreadableFile):  # said where the map is gone through
-            taken.add(_mapped(labels, channel, foreign, place)[0])
+            taken.update(_mapped(labels, channel, foreign, place).factors)
     free = [Label("", "") if column in taken else label for column, label in enumerate(labels)]
     return {**proposed_map(free), **stated}
 

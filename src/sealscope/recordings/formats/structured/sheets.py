@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import ColumnMap, listed
+from sealscope.recordings.formats.columns import ColumnMap, Source, listed
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import RawTable
@@ -138,14 +138,14 @@ def _table(runs: Sequence[_SheetRun], notes: tuple[str, ...], place: str) -> Raw
     """Return the table of runs on one clock, in SI units."""
     base = runs[0]
     series: list[Series] = []
-    channels: dict[str, tuple[int, str]] = {}
+    channels: dict[str, Source] = {}
     names: dict[str, str] = {}
     said = []
     for number, run in enumerate(runs):
         clock = Clock(number, partial(np.asarray, run.t), run.start)
         for name, values in run.channels.items():
             unit = run.units[name]
-            channels[name] = len(series), unit
+            channels[name] = Source.of(len(series), unit)
             label = Label(f"{name} [{unit}]", name, unit)
             series.append(Series(run.sheets[0], label, values.size, partial(np.asarray, values), clock))
         names.update(run.table.choice.names)
