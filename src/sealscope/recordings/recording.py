@@ -250,7 +250,7 @@ class Recording:
     @classmethod
     @checked_call
     def from_pandas(
-        cls, frame: pandas.DataFrame, *, channel_map: Mapping[str, str] | None = None, rate: float | None = None
+        cls, frame: pandas.DataFrame, *, map: Mapping[str, str] | None = None, rate: float | None = None
     ) -> Recording:
         """Make a recording of a data frame, by the rules that hold for files.
 
@@ -260,7 +260,7 @@ class Recording:
             Columns such as ``p_A [bar]``; a unit may also be in ``frame.attrs["units"][column]`` or in the column's
             own ``attrs["units"]``. The time is a column such as ``t [s]``, or the index: with a name, of numbers with
             a fraction, of dates or of time differences.
-        channel_map : mapping of str to str, optional
+        map : mapping of str to str, optional
             Channel (or ``t``) -> column, as for `read`.
         rate : float, optional
             Sampling rate [Hz], in place of a time. It is inferred from the time otherwise.
@@ -280,7 +280,7 @@ class Recording:
         """
         from sealscope.recordings.formats.frames import read_pandas
 
-        channel_map = channel_map or {}
+        channel_map = map or {}
         check_call(channel_map, rate)
         choose = partial(choose_columns, channel_map=channel_map, rate=rate, place="data frame")
         try:

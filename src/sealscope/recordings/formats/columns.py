@@ -91,7 +91,8 @@ class Source:
         if self.is_column:
             return columns[self.column]
         with np.errstate(over="ignore", invalid="ignore"):
-            return self.constant + np.sum([factor * columns[i] for i, factor in self.factors.items()], axis=0)
+            terms = [factor * columns[column] for column, factor in self.factors.items()]
+            return np.asarray(self.constant + np.sum(terms, axis=0))
 
 
 @dataclass(frozen=True)
@@ -155,13 +156,13 @@ def check_call(channel_map: ChannelMap, rate: float | None) -> None:
     """Raise InputError for a map of what is no channel, and for a rate that is not positive."""
     if isinstance(channel_map, str):
         if channel_map != "auto":
-            raise InputError(f"channel_map must be a mapping or the word auto, got {channel_map!r}")
+            raise InputError(f"map must be a mapping or the word auto, got {channel_map!r}")
     else:
         for channel, column in channel_map.items():
             if channel != REST:
                 check_channel(channel)
             elif column != "auto":
-                raise InputError(f"channel_map must map {REST} to the word auto, got {column!r}")
+                raise InputError(f"map must map {REST} to the word auto, got {column!r}")
     if rate is not None and not (isfinite(rate) and rate > 0):
         raise InputError(f"rate must be > 0 Hz, got {rate}")
 
@@ -224,8 +225,8 @@ def _inside(labels: Sequence[Label], channel: str) -> int | None:
     matches = [
         i
         for i, label in enumerate(labels)
-        if channel in _PARTS.split(label.name) and label.unit is not None and same_dimension(label.unit, unit)
-        or split_unit(label.name)[0] == channel and _unit_of(label, channel) is not None
+        if (channel in _PARTS.split(label.name) and label.unit is not None and same_dimension(label.unit, unit))
+        or (split_unit(label.name)[0] == channel and _unit_of(label, channel) is not None)
     ]
     return matches[0] if len(matches) == 1 else None
 
@@ -304,6 +305,87 @@ def _find_time(labels: Sequence[Label], place: str) -> int | None:
     return next((i for i in named if labels[i].unit is not None), named[0] if named else None)
 
 
+@dataclass
+class _Taken:
+    """What is taken of a table so far; `formulas`: channel -> a map's text that is no column; others as in `ColumnMap`."""
+
+    labels: Sequence[Label]
+    place: str
+    time: int | None = None
+    time_label: Label | None = None
+    channels: dict[str, Source] = field(default_factory=dict)
+    formulas: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+
+    @property
+    def columns(self) -> set[int]:
+        """Columns that channels are made of."""
+        return {column for source in self.channels.values() for column in source.factors}
+
+    def by_map(self, columns: Mapping[str, str], some: bool) -> None:
+        """Take what a map says; with `some`, its columns may be missing."""
+        for channel, foreign in columns.items():
+            try:
+                source = _mapped(self.labels, channel, foreign, self.place)
+            except UnreadableFile:
+                if not some:
+                    raise
+                self.missing.append(channel)
+                continue
+            whole = self.labels[source.column].whole if source.is_column else foreign
+            if channel == "t":
+                if not source.is_column:
+                    raise UnreadableFile(
+                        f"t must be a column and its unit, such as t=time ms, got {foreign} ({self.place})"
+                    )
+                self.time, self.time_label = source.column, Label(whole, whole, source.unit)
+                continue
+            kind = "column" if source.is_column else "formula"
+            unit, note = _checked_unit(channel, source.unit, f"{kind} {whole}, read as {channel},", self.place)
+            self.channels[channel] = replace(source, unit=unit)
+            if not source.is_column:
+                self.formulas[channel] = whole
+            self.notes.append(note or f"{kind} {whole} read as {channel} in {unit}")
+
+    def by_own_names(self) -> None:
+        """Take the other channels from the columns that bear their names, and the time where no map names it."""
+        for channel in (name for name in CHANNEL_UNITS if name not in self.channels and name not in self.missing):
+            own = _find(self.labels, channel, f"channel {channel}", self.place)
+            own = _inside(self.labels, channel) if own is None else own
+            if own is not None and own != self.time and own not in self.columns:
+                label = self.labels[own]
+                unit, note = _checked_unit(channel, _unit_of(label, channel), f"column {label.whole}", self.place)
+                self.channels[channel] = Source.of(own, unit)
+                self.notes += [note] if note else []
+        if self.time is None and (time := _find_time(self.labels, self.place)) is not None:
+            label = self.labels[time]
+            unit_of_name = label.unit or _TIME_NAMES.get(label.name.casefold()) or unit_of_time(label)
+            self.time, self.time_label = time, Label(label.whole, label.name, unit_of_name)
+
+    def check(self, rate: float | None, stated_rate: float | None) -> None:
+        """Raise UnreadableFile where there is no channel, or neither a time nor a rate [Hz]."""
+        have = listed(label.whole for label in self.labels)
+        if not self.channels:
+            guess = map_options(proposed_map(self.labels))
+            raise UnreadableFile(
+                f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
+                f"got columns {have} ({self.place})" + (f"; --map auto would read {guess}" if guess else "")
+            )
+        if rate is None and self.time is None:
+            if stated_rate is None:
+                raise UnreadableFile(
+                    "a recording must have a time column such as t [s] or be given a rate, "
+                    f"got columns {have} ({self.place})"
+                )
+            self.notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
+
+    def names(self) -> dict[str, str]:
+        """Return channel -> label of its column, or its formula, where the file calls it otherwise."""
+        labels = {channel: self.labels[source.column] for channel, source in self.channels.items()}
+        return {channel: label.whole for channel, label in labels.items() if label.name != channel} | self.formulas
+
+
 def choose_columns(
     labels: Sequence[Label],
     stated_rate: float | None = None,
@@ -321,90 +403,50 @@ def choose_columns(
     missing, where no column is a channel, and where there is neither time nor rate; InputError for a unit of another
     dimension. With `some`, mapped columns may be missing, which another sheet may have.
     """
-    missing: list[str] = []
-    notes: list[str] = []
-    channels: dict[str, Source] = {}
-    formulas: dict[str, str] = {}
     stated = stated_columns(channel_map)
     columns = _completed(labels, stated, place) if by_names(channel_map) else stated
-    time: int | None = None
-    time_label: Label | None = None
-    for channel, foreign in columns.items():
-        try:
-            source = _mapped(labels, channel, foreign, place)
-        except UnreadableFile:
-            if not some:
-                raise
-            missing.append(channel)
-            continue
-        whole = labels[source.column].whole if source.is_column else foreign
-        if channel == "t":
-            if not source.is_column:
-                raise UnreadableFile(f"t must be a column and its unit, such as t=time ms, got {foreign} ({place})")
-            time, time_label = source.column, Label(whole, whole, source.unit)
-            continue
-        kind = "column" if source.is_column else "formula"
-        unit, note = _checked_unit(channel, source.unit, f"{kind} {whole}, read as {channel},", place)
-        channels[channel] = replace(source, unit=unit)
-        if not source.is_column:
-            formulas[channel] = whole
-        notes.append(note or f"{kind} {whole} read as {channel} in {unit}")
-    for channel in (channel for channel in CHANNEL_UNITS if channel not in missing):
-        own = None if channel in channels else _find(labels, channel, f"channel {channel}", place)
-        own = _inside(labels, channel) if own is None and channel not in channels else own
-        if own is not None and own != time and all(own not in source.factors for source in channels.values()):
-            unit, note = _checked_unit(channel, _unit_of(labels[own], channel), f"column {labels[own].whole}", place)
-            channels[channel] = Source.of(own, unit)
-            notes += [note] if note else []
-    if time is None:
-        time = _find_time(labels, place)
-        if time is not None:
-            label = labels[time]
-            unit = label.unit or _TIME_NAMES.get(label.name.casefold()) or unit_of_time(label)
-            time_label = Label(label.whole, label.name, unit)
+    taken = _Taken(labels, place)
+    taken.by_map(columns, some)
+    taken.by_own_names()
+    time, time_label, channels, notes = taken.time, taken.time_label, taken.channels, taken.notes
     parts: dict[str, int] = {}
     if rate is None:
-        taken = [column for source in channels.values() for column in source.factors]
-        time, time_label, parts = _split(labels, time, time_label, taken, stated_rate is not None)
-    have = listed(label.whole for label in labels)
-    if not channels:
-        guess = map_options(proposed_map(labels))
-        raise UnreadableFile(
-            f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
-            f"got columns {have} ({place})" + (f"; --map auto would read {guess}" if guess else "")
-        )
-    if rate is None and time is None:
-        if stated_rate is None:
-            raise UnreadableFile(
-                f"a recording must have a time column such as t [s] or be given a rate, got columns {have} ({place})"
-            )
-        notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
-    used = {column for source in channels.values() for column in source.factors} | {time} | set(parts.values())
+        time, time_label, parts = _split(labels, time, time_label, [*taken.columns], stated_rate is not None)
+        taken.time = time
+    taken.check(rate, stated_rate)
+    used = taken.columns | {time} | set(parts.values())
     dates = [i for i, label in enumerate(labels) if label.name.casefold() in _DATE_NAMES and i not in used]
     date = dates[0] if dates and time is not None else None
+    left = [label for i, label in enumerate(labels) if i not in used and i != date and label.whole]
     if rate is not None and time_label is not None:
         notes.append(f"time column {time_label.whole} not used: the rate was given as {rate:g} Hz")
         time = time_label = None
-    ignored = [label.whole for i, label in enumerate(labels) if i not in used and i != date and label.whole]
-    if ignored:
+    if left:
         guesses = {name: column for name, column in proposed_map(labels).items() if name not in {*channels, "t"}}
         hint = f"; --map auto would also read {map_options(guesses)}" if guesses else ""
-        notes.append(f"{UNUSED}: {listed(ignored, 40)}{hint}")
+        notes.append(f"{UNUSED}: {listed((label.whole for label in left), 40)}{hint}")
     order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel].column)}
-    labelled = {channel: labels[source.column] for channel, source in order.items()}
-    names = {channel: label.whole for channel, label in labelled.items() if label.name != channel} | formulas
-    unused = tuple(label.whole for i, label in enumerate(labels) if i not in {*used, date} and is_recorded(label))
-    own_rate = stated_rate if rate is None else rate
     if time is None:
         date = None
     elif "t" not in columns and not parts and labels[time].name.casefold() in _DATE_NAMES:
         date = time
-    return ColumnMap(time, time_label, order, tuple(notes), date, names, own_rate, parts, tuple(missing), unused)
+    return ColumnMap(
+        time,
+        time_label,
+        order,
+        tuple(notes),
+        date,
+        taken.names(),
+        stated_rate if rate is None else rate,
+        parts,
+        tuple(taken.missing),
+        tuple(label.whole for label in left if is_recorded(label)),
+    )
 
 
 def _completed(labels: Sequence[Label], stated: Mapping[str, str], place: str) -> dict[str, str]:
     """Return a map with the channels that it does not name, by the names of the columns that it does not take."""
-    taken = set()
+    taken: set[int] = set()
     for channel, foreign in stated.items():
         with suppress(UnreadableFile):  # said where the map is gone through
             taken.update(_mapped(labels, channel, foreign, place).factors)

@@ -48,8 +48,8 @@ _WORDS: Mapping[str, frozenset[str]] = {
 #: Last words of German compounds (Zylinderweg, Messzeit), where a whole word is not known.
 _ENDINGS = ("druck", "weg", "hub", "position", "winkel", "drehzahl", "zeit", "druk")
 _A = _words(
-    "a cap bore bottom base blind extend extension piston kolben kolbenseite kolbenseitig kolbenraum kolbenkammer bodenseite boden "
-    "bodem fond fondo fondello embolo zuiger tlok 无杆腔 無桿腔 ヘッド側 "
+    "a cap bore bottom base blind extend extension piston kolben kolbenseite kolbenseitig kolbenraum kolbenkammer "
+    "bodenseite boden bodem fond fondo fondello embolo zuiger tlok 无杆腔 無桿腔 ヘッド側 "
     "ボトム側 キャップ側"
 )
 _B = _words(
@@ -96,6 +96,8 @@ _CHANNELS = {
 #: How loggers call their inputs, as one word.
 _CHANNEL_WORDS = dict.fromkeys(("ch", "chan", "kanal", "voie", "canal", "canale"), "channel")
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
+#: The last word of `MainPaBar`; in `MainPa` it is the pressure A, and no pascal.
+_HUMPED = re.compile(r"(?<=[a-z\d])[A-Z]+[a-z]*$")
 _LONGEST_NAME = 80
 
 
@@ -239,9 +241,9 @@ def split_unit(name: str) -> tuple[str, str | None]:
     """
     parts = name.replace(" ", "_").split("_")
     endings = [("_".join(parts[:-2]), "/".join(parts[-2:])), ("_".join(parts[:-1]), parts[-1])]
-    last = _TOKEN.findall(parts[-1])[-1:]
-    if last and len(last[0]) > 2 and parts[-1].endswith(last[0]):  # `MainPa` is a pressure A, not in pascal
-        endings.append((name.removesuffix(last[0]), last[0]))
+    humped = _HUMPED.search(name)
+    if humped and len(humped[0]) > 2:
+        endings.append((name[: humped.start()], humped[0]))
     for before, unit in endings:
         if not before or not unit or unit in ("A", "B", "a", "b"):
             continue

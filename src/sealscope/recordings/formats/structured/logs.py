@@ -121,4 +121,3 @@ def _clock(times: NDArray[Any], label: Label, key: int, start: np.datetime64 | N
         return Clock(key, partial(np.asarray, (known - first).astype(np.int64) / 1e9), first)
     seconds = to_si(known, label.unit or unit_of_time(label) or "s", "s", name="time")
     return Clock(key, partial(np.asarray, seconds), start)
-

@@ -1,4 +1,4 @@
-"""Signals that Simulink streamed into a MATLAB 7.3 file: names with the number of a stream of bytes, and the streams."""
+"""Signals that Simulink streamed into a MATLAB 7.3 file: names with numbers of streams of bytes."""
 
 from __future__ import annotations
 
