@@ -164,3 +164,16 @@ def test_signals_that_simulink_streamed_are_read_by_name(tmp_path: Path) -> None
     assert recording.rate == 100.0
     np.testing.assert_array_equal(recording["p_A"], 1e5 * COLUMNS[:, 0])
     np.testing.assert_array_equal(recording["p_B"], 1e3 * COLUMNS[:, 1])
+
+
+def test_a_twincat_export_with_names_alone_has_its_clock_and_its_start(tmp_path: Path) -> None:
+    """Its last row is cut short."""
+    head = "Name,crane,\nStarttime of export,133898814400300000,onsdag 23. april 2025\n\n\nName,MainPa,MainPb,MainX\n\n"
+    rows = [f"{10 * k},{20 + k % 5},{5 + k % 3},0.5" for k in range(60)]
+    path = tmp_path / "log.csv"
+    path.write_text(head + "\n".join(rows)[:-8])
+    recording = read(path, map={"p_A": "MainPa bar", "p_B": "MainPb bar"})
+    assert (len(recording), recording.rate) == (60, 100.0)
+    assert recording.provenance["start"].startswith("2025-04-23T11:30:40.03")
+    assert recording.unused == ("MainX",)
+    assert recording["p_A"][-2] == 23e5

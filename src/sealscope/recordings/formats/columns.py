@@ -307,7 +307,7 @@ def _find_time(labels: Sequence[Label], place: str) -> int | None:
 
 @dataclass
 class _Taken:
-    """What is taken of a table so far; `formulas`: channel -> a map's text that is no column; others as in `ColumnMap`."""
+    """What is taken of a table so far, as in `ColumnMap`; `formulas`: channel -> text of a map that is no column."""
 
     labels: Sequence[Label]
     place: str

@@ -154,7 +154,9 @@ def _table(runs: Sequence[_SheetRun], notes: tuple[str, ...], place: str) -> Raw
         if number:
             said.append(f"{', '.join(run.channels)} read from sheet {run.sheets[0]}")
     time = base.table.choice.time_label
-    choice = ColumnMap(len(series), Label("t [s]" if time is None else time.whole, "t", "s"), channels, names=names)
+    label = Label("t [s]" if time is None else time.whole, "t", "s")
+    unused = tuple(name for run in runs for name in run.table.choice.unused)
+    choice = ColumnMap(len(series), label, channels, names=names, unused=unused)
     table = table_of(series, lambda *_: choice, base.table.kind, place, base.table.about)
     history = tuple(dict.fromkeys(line for run in runs for line in run.history))
     return replace(table, notes=(*history, *said, *notes, *table.notes))

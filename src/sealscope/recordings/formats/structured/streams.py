@@ -45,4 +45,4 @@ def _text(characters: Any) -> str:
 
 
 def _samples(data: Any, count: int) -> Array:
-    return np.frombuffer(data[()].tobytes(), dtype=np.float64, count=count)
+    return np.frombuffer(data[: count * np.dtype(np.float64).itemsize].tobytes(), dtype=np.float64, count=count)
