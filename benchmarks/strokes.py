@@ -34,7 +34,7 @@ VERDICTS = ("leak", "cannot tell", "no leak")
 def strokes(folder: Path) -> list[Recording]:
     """Read the strokes of a session in the order in which they were made."""
     files = sorted(folder.glob("*.txt"), key=lambda path: int(re.findall(r"_000_(\d+)_", path.name)[0]))
-    return [ss.read(path, rate=1000.0, channel_map={"p_A": "PG_1", "p_B": "PG_2"}) for path in files]
+    return [ss.read(path, rate=1000.0, map={"p_A": "PG_1", "p_B": "PG_2"}) for path in files]
 
 
 def without_times(recordings: Iterable[Recording]) -> list[Recording]:

@@ -239,7 +239,7 @@ def read(
     dataset: str | Dataset,
     folder: str | os.PathLike[str],
     *,
-    channel_map: Mapping[str, str] | None = None,
+    map: Mapping[str, str] | None = None,
     check_files: bool = True,
 ) -> Iterator[LabelledRecording]:
     r"""Read the recordings of a data set from a folder, after the checksums of their files.
@@ -250,7 +250,7 @@ def read(
         The data set, or its name.
     folder : str or path
         Where it was downloaded to; what is not there is left out.
-    channel_map : mapping of str to str, optional
+    map : mapping of str to str, optional
         Channel -> column or sensor, in place of the data set's own map.
     check_files : bool, default True
         Whether a file must have its checksum; with False, matrices without a known one are read, too.
@@ -295,7 +295,7 @@ def read(
     files = {**found.right, **found.wrong}
     if not check_files:
         files = {**{path.name: path for path in found.unknown}, **files}
-    channels = dict(chosen.channel_map if channel_map is None else channel_map)
+    channels = dict(chosen.channel_map if map is None else map)
     recordings = _cycles if chosen.layout == "cycles" else _strokes
     return recordings(chosen, files, channels, Path(folder))
 
@@ -323,7 +323,7 @@ def _strokes(
 
     def strokes() -> Iterator[LabelledRecording]:
         for name in names:
-            recording = read_file(files[name], channel_map=channels, rate=dataset.rate)
+            recording = read_file(files[name], map=channels, rate=dataset.rate)
             recording = replace(recording, provenance=_from(dataset, recording.provenance))
             yield LabelledRecording(recording, MappingProxyType(dict(dataset.labels.get(name, {}))))
 
@@ -339,7 +339,7 @@ def _cycles(
     """
     for channel, sensor in channels.items():
         if CHANNEL_UNITS.get(channel) != "Pa" or sensor not in _SENSORS:
-            raise InputError(f"channel_map must map pressures to {_SENSORS[0]}..{_SENSORS[-1]}, got {channel}={sensor}")
+            raise InputError(f"map must map pressures to {_SENSORS[0]}..{_SENSORS[-1]}, got {channel}={sensor}")
     sensors = tuple(channels.values())
     if "data.zip" in files:
         with whole("a data set's archive", files["data.zip"]), zipfile.ZipFile(files["data.zip"]) as archive:

@@ -301,6 +301,16 @@ def same_dimension(unit: str, other: str) -> bool:
         return False
 
 
+def is_familiar(unit: str) -> bool:
+    """Whether a unit is made of those known without pint, as `bar`, `psig` and `cm3/s`; a name's last word may be one.
+
+    Of pint's thousands of names many are plain words: a rod is 5 m long.
+    """
+    names = {*_ATOMS, *_SPELLINGS} - {""}
+    parts = [unit] if unit in names else unit.split("/")
+    return all(names & {part, part.rstrip("23"), part[:-1] if part[-1:] in ("a", "g") else part} for part in parts)
+
+
 @lru_cache(maxsize=1024)
 def _conversion(unit: str, si_unit: str) -> _Conversion:
     """(factor, power of pi, offset before, offset after): target = (value + before) * factor * pi**power - after."""

@@ -37,12 +37,12 @@ def files(name: str) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def healthy() -> list[Recording]:
-    return [read(path, channel_map=MAP, rate=1000) for path in files("act_1_healthy")]
+    return [read(path, map=MAP, rate=1000) for path in files("act_1_healthy")]
 
 
 @pytest.fixture(scope="module")
 def defective() -> list[Recording]:
-    return [read(path, channel_map=MAP, rate=1000) for path in files("act_4_seal_defect")]
+    return [read(path, map=MAP, rate=1000) for path in files("act_4_seal_defect")]
 
 
 def test_direction_is_that_of_the_angle(healthy: list[Recording], defective: list[Recording]) -> None:
@@ -91,7 +91,7 @@ def sessions() -> dict[str, list[Recording]]:
     missing = [name for name in SESSIONS if not (FOLDER / name).is_dir()]
     if missing:
         pytest.skip(f"{missing} not in {FOLDER}")
-    return {name: [read(path, channel_map=MAP, rate=1000) for path in files(name)] for name in SESSIONS}
+    return {name: [read(path, map=MAP, rate=1000) for path in files(name)] for name in SESSIONS}
 
 
 def without_time(stroke: Recording) -> Recording:
@@ -194,7 +194,7 @@ def test_a_single_stroke_is_too_short_to_be_its_own_baseline(defective: list[Rec
 @pytest.mark.parametrize("count", [pytest.param(12, marks=pytest.mark.long), 20])
 def test_few_strokes_calibrate_every_detector(name: str, count: int, tmp_path: Path) -> None:
     """Five strokes a direction were too few, and 107 left every stroke `cannot tell`."""
-    strokes = [read(path, channel_map=MAP, rate=1000) for path in files(name)]
+    strokes = [read(path, map=MAP, rate=1000) for path in files(name)]
     strokes = [stroke for stroke in strokes if inspected(stroke).defect is None]
     known = {str(k): stroke for k, stroke in enumerate(strokes[:count])}
     made = calibrate_on(known, false_alarm_probability=0.01)

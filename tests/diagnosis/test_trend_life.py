@@ -98,7 +98,7 @@ def test_without_the_temperature_the_summer_looks_like_wear(readings: list[LeakR
 def test_real_strokes_of_a_specimen_raise_no_alarm(session: str) -> None:
     """Thirty strokes in seven minutes: counts and no command, so the ringing alone, which never says `leak`."""
     files = sorted((REAL / session).glob("*.txt"))
-    strokes = [ss.read(file, rate=1000.0, channel_map={"p_A": "PG_1", "p_B": "PG_2"}) for file in files]
+    strokes = [ss.read(file, rate=1000.0, map={"p_A": "PG_1", "p_B": "PG_2"}) for file in files]
     trend = trend_of([reading_of(own, file=file.name) for own, file in zip(strokes, files, strict=True)], healthy=5)
     assert trend.basis == "ringing" and trend.verdict == "cannot tell" and trend.alarm is None
     assert len(trend.rows) >= 28 and len(trend.groups) == 2 and trend.unit == "%"

@@ -85,7 +85,8 @@ FAULTS = (
 )
 SIZES = ("3 min", "180", "500 Hz", "20[Pa]", "1e-5 s", "2[L/min]", "0.8[ohm]", "50 %", "3 psi")
 UNITS = ("Pa", "m^3/(s Pa)", "N m/A", "cm3/rev", "rad/s/V", "kelvin", "bar(a)", "N/(m m)", "µm", "BTU/(ft*h)")
-MAPS = ("p_A=PG_1[psi]", "p_B=#3", "x=#4[mm]", "t=Time", "p_A=p (port A)[bar]")
+FORMULAS = ("p_A=PG_1*0.0625-0.625 bar", "x=0.5*(#4 - `Pos`/2) mm")
+MAPS = ("p_A=PG_1[psi]", "p_B=#3", "x=#4[mm]", "t=Time", "p_A=p (port A)[bar]", *FORMULAS)
 SETS = ("V_1=50[cm^3]", "orifices=present", "sensors.p_A.noise=1[psi]", "K_oil=689 MPa", "sample_rate=1 kHz")
 LABELS = [Label.parse(text) for text in ("Time", "PG_1", "PG_2 [psi]", "Pos", "p (port A)")]
 T = np.linspace(0.0, 10.0, 50)

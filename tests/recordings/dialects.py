@@ -547,24 +547,18 @@ TEXTS: dict[str, Dialect] = {
     "text, OVERLOAD in a cell": Dialect(spoilt("OVERLOAD")),
     "text, #N/A in a cell": Dialect(spoilt("#N/A")),
     "text, an empty cell": Dialect(spoilt("")),
-    "text, German names": Dialect(log("Zeit [s],Druck A [bar],Druck B [bar],Weg [mm]\n"), {"channel_map": "auto"}),
-    "text, units as suffixes": Dialect(log("time_s,PA_bar,PB_bar,Weg_mm\n"), {"channel_map": "auto"}),
-    "text, English names": Dialect(
-        log("Time (s),Cyl_P_Cap (bar),Cyl_P_Rod (bar),Position (mm)\n"), {"channel_map": "auto"}
-    ),
+    "text, German names": Dialect(log("Zeit [s],Druck A [bar],Druck B [bar],Weg [mm]\n"), {"map": "auto"}),
+    "text, units as suffixes": Dialect(log("time_s,PA_bar,PB_bar,Weg_mm\n"), {"map": "auto"}),
+    "text, English names": Dialect(log("Time (s),Cyl_P_Cap (bar),Cyl_P_Rod (bar),Position (mm)\n"), {"map": "auto"}),
     "text, mapped names": Dialect(
         log("Zeit,Druck1,Druck2,Weg1\n"),
-        {"channel_map": {"t": "Zeit[s]", "p_A": "Druck1[bar]", "p_B": "Druck2[bar]", "x": "Weg1[mm]"}},
+        {"map": {"t": "Zeit[s]", "p_A": "Druck1[bar]", "p_B": "Druck2[bar]", "x": "Weg1[mm]"}},
     ),
-    "text, names twice": Dialect(
-        log("t [s],P,P,s\n"), {"channel_map": {"p_A": "#2[bar]", "p_B": "#3[bar]", "x": "#4[mm]"}}
-    ),
-    "text, no head": Dialect(
-        log(""), {"channel_map": {"t": "#1[s]", "p_A": "#2[bar]", "p_B": "#3[bar]", "x": "#4[mm]"}}
-    ),
+    "text, names twice": Dialect(log("t [s],P,P,s\n"), {"map": {"p_A": "#2[bar]", "p_B": "#3[bar]", "x": "#4[mm]"}}),
+    "text, no head": Dialect(log(""), {"map": {"t": "#1[s]", "p_A": "#2[bar]", "p_B": "#3[bar]", "x": "#4[mm]"}}),
     "text, a rate and no time": Dialect(
         log("no," + HEADS, [str(k) for k in range(N)]),
-        {"channel_map": {"p_A": "p_A", "p_B": "p_B", "x": "x"}, "rate": RATE},
+        {"map": {"p_A": "p_A", "p_B": "p_B", "x": "x"}, "rate": RATE},
     ),
     "text, quoted decimal commas": Dialect(log("t [s],p_A [bar],p_B [bar],x [mm]\n", change=quoted)),
     "text, thousands with points": Dialect(thousands(".", ",", ";")),
@@ -578,9 +572,7 @@ TEXTS: dict[str, Dialect] = {
     "text, a summary at the end": Dialect(log("t [s]," + HEADS, change=with_lines("Min,1,2,3", "", "End", at=N + 1))),
     "text, a row of types": Dialect(log("Time,p_A,p_B,x\ns,bar,bar,mm\nREAL,REAL,REAL,REAL\n")),
     "text, units above names": Dialect(log("s,bar,bar,mm\nt,p_A,p_B,x\n")),
-    "text, groups above names": Dialect(
-        log(",Pressure,,Position\nTime,A,B,Cyl\ns,bar,bar,mm\n"), {"channel_map": "auto"}
-    ),
+    "text, groups above names": Dialect(log(",Pressure,,Position\nTime,A,B,Cyl\ns,bar,bar,mm\n"), {"map": "auto"}),
     "text, rows that say what they hold": Dialect(
         log(
             '"Model","DL"\n"TraceName","p_A","p_B","x"\n"VUnit","bar","bar","mm"\n"SampleRate",500,500,500\n\n',
@@ -634,14 +626,14 @@ TEXTS: dict[str, Dialect] = {
     "text, days since 1899": Dialect(log("Date/Time," + HEADS, [repr(45443.99 + t / 86400) for t in T.tolist()])),
     "text, GB 18030": Dialect(
         log("时间(s),无杆腔压力(bar),有杆腔压力(bar),位移（mm）\n", encoding="gb18030"),
-        {"channel_map": "auto"},
+        {"map": "auto"},
     ),
     "text, Shift JIS": Dialect(
         log("時間[s],ヘッド側圧力[bar],ロッド側圧力[bar],変位[mm]\n", encoding="shift_jis"),
-        {"channel_map": "auto"},
+        {"map": "auto"},
     ),
     **{
-        f"text, {language}": Dialect(log(head + "\n"), {"channel_map": "auto"})
+        f"text, {language}": Dialect(log(head + "\n"), {"map": "auto"})
         for language, head in {
             "French": "Temps écoulé (s),Pression côté fond (bar),Pression côté tige (bar),Course (mm)",
             "Italian": "Tempo [s],Pressione lato fondello [bar],Pressione lato stelo [bar],Corsa [mm]",
@@ -682,7 +674,7 @@ DIALECTS: dict[str, Dialect] = {
     ),
     "Excel, merged heads": Dialect(
         lambda folder: sheets(folder, [["Zeit", "Druck", None, "Weg"], [None, "A", "B"], ["s", "bar", "bar", "mm"]]),
-        {"channel_map": "auto"},
+        {"map": "auto"},
     ),
     "Excel, times of the day": Dialect(
         lambda folder: sheets(

@@ -77,11 +77,11 @@ JSONS: dict[str, Dialect] = {
         )
     ),
     "JSON lines, units as suffixes": Dialect(
-        lines({"time_s": t, "PA_bar": a, "PB_bar": b, "Weg_mm": x} for t, a, b, x in ROWS), {"channel_map": "auto"}
+        lines({"time_s": t, "PA_bar": a, "PB_bar": b, "Weg_mm": x} for t, a, b, x in ROWS), {"map": "auto"}
     ),
     "JSON lines, rows under names": Dialect(lines([list(NAMED), *ROWS])),
     "JSON lines, rows": Dialect(
-        lines(ROWS), {"channel_map": {"t": "#1[s]", "p_A": "#2[bar]", "p_B": "#3[bar]", "x": "#4[mm]"}}
+        lines(ROWS), {"map": {"t": "#1[s]", "p_A": "#2[bar]", "p_B": "#3[bar]", "x": "#4[mm]"}}
     ),
     "JSON lines, a sample each": Dialect(
         lines(
@@ -102,7 +102,7 @@ JSONS: dict[str, Dialect] = {
     ),
     "JSON lines, vectors": Dialect(
         lines({"t": t, "p": [a, b], "x": x} for t, a, b, x in ROWS),
-        {"channel_map": {"p_A": "p(1)[bar]", "p_B": "p(2)[bar]", "x": "x[mm]"}},
+        {"map": {"p_A": "p(1)[bar]", "p_B": "p(2)[bar]", "x": "x[mm]"}},
     ),
     "JSON, records": Dialect(document(RECORDS)),
     "JSON, records on lines": Dialect(document(RECORDS, indent=2)),
@@ -214,7 +214,7 @@ def influx(head: str, annotations: bool, tables: bool) -> Writer:
     return text(above + (f"\n{above}" if tables else "").join(parts))
 
 
-MAPPED = {"channel_map": {"p_A": "p_A[bar]", "p_B": "p_B[bar]", "x": "x[mm]"}}
+MAPPED = {"map": {"p_A": "p_A[bar]", "p_B": "p_B[bar]", "x": "x[mm]"}}
 INFLUX = ",result,table,_start,_stop,_time,_value,_field,_measurement,host"
 LONG: dict[str, Dialect] = {
     "long, WinCC": Dialect(long('"VarName";"TimeString";"VarValue";"Validity";"Time_ms"', wincc), MAPPED),
@@ -262,10 +262,11 @@ LONG: dict[str, Dialect] = {
 }
 
 
-def twincat(comma: bool = False, single: bool = False, join: str = "\t", every: int = 1) -> Writer:
+def twincat(comma: bool = False, single: bool = False, join: str = "\t", every: int = 1, brief: bool = False) -> Writer:
     """Write what TwinCAT Scope exports, in the form of the files that accompany pytcs, with a full header.
 
-    `single`: channels of one clock share a column of times; `every`: the position is sampled so many times slower.
+    `single`: channels of one clock share a column of times; `every`: the position is sampled so many times slower;
+    `brief`: the heading is the row of names alone.
     """
     heads = [
         ("Name", "p_A", "p_B", "x"), ("SymbolComment", "", "", ""), ("Data-Type", "REAL64", "REAL64", "REAL32"),
@@ -279,6 +280,7 @@ def twincat(comma: bool = False, single: bool = False, join: str = "\t", every: 
     lines = ["Name" + join + "rig", "File" + join + "C:\\rig.csv"]
     lines += [f"Starttime of export{join}132959733843760000{join}Montag, 2. Mai 2022{join}15:56:24.376"]
     lines += [f"Endtime of export{join}132959733853750000{join}Montag, 2. Mai 2022{join}15:56:25.375", "", ""]
+    heads = heads[:1] if brief else heads
     lines += [join.join([k, a, b, k, x] if single else [k, a, k, b, k, x]) for k, a, b, x in heads] + [""]
     for k, t in enumerate(TIMES):
         at = every * k
@@ -299,13 +301,14 @@ EACH: dict[str, Dialect] = {
     "a clock each, TwinCAT Scope": Dialect(twincat()),
     "a clock each, TwinCAT Scope, decimal comma": Dialect(twincat(comma=True)),
     "a clock each, TwinCAT Scope, shared clocks": Dialect(twincat(single=True)),
+    "a clock each, TwinCAT Scope, names alone": Dialect(twincat(single=True, brief=True), MAPPED),
     "a clock each, TwinCAT Scope, semicolon": Dialect(twincat(comma=True, join=";")),
     "a clock each, two called t": Dialect(pairs("t,p_A [bar],t,p_B [bar],t,x [mm]")),
     "a clock each, with units": Dialect(pairs("t [s],p_A [bar],t [s],p_B [bar],t [s],x [mm]", join=";")),
     "a clock each, numbered": Dialect(pairs("Time,p_A [bar],Time.1,p_B [bar],Time.2,x [mm]", join="\t")),
     "a clock each, German": Dialect(
         pairs("Zeit 1 - Standard [s],Druck A [bar],Zeit 2 - schnell [s],Druck B [bar],Zeit 3 [s],Weg [mm]"),
-        {"channel_map": "auto"},
+        {"map": "auto"},
     ),
 }
 
@@ -335,7 +338,7 @@ def graphtec(alarms: bool, names: bool) -> Dialect:
     head += "AMP settings\nCH,Signal name,Input,Range,Filter,Span\n" + "\n".join(table) + "\nLogic/Pulse,Off\nData\n"
     head += "Number,Date&Time,ms,CH1,CH2,CH3" + (",Alarm1-10,Alarm11-20,AlarmOut" if alarms else "") + "\n"
     head += "NO.,Time,ms,bar,bar,mm" + (",A1234567890,A1234567890,A1234" if alarms else "")
-    options = {} if names else {"channel_map": {"p_A": "CH1", "p_B": "CH2", "x": "CH3"}}
+    options = {} if names else {"map": {"p_A": "CH1", "p_B": "CH2", "x": "CH3"}}
     tail = ",LLLLLLLLLL,LLLLLLLLLL,LLLL" if alarms else ""
     return bench(head, lambda k, moment, ms: f"{k + 1},{moment:%Y-%m-%d %H:%M:%S},{ms:03d}", options, tail, form="+.6f")
 
@@ -376,7 +379,7 @@ File Header\t
 Ch\tCH001\tCH002\tCH003
 Tag\tp_A\tp_B\tx
 Unit\tbar\tbar\tmm"""
-NUMBERED = {"channel_map": {"p_A": "CH1[bar]", "p_B": "CH2[bar]", "x": "CH3[mm]"}}
+NUMBERED = {"map": {"p_A": "CH1[bar]", "p_B": "CH2[bar]", "x": "CH3[mm]"}}
 INSTRUMENTS: dict[str, Dialect] = {
     "Graphtec GL": graphtec(True, True),
     "Graphtec GL, no alarms": graphtec(False, True),
@@ -385,7 +388,7 @@ INSTRUMENTS: dict[str, Dialect] = {
     "Hioki, channels by number": bench(
         HIOKI,
         lambda k, moment, ms: f"{TIMES[k]:.9E}",
-        {"channel_map": {"p_A": "CH-1", "p_B": "CH-2[bar]", "x": "CH-3"}},
+        {"map": {"p_A": "CH-1", "p_B": "CH-2[bar]", "x": "CH-3"}},
         ",0,0,",
     ),
     "Tektronix, labels": bench(
@@ -398,12 +401,12 @@ INSTRUMENTS: dict[str, Dialect] = {
     "Keysight InfiniiVision": bench(
         "x-axis,1,2,3\nsecond,Volt,Volt,Volt",
         lambda k, moment, ms: f"{TIMES[k] - 0.1:+.6E}",
-        {"channel_map": {"p_A": "1[bar]", "p_B": "2[bar]", "x": "3[mm]"}},
+        {"map": {"p_A": "1[bar]", "p_B": "2[bar]", "x": "3[mm]"}},
     ),
     "Keysight 34972A": bench(
         "Sweep #,Time,Chan 201 (BAR),Chan 202 (BAR),Chan 203 (MM)",
         lambda k, moment, ms: f"{k + 1},{moment:%m/%d/%Y %H:%M:%S}:{ms:03d}",
-        {"channel_map": {"p_A": "Chan 201 (BAR)", "p_B": "Chan 202", "x": "Chan 203"}},
+        {"map": {"p_A": "Chan 201 (BAR)", "p_B": "Chan 202", "x": "Chan 203"}},
     ),
     "Keysight BenchLink": Dialect(
         text(
@@ -418,7 +421,7 @@ INSTRUMENTS: dict[str, Dialect] = {
     "PicoScope": bench(
         "Time,Channel A,Channel B,Channel C\n(ms),(bar),(bar),(mm)\n",
         lambda k, moment, ms: f"{1e3 * TIMES[k]:.8f}",
-        {"channel_map": {"p_A": "Channel A", "p_B": "Channel B", "x": "Channel C"}},
+        {"map": {"p_A": "Channel A", "p_B": "Channel B", "x": "Channel C"}},
     ),
     "Yokogawa WT": bench(
         "Store No.,Date,Time,Millisecond,p_A,p_B,x",
@@ -458,7 +461,7 @@ QUANTITIES: dict[str, Dialect] = {
     "units in cells, quoted decimal commas": Dialect(quantities('"t","p_A","p_B","x"', join=",", quote='"')),
     "units in cells, preamble": Dialect(
         quantities("Operator;N. N.\nOil temperature;41 degC\nSupply;200 bar\nZeit;Druck A;Druck B;Weg"),
-        {"channel_map": "auto"},
+        {"map": "auto"},
     ),
 }
 TEXTS = {**CLOCKS, **LONG, **EACH, **INSTRUMENTS, **QUANTITIES}

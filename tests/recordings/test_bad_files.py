@@ -168,9 +168,9 @@ def test_hdf5_of_unequal_lengths(tmp_path: Path) -> None:
 def test_missing_mapped_column(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text(GOOD)
-    text = refused(path, channel_map={"p_A": "PG_1"})
+    text = refused(path, map={"p_A": "PG_1"})
     assert text == "PG_1, mapped to p_A, must be a column, got columns t [s], p_A [bar], note (FILE)"
-    text = refused(path, channel_map={"x": "p_A"})
+    text = refused(path, map={"x": "p_A"})
     assert text == "x must have a unit of length, such as m, got bar (FILE)"
 
 
@@ -183,7 +183,7 @@ def test_missing_mapped_column(tmp_path: Path) -> None:
             {"format": "xlsx"},
             "format must be one of json, lvm, matlab, .*, text, got xlsx",
         ),
-        ({"channel_map": {"P_X": "a"}}, "a mapped channel must be one of"),
+        ({"map": {"P_X": "a"}}, "a mapped channel must be one of"),
     ],
 )
 def test_wrong_calls(tmp_path: Path, options: dict[str, object], message: str) -> None:
@@ -214,7 +214,7 @@ def test_any_bytes_are_a_recording_or_one_clear_line(tmp_path: Path, content: by
     path = tmp_path / "log.csv"
     path.write_bytes(content)
     try:
-        read(path, channel_map={"p_A": "1"}, rate=10.0)
+        read(path, map={"p_A": "1"}, rate=10.0)
     except UnreadableFile as error:
         assert "\n" not in str(error)
 

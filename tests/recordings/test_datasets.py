@@ -148,7 +148,7 @@ def cycles(tmp_path) -> tuple[datasets.Dataset, Path]:
 
 def test_cycles_of_an_archive(cycles):
     made, folder = cycles
-    read = list(datasets.read(made, folder, channel_map={"p_A": "PS2", "p_1": "PS1"}))
+    read = list(datasets.read(made, folder, map={"p_A": "PS2", "p_1": "PS1"}))
     assert [labels["pump_leakage"] for _, labels in read] == [0, 2, 1, 0]
     for row, (recording, _) in enumerate(read):
         np.testing.assert_allclose(recording["p_A"], 1e5 * BAR["PS2"][row], rtol=1e-15)
@@ -185,8 +185,8 @@ def test_matrices_that_do_not_fit_are_refused(cycles, tmp_path_factory):
         (folder / "profile.txt").write_text(text)
         with pytest.raises(UnreadableFile, match=error):
             datasets.read(made, folder, check_files=False)
-    with pytest.raises(InputError, match=r"channel_map must map pressures to PS1\.\.PS6, got x=PS1"):
-        datasets.read(made, folder, channel_map={"x": "PS1"}, check_files=False)
+    with pytest.raises(InputError, match=r"map must map pressures to PS1\.\.PS6, got x=PS1"):
+        datasets.read(made, folder, map={"x": "PS1"}, check_files=False)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/real is absent")
@@ -194,9 +194,7 @@ def test_the_real_strokes():
     found = datasets.check("vtnsi-actuator", REAL)
     assert (len(found.right), found.wrong, found.missing) == (239, {}, ())
     name = "Leak_000_0_303_9-10-2019-4-37-01_PM.txt"
-    own = ss.read(
-        REAL / "vtnsi_actuator" / "act_4_seal_defect" / name, channel_map={"p_A": "PG_1", "p_B": "PG_2"}, rate=1000
-    )
+    own = ss.read(REAL / "vtnsi_actuator" / "act_4_seal_defect" / name, map={"p_A": "PG_1", "p_B": "PG_2"}, rate=1000)
     strokes = datasets.read("vtnsi-actuator", REAL / "vtnsi_actuator" / "act_4_seal_defect")
     same, labels = next(item for item in strokes if item.recording.provenance["file"] == name)
     np.testing.assert_array_equal(same["p_A"], own["p_A"])

@@ -164,14 +164,14 @@ def test_hours_minutes_and_seconds_must_be_those_of_a_clock(tmp_path: Path) -> N
 def test_a_column_called_date_is_the_time_where_it_holds_times_of_the_day(tmp_path: Path) -> None:
     for cells in (["1", "2", "3"], ["2024-05-31", "2024-06-01", "2024-06-02"]):
         assert "got dates alone in column data (FILE)" in refused(saved(tmp_path, "data", cells))
-    assert read(saved(tmp_path, "data", ["1", "2", "3"]), channel_map={"t": "data[s]"}).rate == 1.0
+    assert read(saved(tmp_path, "data", ["1", "2", "3"]), map={"t": "data[s]"}).rate == 1.0
 
 
 def test_a_column_called_s_that_a_map_takes_is_no_part_of_the_time(tmp_path: Path) -> None:
     path = saved(tmp_path, "h,m,s", [f"1,2,{k}" for k in range(80)])
-    recording = read(path, channel_map={"x": "s[mm]"}, rate=500)
+    recording = read(path, map={"x": "s[mm]"}, rate=500)
     assert recording["x"] == pytest.approx(np.arange(80) * 1e-3)
-    assert "a recording must have a time column" in refused(path, channel_map={"x": "s[mm]"})
+    assert "a recording must have a time column" in refused(path, map={"x": "s[mm]"})
 
 
 def test_parts_of_the_time_in_other_tables(tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_channels_of_one_length_whose_clocks_differ_are_not_put_beside_each_othe
     assert recording["p_A"] == pytest.approx(1e5 * np.arange(100))
     assert recording["p_B"][1:] == pytest.approx(1e5 * (np.arange(1, 100) - 0.5))
     # a map that names the time takes the rows as they are
-    assert read(tmp_path / "log.csv", channel_map={"t": "#1[s]"})["p_B"] == pytest.approx(1e5 * np.arange(100))
+    assert read(tmp_path / "log.csv", map={"t": "#1[s]"})["p_B"] == pytest.approx(1e5 * np.arange(100))
 
 
 def test_what_a_long_table_says_of_its_samples(tmp_path: Path) -> None:
@@ -224,13 +224,13 @@ def test_what_a_long_table_says_of_its_samples(tmp_path: Path) -> None:
     assert "1 value that the file calls invalid read as missing" in recording.history
     assert "long table: 401 rows of 3 names" in recording.history
     assert "must be a column, got columns p_A [bar], p_B [bar], $RT_OFF$" in refused(
-        tmp_path / "log.csv", channel_map={"x": "Weg"}
+        tmp_path / "log.csv", map={"x": "Weg"}
     )
 
 
 def test_a_table_with_a_column_of_names_is_read_as_it_was_where_a_map_names_its_columns(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("Name,Time [s],Value\n" + "".join(f"rig 3,{k / 50},{k}\n" for k in range(99)))
-    assert read(tmp_path / "log.csv", channel_map={"p_A": "Value[bar]"})["p_A"][7] == 7e5
+    assert read(tmp_path / "log.csv", map={"p_A": "Value[bar]"})["p_A"][7] == 7e5
 
 
 @pytest.mark.parametrize(

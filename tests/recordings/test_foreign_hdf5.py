@@ -19,13 +19,13 @@ def test_plain_hdf5_in_groups(tmp_path: Path) -> None:
         group["time"], group["PG_1"], group["p_B [bar]"] = T, (1000 * P).astype(np.int16), P
         group["time"].attrs["unit"] = b"s"
         file["picture"] = np.zeros((3, 3))
-    recording = read(path, channel_map={"p_A": "PG_1"})
+    recording = read(path, map={"p_A": "PG_1"})
     assert np.array_equal(recording.t, T)
     assert recording.rate == 500
     assert np.array_equal(recording["p_A"], (1000 * P).astype(np.int16))
     assert recording.units["p_A"] == COUNTS
     assert recording["p_B"] == pytest.approx(P * 1e5, rel=1e-15)
-    assert read(path, channel_map={"p_A": "rig/daq/PG_1[bar]"}).units["p_A"] == "Pa"
+    assert read(path, map={"p_A": "rig/daq/PG_1[bar]"}).units["p_A"] == "Pa"
 
 
 def test_without_time_a_rate_is_needed(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_parquet_of_others(tmp_path: Path) -> None:
         "who": pyarrow.array(["x"] * T.size),
     }
     parquet.write_table(pyarrow.table(columns), tmp_path / "log.parquet")
-    recording = read(tmp_path / "log.parquet", channel_map={"p_B": "PG_2"})
+    recording = read(tmp_path / "log.parquet", map={"p_B": "PG_2"})
     assert recording.t == pytest.approx(T, abs=1e-9)
     assert np.isnan(recording["p_A"][0])
     assert recording["p_A"][1:] == pytest.approx(P[1:] * 1e5, rel=1e-15)

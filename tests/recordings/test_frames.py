@@ -59,7 +59,7 @@ def test_indices_of_time(tz: str | None) -> None:
         dates.rename("when"),
         pandas.to_timedelta(expected, unit="s"),
     ):
-        options = {"channel_map": {"t": "when"}} if index.name == "when" else {}
+        options = {"map": {"t": "when"}} if index.name == "when" else {}
         recording = Recording.from_pandas(pandas.DataFrame({"p_A [bar]": p}, index=index), **options)
         assert recording.t == pytest.approx(expected, abs=1e-12)
         assert recording.rate == 2.0
@@ -103,7 +103,7 @@ def test_units_from_attributes_and_columns_of_other_kinds() -> None:
         ({"p_A [Pa]": [1j]}, {"rate": 1.0}, "p_A [Pa] must hold numbers, got the type complex128 (data frame)"),
         ({"p_A [Pa]": []}, {"rate": 1.0}, "a recording must have samples"),
         ({"p_A [Pa]": [1.0]}, {"rate": 0.0}, "rate must be > 0 Hz, got 0.0"),
-        ({"p_A [Pa]": [1.0]}, {"channel_map": {"p_C": "a"}}, "a mapped channel must be one of"),
+        ({"p_A [Pa]": [1.0]}, {"map": {"p_C": "a"}}, "a mapped channel must be one of"),
         ({"p_A [Pa]": [1.0]}, {"rat": 1.0}, "Recording.from_pandas has no argument 'rat'; did you mean 'rate'?"),
     ],
 )  # fmt: skip

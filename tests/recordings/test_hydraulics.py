@@ -112,7 +112,7 @@ def test_real_rotary_strokes_pass() -> None:
     if not files:
         pytest.skip("the real recordings are not here")
     for path in files:
-        assert no_machine(read(path, channel_map={"p_A": "PG_1", "p_B": "PG_2"}, rate=1000)) is None
+        assert no_machine(read(path, map={"p_A": "PG_1", "p_B": "PG_2"}, rate=1000)) is None
 
 
 def test_pressures_of_one_circuit_of_a_real_test_rig_pass() -> None:

@@ -78,7 +78,7 @@ def test_there_are_forty_dialects() -> None:
 def test_the_group_that_holds_most_channels_is_read(tmp_path: Path) -> None:
     recording = read(tdms_other_groups(tmp_path))
     assert "channels of group Fast read, not those of the same name of Statistics" in recording.history
-    other = read(tmp_path / "log.tdms", channel_map={"p_A": "Statistics/p_A", "p_B": "oil[bar]"})
+    other = read(tmp_path / "log.tdms", map={"p_A": "Statistics/p_A", "p_B": "oil[bar]"})
     assert len(other) == 4
 
 

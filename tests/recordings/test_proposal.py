@@ -85,11 +85,11 @@ def test_the_error_prints_the_map_and_auto_takes_it(tmp_path: Path) -> None:
     path.write_text("Zeit [s];Druck A [bar];PB_bar\n0;1;2\n0,002;2;3\n0,004;1;2\n")
     with pytest.raises(UnreadableFile, match=r"--map auto would read --map 'p_A=Druck A \[bar\]' --map 'p_B=PB_bar\["):
         read(path)
-    recording = read(path, channel_map="auto")
+    recording = read(path, map="auto")
     assert recording["p_B"].tolist() == [2e5, 3e5, 2e5]
     assert "column PB_bar read as p_B in bar" in recording.history
-    with pytest.raises(InputError, match="channel_map must be a mapping or the word auto, got 'guess'"):
-        read(path, channel_map="guess")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="map must be a mapping or the word auto, got 'guess'"):
+        read(path, map="guess")  # type: ignore[arg-type]
 
 
 @given(st.lists(st.text(max_size=100), max_size=8))

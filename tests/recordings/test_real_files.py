@@ -19,7 +19,7 @@ MAP = {"p_A": "PG_1", "p_B": "PG_2"}
 
 @cache
 def stroke(path: Path) -> Recording:
-    return read(path, channel_map=MAP, rate=1000)
+    return read(path, map=MAP, rate=1000)
 
 
 def test_every_twelfth_stroke_reads_as_numpy_reads_it() -> None:
@@ -39,7 +39,9 @@ def test_ports_are_clean_but_for_the_strokes_that_fall_below_zero() -> None:
     found = Counter()
     for path in FILES[::6]:
         recording = stroke(path)
-        for finding in inspect(recording):
+        findings = inspect(recording)
+        assert [finding.channel for finding in findings if finding.code == "raw_counts"] == ["p_A", "p_B"]
+        for finding in (finding for finding in findings if finding.code != "raw_counts"):
             assert finding.code == "clipped"
             at_zero = np.flatnonzero(recording[finding.channel] == 0)
             assert finding.count == at_zero.size > 300
@@ -49,10 +51,7 @@ def test_ports_are_clean_but_for_the_strokes_that_fall_below_zero() -> None:
 
 def test_what_is_not_connected_is_seen_as_hum() -> None:
     hums = sum(
-        any(
-            f.code == "mains_hum" and "60 Hz" in f.text
-            for f in inspect(read(path, channel_map={"p_A": "PG_3"}, rate=1000))
-        )
+        any(f.code == "mains_hum" and "60 Hz" in f.text for f in inspect(read(path, map={"p_A": "PG_3"}, rate=1000)))
         for path in SINGLE
     )
     assert hums > len(SINGLE) // 2

@@ -95,7 +95,7 @@ def test_sheets_whose_clocks_do_not_fit_are_named(tmp_path: Path) -> None:
 def test_the_names_of_all_sheets_are_read_by_their_words(tmp_path: Path) -> None:
     pressures = [["Zeit [s]", "Druck A [bar]", "Druck B [bar]"], *[row[:3] for row in ROWS]]
     position = [["Zeit [s]", "Weg [mm]"], *[[row[0], row[3]] for row in ROWS]]
-    recording = read(workbook(tmp_path, Messung=pressures, Weg=position), channel_map="auto")
+    recording = read(workbook(tmp_path, Messung=pressures, Weg=position), map="auto")
     agrees(recording)
     assert recording.provenance["columns"] == {"p_A": "Druck A [bar]", "p_B": "Druck B [bar]", "x": "Weg [mm]"}
 
@@ -105,9 +105,9 @@ def test_a_map_whose_columns_stand_in_two_sheets(tmp_path: Path) -> None:
     position = [["Zeit [s]", "LVDT [mm]"], *[[row[0], row[3]] for row in ROWS]]
     path = workbook(tmp_path, Messung=pressures, Weg=position)
     mapped = {"p_A": "PG_1 [bar]", "p_B": "PG_2", "x": "LVDT"}
-    agrees(read(path, channel_map=mapped))
-    agrees(read(path, channel_map={"t": "Zeit", **mapped}))
+    agrees(read(path, map=mapped))
+    agrees(read(path, map={"t": "Zeit", **mapped}))
     with pytest.raises(UnreadableFile, match="must be in sheets of one time, got none for theta in Messung, Weg"):
-        read(path, channel_map={**mapped, "theta": "Encoder[deg]"})
+        read(path, map={**mapped, "theta": "Encoder[deg]"})
     with pytest.raises(UnreadableFile, match="mapped to theta, must be a column, got columns Zeit"):
-        read(path, channel_map={"theta": "Encoder[deg]"})
+        read(path, map={"theta": "Encoder[deg]"})

@@ -107,7 +107,7 @@ def test_other_channels_and_units(tmp_path: Path) -> None:
 
 def test_map_and_rate(tmp_path: Path) -> None:
     path = saved(tmp_path, "Time\tPG_1\tPG_2\tname\n1\t10\t20\ta\n2\t11\t21\tb\n3\t12\t22\t\n", "log.txt")
-    recording = read(path, channel_map={"p_A": "PG_1", "p_B": "PG_2[psi]"}, rate=1000)
+    recording = read(path, map={"p_A": "PG_1", "p_B": "PG_2[psi]"}, rate=1000)
     assert np.array_equal(recording["p_A"], [10, 11, 12])
     assert recording.units["p_A"] == COUNTS
     assert recording["p_B"] == pytest.approx(np.array([20, 21, 22]) * 6894.757293168361, rel=1e-15)
@@ -115,18 +115,18 @@ def test_map_and_rate(tmp_path: Path) -> None:
     assert any("Time not used: the rate was given as 1000 Hz" in line for line in recording.history)
     assert any("raw counts" in line for line in recording.history)
     with pytest.raises(UnreadableFile, match="count of rows 1, 2"):
-        read(path, channel_map={"p_A": "PG_1"})
+        read(path, map={"p_A": "PG_1"})
 
 
 def test_map_by_number_without_a_header(tmp_path: Path) -> None:
-    recording = read(saved(tmp_path, body(",")), channel_map={"t": "1[s]", "p_A": "2[bar]"})
+    recording = read(saved(tmp_path, body(",")), map={"t": "1[s]", "p_A": "2[bar]"})
     assert recording["p_A"] == pytest.approx(BAR)
     assert recording.rate == 500
 
 
 def test_mapped_column_comes_before_the_namesake(tmp_path: Path) -> None:
     path = saved(tmp_path, "t [s],p_A [bar],true p_A [bar]\n0,1,5\n1,2,6\n")
-    assert read(path, channel_map={"p_A": "true p_A"})["p_A"] == pytest.approx([5e5, 6e5])
+    assert read(path, map={"p_A": "true p_A"})["p_A"] == pytest.approx([5e5, 6e5])
 
 
 def test_epoch_and_stamps(tmp_path: Path) -> None:
@@ -281,10 +281,10 @@ def test_a_few_words_among_many_numbers_are_missing_samples(tmp_path: Path) -> N
 
 def test_columns_by_number(tmp_path: Path) -> None:
     path = saved(tmp_path, "t [s],P [bar],P [bar]\n0,1,2\n1,2,3\n2,1,3\n")
-    recording = read(path, channel_map={"p_A": "#2", "p_B": "#3"})
+    recording = read(path, map={"p_A": "#2", "p_B": "#3"})
     assert recording["p_B"].tolist() == [2e5, 3e5, 3e5]
     with pytest.raises(UnreadableFile, match=r"#4, mapped to p_A, must be a column"):
-        read(path, channel_map={"p_A": "#4"})
+        read(path, map={"p_A": "#4"})
 
 
 def test_what_stands_above_the_header_is_kept(tmp_path: Path) -> None:

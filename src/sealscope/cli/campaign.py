@@ -308,7 +308,7 @@ def calibrate(
     channel_map = channel_map_of(maps)
     recordings = {}
     for path in baseline:
-        recording = attempt(path, partial(read, path, channel_map=channel_map or None, rate=rate))
+        recording = attempt(path, partial(read, path, map=channel_map or None, rate=rate))
         if recording is not None:
             recordings[str(path)] = recording
     if len(recordings) < len(baseline):

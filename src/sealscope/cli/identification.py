@@ -35,7 +35,7 @@ def identify(
         if output.exists():
             raise InputError(f"a rig's file must be new, got {output}, which exists")
     columns = channel_map_of(channel_map) or None
-    recordings = [read(file, channel_map=columns, rate=rate) for file in files]
+    recordings = [read(file, map=columns, rate=rate) for file in files]
     found = identified(recordings, rig)
     if found.mismatch is not None:
         raise InputError(f"the recordings must be of a machine like {load_rig(rig).name}: {found.mismatch}")

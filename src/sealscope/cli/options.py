@@ -89,8 +89,9 @@ MapOption = Annotated[
     typer.Option(
         "--map",
         metavar="CHANNEL=COLUMN",
-        help="Take a channel from a foreign column, with its unit if the file has none: p_A=PG_1[psi], x=#4[mm]; "
-        "repeat. `auto`: what the columns' names tell, also beside others.",
+        help="Take a channel from a foreign column, with its unit if neither the file nor the name has one: "
+        "p_A=PG_1[psi], x=#4[mm], or from a formula of columns: 'p_A=ch2*0.0625-0.625 bar'; repeat. `auto`: what the "
+        "columns' names tell, also beside others.",
     ),
 ]
 RateOption = Annotated[float | None, typer.Option("--rate", help="Sampling rate [Hz] of files without a time column.")]

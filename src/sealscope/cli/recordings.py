@@ -120,9 +120,9 @@ class _Reading:
         from sealscope.recordings import read
 
         if not self.beside_rig:
-            return read(file, channel_map=self.channel_map or None, rate=self.rate)
+            return read(file, map=self.channel_map or None, rate=self.rate)
         try:
-            return read(file, channel_map=self.beside_rig, rate=self.rate)
+            return read(file, map=self.beside_rig, rate=self.rate)
         except UnreadableFile as unmapped:
             try:
                 return read(file, rate=self.rate)
@@ -512,7 +512,7 @@ def _convert_parts(source: Path, folder: Path, reading: _Reading, every: str) ->
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"with --every, TARGET must be a new or empty folder, got {folder}")
     count, samples = 0, 0
-    for part in read_parts(source, length, channel_map=reading.channel_map or None, rate=reading.rate):
+    for part in read_parts(source, length, map=reading.channel_map or None, rate=reading.rate):
         if not count:
             folder.mkdir(exist_ok=True)
         count, samples = count + 1, samples + len(part)

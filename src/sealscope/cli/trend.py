@@ -65,7 +65,7 @@ def _readings(
 
     with progress() as update:
         for k, file in enumerate(files):
-            recording = attempt(file, partial(read, file, channel_map=channel_map or None, rate=rate))
+            recording = attempt(file, partial(read, file, map=channel_map or None, rate=rate))
             reading = None
             if recording is not None:
                 reading = attempt(file, partial(reading_of, recording, rig, file.name))

@@ -188,7 +188,7 @@ def _writer(kind: str) -> Writer:
 def read(
     path: str | os.PathLike[str],
     *,
-    channel_map: ChannelMap | None = None,
+    map: ChannelMap | None = None,
     rate: float | None = None,
     format: str | None = None,
 ) -> Recording:
@@ -202,9 +202,11 @@ def read(
     ----------
     path : str or path
         The file. Its content tells the format.
-    channel_map : mapping of str to str or "auto", optional
+    map : mapping of str to str or "auto", optional
         Channel (or ``t``) -> name of the file's column, or name and unit, as in ``{"p_A": "PG_1[psi]"}``, or number,
-        as in ``{"p_A": "#2"}``. A column without any unit is raw counts. ``"auto"``: what the columns' names and units
+        as in ``{"p_A": "#2"}``, or a constant plus columns times factors and the unit, as in
+        ``{"p_A": "ch2*0.0625-0.625 bar"}``. A unit at the end of the column's name is read, as in ``p_bottom_bar``; a
+        column without any is raw counts. ``"auto"``: what the columns' names and units
         tell, in several languages; the history says what was taken. ``{"*": "auto", ...}``: so for the channels that
         the mapping does not name.
     rate : float, optional
@@ -222,7 +224,7 @@ def read(
     UnreadableFile
         If the file cannot be read as a recording; the message names the file, the place and the rule.
     InputError
-        If `channel_map`, `rate` or `format` is wrong.
+        If `map`, `rate` or `format` is wrong.
     MissingExtra
         If the library that reads the format is not installed.
 
@@ -231,13 +233,13 @@ def read(
     >>> import sealscope as ss
     >>> from pathlib import Path
     >>> _ = Path("log.csv").write_text("t [s],p_A [bar],PG_2\n0,3,300\n0.002,3.5,310\n0.004,3,305\n")
-    >>> recording = ss.read("log.csv", channel_map={"p_B": "PG_2[kPa]"})
+    >>> recording = ss.read("log.csv", map={"p_B": "PG_2[kPa]"})
     >>> recording
     Recording(p_A [Pa], p_B [Pa]; 3 samples, 500 Hz, 0.006 s)
     >>> recording["p_A"].tolist()
     [300000.0, 350000.0, 300000.0]
     """
-    file, channel_map = Path(path), channel_map or {}
+    file, channel_map = Path(path), map or {}
     check_call(channel_map, rate)
     if format is not None and format not in _NAMES:
         raise InputError(f"format must be one of {', '.join(sorted(_NAMES))}, got {format}")
@@ -250,7 +252,7 @@ def read_parts(
     path: str | os.PathLike[str],
     every: float,
     *,
-    channel_map: ChannelMap | None = None,
+    map: ChannelMap | None = None,
     rate: float | None = None,
 ) -> Iterator[Recording]:
     r"""Read a long recording part by part.
@@ -263,7 +265,7 @@ def read_parts(
         The file, as for `read`.
     every : float
         Length of a part [s], by the sampling rate of the file's beginning; the last may be shorter. Gaps do not count.
-    channel_map : mapping of str to str or "auto", optional
+    map : mapping of str to str or "auto", optional
         As for `read`.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
@@ -278,7 +280,7 @@ def read_parts(
     UnreadableFile
         If the file, or the next part of it, cannot be read as a recording.
     InputError
-        If `every`, `channel_map` or `rate` is wrong.
+        If `every`, `map` or `rate` is wrong.
 
     Examples
     --------
@@ -289,7 +291,7 @@ def read_parts(
     >>> [part.duration for part in ss.read_parts("long.csv", every=0.8)]
     [0.8, 0.8, 0.4]
     """
-    file, channel_map = Path(path), channel_map or {}
+    file, channel_map = Path(path), map or {}
     check_call(channel_map, rate)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
-from sealscope.recordings.channels import SLOW, Array
+from sealscope.recordings.channels import COUNTS, SLOW, Array
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.motion import constant, runs_of, spacing, stuck
 from sealscope.recordings.recording import Recording
@@ -70,7 +70,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 
     Codes of the time: ``too_short``, ``missing_time``, ``reversed_time``, ``duplicated_time``, ``gap``,
     ``rate_mismatch``, ``irregular_sampling``; of a channel: ``missing``, ``mixed_rate``, ``infinite``, ``constant``,
-    ``clipped``, ``stuck``, ``mains_hum``; of both chambers: ``creeping_pressures``.
+    ``clipped``, ``stuck``, ``mains_hum``, ``raw_counts``; of both chambers: ``creeping_pressures``.
 
     Parameters
     ----------
@@ -194,6 +194,9 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     def add(code: str, severity: Severity, count: int, first: int, text: str) -> None:
         findings.append(Finding(code, severity, name, count, _moment(recording, first), f"{name}: {text}"))
 
+    if name.startswith("p_") and recording.units[name] == COUNTS:
+        text = f"is in raw counts: state the unit (--map '{name}=COLUMN bar'), or a leak's size stays relative"
+        add("raw_counts", "note", values.size, 0, text)
     holes = missing(values)
     if holes is not None:
         if holes.every:

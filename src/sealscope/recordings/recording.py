@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
-from sealscope.recordings.formats.columns import check_call, choose_columns, counted
+from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns, counted
 
 if TYPE_CHECKING:
     import pandas
@@ -172,6 +172,12 @@ class Recording:
         """Number of samples over the nominal rate [s]."""
         return self.t.size / self.rate
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Names of the recorded pressures, positions and speeds of its file that no channel is made of."""
+        names = self.provenance.get("unused", ())
+        return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+
     def between(self, start: float, stop: float) -> Recording:
         """Return the samples with start <= t < stop [s]."""
         return self._cut((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")
@@ -244,7 +250,7 @@ class Recording:
     @classmethod
     @checked_call
     def from_pandas(
-        cls, frame: pandas.DataFrame, *, channel_map: Mapping[str, str] | None = None, rate: float | None = None
+        cls, frame: pandas.DataFrame, *, map: ChannelMap | None = None, rate: float | None = None
     ) -> Recording:
         """Make a recording of a data frame, by the rules that hold for files.
 
@@ -254,7 +260,7 @@ class Recording:
             Columns such as ``p_A [bar]``; a unit may also be in ``frame.attrs["units"][column]`` or in the column's
             own ``attrs["units"]``. The time is a column such as ``t [s]``, or the index: with a name, of numbers with
             a fraction, of dates or of time differences.
-        channel_map : mapping of str to str, optional
+        map : mapping of str to str or "auto", optional
             Channel (or ``t``) -> column, as for `read`.
         rate : float, optional
             Sampling rate [Hz], in place of a time. It is inferred from the time otherwise.
@@ -274,7 +280,7 @@ class Recording:
         """
         from sealscope.recordings.formats.frames import read_pandas
 
-        channel_map = channel_map or {}
+        channel_map = map or {}
         check_call(channel_map, rate)
         choose = partial(choose_columns, channel_map=channel_map, rate=rate, place="data frame")
         try:

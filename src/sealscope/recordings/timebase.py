@@ -259,7 +259,7 @@ def from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, dic
         if np.all(np.diff(finite) == 1) and finite.size == values.size and size < _EARLIEST_EPOCH:
             raise InputError(
                 f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
-                f"give the rate"
+                f"give the rate, or the unit of its column (t={name} ms)"
             )
         for least, epoch_unit in _EPOCH:
             if size >= least:

@@ -10,6 +10,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import Level
+from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.quality import Finding
 
 ABSENT = "–"
@@ -340,6 +341,17 @@ def quality_summary(diagnosis: Diagnosis) -> str:
     return f"{count} finding{'s' if count != 1 else ''}{worst},"
 
 
+def raw_counts(diagnosis: Diagnosis) -> str | None:
+    """Return which pressures are in raw counts, and what to do; None where none is."""
+    names = [finding.channel for finding in diagnosis.quality if finding.code == "raw_counts" and finding.channel]
+    return f"{' and '.join(names)} in raw counts: state the unit, or a leak's size stays relative" if names else None
+
+
+def not_used(diagnosis: Diagnosis) -> str | None:
+    """Return which recorded pressures, positions and speeds no channel is made of; None where all are."""
+    return f"{listed(diagnosis.unused)}: recorded, and taken for no channel" if diagnosis.unused else None
+
+
 def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     """Return the verdict, its figures and the next step as plain text of about five lines; `width`: columns [1]."""
     sure = in_short(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
@@ -352,6 +364,8 @@ def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
         ("how sure", sure if diagnosis.verdict != "cannot tell" else None),
         ("reason", diagnosis.reason if diagnosis.verdict == "cannot tell" else None),
         ("data", quality_summary(diagnosis).rstrip(",") if diagnosis.quality else None),
+        ("units", raw_counts(diagnosis)),
+        ("not used", not_used(diagnosis)),
         ("next", next_steps(diagnosis)[0]),
     ]
     lines = [_row(label, text, width) for label, text in rows if text]
@@ -372,6 +386,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
         ("cause", cause(diagnosis)),
         ("how sure", how_sure(diagnosis)),
         ("reason", diagnosis.reason or None),
+        ("not used", not_used(diagnosis)),
     ]
     lines += [_row(label, text, width) for label, text in rows if text]
     for method in diagnosis.methods:

@@ -51,6 +51,7 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
         ends = f"{known.min():.4g} to {known.max():.4g} {unit}" if known.size else "no values"
         lines.append(f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<30}{curve(values)}")
     lines += [f"  {name}: {value}" for name, value in remarks_of(provenance).items()]
+    lines += [f"  not used: {', '.join(recording.unused)}"] if recording.unused else []
     lines += [f"  note: {line}" for line in recording.history]
     lines += [f"  {finding.severity}: {finding.text}" for finding in findings]
     if not findings:

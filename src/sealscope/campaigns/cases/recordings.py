@@ -65,7 +65,7 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
         replicate=0,
     )
     try:
-        recording = read(path, channel_map=plan.channel_map or None, rate=plan.rate_hz)
+        recording = read(path, map=plan.channel_map or None, rate=plan.rate_hz)
         record = inspected(recording)
         if record.defect is not None:
             return row(error=f"{name}: {record.defect}")

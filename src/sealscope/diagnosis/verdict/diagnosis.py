@@ -105,6 +105,8 @@ class Diagnosis(Evidence):
         What the file says of its recording: operator, machine, oil temperature.
     start : str, optional
         When the recording began, as ISO 8601, where the file says so.
+    unused : tuple of str
+        Recorded pressures, positions and speeds that no channel is made of.
 
     Examples
     --------
@@ -128,6 +130,7 @@ class Diagnosis(Evidence):
     limit: RepairLimit = field(default_factory=lambda: RepairLimit.of(None))
     about: Mapping[str, str] = field(default_factory=dict)
     start: str | None = None
+    unused: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -146,6 +149,7 @@ class Diagnosis(Evidence):
             machine=machine,
             about=remarks_of(recording.provenance),
             start=None if start is None else str(start),
+            unused=recording.unused,
             **stated,
         )
 
@@ -242,6 +246,7 @@ class Diagnosis(Evidence):
             "severity": None if self.severity is None else self.severity.as_dict(),
             "limit": self.limit.as_dict(),
             "evidence": self._evidence(),
+            "unused": list(self.unused),
         }
 
     def _evidence(self) -> dict[str, Any]:

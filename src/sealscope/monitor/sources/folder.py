@@ -69,7 +69,7 @@ class WatchedFolder:
                 continue
             samples = None
             try:
-                samples = _on_the_clock(read(path, channel_map=self._channel_map), at)
+                samples = _on_the_clock(read(path, map=self._channel_map), at)
             except InputError as error:
                 if age < _PATIENCE * self.settle_s:
                     continue

@@ -5,15 +5,27 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from typing import Literal
 
+import numpy as np
+
 from sealscope.calls import nearest
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED, Array
+from sealscope.recordings.formats.headings.formula import Formula
 from sealscope.recordings.formats.headings.labels import Label, square_brackets
-from sealscope.recordings.formats.headings.proposal import TURNS, is_time, map_options, proposed_map, unit_of_time
+from sealscope.recordings.formats.headings.proposal import (
+    TURNS,
+    ends_in,
+    is_recorded,
+    is_time,
+    map_options,
+    proposed_map,
+    split_unit,
+    unit_of_time,
+)
 from sealscope.recordings.formats.headings.split_time import below_seconds, parts_of_time
 from sealscope.units import same_dimension, to_si
 
@@ -52,25 +64,64 @@ REST = "*"
 
 
 @dataclass(frozen=True)
+class Source:
+    """What a channel is made of: `constant` plus the sum of columns times `factors`, by their numbers, in `unit`."""
+
+    factors: Mapping[int, float]
+    unit: str | None
+    constant: float = 0.0
+
+    @classmethod
+    def of(cls, column: int, unit: str | None) -> Source:
+        """Return the source that is a column itself."""
+        return cls({column: 1.0}, unit)
+
+    @property
+    def column(self) -> int:
+        """The first column."""
+        return next(iter(self.factors))
+
+    @property
+    def is_column(self) -> bool:
+        """Whether it is a column as it stands."""
+        return self.constant == 0.0 and [*self.factors.values()] == [1.0]
+
+    def values(self, columns: Mapping[int, Array]) -> Array:
+        """Return the samples (n,) in `unit`: those of the only column itself, where it is one."""
+        if self.is_column:
+            return columns[self.column]
+        with np.errstate(over="ignore", invalid="ignore"):
+            terms = [factor * columns[column] for column, factor in self.factors.items()]
+            return np.asarray(self.constant + np.sum(terms, axis=0))
+
+
+@dataclass(frozen=True)
 class ColumnMap:
-    """What to load of a table: the number of the time column and its label, name -> (column, unit) of each channel.
+    """What to load of a table: the number of the time column and its label, name -> source of each channel.
 
     `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day, or
     the time column itself where a date is taken for it; `names`: channel -> label of its column, where the file calls
     it otherwise; `rate`: of the samples [Hz], as the caller or the file says, or None;
     `parts`: part of the time -> its column, where several columns hold the time;
-    `missing`: mapped channels whose column is not there, where some may be.
+    `missing`: mapped channels whose column is not there, where some may be; `unused`: recorded pressures, positions and
+    speeds that no channel is made of.
     """
 
     time: int | None
     time_label: Label | None
-    channels: Mapping[str, tuple[int, str]]
+    channels: Mapping[str, Source]
     notes: tuple[str, ...] = ()
     date: int | None = None
     names: Mapping[str, str] = field(default_factory=dict)
     rate: float | None = None
     parts: Mapping[str, int] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
+
+    @property
+    def channel_of(self) -> dict[int, str]:
+        """Column -> a channel that is made of it."""
+        return {column: name for name, source in self.channels.items() for column in source.factors}
 
     @property
     def columns(self) -> list[tuple[int, bool]]:
@@ -78,7 +129,7 @@ class ColumnMap:
 
         A column of hours is the time and a part of it.
         """
-        read = {column for column, _ in self.channels.values()} | (set(self.parts.values()) - {self.time})
+        read = {*self.channel_of} | (set(self.parts.values()) - {self.time})
         channels = [(column, False) for column in sorted(read)]
         return channels if self.time is None else [*channels, (self.time, True)]
 
@@ -105,13 +156,13 @@ def check_call(channel_map: ChannelMap, rate: float | None) -> None:
     """Raise InputError for a map of what is no channel, and for a rate that is not positive."""
     if isinstance(channel_map, str):
         if channel_map != "auto":
-            raise InputError(f"channel_map must be a mapping or the word auto, got {channel_map!r}")
+            raise InputError(f"map must be a mapping or the word auto, got {channel_map!r}")
     else:
         for channel, column in channel_map.items():
             if channel != REST:
                 check_channel(channel)
             elif column != "auto":
-                raise InputError(f"channel_map must map {REST} to the word auto, got {column!r}")
+                raise InputError(f"map must map {REST} to the word auto, got {column!r}")
     if rate is not None and not (isfinite(rate) and rate > 0):
         raise InputError(f"rate must be > 0 Hz, got {rate}")
 
@@ -139,14 +190,18 @@ def listed(names: Iterable[str], most: int = 12) -> str:
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"
 
 
-def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | None:
-    """Return the column called `name`: as written, else whatever its case, else by its number as in `#4`, from 1."""
+def _find(labels: Sequence[Label], name: str, what: str, place: str, *, mapped: bool = False) -> int | None:
+    """Return the column called `name`: as written, else whatever its case, else by its number as in `#4`, from 1.
+
+    A `mapped` one may also be called by the last words of its name: `ch2`, `Pa`.
+    """
     folded = name.casefold()
     for matches in (
         [i for i, label in enumerate(labels) if label.whole == name],
         [i for i, label in enumerate(labels) if label.name == name],
         [i for i, label in enumerate(labels) if label.called and label.called == name],
         [i for i, label in enumerate(labels) if folded in (label.whole.casefold(), label.name.casefold())],
+        [i for i, label in enumerate(labels) if mapped and ends_in(label.name, name)],
     ):
         if len(matches) > 1:
             numbers = " and ".join(str(i + 1) for i in matches)
@@ -162,27 +217,59 @@ def _find(labels: Sequence[Label], name: str, what: str, place: str) -> int | No
 
 
 def _inside(labels: Sequence[Label], channel: str) -> int | None:
-    """Return the only column that bears a channel's name between points, strokes or brackets: `Rig.Cyl.p_A`."""
+    """Return the only column that bears a channel's name between points, strokes or brackets, or before a unit.
+
+    `Rig.Cyl.p_A [bar]`, `p_A_bar`.
+    """
     unit = CHANNEL_UNITS[channel]
     matches = [
         i
         for i, label in enumerate(labels)
-        if channel in _PARTS.split(label.name) and label.unit is not None and same_dimension(label.unit, unit)
+        if (channel in _PARTS.split(label.name) and label.unit is not None and same_dimension(label.unit, unit))
+        or (split_unit(label.name)[0] == channel and _unit_of(label, channel) is not None)
     ]
     return matches[0] if len(matches) == 1 else None
 
 
-def _mapped(labels: Sequence[Label], channel: str, foreign: str, place: str) -> tuple[int, str | None]:
+def _mapped(labels: Sequence[Label], channel: str, foreign: str, place: str) -> Source:
+    """Return what a map's text stands for: a column, a column and its unit, or a formula.
+
+    A unit of the text goes before that of the column's heading, and this before the ending of the column's name.
+    """
     what = f"{foreign}, mapped to {channel},"
-    column = _find(labels, foreign, what, place)
-    if column is not None:
-        return column, labels[column].unit
-    name, unit = square_brackets(foreign)
-    column = None if unit is None else _find(labels, name, what, place)
-    if column is None:
-        have = listed(label.whole for label in labels)
-        raise UnreadableFile(f"{what} must be a column, got columns {have} ({place})")
-    return column, unit
+    blank = foreign.rpartition(" ")
+    for name, unit in ((foreign, None), square_brackets(foreign), (blank[0], blank[2])):
+        column = _find(labels, name, what, place) if name else None
+        if column is not None:
+            return Source.of(column, _unit_of(labels[column], channel) if unit is None else unit)
+    try:
+        formula = Formula.parse(foreign)
+    except InputError as error:
+        if any(sign in foreign for sign in "*+"):
+            raise UnreadableFile(f"{error} ({place})") from None
+        raise _no_column(labels, what, place) from None
+    factors: dict[int, float] = {}
+    for name, factor in formula.factors.items():
+        column = _find(labels, name, f"{name} of {what}", place, mapped=True)
+        if column is None:
+            raise _no_column(labels, what if name == foreign else f"{name} of {what}", place)
+        factors[column] = factors.get(column, 0.0) + factor
+    units = {_unit_of(labels[column], channel) for column in factors}
+    if formula.unit is None and len(units) > 1:
+        raise UnreadableFile(f"{what} must state its unit, got columns in different ones ({place})")
+    return Source(factors, units.pop() if formula.unit is None else formula.unit, formula.constant)
+
+
+def _no_column(labels: Sequence[Label], what: str, place: str) -> UnreadableFile:
+    have = listed(label.whole for label in labels)
+    return UnreadableFile(f"{what} must be a column, got columns {have} ({place})")
+
+
+def _unit_of(label: Label, channel: str) -> str | None:
+    """Return a column's unit, by its heading or by the ending of its name where the channel may have it."""
+    ending = split_unit(label.name)[1] if label.unit is None else None
+    fits = ending is not None and same_dimension(ending, "s" if channel == "t" else CHANNEL_UNITS[channel])
+    return ending if fits else label.unit
 
 
 def _checked_unit(channel: str, unit: str | None, what: str, place: str) -> tuple[str, str | None]:
@@ -218,6 +305,87 @@ def _find_time(labels: Sequence[Label], place: str) -> int | None:
     return next((i for i in named if labels[i].unit is not None), named[0] if named else None)
 
 
+@dataclass
+class _Taken:
+    """What is taken of a table so far, as in `ColumnMap`; `formulas`: channel -> text of a map that is no column."""
+
+    labels: Sequence[Label]
+    place: str
+    time: int | None = None
+    time_label: Label | None = None
+    channels: dict[str, Source] = field(default_factory=dict)
+    formulas: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+
+    @property
+    def columns(self) -> set[int]:
+        """Columns that channels are made of."""
+        return {column for source in self.channels.values() for column in source.factors}
+
+    def by_map(self, columns: Mapping[str, str], some: bool) -> None:
+        """Take what a map says; with `some`, its columns may be missing."""
+        for channel, foreign in columns.items():
+            try:
+                source = _mapped(self.labels, channel, foreign, self.place)
+            except UnreadableFile:
+                if not some:
+                    raise
+                self.missing.append(channel)
+                continue
+            whole = self.labels[source.column].whole if source.is_column else foreign
+            if channel == "t":
+                if not source.is_column:
+                    raise UnreadableFile(
+                        f"t must be a column and its unit, such as t=time ms, got {foreign} ({self.place})"
+                    )
+                self.time, self.time_label = source.column, Label(whole, whole, source.unit)
+                continue
+            kind = "column" if source.is_column else "formula"
+            unit, note = _checked_unit(channel, source.unit, f"{kind} {whole}, read as {channel},", self.place)
+            self.channels[channel] = replace(source, unit=unit)
+            if not source.is_column:
+                self.formulas[channel] = whole
+            self.notes.append(note or f"{kind} {whole} read as {channel} in {unit}")
+
+    def by_own_names(self) -> None:
+        """Take the other channels from the columns that bear their names, and the time where no map names it."""
+        for channel in (name for name in CHANNEL_UNITS if name not in self.channels and name not in self.missing):
+            own = _find(self.labels, channel, f"channel {channel}", self.place)
+            own = _inside(self.labels, channel) if own is None else own
+            if own is not None and own != self.time and own not in self.columns:
+                label = self.labels[own]
+                unit, note = _checked_unit(channel, _unit_of(label, channel), f"column {label.whole}", self.place)
+                self.channels[channel] = Source.of(own, unit)
+                self.notes += [note] if note else []
+        if self.time is None and (time := _find_time(self.labels, self.place)) is not None:
+            label = self.labels[time]
+            unit_of_name = label.unit or _TIME_NAMES.get(label.name.casefold()) or unit_of_time(label)
+            self.time, self.time_label = time, Label(label.whole, label.name, unit_of_name)
+
+    def check(self, rate: float | None, stated_rate: float | None) -> None:
+        """Raise UnreadableFile where there is no channel, or neither a time nor a rate [Hz]."""
+        have = listed(label.whole for label in self.labels)
+        if not self.channels:
+            guess = map_options(proposed_map(self.labels))
+            raise UnreadableFile(
+                f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
+                f"got columns {have} ({self.place})" + (f"; --map auto would read {guess}" if guess else "")
+            )
+        if rate is None and self.time is None:
+            if stated_rate is None:
+                raise UnreadableFile(
+                    "a recording must have a time column such as t [s] or be given a rate, "
+                    f"got columns {have} ({self.place})"
+                )
+            self.notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
+
+    def names(self) -> dict[str, str]:
+        """Return channel -> label of its column, or its formula, where the file calls it otherwise."""
+        labels = {channel: self.labels[source.column] for channel, source in self.channels.items()}
+        return {channel: label.whole for channel, label in labels.items() if label.name != channel} | self.formulas
+
+
 def choose_columns(
     labels: Sequence[Label],
     stated_rate: float | None = None,
@@ -235,85 +403,53 @@ def choose_columns(
     missing, where no column is a channel, and where there is neither time nor rate; InputError for a unit of another
     dimension. With `some`, mapped columns may be missing, which another sheet may have.
     """
-    missing: list[str] = []
-    notes: list[str] = []
-    channels: dict[str, tuple[int, str]] = {}
     stated = stated_columns(channel_map)
     columns = _completed(labels, stated, place) if by_names(channel_map) else stated
-    time: int | None = None
-    time_label: Label | None = None
-    for channel, foreign in columns.items():
-        try:
-            column, unit = _mapped(labels, channel, foreign, place)
-        except UnreadableFile:
-            if not some:
-                raise
-            missing.append(channel)
-            continue
-        whole = labels[column].whole
-        if channel == "t":
-            time, time_label = column, Label(whole, whole, unit)
-            continue
-        unit, note = _checked_unit(channel, unit, f"column {whole}, read as {channel},", place)
-        channels[channel] = column, unit
-        notes.append(note or f"column {whole} read as {channel} in {unit}")
-    for channel in (channel for channel in CHANNEL_UNITS if channel not in missing):
-        own = None if channel in channels else _find(labels, channel, f"channel {channel}", place)
-        own = _inside(labels, channel) if own is None and channel not in channels else own
-        if own is not None and own != time and own not in {column for column, _ in channels.values()}:
-            unit, note = _checked_unit(channel, labels[own].unit, f"column {labels[own].whole}", place)
-            channels[channel] = own, unit
-            notes += [note] if note else []
-    if time is None:
-        time = _find_time(labels, place)
-        if time is not None:
-            label = labels[time]
-            unit = label.unit or _TIME_NAMES.get(label.name.casefold()) or unit_of_time(label)
-            time_label = Label(label.whole, label.name, unit)
+    taken = _Taken(labels, place)
+    taken.by_map(columns, some)
+    taken.by_own_names()
+    time, time_label, channels, notes = taken.time, taken.time_label, taken.channels, taken.notes
     parts: dict[str, int] = {}
     if rate is None:
-        taken = [column for column, _ in channels.values()]
-        time, time_label, parts = _split(labels, time, time_label, taken, stated_rate is not None)
-    have = listed(label.whole for label in labels)
-    if not channels:
-        guess = map_options(proposed_map(labels))
-        raise UnreadableFile(
-            f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
-            f"got columns {have} ({place})" + (f"; --map auto would read {guess}" if guess else "")
-        )
-    if rate is None and time is None:
-        if stated_rate is None:
-            raise UnreadableFile(
-                f"a recording must have a time column such as t [s] or be given a rate, got columns {have} ({place})"
-            )
-        notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
-    used = {column for column, _ in channels.values()} | {time} | set(parts.values())
+        time, time_label, parts = _split(labels, time, time_label, [*taken.columns], stated_rate is not None)
+        taken.time = time
+    taken.check(rate, stated_rate)
+    used = taken.columns | {time} | set(parts.values())
     dates = [i for i, label in enumerate(labels) if label.name.casefold() in _DATE_NAMES and i not in used]
     date = dates[0] if dates and time is not None else None
+    left = [label for i, label in enumerate(labels) if i not in used and i != date and label.whole]
     if rate is not None and time_label is not None:
         notes.append(f"time column {time_label.whole} not used: the rate was given as {rate:g} Hz")
         time = time_label = None
-    ignored = [label.whole for i, label in enumerate(labels) if i not in used and i != date and label.whole]
-    if ignored:
+    if left:
         guesses = {name: column for name, column in proposed_map(labels).items() if name not in {*channels, "t"}}
         hint = f"; --map auto would also read {map_options(guesses)}" if guesses else ""
-        notes.append(f"{UNUSED}: {listed(ignored, 40)}{hint}")
-    order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel][0])}
-    names = {channel: labels[column].whole for channel, (column, _) in order.items() if labels[column].name != channel}
-    own_rate = stated_rate if rate is None else rate
+        notes.append(f"{UNUSED}: {listed((label.whole for label in left), 40)}{hint}")
+    order = {channel: channels[channel] for channel in sorted(channels, key=lambda channel: channels[channel].column)}
     if time is None:
         date = None
     elif "t" not in columns and not parts and labels[time].name.casefold() in _DATE_NAMES:
         date = time
-    return ColumnMap(time, time_label, order, tuple(notes), date, names, own_rate, parts, tuple(missing))
+    return ColumnMap(
+        time,
+        time_label,
+        order,
+        tuple(notes),
+        date,
+        taken.names(),
+        stated_rate if rate is None else rate,
+        parts,
+        tuple(taken.missing),
+        tuple(label.whole for label in left if is_recorded(label)),
+    )
 
 
 def _completed(labels: Sequence[Label], stated: Mapping[str, str], place: str) -> dict[str, str]:
     """Return a map with the channels that it does not name, by the names of the columns that it does not take."""
-    taken = set()
+    taken: set[int] = set()
     for channel, foreign in stated.items():
         with suppress(UnreadableFile):  # said where the map is gone through
-            taken.add(_mapped(labels, channel, foreign, place)[0])
+            taken.update(_mapped(labels, channel, foreign, place).factors)
     free = [Label("", "") if column in taken else label for column, label in enumerate(labels)]
     return {**proposed_map(free), **stated}
 

@@ -16,6 +16,7 @@ from sealscope.recordings.formats.headings.preamble import stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
 from sealscope.recordings.formats.series import table_of
+from sealscope.recordings.formats.structured.streams import STREAMS, streamed_series
 from sealscope.recordings.formats.structured.tree import number_of, series_in
 from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable
 
@@ -41,8 +42,10 @@ def is_matlab_4(head: bytes) -> bool:
 
 def read_matlab(path: Path, choose: Choose) -> RawTable:
     """Read the chosen series of a MATLAB file; raise MissingExtra where mat-io is absent."""
-    matio = library("matio", "a MATLAB file", "mat-io")
     place = str(path)
+    if (table := _streamed(path, choose, place)) is not None:
+        return table
+    matio = library("matio", "a MATLAB file", "mat-io")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # on classes that have no meaning here
         for name, (shape, *_) in matio.whosmat(path).items():
@@ -54,6 +57,19 @@ def read_matlab(path: Path, choose: Choose) -> RawTable:
     series = list(series_in(values))
     scalars = {name: repr(number) for name, value in values.items() if (number := number_of(value)) is not None}
     return table_of(series, choose, "MATLAB", place, rate=stated_rate(scalars))
+
+
+def _streamed(path: Path, choose: Choose, place: str) -> RawTable | None:
+    """Return the table of a file whose signals Simulink has streamed; None for any other file."""
+    import h5py
+
+    if not h5py.is_hdf5(path):
+        return None
+    with h5py.File(path, "r") as file:
+        if STREAMS not in file:
+            return None
+        _refuse_elsewhere(path, place)
+        return table_of(list(streamed_series(file)), choose, "MATLAB", place)
 
 
 def _refuse_elsewhere(path: Path, place: str) -> None:

@@ -201,7 +201,7 @@ def _on_one_clock(
     choice: ColumnMap, chosen: dict[int, Series], place: str
 ) -> tuple[list[NDArray[Any]], tuple[str, ...]]:
     """Return the chosen columns and the time, all on the clock of the chamber pressures, and lines for the history."""
-    channel_of = {column: name for name, (column, _) in choice.channels.items()}
+    channel_of = choice.channel_of
     ranked = sorted(chosen, key=lambda column: (_rank(channel_of[column]), -chosen[column].count))
     base = next((chosen[column] for column in ranked if chosen[column].clock is not None), None)
     if base is None:

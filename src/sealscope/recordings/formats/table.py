@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
 from sealscope.recordings.formats.columns import ColumnMap
+from sealscope.recordings.formats.headings.preamble import exported_from
 from sealscope.recordings.formats.headings.split_time import joined_time
 from sealscope.recordings.timebase import falling, stamps, time_base
 from sealscope.units import to_si
@@ -78,10 +79,11 @@ class RawTable:
             notes += ("rows begin with the last sample: taken in the order of time",)
         values = {column: cells for (column, time), cells in zip(choice.columns, read, strict=True) if not time}
         channels, units = {}, {}
-        for name, (column, unit) in choice.channels.items():
+        for name, made in choice.channels.items():
+            unit = made.unit or COUNTS
             units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
-            channels[name] = to_si(values[column], unit, units[name], name=name)
-            if channels[name] is not values[column]:
+            channels[name] = to_si(made.values(values), unit, units[name], name=name)
+            if channels[name] is not values[made.column]:
                 channels[name].setflags(write=False)  # made here: a recording takes it as it is
         start: dict[str, Any] = {}
         if choice.time_label is None:
@@ -94,11 +96,15 @@ class RawTable:
             label = choice.time_label
             t, rate, start, more = time_base(read[-1], label.unit, label.whole, choice.rate)
             notes += more
+            if not start and (begin := exported_from(self.about)) is not None:
+                start = {"start": str(begin)}
         if own is not None:
             return RecordingFields(t, channels, units, rate, own["provenance"], (*own["history"], *notes))
-        about = {"about": dict(self.about)} if self.about else {}
+        about: dict[str, Any] = {"about": dict(self.about)} if self.about else {}
         if choice.names:
             about["columns"] = dict(choice.names)
+        if choice.unused:
+            about["unused"] = list(choice.unused)
         return RecordingFields(t, channels, units, rate, {**source, "format": self.kind, **start, **about}, notes)
 
     def _check_clock(self, time: NDArray[Any]) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
+
 from sealscope.errors import InputError
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.units import parse_unit, to_si
@@ -24,6 +26,9 @@ _INTERVAL = re.compile(
     r"horizontal interval|hresolution|increment|\u91c7\u6837(?:\u5468\u671f|\u95f4\u9694))",
     re.IGNORECASE,
 )
+#: TwinCAT's start of an export: 100 ns since 1601.
+_FILETIME = re.compile(r"(1[23]\d{16})\b")
+_FROM_1601_TO_1970 = 11_644_473_600 * 10**9  # [ns]
 _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d{1,3})?)\s*(?P<unit>\S{0,10}).*")
 
 
@@ -45,6 +50,15 @@ def stated_rate(about: Mapping[str, str]) -> float | None:
             value, per_second = float(quantity["number"].replace(",", ".")), bool(matches[0])
         if value > 0.0:
             return float(f"{value if per_second else 1.0 / value:.12g}")
+    return None
+
+
+def exported_from(about: Mapping[str, str]) -> np.datetime64 | None:
+    """Return the moment at which a TwinCAT Scope export says that it begins, None where it does not."""
+    for name, entry in about.items():
+        match = _FILETIME.match(entry) if name.casefold().startswith(("starttime", "start time")) else None
+        if match is not None:
+            return np.datetime64(int(match[1]) * 100 - _FROM_1601_TO_1970, "ns")
     return None
 
 

@@ -8,10 +8,9 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.units import parse_unit, same_dimension
+from sealscope.units import is_familiar, same_dimension
 
 
 def _words(text: str) -> frozenset[str]:
@@ -26,7 +25,7 @@ _WORDS: Mapping[str, frozenset[str]] = {
         "pg pt tlak tryck basinc basınc давление 压力 压强 壓力 圧力 압력"
     ),
     "position": _words(
-        "x pos position weg hub stroke displ displacement travel kolbenweg kolbenposition lvdt deplacement course "
+        "x pos xpos position weg hub stroke displ displacement travel kolbenweg kolbenposition lvdt deplacement course "
         "posicion carrera posizione corsa posicao curso positie slag polozenie skok "
         "poloha lage laege konum положение ход 位移 行程 位置 変位 ストローク 변위 위치"
     ),
@@ -36,7 +35,7 @@ _WORDS: Mapping[str, frozenset[str]] = {
         "consigne tension comando mando tensione 指令 电压 電圧"
     ),
     "speed": _words(
-        "omega n speed rpm drehzahl motordrehzahl vitesse velocidad velocidade velocita giri toerental 转速 回転数"
+        "omega n speed spd rpm drehzahl motordrehzahl vitesse velocidad velocidade velocita giri toerental 转速 回転数"
     ),
     "angle": _words("theta phi angle winkel motorwinkel encoder drehwinkel angulo angolo hoek kat 角度 转角"),
     "leak": _words("leak leakage leck leckage leckstrom fuite fuga trafilamento 泄漏 漏れ"),
@@ -49,8 +48,8 @@ _WORDS: Mapping[str, frozenset[str]] = {
 #: Last words of German compounds (Zylinderweg, Messzeit), where a whole word is not known.
 _ENDINGS = ("druck", "weg", "hub", "position", "winkel", "drehzahl", "zeit", "druk")
 _A = _words(
-    "a cap bore blind extend extension piston kolben kolbenseite kolbenseitig kolbenraum kolbenkammer bodenseite boden "
-    "bodem fond fondo fondello embolo zuiger tlok 无杆腔 無桿腔 ヘッド側 "
+    "a cap bore bottom base blind extend extension piston kolben kolbenseite kolbenseitig kolbenraum kolbenkammer "
+    "bodenseite boden bodem fond fondo fondello embolo zuiger tlok 无杆腔 無桿腔 ヘッド側 "
     "ボトム側 キャップ側"
 )
 _B = _words(
@@ -75,6 +74,12 @@ _WANTED = _words("soll sollwert setpoint set target demand reference ref cmd com
 _MADE = _words("filtered filt gefiltert filtre smoothed mean mittel avg average min max rms error fehler")
 #: Words of a script that writes no blanks between words.
 _UNSPACED = frozenset(word for words in (*_WORDS.values(), _A, _B, _PUMP) for word in words if ord(word[0]) > 0x2E7F)
+#: A velocity has no channel of its own; like a speed it is named where nothing took it.
+_VELOCITY = _words("velocity vel geschwindigkeit vitesse velocidad velocita snelheid \u901f\u5ea6")
+#: Pressure of the supply, which is no channel.
+_SUPPLY = _words("ps")
+#: What turns, where the unit alone says that it is a speed.
+_MOTOR = _words("motor mot pump pumpe drive shaft servo engine \u7535\u673a")
 #: How loggers write revolutions a minute, which as a unit of its own is a frequency.
 TURNS = ("1/min", "min-1", "min^-1", "min\u207b\u00b9", "/min", "U/min")
 _MEASURED = ("pressure", "position", "speed", "angle")
@@ -88,7 +93,11 @@ _CHANNELS = {
     "leak": "q_leak",
     "time": "t",
 }
+#: How loggers call their inputs, as one word.
+_CHANNEL_WORDS = dict.fromkeys(("ch", "chan", "kanal", "voie", "canal", "canale"), "channel")
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
+#: The last word of `MainPaBar`; in `MainPa` it is the pressure A, and no pascal.
+_HUMPED = re.compile(r"(?<=[a-z\d])[A-Z]+[a-z]*$")
 _LONGEST_NAME = 80
 
 
@@ -180,7 +189,7 @@ def _guess(label: Label, head: str) -> _Guess | None:
     """Return what a column's name tells; `head`: the chamber that the word head stands for."""
     if len(label.name) > _LONGEST_NAME:
         return None
-    name, unit = _split_unit(label.name)
+    name, unit = split_unit(label.name)
     words = _words_of(name if label.unit is None and unit is not None else label.name)
     unit = label.unit if label.unit is not None else unit
     side = head if _HEAD in words and head else _side(words)
@@ -190,8 +199,9 @@ def _guess(label: Label, head: str) -> _Guess | None:
         return _Guess("oil", "", unit)
     if words & _OTHERS or (words & _WANTED and any(words & _WORDS[kind] for kind in _MEASURED)):
         return None
-    if unit in TURNS and words & _WORDS["speed"]:
-        return _Guess("speed", side, "rpm")
+    turns = unit is not None and (unit in TURNS or same_dimension(unit, "rad/s"))
+    if turns and words & (_WORDS["speed"] | _MOTOR):
+        return _Guess("speed", side, "rpm" if unit in TURNS else unit)
     if unit is not None and "s" in words and same_dimension(unit, "m"):  # the path in German books
         return _Guess("position", side, unit)
     for kind, known in _WORDS.items():
@@ -224,17 +234,44 @@ def _channels(guess: _Guess) -> tuple[str, ...]:
     return (_CHANNELS[guess.kind],)
 
 
-def _split_unit(name: str) -> tuple[str, str | None]:
-    """Split `PA_bar` into name and unit; (name, None) where the last word is no unit of what a channel measures."""
-    before, _, last = name.replace(" ", "_").rpartition("_")
-    if not before or not last or last in ("A", "B"):
-        return name, None
-    kind = {"s": "time", "m": "position"}.get(last)
-    if kind is not None and not _words_of(before) & _WORDS[kind]:  # x_s may as well be a set point
-        return name, None
-    try:
-        parse_unit(last)
-    except InputError:
-        return name, None
-    si_units = {*CHANNEL_UNITS.values(), "s"}
-    return (before, last) if any(same_dimension(last, unit) for unit in si_units) else (name, None)
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit.
+
+    (name, None) where the last words are no unit of what a channel measures.
+    """
+    parts = name.replace(" ", "_").split("_")
+    endings = [("_".join(parts[:-2]), "/".join(parts[-2:])), ("_".join(parts[:-1]), parts[-1])]
+    humped = _HUMPED.search(name)
+    if humped and len(humped[0]) > 2:
+        endings.append((name[: humped.start()], humped[0]))
+    for before, unit in endings:
+        if not before or not unit or unit in ("A", "B", "a", "b"):
+            continue
+        kind = {"s": "time", "m": "position"}.get(unit)
+        if kind is not None and not _words_of(before) & _WORDS[kind]:  # x_s may as well be a set point
+            continue
+        if is_familiar(unit) and any(same_dimension(unit, known) for known in (*CHANNEL_UNITS.values(), "s", "m/s")):
+            return before, unit
+    return name, None
+
+
+def ends_in(name: str, words: str) -> bool:
+    """Return whether the last words of a column's name are these: `ch2` of `ADC1_Channel_2`, `Pa` of `Main_Pa`."""
+    tokens = ([token.casefold() for token in _TOKEN.findall(_plain(text))] for text in (name, words))
+    own, wanted = ([_CHANNEL_WORDS.get(token, token) for token in text] for text in tokens)
+    return words[:1].isalpha() and 0 < len(wanted) <= len(own) and own[-len(wanted) :] == wanted
+
+
+def is_recorded(label: Label) -> bool:
+    """Return whether a column is a measured pressure, position or speed, by its name or its unit."""
+    if len(label.name) > _LONGEST_NAME:
+        return False
+    name, ending = split_unit(label.name)
+    unit = ending if label.unit is None else label.unit
+    words = _words_of(name)
+    if words & (_WANTED | _MADE):
+        return False
+    if unit is not None:
+        return unit in TURNS or any(same_dimension(unit, own) for own in ("Pa", "m", "rad/s", "m/s"))
+    kinds = (_SUPPLY, *(_WORDS[kind] for kind in ("pressure", "position", "speed")), _VELOCITY)
+    return len(name) > 1 and any(words & known for known in kinds)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from sealscope.recordings.formats.headings.labels import Label
 
 #: Rows by which the export is known: the first begins the heading.
-_NAME, _SAMPLE_TIME, _UNIT = "Name", "SampleTime[ms]", "Unit"
+_NAME, _UNIT, _MARKS = "Name", "Unit", ("SampleTime[ms]", "Starttime of export")
 #: `V (Voltage)`, `(None)`: a unit and what it measures.
 _MEASURED = re.compile(r"(?P<unit>[^()]{0,20})\([^()]{0,40}\)")
 
@@ -20,9 +20,9 @@ def scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], in
     in milliseconds since the start of the export.
     """
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
-    if not any(row[0] == _SAMPLE_TIME for row in rows):
+    if not any(row[0] in _MARKS for row in rows):
         return None
-    begin = max((index for index, row in enumerate(rows) if row[0] == _NAME and len(row) > 1), default=None)
+    begin = max((index for index, row in enumerate(rows) if row[0] == _NAME and len(row) > 2), default=None)
     if begin is None:
         return None
     properties = {row[0]: row for row in rows[begin:]}

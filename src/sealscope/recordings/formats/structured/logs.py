@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.formats import text
 from sealscope.recordings.formats.columns import ColumnMap
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import exported_from
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
 from sealscope.recordings.formats.series import CLOCK_LABEL, Clock, Series, table_of
 from sealscope.recordings.formats.structured.long_table import long_columns, read_long
@@ -25,9 +26,6 @@ from sealscope.units import to_si
 
 #: The number of a column of times: `t.1` of pandas, `Time 2 - slow` of catman.
 _NUMBER = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
-#: TwinCAT's start of an export: 100 ns since 1601.
-_FILETIME = re.compile(r"(1[23]\d{16})\b")
-_FROM_1601_TO_1970 = 11_644_473_600 * 10**9  # [ns]
 
 
 def read_text(path: Path, choose: Choose) -> RawTable:
@@ -96,7 +94,7 @@ def _each_on_its_clock(path: Path, choose: Choose, layout: Layout, times: Sequen
     read = [(column, column in times) for column in sorted({*wanted, *owner.values()})]
     table = text.read_text(path, lambda *_: _Several(None, None, {}, wanted=tuple(read)), layout)
     samples = dict(zip((column for column, _ in read), table.columns, strict=True))
-    start = _start(layout.about)
+    start = exported_from(layout.about)
     clocks = {time: _clock(samples[time], labels[time], time, start) for time in set(owner.values())}
     series = []
     for column in values:
@@ -123,12 +121,3 @@ def _clock(times: NDArray[Any], label: Label, key: int, start: np.datetime64 | N
         return Clock(key, partial(np.asarray, (known - first).astype(np.int64) / 1e9), first)
     seconds = to_si(known, label.unit or unit_of_time(label) or "s", "s", name="time")
     return Clock(key, partial(np.asarray, seconds), start)
-
-
-def _start(about: Mapping[str, str]) -> np.datetime64 | None:
-    """Return the moment at which a TwinCAT Scope export says that it begins."""
-    for name, entry in about.items():
-        match = _FILETIME.match(entry) if name.casefold().startswith(("starttime", "start time")) else None
-        if match is not None:
-            return np.datetime64(int(match[1]) * 100 - _FROM_1601_TO_1970, "ns")
-    return None

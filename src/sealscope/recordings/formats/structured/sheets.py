@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import ColumnMap, listed
+from sealscope.recordings.formats.columns import ColumnMap, Source, listed
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.series import Clock, Series, table_of
 from sealscope.recordings.formats.table import RawTable
@@ -138,14 +138,14 @@ def _table(runs: Sequence[_SheetRun], notes: tuple[str, ...], place: str) -> Raw
     """Return the table of runs on one clock, in SI units."""
     base = runs[0]
     series: list[Series] = []
-    channels: dict[str, tuple[int, str]] = {}
+    channels: dict[str, Source] = {}
     names: dict[str, str] = {}
     said = []
     for number, run in enumerate(runs):
         clock = Clock(number, partial(np.asarray, run.t), run.start)
         for name, values in run.channels.items():
             unit = run.units[name]
-            channels[name] = len(series), unit
+            channels[name] = Source.of(len(series), unit)
             label = Label(f"{name} [{unit}]", name, unit)
             series.append(Series(run.sheets[0], label, values.size, partial(np.asarray, values), clock))
         names.update(run.table.choice.names)
@@ -154,7 +154,9 @@ def _table(runs: Sequence[_SheetRun], notes: tuple[str, ...], place: str) -> Raw
         if number:
             said.append(f"{', '.join(run.channels)} read from sheet {run.sheets[0]}")
     time = base.table.choice.time_label
-    choice = ColumnMap(len(series), Label("t [s]" if time is None else time.whole, "t", "s"), channels, names=names)
+    label = Label("t [s]" if time is None else time.whole, "t", "s")
+    unused = tuple(name for run in runs for name in run.table.choice.unused)
+    choice = ColumnMap(len(series), label, channels, names=names, unused=unused)
     table = table_of(series, lambda *_: choice, base.table.kind, place, base.table.about)
     history = tuple(dict.fromkeys(line for run in runs for line in run.history))
     return replace(table, notes=(*history, *said, *notes, *table.notes))

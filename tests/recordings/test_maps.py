@@ -1,0 +1,179 @@
+"""Maps: formulas, units from names, columns by the last words of a name, and what a map leaves unused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+import sealscope as ss
+from sealscope.cli.app import app
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings import Recording, read, write
+
+COUNT, RATE = 40, 500.0
+COLUMNS = np.random.default_rng(7).integers(-4000, 4000, size=(COUNT, 3)).astype(float)
+NUMBERS = st.floats(-1e3, 1e3).map(lambda value: round(value, 6))
+
+
+def table(folder: Path, head: str, columns: np.ndarray = COLUMNS, name: str = "log.csv") -> Path:
+    """Write rows of a time [s] and these columns under a heading."""
+    rows = [";".join(f"{value:.10g}" for value in (k / RATE, *row)) for k, row in enumerate(columns)]
+    path = folder / name
+    path.write_text("\n".join([head, *rows]) + "\n")
+    return path
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(a=NUMBERS, b=NUMBERS, c=NUMBERS, unit=st.sampled_from([("bar", 1e5), ("kPa", 1e3), ("Pa", 1.0)]))
+def test_a_formula_is_the_affine_function_that_it_says(tmp_path: Path, a: float, b: float, c: float, unit) -> None:
+    path = table(tmp_path, "t [s];ADC_1;ADC_2;ADC_3")
+    one, two, _ = COLUMNS.T
+    expected = (a * one + b * two / 2 - c) * unit[1]
+    for text in (
+        f"{a}*ADC_1 + {b}*ADC_2/2 - {c} {unit[0]}",
+        f"ADC_1*{a} - ({c} - ADC_2*{b}*0.5) [{unit[0]}]",
+        f"-({c}) + ({a}*#2 + 0.5*(`ADC_2`*{b})) {unit[0]}",
+    ):
+        pressure = read(path, map={"p_A": text})["p_A"]
+        np.testing.assert_allclose(pressure, expected, rtol=1e-12, atol=1e-6 * unit[1])
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("ADC_1*ADC_2 bar", "a formula of a map must be"),
+        ("2*ADC_1/ADC_2 bar", "a formula of a map must be"),
+        ("ADC_1*1/0 bar", "a formula of a map must be"),
+        ("2*3 bar", "a formula of a map must be"),
+        ("ADC_1*1e999 bar", "a formula of a map must be"),
+        ("(" * 300 + "ADC_1*2", "a formula of a map must be"),
+        ("__import__('os')*ADC_1", "a formula of a map must be"),
+        ("ADC_1**2 bar", "a formula of a map must be"),
+        ("ADC_7*2 bar", "ADC_7 of .* must be a column"),
+        ("ADC_1*2 mm", "p_A must have a unit of pressure"),
+        ("ADC*2 bar", "must be a column"),
+    ],
+)
+def test_what_is_no_affine_formula_is_refused_in_a_line(tmp_path: Path, text: str, rule: str) -> None:
+    with pytest.raises(InputError, match=rule) as caught:
+        read(table(tmp_path, "t [s];ADC_1;ADC_2;ADC_3"), map={"p_A": text})
+    assert "\n" not in str(caught.value)
+
+
+def test_a_log_of_converter_counts_is_read_by_one_command(tmp_path: Path) -> None:
+    """Times are numbers of milliseconds, which alone could be numbers of rows."""
+    head = "time;" + ";".join(f"ADC1_Channel_{number}" for number in range(1, 13))
+    rows = [[k, *(100 * number + k % 7 for number in range(1, 13))] for k in range(300)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([head, *(";".join(map(str, row)) for row in rows)]) + "\n")
+    maps = ["p_A=ch2*0.0625-0.625 bar", "x=0.025*ch12 mm", "omega=ch10 rpm"]
+    options = [word for text in maps for word in ("--map", text)]
+    refused = CliRunner().invoke(app, ["inspect", str(path), *options])
+    assert refused.exit_code == 1
+    done = CliRunner().invoke(app, ["inspect", str(path), *options, "--map", "t=time ms"])
+    assert done.exit_code == 0, done.output
+    assert "300 samples at 1000 Hz" in done.output
+    recording = read(path, map={**dict(text.split("=") for text in maps), "t": "time ms"})
+    np.testing.assert_allclose(recording["p_A"], [(0.0625 * row[2] - 0.625) * 1e5 for row in rows])
+    np.testing.assert_allclose(recording["x"], [0.025e-3 * row[12] for row in rows])
+    np.testing.assert_allclose(recording["omega"], [row[10] * np.pi / 30 for row in rows])
+    with pytest.raises(UnreadableFile, match="ch3, mapped to p_A"):
+        read(table(tmp_path, "t [s];A_ch_3;B_channel_3;C"), map={"p_A": "ch3"})
+
+
+@pytest.mark.parametrize(
+    ("heads", "channel", "factor"),
+    [
+        ("p_bottom_bar;p_rod_bar;stroke_mm", "p_A", 1e5),
+        ("p_cap_psi;p_rod_psi;pos_mm", "p_A", 6894.757293168),
+        ("p_cap_kPa;p_rod_kPa;xpos_mm", "p_A", 1e3),
+        ("MainPaMPa;MainPbMPa;Weg_mm", "p_A", 1e6),
+        ("PaBar;PbBar;MotSpd_rpm", "p_A", 1e5),
+        ("motor_rpm;p_rod_bar;p_cap_bar", "omega", np.pi / 30),
+        ("MotSpd_rad_s;p_rod_bar;p_cap_bar", "omega", 1.0),
+        ("stroke_mm;p_rod_bar;p_cap_bar", "x", 1e-3),
+        ("leak_l_min;p_rod_bar;p_cap_bar", "q_leak", 1e-3 / 60),
+        ("leak_lpm;p_rod_bar;p_cap_bar", "q_leak", 1e-3 / 60),
+    ],
+)
+def test_units_come_from_the_names(tmp_path: Path, heads: str, channel: str, factor: float) -> None:
+    path = table(tmp_path, f"time_s;{heads}")
+    first = COLUMNS[:, 0]
+    for channel_map in ("auto", {channel: heads.split(";", maxsplit=1)[0]}):
+        np.testing.assert_allclose(read(path, map=channel_map)[channel], factor * first, rtol=1e-9)
+
+
+def test_a_stated_unit_goes_before_that_of_the_name(tmp_path: Path) -> None:
+    path = table(tmp_path, "t [s];p_bottom_bar;p_A_bar;rod")
+    assert read(path, map={"p_B": "p_bottom_bar[kPa]"})["p_B"] == pytest.approx(1e3 * COLUMNS[:, 0])
+    assert read(path, map={"p_B": "2*p_bottom_bar"})["p_B"] == pytest.approx(2e5 * COLUMNS[:, 0])
+    assert read(path)["p_A"] == pytest.approx(1e5 * COLUMNS[:, 1])  # its own name, before a unit
+    raw = read(path, map={"p_B": "rod"})  # a word, not the length of 5 m
+    assert raw.units["p_B"] == "count"
+    assert [finding.channel for finding in ss.inspect(raw) if finding.code == "raw_counts"] == ["p_B"]
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".csv", ".parquet"])
+def test_what_was_recorded_and_not_used_survives_a_round_trip(tmp_path: Path, suffix: str) -> None:
+    head = "t [s];p_bottom_bar;p_tank_bar;motor_rpm;x_set_mm;oil [degC];v [mm/s];gauge"
+    path = table(tmp_path, head, np.hstack([COLUMNS, COLUMNS, COLUMNS[:, :1]]))
+    recording = read(path, map={"p_A": "p_bottom_bar"})
+    assert recording.unused == ("p_tank_bar", "motor_rpm", "v [mm/s]")  # no set point, no temperature
+    assert read(path, map={"p_A": "p_bottom_bar-0.5*p_tank_bar", "omega": "motor_rpm"}).unused == ("v [mm/s]",)
+    kept = tmp_path / f"own{suffix}"
+    write(recording, kept)
+    assert read(kept).unused == recording.unused
+    assert Recording(recording.t, recording.channels, recording.units, RATE).unused == ()
+
+
+def test_a_verdict_names_what_was_not_used(tmp_path: Path) -> None:
+    path = table(tmp_path, "t [s];p_bottom;p_rod_bar;p_tank_bar")
+    arguments = ["diagnose", str(path), "--map", "p_A=p_bottom", "--map", "p_B=p_rod_bar"]
+    line = CliRunner().invoke(app, [*arguments, "--format", "jsonl"]).stdout
+    assert json.loads(line)["unused"] == ["p_tank_bar"]
+    text = CliRunner().invoke(app, arguments).stdout
+    assert "p_tank_bar" in text and "state the unit" in text
+    page = tmp_path / "page.html"
+    done = CliRunner().invoke(app, ["report", *arguments[1:], "-o", str(page)])
+    assert done.exit_code == 0, done.output
+    assert "p_tank_bar" in page.read_text()
+
+
+def test_signals_that_simulink_streamed_are_read_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "test.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for number, (name, unit) in enumerate((("<rig_Pa>", "bar"), ("<rig_Pb>", ""), ("<rig_PaFiltered>", "bar"))):
+            group = file.create_group(f"#refs#/{'abc'[number]}")
+            group["Name"] = np.frombuffer(name.encode("utf-16-le"), np.uint16)[:, None]
+            group["Values/DataR2"] = [[float(2 - number)]]
+            group["Values/CompressedTime"] = [[0.0], [0.01], [float(COUNT)]]
+            group["Values/DataUnits/Value"] = np.frombuffer(unit.encode("utf-16-le"), np.uint16)
+            stream = file.create_group(f"#sigstream#/{2 - number}")
+            stream["#data#"] = np.frombuffer(COLUMNS[:, number].tobytes() + bytes(80), np.uint8)
+            stream["#length#"], stream["#sampleSize#"] = np.uint64([COUNT]), np.uint64([8])
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
+    recording = read(path, map={"p_A": "Pa", "p_B": "Pb kPa"})
+    assert recording.rate == 100.0
+    np.testing.assert_array_equal(recording["p_A"], 1e5 * COLUMNS[:, 0])
+    np.testing.assert_array_equal(recording["p_B"], 1e3 * COLUMNS[:, 1])
+
+
+def test_a_twincat_export_with_names_alone_has_its_clock_and_its_start(tmp_path: Path) -> None:
+    """Its last row is cut short."""
+    head = "Name,crane,\nStarttime of export,133898814400300000,onsdag 23. april 2025\n\n\nName,MainPa,MainPb,MainX\n\n"
+    rows = [f"{10 * k},{20 + k % 5},{5 + k % 3},0.5" for k in range(60)]
+    path = tmp_path / "log.csv"
+    path.write_text(head + "\n".join(rows)[:-8])
+    recording = read(path, map={"p_A": "MainPa bar", "p_B": "MainPb bar"})
+    assert (len(recording), recording.rate) == (60, 100.0)
+    assert recording.provenance["start"].startswith("2025-04-23T11:30:40.03")
+    assert recording.unused == ("MainX",)
+    assert recording["p_A"][-2] == 23e5
