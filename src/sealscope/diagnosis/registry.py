@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-def _built_in(room: str, name: str) -> Factory:
+def _built_in(module: str, name: str) -> Factory:
     def make(rig: Rig) -> Detector:
-        detector: Detector = getattr(import_module(f"sealscope.diagnosis.{room}.detector"), name)(rig)
+        detector: Detector = getattr(import_module(f"sealscope.diagnosis.{module}"), name)(rig)
         return detector
 
     return make
@@ -23,11 +23,11 @@ def _built_in(room: str, name: str) -> Factory:
 
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
-    "volume balance": _built_in("volume_balance", "VolumeBalance"),
-    "cycle balance": _built_in("volume_balance.over_cycles", "CycleBalance"),
-    "pressure model": _built_in("pressure_model", "PressureModel"),
-    "observer": _built_in("observer", "Observer"),
-    "rms change": _built_in("rms_change", "RmsChange"),
+    "volume balance": _built_in("balance_detector", "VolumeBalance"),
+    "cycle balance": _built_in("volume_balance.over_cycles.detector", "CycleBalance"),
+    "pressure model": _built_in("pressure_model.detector", "PressureModel"),
+    "observer": _built_in("observer.detector", "Observer"),
+    "rms change": _built_in("rms_change.detector", "RmsChange"),
 }
 
 

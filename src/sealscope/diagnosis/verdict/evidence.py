@@ -155,6 +155,8 @@ class Evidence:
     unruly : bool
         Whether the detector abstains because the machine's parameters wander more than those of a healthy one may: then
         the details' RMS wander, too, and a change of it says less.
+    bound_lpm : float, optional
+        95 % upper bound of a leak [L/min] where none is reported; None where the channels do not allow one.
     """
 
     verdict: Verdict
@@ -179,6 +181,7 @@ class Evidence:
     ratio_interval: tuple[float, float] | None = None
     weighed: frozenset[Cause] = frozenset()
     unruly: bool = False
+    bound_lpm: float | None = None
 
     @property
     def alarmed(self) -> bool:

@@ -1,0 +1,73 @@
+"""What else stepped? The same likelihood ratio for the coefficient of every term of the balance; causes compete.
+
+Each hypothesis says that one coefficient stepped once, at an onset that nobody knows; they differ in their term alone,
+so that twice the logarithms of their likelihood ratios compare as they are. A cause's probability sums those of its
+terms, all equally likely beforehand; hypotheses that the channels cannot tell apart share it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import Blocks, Columns, information
+from sealscope.diagnosis.onset import StepTest, step_test
+from sealscope.diagnosis.terms import ORIFICE, Equation, priors
+from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
+
+#: Blocks that causes are weighed with: a step is dated by the leak's own test.
+COARSE = 40
+#: A change of the scale of the left side: displacement, angle, speed, or the position behind a valve.
+SCALE = "scale"
+
+
+class Hypothesis(NamedTuple):
+    """The coefficient of a term stepped: its `name`, the `cause`, the test, and the sign of the step."""
+
+    name: str
+    cause: Cause
+    test: StepTest
+
+
+def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns]) -> tuple[Hypothesis, ...]:
+    """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak."""
+    coarse = blocks.merged(COARSE)
+    terms = [(term.name, term.cause) for term in balances[0].terms]
+    terms.append((SCALE, "sensor fault"))
+    tested = []
+    for index, (name, cause) in enumerate(terms):
+        replaced = columns[0].leak if name == ORIFICE else None
+        own = information(coarse, columns, index, replaced)
+        signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
+        tests = [step_test(own._replace(vector=sign * own.vector)) for sign in signs]
+        best = max((test for test in tests if test is not None), key=lambda test: test.score, default=None)
+        if best is not None:
+            tested.append(Hypothesis(name, cause, best))
+    return tuple(sorted(tested, key=lambda own: -own.test.score))
+
+
+def probabilities(tested: Sequence[Hypothesis]) -> dict[Cause, float]:
+    """Return the probability of each cause, given that one of them is present, the most probable first.
+
+    A cause is as likely as its best term; logarithms of likelihoods are believed to within a share of the largest.
+    """
+    if not tested:
+        return {}
+    beliefs = priors()["causes"]
+    most = max(own.test.score for own in tested)
+    temper = 2.0 * (1.0 + beliefs["model"].value * max(most, 0.0))
+    weights: dict[Cause, float] = {}
+    for own in tested:
+        odds = beliefs["leak" if own.cause in (*LEAKS, "pump leak") else own.cause].value
+        weights[own.cause] = max(weights.get(own.cause, 0.0), odds * float(np.exp((own.test.score - most) / temper)))
+    total = sum(weights.values())
+    return {cause: weight / total for cause, weight in sorted(weights.items(), key=lambda item: -item[1])}
+
+
+def stepped(tested: Sequence[Hypothesis], chance: float) -> Cause | None:
+    """Return the most probable cause where a step of its term is as rare as `chance` among so many; else None."""
+    named = next(iter(probabilities(tested)), None)
+    best = max((own.test for own in tested if own.cause == named), key=lambda test: test.score, default=None)
+    return named if best is not None and best.chance * len(tested) < chance else None

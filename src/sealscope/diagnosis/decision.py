@@ -1,0 +1,367 @@
+"""The only place that makes a verdict of a balance: three questions, each with an estimate, an interval and a bound.
+
+1. Did a leak begin within the recording? (`onset.step_test`)
+2. Is it more than in the baseline? (`scatter.rise`)
+3. Is it more than a healthy machine passes? (the level of G against the rig's file, where it says so)
+
+`leak` where one of them is answered with yes at its share of the false-alarm probability, and a leak past piston or
+pump is the most probable of all causes; `no leak` with the 95 % bound X where X is below the leak worth finding
+(`terms.toml`); else `cannot tell` with X. Nothing changes the verdict afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import Blocks, Columns, Information, information, solve, total
+from sealscope.diagnosis.causes import Hypothesis, hypotheses, probabilities
+from sealscope.diagnosis.causes import stepped as stepped_cause
+from sealscope.diagnosis.onset import Course, Interval, StepTest, course, step_test
+from sealscope.diagnosis.scatter import Rise, rise
+from sealscope.diagnosis.terms import ORIFICE, Equation, priors
+from sealscope.diagnosis.verdict.evidence import (
+    LEAKS,
+    NO_RIG,
+    RAREST,
+    Cause,
+    Evidence,
+    LeakCourse,
+    Passage,
+    RelativeLeak,
+)
+from sealscope.recordings.recording import Array
+from sealscope.units import LITRE_PER_MINUTE
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Share of the false-alarm probability that the change within the recording has where there is a baseline, too.
+WITHIN = 0.25
+_95 = 1.96
+
+
+class Size(NamedTuple):
+    """What turns a flow by the assumed displacement into that of the machine.
+
+    `scale`, its relative `deviation`; `stated`: whether L/min can be stated at all; `ratio`: displacement over area as
+    measured, over the assumed one, with its interval, None where the position has no unit; `area` of the piston by the
+    assumed displacement [m^2].
+    """
+
+    scale: float
+    deviation: float
+    stated: bool
+    ratio: Interval | None
+    area: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """A recording's blocks with all that is asked of them."""
+
+    blocks: Blocks
+    equations: tuple[Equation, ...]
+    columns: tuple[Columns, ...]
+    rig: Rig
+    units: frozenset[tuple[str, str]]
+
+    @cached_property
+    def leak(self) -> Information:
+        """What the blocks say of the leak's coefficient."""
+        return information(self.blocks, self.columns, self.columns[0].leak)
+
+    @cached_property
+    def test(self) -> StepTest | None:
+        """Test of a step of the leak's coefficient."""
+        return step_test(self.leak)
+
+    @cached_property
+    def through_orifice(self) -> StepTest | None:
+        """Test of a step of the flow through an orifice."""
+        column = self.columns[0]
+        return step_test(information(self.blocks, self.columns, column.names.index(ORIFICE), column.leak))
+
+    @cached_property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """Tests of all terms' coefficients, the most likely first."""
+        return hypotheses(self.blocks, self.equations, self.columns)
+
+    def mean(self, column: int, since: float = -np.inf) -> float:
+        """Return a mean over the blocks whose middle is at `since` or later."""
+        chosen = self.blocks.time >= since
+        if not chosen.any():
+            chosen[-1] = True
+        return float(np.average(self.blocks.means[chosen, column], weights=np.maximum(self.blocks.rows[chosen], 1e-9)))
+
+    @cached_property
+    def size(self) -> Size:
+        """What turns a flow by the assumed displacement into that of the machine."""
+        return _size(self)
+
+    def course(self, step: bool) -> Course:
+        """Return the leak's coefficient over the blocks."""
+        return course(self.leak, self.test, step)
+
+
+def _size(balance: Balance) -> Size:
+    """Weigh what is stated of displacement and area against each other.
+
+    The balance measures their ratio. A stated displacement sizes every flow directly, a stated area by that ratio;
+    where both are stated and disagree the flow lies between what either says.
+    """
+    column, rig = balance.columns[0], balance.rig
+    beliefs = priors()["size"]
+    with_unit = not {("theta", "count"), ("omega", "count"), ("u", "count")} & balance.units
+    pressures = not {("p_A", "count"), ("p_B", "count")} & balance.units
+    states_displacement = rig.states("pump.q_b") and with_unit
+    if len(balance.columns) > 1:  # behind a valve the area sizes the flow
+        return Size(1.0, beliefs["area"].value, rig.states("cylinder.A_A", "cylinder.A_B") and pressures, None, None)
+    motion = [k for k in column.motion if column.names[k].startswith("motion")]
+    area = _area(balance, motion) if motion and ("x", "m") in balance.units else None
+    if area is None or not area.value > 0.0 or not with_unit:
+        return Size(1.0, beliefs["displacement"].value, states_displacement and pressures, None, None)
+    assumed = 0.5 * (rig.cylinder.A_A + rig.cylinder.A_B)
+    ratio = Interval(assumed / area.value, *sorted(assumed / np.maximum([area.low, area.high], 1e-12)))
+    apart = abs(1.0 / ratio.value - 1.0)
+    known = float(np.hypot(beliefs["displacement"].value, beliefs["area"].value))
+    if states_displacement:
+        deviation = beliefs["displacement"].value
+        if rig.states("cylinder.A_A", "cylinder.A_B") and apart > _95 * known:
+            deviation = apart
+        return Size(1.0, deviation, pressures, ratio, area.value)
+    if rig.states("cylinder.A_A", "cylinder.A_B"):
+        return Size(ratio.value, beliefs["area"].value, pressures, ratio, area.value)
+    return Size(1.0, known, pressures and apart < _95 * known, ratio, area.value)
+
+
+def _area(balance: Balance, motion: list[int]) -> Interval:
+    """Return the piston's area by the assumed displacement [m^2], the mean of both ways and sides that occur."""
+    column = balance.columns[0]
+    sums = total(balance.blocks, balance.columns)[0]
+    chosen = list(column.nuisance)
+    coefficients = solve(sums[np.ix_(chosen, chosen)], sums[chosen, column.left])
+    energy = np.array([sums[k, k] for k in motion])
+    weights = np.zeros(len(chosen))
+    weights[[chosen.index(k) for k in motion]] = energy / max(float(energy.sum()), np.finfo(float).tiny)
+    variance = float(weights @ solve(sums[np.ix_(chosen, chosen)], weights))
+    value = float(weights @ coefficients)
+    half = _95 * float(np.sqrt(max(variance, 0.0)))
+    return Interval(abs(value), abs(value) - half, abs(value) + half)
+
+
+def judge(balance: Balance, probability: float, baseline: Sequence[Blocks] = ()) -> Evidence:
+    """Return the evidence of a balance at a false-alarm probability, against healthy recordings where there are any."""
+    test = balance.test
+    against = rise(balance.blocks, baseline, balance.columns) if baseline else None
+    if test is None and against is None:
+        return Evidence("cannot tell", f"too short for a balance: {len(balance.blocks)} blocks say something of a leak")
+    within = probability * (WITHIN if against is not None else 1.0)
+    stepped = test is not None and test.chance < within
+    risen = against is not None and against.chance < probability - (within if test is not None else 0.0)
+    causes = probabilities(balance.hypotheses) if stepped else {}
+    if stepped and _is_leak(causes):
+        evidence = _step(balance, causes)
+    elif risen and not stepped:
+        assert against is not None
+        evidence = _flow(balance, Evidence("leak", "", cause=_together(balance)), *_of_rise(balance, against))
+    else:
+        evidence = _none(balance, against, stepped_cause(balance.hypotheses, probability))
+    return _with_figures(balance, evidence, against, probability, within, risen=risen and not stepped)
+
+
+def _is_leak(causes: dict[Cause, float]) -> bool:
+    """Whether a leak past piston or pump is more probable than every other cause; either may be the pump's alone."""
+    leak = sum(causes.get(cause, 0.0) for cause in LEAKS)
+    pump = causes.get("pump leak", 0.0)
+    others = max((share for cause, share in causes.items() if cause not in (*LEAKS, "pump leak")), default=0.0)
+    return leak + pump > others and leak > RAREST * pump
+
+
+def _together(balance: Balance) -> Cause:
+    return "piston or pump leak" if len(balance.columns) == 1 else "piston leak"
+
+
+def _step(balance: Balance, causes: dict[Cause, float]) -> Evidence:
+    """Return the evidence of a leak that began within the recording; its law is weighed, laminar against an orifice."""
+    test, orifice = balance.test, balance.through_orifice
+    assert test is not None
+    onset = test.onset()
+    flows, deviations, scores = [], [], []
+    for own, mean in ((test, 0), (orifice, 1)):
+        if own is not None:
+            pressure = balance.mean(mean, onset.value)
+            flows.append(own.fitted[0] * pressure)
+            deviations.append(own.fitted[1] * pressure)
+            scores.append(own.score)
+    weights = np.exp(0.5 * (np.array(scores) - max(scores)))
+    weights /= weights.sum()
+    value = float(weights @ flows)
+    spread = float(np.sqrt(weights @ (np.square(deviations) + (np.array(flows) - value) ** 2)))
+    pump = causes.get("pump leak", 0.0)
+    cause: Cause = _together(balance)
+    if "pump leak" in causes and pump < RAREST:
+        cause = "piston leak"
+    evidence = Evidence("leak", "", onset_s=onset.value, onset_interval_s=(onset.low, onset.high), cause=cause)
+    return _flow(balance, evidence, value, spread)
+
+
+def _of_rise(balance: Balance, against: Rise) -> tuple[float, float]:
+    """Return a rise against the baseline and its deviation as flows [m^3/s]."""
+    pressure = balance.mean(0)
+    half = 0.5 * (against.interval()[1] - against.interval()[0]) / _95
+    return against.value * pressure, half * pressure
+
+
+def _flow(balance: Balance, evidence: Evidence, value: float, deviation: float) -> Evidence:
+    """Return the evidence with the flow [m^3/s] of a leak and its deviation, as far as the machine's size is known."""
+    size = balance.size
+    pump = balance.mean(2)
+    half = _95 * float(np.hypot(deviation, value * size.deviation))
+    low, high = max(value - half, 0.0), value + half
+    relative = RelativeLeak(
+        pump_share=value / pump if pump > 0.0 else None,
+        pump_share_interval=_over((value - _95 * deviation, value + _95 * deviation), pump),
+        creep=None if size.area is None else value / size.area,
+        creep_interval=_over((value - _95 * deviation, value + _95 * deviation), size.area),
+    )
+    evidence = replace(evidence, relative=relative)
+    if not size.stated:
+        return replace(evidence, refuses=frozenset({"leak_lpm"}))
+    unit = size.scale / LITRE_PER_MINUTE
+    return replace(evidence, leak_lpm=value * unit, leak_interval_lpm=(low * unit, high * unit))
+
+
+def _over(interval: tuple[float, float], unit: float | None) -> tuple[float, float] | None:
+    return None if unit is None or not unit > 0.0 else (max(interval[0], 0.0) / unit, interval[1] / unit)
+
+
+def _none(balance: Balance, against: Rise | None, cause: Cause | None) -> Evidence:
+    """Return the evidence where no leak is said to be: `no leak` where one worth finding would have been."""
+    bound, pump = bound_of(balance, against), balance.mean(2)
+    enough = pump > 0.0 and bound <= priors()["worth"]["share"].value * pump
+    return Evidence("no leak" if enough else "cannot tell", "", cause=cause)
+
+
+def bound_of(balance: Balance, against: Rise | None) -> float:
+    """Return the 95 % upper bound of a leak that began within the recording, or that came since the baseline [m^3/s]."""
+    bounds = []
+    if against is not None:
+        bounds.append((against.value + against.threshold(0.05) * against.deviation) * balance.mean(0))
+    elif balance.test is not None:
+        bounds.append(balance.test.bound() * balance.mean(0))
+    return max(max(bounds, default=np.inf), 0.0)
+
+
+def _with_figures(
+    balance: Balance, evidence: Evidence, against: Rise | None, probability: float, within: float, *, risen: bool
+) -> Evidence:
+    """Return the evidence with scores, thresholds, course, total, bound and the reason in words."""
+    test, size = balance.test, balance.size
+    parts = []
+    if test is not None:
+        parts.append(
+            Evidence(
+                "leak" if evidence.verdict == "leak" and not risen else "no leak",
+                "a step of the leakage within the recording, over all onsets",
+                test.score,
+                test.threshold(within),
+                detector="within the recording",
+                chance=max(test.chance, RAREST),
+            )
+        )
+    if against is not None:
+        share = probability - (within if test is not None else 0.0)
+        parts.append(
+            Evidence(
+                "leak" if evidence.verdict == "leak" and risen else "no leak",
+                f"the leakage against that of healthy recordings, {against.freedom:g} degrees of freedom",
+                against.score,
+                against.threshold(share),
+                detector="against the baseline",
+                chance=max(against.chance, RAREST),
+            )
+        )
+    judging = parts[-1] if risen or test is None else parts[0]
+    level = _level(balance)
+    flow = size.scale / LITRE_PER_MINUTE
+    bound = bound_of(balance, against)
+    evidence = replace(
+        evidence,
+        score=judging.score,
+        threshold=judging.threshold,
+        chance=judging.chance,
+        parts=tuple(parts) if len(parts) > 1 else (),
+        passage=_passage(balance, level, None if evidence.verdict == "leak" else bound),
+        ratio=None if size.ratio is None else size.ratio.value,
+        ratio_interval=None if size.ratio is None else (size.ratio.low, size.ratio.high),
+        bound_lpm=bound * flow if size.stated and evidence.verdict != "leak" and np.isfinite(bound) else None,
+        course=_leak_course(balance, evidence) if size.stated else None,
+    )
+    return replace(evidence, reason=_reason(balance, evidence, bound))
+
+
+def _level(balance: Balance) -> Interval:
+    """Return what passes in all over the recording, as a conductance with its interval."""
+    weights = np.maximum(balance.blocks.rows, 0.0)
+    return balance.course(step=False).over(weights / weights.sum())
+
+
+def _passage(balance: Balance, level: Interval, findable: float | None) -> Passage:
+    size, pressure, pump = balance.size, balance.mean(0), balance.mean(2)
+    healthy = balance.rig.pump.G_healthy
+    flow = pressure * size.scale / LITRE_PER_MINUTE
+    wide = 1.0 + _95 * size.deviation
+    stated = size.stated and len(balance.columns) == 1  # a valve's edges pass as well, by an amount that is not known
+    low, high = (end * flow * (wide if (end > 0.0) == upper else 1.0 / wide) for end, upper in zip(level[1:], (False, True), strict=True))
+    return Passage(
+        lpm=level.value * flow if stated else None,
+        interval_lpm=(low, high) if stated else None,
+        pressure=pressure,
+        findable_lpm=None if findable is None or not size.stated else findable * size.scale / LITRE_PER_MINUTE,
+        healthy_lpm=healthy * pressure / LITRE_PER_MINUTE if healthy > 0.0 else None,
+        pump_share=max(level.value, 0.0) * pressure / pump if pump > 0.0 and len(balance.columns) == 1 else None,
+        findable_share=None if findable is None or not pump > 0.0 else findable / pump,
+    )
+
+
+def _leak_course(balance: Balance, evidence: Evidence) -> LeakCourse:
+    """Return the leak over the recording: what came with it, or what passes in all where none began."""
+    own = balance.course(step=evidence.onset_s is not None)
+    time, value = balance.blocks.time, own.mean
+    deviation = np.sqrt(np.maximum(np.diag(own.covariance), 0.0))
+    whole = evidence.onset_s is None
+    if not whole:
+        before: Array = (time < evidence.onset_s).astype(float)
+        weights = np.eye(len(time)) - before / max(float(before.sum()), 1.0)
+        value = weights @ own.mean
+        deviation = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", weights, own.covariance, weights), 0.0))
+    unit = balance.blocks.means[:, 0] * balance.size.scale / LITRE_PER_MINUTE
+    half = _95 * np.hypot(deviation, value * balance.size.deviation)
+    return LeakCourse(time, value * unit, (value - half) * unit, (value + half) * unit, whole=whole)
+
+
+def _reason(balance: Balance, evidence: Evidence, bound: float) -> str:
+    """Return why, in one line."""
+    share = f"{100.0 * bound / balance.mean(2):.2g} % of the pump's flow" if balance.mean(2) > 0.0 else "any size"
+    limit = f"{evidence.bound_lpm:.2g} L/min" if evidence.bound_lpm is not None else share
+    if evidence.verdict == "leak":
+        text = (
+            "leakage steps up within the recording, beyond the drift of this machine"
+            if evidence.onset_s is not None
+            else "leakage is above that of the healthy recordings by more than they scatter"
+        )
+        if "leak_lpm" in evidence.refuses:
+            text += f"; {NO_RIG}"
+    elif evidence.verdict == "no leak":
+        text = f"no leak above {limit} (95 %)"
+    else:
+        text = f"a leak of up to {limit} would not show (95 %)"
+        text += "; a longer recording, with the load or direction changing, bounds it closer"
+    if evidence.verdict != "leak" and evidence.cause is not None:
+        text += f"; what stepped is rather {evidence.cause}"
+    return text
