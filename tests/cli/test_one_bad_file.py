@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from ..recordings.test_packed_files import rows, workbook
+
 
 @pytest.fixture
 def batch(recordings: Path, tmp_path: Path) -> Path:
@@ -41,6 +43,14 @@ def test_diagnose_goes_on_after_a_defect(batch, call, monkeypatch):
     first, second = done.err.splitlines()
     assert first.startswith(f"sealscope: cannot handle {batch / 'good.nc'}, got ZeroDivisionError: deep")
     assert "must be whole" in second
+
+
+def test_diagnose_goes_on_after_a_workbook_that_ends_its_reader(batch, call):
+    pytest.importorskip("python_calamine")
+    workbook(batch / "corner.xlsx", [rows([("A1", 1), ("XFD1048576", 2)])])
+    done = call("diagnose", "--format", "jsonl", *(batch / name for name in ("good.nc", "corner.xlsx", "other.nc")))
+    assert [Path(line["file"]).name for line in done.objects] == ["good.nc", "other.nc"]
+    assert str(batch / "corner.xlsx") in done.refused(1)
 
 
 @pytest.mark.parametrize("words", [("-v", "diagnose"), ("diagnose", "--verbose")])

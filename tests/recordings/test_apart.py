@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import operator
 import os
+import subprocess
+import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +45,7 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("sealscope.recordings.files._read_here", os.abort)
     path = tmp_path / "log.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
-    monkeypatch.setattr("sealscope.recordings.files.apart", lambda work, *_, limit: apart(work, limit=limit))
+    monkeypatch.setattr("sealscope.recordings.files.apart", lambda work, *_, limit, memory: apart(work, limit=limit))
     with pytest.raises(UnreadableFile, match=r"must be whole, got: the library that reads it crashed.*log"):
         read(path)
 
@@ -50,12 +53,44 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
 def test_hdf5_with_our_own_mark_is_read_apart_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, kinds = tmp_path / "run.nc", []
 
-    def seen(work: object, kind: str, *arguments: object, limit: float) -> object:
+    def seen(work: object, kind: str, *arguments: object, limit: float, memory: int) -> object:
         kinds.append(kind)
-        return apart(work, kind, *arguments, limit=limit)  # type: ignore[arg-type]
+        return apart(work, kind, *arguments, limit=limit, memory=memory)  # type: ignore[arg-type]
 
     t = np.arange(100) / 100.0
     write(Recording(t, {"p_A": np.sin(t)}, {"p_A": "Pa"}, 100.0), path)
     monkeypatch.setattr("sealscope.recordings.files.apart", seen)
     assert (read(path)["p_A"] == np.sin(t)).all()
     assert kinds == ["netcdf"]  # anybody can write the mark
+
+
+def test_memory_is_limited_for_each_request() -> None:
+    pytest.importorskip("resource")
+    with pytest.raises(MemoryError):
+        apart(bytearray, 2**30, limit=10.0, memory=2**29)
+    assert len(apart(bytearray, 2**28, limit=10.0, memory=2**30)) == 2**28
+
+
+def test_a_long_work_holds_no_other_thread_up() -> None:
+    with ThreadPoolExecutor() as threads:
+        long = threads.submit(apart, time.sleep, 1.0, limit=10.0)
+        while threads.submit(apart, operator.add, 1, 1, limit=10.0).result() == 2 and not long.running():
+            pass
+        assert apart(operator.add, 2, 3, limit=10.0) == 5
+        assert not long.done()
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks Linux for the state of a process")
+def test_work_whose_program_was_killed_ends_at_its_limit() -> None:
+    """It does not see the end of its standard input while it works."""
+    text = "import os, time\nfrom sealscope.recordings.apart import apart\n"
+    text += "print(apart(os.getpid, limit=9.0), flush=True)\napart(time.sleep, 60.0, limit=0.5)\n"
+    with subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        status = Path(f"/proc/{int(program.stdout.readline())}/status")
+        time.sleep(0.2)
+        program.kill()
+    end = time.monotonic() + 5.0
+    while status.exists() and "State:\tZ" not in status.read_text():
+        assert time.monotonic() < end
+        time.sleep(0.05)
