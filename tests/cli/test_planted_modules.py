@@ -123,3 +123,16 @@ def test_settings_of_compiled_code_are_not_taken_from_the_working_folder(planted
     (planted / ".numba_config.yaml").write_text("disable_jit: 1\ncuda_driver: ./evil.so\n")
     text = "from sealscope import compiled\nprint(compiled.config.DISABLE_JIT, repr(compiled.config.CUDA_DRIVER))"
     assert run([], text).stdout == "0 ''\n"
+
+
+def test_a_plan_runs_no_program_beside_it(call, planted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(planted)
+    (planted / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    target = '[factors]\ncommand = ["position 20 mm sin(2t)"]\ncontroller = ["evil.py:x"]\n[[records]]'
+    (planted / "plan.toml").write_text(PLAN.replace("[[records]]", target, 1))
+    assert call("campaign", "status", "plan.toml").out.startswith("records: 0 of 8 done")
+    assert "must have rows" in call("campaign", "report", "plan.toml").refused()
+    assert "--trust" in call("campaign", "run", "plan.toml").refused()
+    assert not (tmp_path / "ran").exists()
+    call("campaign", "run", "plan.toml", "--trust")
+    assert (tmp_path / "ran").exists()

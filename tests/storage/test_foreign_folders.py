@@ -155,7 +155,7 @@ def test_what_is_written_is_on_the_disk_before_its_name_and_the_name_at_the_end(
     sync, rename = os.fsync, Path.replace
 
     def synced(number: int) -> None:
-        name = Path(os.readlink(f"/proc/self/fd/{number}")).name
+        name = Path(f"/proc/self/fd/{number}").readlink().name
         calls.append(("sync", name if name == tmp_path.name else (tmp_path / name).read_text()))
         sync(number)
 
