@@ -12,6 +12,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,6 +21,7 @@ from threading import BoundedSemaphore, Timer
 from typing import Any, TypeVar
 
 from sealscope.errors import SealscopeError
+from sealscope.storage.unpacking import LARGEST
 
 T = TypeVar("T")
 #: Time that starting the process may take beside the work [s].
@@ -50,12 +52,13 @@ class _Process:
 
     def __init__(self) -> None:
         self.fresh = True
+        self._folder = tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "sealscope.recordings.apart"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, **_ONE_THREAD},
+            env={**os.environ, **_ONE_THREAD, "TMPDIR": self._folder.name},  # what it leaves there is removed
         )
 
     @property
@@ -87,6 +90,7 @@ class _Process:
     def end(self) -> None:
         self._process.kill()
         self._process.communicate()
+        self._folder.cleanup()
 
 
 _places = BoundedSemaphore(_MOST_PROCESSES)
@@ -102,9 +106,10 @@ def _process() -> _Process:
             return _Process()
         if process.alive:
             return process
+        process.end()
 
 
-def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY) -> T:
+def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST) -> T:
     """Return ``work(*arguments)``, carried out in a process of its own.
 
     Parameters
@@ -117,6 +122,8 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = M
         Longest time that it may take [s].
     memory : int
         Most memory that it may take [bytes]; `MOST_MEMORY` and half the machine's at most.
+    disk : int
+        Longest file that it may write [bytes].
 
     Raises
     ------
@@ -128,7 +135,7 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = M
     with _places:
         process = _process()
         try:
-            value, where, spent = process.ask(pickle.dumps((work, arguments, limit, memory)), limit)
+            value, where, spent = process.ask(pickle.dumps((work, arguments, (limit, memory, disk))), limit)
         except BaseException:  # also an interrupt: the answer would come to the next request
             process.end()
             raise
@@ -141,8 +148,8 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = M
     return value  # type: ignore[no-any-return]
 
 
-def _limit(seconds: float, memory: int) -> None:
-    """Let this process take so much time and memory at most, where the system can.
+def _limit(seconds: float, memory: int, disk: int) -> None:
+    """Let this process take so much time, memory and disk at most, where the system can.
 
     The time is kept here, too: a process whose parent was killed ends all the same.
     """
@@ -151,9 +158,12 @@ def _limit(seconds: float, memory: int) -> None:
         import resource
 
         machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        most = min(memory, MOST_MEMORY, machine // 2)
-        resource.setrlimit(resource.RLIMIT_DATA, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+        for kind, most in (
+            (resource.RLIMIT_DATA, min(memory, MOST_MEMORY, machine // 2)),
+            (resource.RLIMIT_FSIZE, disk),
+        ):
+            _, hard = resource.getrlimit(kind)
+            resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
 def _is_spent() -> bool:
@@ -173,14 +183,16 @@ def _serve() -> None:
     sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 - for the life of the process
     with suppress(EOFError, KeyboardInterrupt, BrokenPipeError):
         while True:
-            work, arguments, limit, memory = pickle.load(sys.stdin.buffer)
-            _limit(limit, memory)
+            work, arguments, limits = pickle.load(sys.stdin.buffer)
+            _limit(*limits)
             value, where = _carried_out(work, arguments)
-            _limit(0.0, MOST_MEMORY)
+            _limit(0.0, MOST_MEMORY, LARGEST)
             answers.write(pickle.dumps((value, where), protocol=5))
             del work, arguments, value
             pickle.dump(_is_spent(), answers)
             answers.flush()
+    with suppress(OSError):  # the program may have been killed
+        Path(tempfile.gettempdir()).rmdir()
 
 
 def _carried_out(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, str | None]:

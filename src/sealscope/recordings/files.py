@@ -176,7 +176,8 @@ def _table(kind: str, file: Path, choose: Choose) -> RawTable:
         return _read_here(kind, file, choose)
     size = file.stat().st_size
     limit = _LONGEST + size / (_SLOWEST_SHEETS if kind == "spreadsheet" else _SLOWEST)
-    return apart(_read_here, kind, file.absolute(), choose, limit=limit, memory=_MEMORY + _MEMORY_SHARE * size)
+    memory = _MEMORY + _MEMORY_SHARE * size
+    return apart(_read_here, kind, file.absolute(), choose, limit=limit, memory=memory, disk=most_unpacked(file))
 
 
 def _read_here(kind: str, file: Path, choose: Choose) -> RawTable:
