@@ -47,7 +47,9 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("sealscope.recordings.files._read_here", os.abort)
     path = tmp_path / "log.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
-    monkeypatch.setattr("sealscope.recordings.files.apart", lambda work, *_, limit, **more: apart(work, limit=limit))
+    monkeypatch.setattr(
+        "sealscope.recordings.files.file_apart", lambda work, *_, limit, **more: apart(work, limit=limit)
+    )
     with pytest.raises(UnreadableFile, match=r"must be whole, got: the library that reads it crashed.*log"):
         read(path)
 
@@ -55,13 +57,13 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
 def test_hdf5_with_our_own_mark_is_read_apart_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, kinds = tmp_path / "run.nc", []
 
-    def seen(work: object, kind: str, *arguments: object, **limits: Any) -> object:
+    def seen(work: object, file: Path, kind: str, *arguments: object, **limits: Any) -> object:
         kinds.append(kind)
-        return apart(work, kind, *arguments, **limits)  # type: ignore[arg-type]
+        return apart(work, file, kind, *arguments, **limits)  # type: ignore[arg-type]
 
     t = np.arange(100) / 100.0
     write(Recording(t, {"p_A": np.sin(t)}, {"p_A": "Pa"}, 100.0), path)
-    monkeypatch.setattr("sealscope.recordings.files.apart", seen)
+    monkeypatch.setattr("sealscope.recordings.files.file_apart", seen)
     assert (read(path)["p_A"] == np.sin(t)).all()
     assert kinds == ["netcdf"]  # anybody can write the mark
 

@@ -67,11 +67,19 @@ def test_a_bomb_is_unpacked_no_further_than_its_size_allows(kind: str, pack, tmp
     path.write_bytes(pack(bytes(2**24)) * 20)
     most = most_unpacked(path)
     assert most == max(SMALL, 200 * path.stat().st_size)
-    line = re.fullmatch(
-        rf"a packed file must unpack to at most {most} bytes, got (\d+) or more \(FILE\)", refused(path)
-    )
+    line = re.match(rf"a packed file must unpack to at most {most} bytes, got (\d+) or more: ", refused(path))
     assert line is not None
     assert int(line[1]) <= most + 2**20
+
+
+def test_errors_name_the_file_as_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process that reads has the folder in which it was started."""
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(gzip.compress(bytes(2**24)) * 20)
+    refused(path)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UnreadableFile, match=r" \(log\.csv\.gz\)$"):
+        read("log.csv.gz")
 
 
 def test_archives_in_archives_are_bounded_by_the_outermost(tmp_path: Path) -> None:
@@ -99,7 +107,7 @@ def test_a_sparse_archive_that_claims_12_gib(tmp_path: Path) -> None:
         file.write(entry + end)
     if 512 * path.stat().st_blocks > 2**20:
         pytest.skip("the file system keeps no sparse files")
-    assert refused(path) == f"a packed file must unpack to at most {SMALL} bytes, got {size} or more (FILE)"
+    assert f"must unpack to at most {SMALL} bytes, got {size} or more" in refused(path)
     assert most_unpacked(path) == SMALL
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from threading import BoundedSemaphore, Timer
 from typing import Any, TypeVar
 
-from sealscope.errors import SealscopeError
+from sealscope.errors import SealscopeError, UnreadableFile
 from sealscope.storage.unpacking import LARGEST
 
 T = TypeVar("T")
@@ -146,6 +146,15 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = M
     if where is not None:
         raise value from _RaisedApart(where)
     return value  # type: ignore[no-any-return]
+
+
+def file_apart(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
+    """Return ``work(file, *arguments)`` as `apart` does; what it raises names the file as it is given here."""
+    place = file.absolute()  # the process may work in another folder
+    try:
+        return apart(work, place, *arguments, **limits)
+    except UnreadableFile as error:
+        raise UnreadableFile(str(error).replace(str(place), str(file))) from error
 
 
 def _limit(seconds: float, memory: int, disk: int) -> None:

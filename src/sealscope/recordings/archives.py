@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any, TypeVar, cast
 
 from sealscope.errors import UnreadableFile
-from sealscope.recordings.apart import apart
+from sealscope.recordings.apart import file_apart
 from sealscope.recordings.formats.libraries import library
 from sealscope.storage.opening import open_regular, whole
 from sealscope.storage.unpacking import check_unpacked
@@ -52,7 +52,7 @@ def archive_of(path: Path) -> str | None:
 
 def _apart(work: Callable[..., T], path: Path, *arguments: Any) -> T:
     limit = _LONGEST + path.stat().st_size / _SLOWEST
-    return apart(work, path.absolute(), *arguments, limit=limit, memory=_MEMORY)
+    return file_apart(work, path, *arguments, limit=limit, memory=_MEMORY)
 
 
 def _is_workbook(path: Path) -> bool:

@@ -14,7 +14,7 @@ from typing import cast
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.apart import apart
+from sealscope.recordings.apart import file_apart
 from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
@@ -173,14 +173,14 @@ def _reader(kind: str) -> Reader:
 def _table(kind: str, file: Path, choose: Choose) -> RawTable:
     """Read a table, by a process of its own where the format is none of text."""
     if kind in _TEXTS:
-        return _read_here(kind, file, choose)
+        return _read_here(file, kind, choose)
     size = file.stat().st_size
     limit = _LONGEST + size / (_SLOWEST_SHEETS if kind == "spreadsheet" else _SLOWEST)
     memory = _MEMORY + _MEMORY_SHARE * size
-    return apart(_read_here, kind, file.absolute(), choose, limit=limit, memory=memory, disk=most_unpacked(file))
+    return file_apart(_read_here, file, kind, choose, limit=limit, memory=memory, disk=most_unpacked(file))
 
 
-def _read_here(kind: str, file: Path, choose: Choose) -> RawTable:
+def _read_here(file: Path, kind: str, choose: Choose) -> RawTable:
     return _reader(kind)(file, choose)
 
 

@@ -26,4 +26,7 @@ def most_unpacked(path: Path) -> int:
 def check_unpacked(size: int, most: int, place: str | Path) -> None:
     """Raise UnreadableFile where a file unpacks to more than `most` bytes, as `most_unpacked` has it."""
     if size > most:
-        raise UnreadableFile(f"a packed file must unpack to at most {most} bytes, got {size} or more ({place})")
+        raise UnreadableFile(
+            f"a packed file must unpack to at most {most} bytes, got {size} or more: unpack it, or export it as CSV, "
+            f"where you know it ({place})"
+        )
