@@ -94,6 +94,19 @@ def test_none_runs_where_files_are_read_apart(planted: Path, run: Ran) -> None:
     assert all(name in done.stdout for name in names)
 
 
+def test_no_library_runs_where_python_itself_begins_in_the_folder(planted: Path, tmp_path: Path) -> None:
+    """`python -m` puts the working folder first, until the program has begun."""
+    t = np.arange(900) / 500
+    ss.write(ss.Recording(t, {"p_A": 3e5 + np.sin(t)}, {"p_A": "Pa"}, 500.0), planted / "a.nc")
+    for name in {name.partition(".")[0] for name in sys.modules} - sys.stdlib_module_names - {"sealscope"}:
+        (planted / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r} + ' ')\n")
+    words = [sys.executable, "-m", "sealscope", "inspect", "a.nc"]
+    environment = {**os.environ, "PYTHONPATH": str(SOURCES)}
+    done = subprocess.run(words, cwd=planted, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.startswith("a.nc: 900 samples"), done.stderr
+    assert not (tmp_path / "ran").exists(), (tmp_path / "ran").read_text()
+
+
 def test_none_runs_in_worker_processes(run: Ran) -> None:
     ((_, loaded),) = in_order(1, eval, [LOADED])
     assert loaded is not None
