@@ -86,7 +86,7 @@ def files(folder: Path) -> list[str]:
 def test_none_runs_where_files_are_read_apart(planted: Path, run: Ran) -> None:
     names = files(planted)
     for name in names:
-        ss.read(planted / name, channel_map="auto")
+        ss.read(planted / name, map="auto")
     loaded = apart(eval, LOADED, limit=10.0)
     assert {"numpy", "h5py", "pyarrow", "python_calamine", "matio", "pickle"} <= set(loaded)
     done = run(loaded, COMMAND, "inspect", *names, "--map", "auto")
