@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from sealscope.recordings import files, read
-from sealscope.recordings.apart import _server
+from sealscope.recordings.apart import _idle
 
 SAMPLES, RATE = 90_000, 500.0
 
@@ -60,15 +60,16 @@ def main() -> None:
         foreign_file(path)
 
         def fresh() -> None:
-            _server._end()
+            while _idle:
+                _idle.pop().end()
             read(path)
 
         def in_program() -> None:
-            recognised, files._is_own = files._is_own, lambda _: True  # as files with the mark of Sealscope are read
+            elsewhere, files._TEXTS = files._TEXTS, (*files._TEXTS, "netcdf")
             try:
                 read(path)
             finally:
-                files._is_own = recognised
+                files._TEXTS = elsewhere
 
         in_program()
         here, there = np.empty(0), np.empty(0)

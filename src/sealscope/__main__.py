@@ -1,6 +1,10 @@
 """`python -m sealscope`, the same as the command `sealscope`."""
 
-from sealscope.cli import main
+import sys
 
 if __name__ == "__main__":
+    if not sys.flags.safe_path:
+        del sys.path[0]  # the working folder, whose files may be a stranger's
+    from sealscope.cli import main
+
     main()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
@@ -11,8 +12,11 @@ from sealscope.campaigns.cases.bound import _opened, change_bound
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.execution.run import run
+from sealscope.campaigns.execution.store import progress_of
+from sealscope.campaigns.plans.duty import check_controllers
 from sealscope.campaigns.plans.reader import load_plan, plan_names
-from sealscope.control import Flatness
+from sealscope.control import Flatness, registry
 from sealscope.errors import InputError
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.bench.profile import load_profile
@@ -97,6 +101,44 @@ def test_a_controller_of_ones_own_is_part_of_the_case(tmp_path):
         cases.append({case.id for case in cases_of(plan)})
         assert experiment_of(plan, cases_of(plan)[0]).controlled.rate == 500.0
     assert not cases[0] & cases[1]
+
+
+EVIL = "from pathlib import Path\nPath({mark!r}).touch()\n"
+
+
+@pytest.mark.parametrize("of", ["factor", "profile", "module"])
+def test_a_plan_runs_no_program_that_the_caller_does_not_trust(tmp_path, monkeypatch, of):
+    """Neither a file beside the plan nor a module that is installed for something else, whatever they do when made."""
+    mark = tmp_path / "ran"
+    (tmp_path / "evil.py").write_text(EVIL.format(mark=str(mark)))
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "__init__.py").write_text(EVIL.format(mark=str(mark)))
+    (tmp_path / "package" / "inner.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    name = "package.inner:x" if of == "module" else f"{tmp_path / 'evil.py'}:x"
+    text = PLAN.replace('"pi", "flatness"', f'"{name}"')
+    if of == "profile":
+        text = PLAN.replace('controller = ["pi", "flatness"]\n', "").replace('"closed-loop"', '"own.toml"')
+        duty = f'[duty]\ncommands = ["position 20 mm sin(2t)"]\ncontrollers = ["{name}"]\nclosed = [50]\nwhy = "x"\n'
+        (tmp_path / "own.toml").write_text(f'[profile]\nname = "own"\ntitle = "own"\n{duty}')
+        text = text.replace('rig = "own.toml"', 'rig = "thesis-closed-loop"')
+    plan = plan_of(tmp_path, text)
+    assert progress_of(plan, tmp_path / "rows").done == 0
+    with pytest.raises(InputError, match=r"a controller must be installed, or the plan be trusted .*:x \(.*plan\.toml"):
+        run(plan, tmp_path / "rows")
+    assert not mark.exists()
+    with pytest.raises(InputError, match="could not be made"):
+        run(plan, tmp_path / "rows", trust=True)
+    assert mark.exists()
+    assert not (tmp_path / "rows").exists()
+
+
+def test_an_installed_controller_is_run(tmp_path, monkeypatch):
+    point = EntryPoint("own law", "sealscope.control.flatness:Flatness", registry.GROUP)
+    monkeypatch.setattr(registry, "_installed", lambda: {point.name: point})
+    plan = plan_of(tmp_path, PLAN.replace('"pi", "flatness"', '"own law"').replace("count = 2", "count = 1"))
+    check_controllers(plan, trust=False)
+    assert isinstance(experiment_of(plan, cases_of(plan)[0]).controlled, Flatness)
 
 
 @pytest.mark.parametrize("name", PROFILES)

@@ -47,7 +47,7 @@ def make(kind: str, path: Path) -> None:
 
 
 UNREADABLE = {
-    "empty": "a recording must have samples, got an empty file",
+    "empty": "a recording must hold data, got an empty file",
     "header only": "a recording must have samples, got no row of numbers after t [s], p_A [Pa], p_B [Pa]",
     "one column": "a recording must have a time column such as t [s] or be given a rate",
     "text in numbers": "a sample must be a number, got 'high ",

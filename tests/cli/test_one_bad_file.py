@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
+from urllib.parse import unquote_to_bytes
 
 import pytest
+
+from ..recordings.test_packed_files import rows, workbook
 
 
 @pytest.fixture
@@ -41,6 +45,14 @@ def test_diagnose_goes_on_after_a_defect(batch, call, monkeypatch):
     first, second = done.err.splitlines()
     assert first.startswith(f"sealscope: cannot handle {batch / 'good.nc'}, got ZeroDivisionError: deep")
     assert "must be whole" in second
+
+
+def test_diagnose_goes_on_after_a_workbook_that_ends_its_reader(batch, call):
+    pytest.importorskip("python_calamine")
+    workbook(batch / "corner.xlsx", [rows([("A1", 1), ("XFD1048576", 2)])])
+    done = call("diagnose", "--format", "jsonl", *(batch / name for name in ("good.nc", "corner.xlsx", "other.nc")))
+    assert [Path(line["file"]).name for line in done.objects] == ["good.nc", "other.nc"]
+    assert str(batch / "corner.xlsx") in done.refused(1)
 
 
 @pytest.mark.parametrize("words", [("-v", "diagnose"), ("diagnose", "--verbose")])
@@ -92,6 +104,28 @@ def test_a_campaign_over_recordings_goes_on(batch, call, monkeypatch, tmp_path):
 
 
 ODD = os.fsdecode(b"odd\xff\x1b[31m.nc")
+
+
+@pytest.mark.slow
+def test_odd_names_of_files_in_an_index_and_a_trend(batch, call, recordings):
+    """A link of the index leads to the page, whose name is bytes."""
+    odd = [os.fsdecode(b"l\xe4rm \x1b[31m%d.nc" % number) for number in (1, 2)]
+    for number, name in enumerate(odd, 1):
+        shutil.copy(recordings / f"healthy_{number}.nc", batch / name)
+    files = [batch / name for name in odd]
+    done = call("report", "-o", batch / "pages", *files)
+    assert (done.status, done.err) == (0, "")
+    index = (batch / "pages" / "index.html").read_bytes()
+    links = re.findall(rb'href="(l[^"]*)"', index)
+    assert {unquote_to_bytes(link) for link in links} == {os.fsencode(Path(name).stem) + b".html" for name in odd}
+    assert all((batch / "pages" / os.fsdecode(unquote_to_bytes(link))).is_file() for link in links)
+    assert b"\x1b" not in index
+    for suffix in ("csv", "json", "html"):
+        done = call("trend", *files, "--every", "1d", "-o", batch / f"trend.{suffix}")
+        assert (done.status, done.err) == (0, "")
+        text = (batch / f"trend.{suffix}").read_text(encoding="utf-8")
+        assert "rm " in text
+        assert "\x1b" not in text or suffix == "csv"
 
 
 @pytest.mark.slow

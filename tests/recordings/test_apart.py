@@ -5,8 +5,13 @@ from __future__ import annotations
 import math
 import operator
 import os
+import subprocess
+import sys
+import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +47,9 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("sealscope.recordings.files._read_here", os.abort)
     path = tmp_path / "log.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
-    monkeypatch.setattr("sealscope.recordings.files.apart", lambda work, *_, limit: apart(work, limit=limit))
+    monkeypatch.setattr(
+        "sealscope.recordings.files.file_apart", lambda work, *_, limit, **more: apart(work, limit=limit)
+    )
     with pytest.raises(UnreadableFile, match=r"must be whole, got: the library that reads it crashed.*log"):
         read(path)
 
@@ -50,12 +57,57 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
 def test_hdf5_with_our_own_mark_is_read_apart_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, kinds = tmp_path / "run.nc", []
 
-    def seen(work: object, kind: str, *arguments: object, limit: float) -> object:
+    def seen(work: object, file: Path, kind: str, *arguments: object, **limits: Any) -> object:
         kinds.append(kind)
-        return apart(work, kind, *arguments, limit=limit)  # type: ignore[arg-type]
+        return apart(work, file, kind, *arguments, **limits)  # type: ignore[arg-type]
 
     t = np.arange(100) / 100.0
     write(Recording(t, {"p_A": np.sin(t)}, {"p_A": "Pa"}, 100.0), path)
-    monkeypatch.setattr("sealscope.recordings.files.apart", seen)
+    monkeypatch.setattr("sealscope.recordings.files.file_apart", seen)
     assert (read(path)["p_A"] == np.sin(t)).all()
     assert kinds == ["netcdf"]  # anybody can write the mark
+
+
+def test_memory_is_limited_for_each_request() -> None:
+    pytest.importorskip("resource")
+    with pytest.raises(MemoryError):
+        apart(bytearray, 2**30, limit=10.0, memory=2**29)
+    assert len(apart(bytearray, 2**28, limit=10.0, memory=2**30)) == 2**28
+
+
+def test_files_are_limited_and_removed_with_the_process(tmp_path: Path) -> None:
+    """What a reader keeps in its temporary folder does not outlive it, however it ends."""
+    pytest.importorskip("resource")
+    with pytest.raises(RuntimeError, match="File too large"):
+        apart(Path.write_bytes, tmp_path / "large", bytes(2**20), limit=10.0, disk=2**19)
+    folder = Path(apart(tempfile.mkdtemp, limit=10.0))
+    assert folder.is_dir()
+    with pytest.raises(CrashedApartError, match="crashed"):
+        apart(os.abort, limit=10.0)
+    assert not folder.exists()
+
+
+def test_a_long_work_holds_no_other_thread_up() -> None:
+    with ThreadPoolExecutor() as threads:
+        long = threads.submit(apart, time.sleep, 1.0, limit=10.0)
+        while threads.submit(apart, operator.add, 1, 1, limit=10.0).result() == 2 and not long.running():
+            pass
+        assert apart(operator.add, 2, 3, limit=10.0) == 5
+        assert not long.done()
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks Linux for the state of a process")
+def test_work_whose_program_was_killed_ends_at_its_limit(tmp_path: Path) -> None:
+    """It does not see the end of its standard input while it works."""
+    text = "import os, time\nfrom sealscope.recordings.apart import apart\n"
+    text += "print(apart(os.getpid, limit=9.0), flush=True)\napart(time.sleep, 60.0, limit=0.5)\n"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True, env=environment) as program:
+        assert program.stdout is not None
+        status = Path(f"/proc/{int(program.stdout.readline())}/status")
+        time.sleep(0.2)
+        program.kill()
+    end = time.monotonic() + 5.0
+    while status.exists() and "State:\tZ" not in status.read_text():
+        assert time.monotonic() < end
+        time.sleep(0.05)

@@ -27,7 +27,7 @@ def refused(path: Path, **options: object) -> str:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "a recording must have samples, got an empty file (FILE)"),
+        ("", "a recording must hold data, got an empty file (FILE)"),
         ("\n  \n", "a recording must have samples, got an empty file (FILE)"),
         ("t [s],p_A [Pa]\n", "a recording must have samples, got no row of numbers after t [s], p_A [Pa] (FILE)"),
         (

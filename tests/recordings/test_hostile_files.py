@@ -101,7 +101,7 @@ def test_whatever_a_format_library_raises_names_the_file(
         raise error("odd\nthing")
 
     monkeypatch.setattr(f"sealscope.recordings.formats.{module}.{inner}", fail)
-    monkeypatch.setattr("sealscope.recordings.files.apart", lambda work, *arguments, limit: work(*arguments))
+    monkeypatch.setattr("sealscope.recordings.files.file_apart", lambda work, *arguments, **limits: work(*arguments))
     kind = {"text": "text", "netcdf": "NetCDF or HDF5", "parquet": "Parquet"}[module]
     with caplog.at_level(logging.DEBUG, "sealscope"):
         assert refused(path) == f"a {kind} file must be whole, got: odd thing (FILE)"

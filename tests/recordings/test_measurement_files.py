@@ -156,7 +156,7 @@ def test_what_is_not_read_names_the_way_out(name: str, content: bytes, way_out: 
 
 
 def test_what_an_archive_unpacks_to_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sealscope.recordings.archives.LARGEST", 1_000_000)
+    monkeypatch.setattr("sealscope.storage.unpacking.LARGEST", 1_000_000)
     (tmp_path / "bomb.csv.gz").write_bytes(gzip.compress(b"0" * 20_000_000))
     with pytest.raises(UnreadableFile, match="must unpack to at most 1000000 bytes"):
         read(tmp_path / "bomb.csv.gz")

@@ -271,6 +271,13 @@ def test_sensors_carry_the_files_own_names(recording, make_diagnosis):
     assert "column Druck A [bar]" in text and "no channel" not in text.split("Where the recording")[0]
 
 
+def test_signs_that_a_terminal_obeys_are_replaced(recording, make_diagnosis):
+    about = {"Test\x9b2J": "a\x1b]0;title\x07\x1b[31m", "Operator": "a \u202egnp.exe", "Line": "one\r\ntwo\tthree"}
+    page = render_page(replace(recording, provenance={"about": about}), make_diagnosis(file="odd\x1b[2J.nc"))
+    assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", page)
+    assert "\N{REPLACEMENT CHARACTER}[31m" in page
+
+
 def test_machine_date_operator_and_oil_stand_under_the_title(recording, make_diagnosis):
     about = {"Bediener": "A. B.", "Test": "weekly", "Öltemperatur": "41 °C", "Prüfling": "Press 7"}
     known = replace(recording, provenance={"about": about, "start": "2026-05-31T14:05:00.250000000"})

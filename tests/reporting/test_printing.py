@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import shutil
+import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -110,6 +111,69 @@ def test_a_picture_of_another_size_is_refused(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(InputError, match="must make a picture of the size asked for, got status 0: no message"):
         printing.draw_page(PAGE, tmp_path / "card.png", 1200, 630)
     assert [path.name for path in tmp_path.iterdir()] == ["browser"]
+
+
+def _browser_that_copies(path: Path, name: str, content: bytes) -> str:
+    """Write a program that is called as a browser, and makes a file of this content."""
+    (path / "content").write_bytes(content)
+    program = path / "browser"
+    program.write_text(
+        f'#!/bin/sh\nfor a in "$@"; do case $a in --{name}=*) cat {path / "content"} > "${{a#*=}}";; esac; done\n'
+    )
+    program.chmod(0o755)
+    return str(program)
+
+
+def _png(width: int, height: int) -> bytes:
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">L", len(data)) + name + data + struct.pack(">L", zlib.crc32(name + data))
+
+    head = struct.pack(">LL5B", width, height, 8, 0, 0, 0, 0)
+    pixels = zlib.compress(bytes(height * (width + 1)))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+PDF = b"%PDF-1.4\n1 0 obj\n<<>>\nendobj\nxref\n0 1\n0000000000 65535 f \ntrailer\n<<>>\nstartxref\n29\n%%EOF\n"
+
+
+@pytest.mark.parametrize("kind", ["pdf", "png"])
+def test_what_a_full_disk_cuts_off_replaces_nothing(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A browser ends with status 0 all the same; whatever it cuts off, the file of before is there."""
+    whole, target, tools = (PDF if kind == "pdf" else _png(40, 30)), tmp_path / f"out.{kind}", tmp_path / "tools"
+    tools.mkdir()
+    for length in range(0, len(whole) - 1, 7 if kind == "pdf" else 5):
+        cut = whole[:length]
+        name = "print-to-pdf" if kind == "pdf" else "screenshot"
+        monkeypatch.setattr(printing, "BROWSERS", (_browser_that_copies(tools, name, cut),))
+        target.write_text("what was there before")
+        with pytest.raises(InputError, match="a browser must make a "):
+            printing.print_page(PAGE, target) if kind == "pdf" else printing.draw_page(PAGE, target, 40, 30)
+        assert target.read_text() == "what was there before"
+        assert sorted(path.name for path in tmp_path.iterdir()) == [target.name, "tools"]
+    _browser_that_copies(tools, name, whole)
+    printing.print_page(PAGE, target) if kind == "pdf" else printing.draw_page(PAGE, target, 40, 30)
+    assert target.read_bytes() == whole
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no browser of Chromium's family on this machine")
+@pytest.mark.parametrize("kind", ["pdf", "png"])
+def test_a_browser_on_a_full_disk(kind: str, tmp_path: Path, recording, make_diagnosis) -> None:
+    """No file may become longer than `size` bytes, here or in the browser."""
+    resource = pytest.importorskip("resource")
+    target, before = tmp_path / f"page.{kind}", resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in (4_000, 12_000, 20_000):
+        target.write_text("what was there before")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            with pytest.raises(InputError):
+                write_page(target, recording, make_diagnosis())
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert target.read_text() == "what was there before"
+        assert [path.name for path in tmp_path.iterdir()] == [target.name]
+    write_page(target, recording, make_diagnosis())
+    assert target.stat().st_size > 20_000
 
 
 def test_without_a_printer_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -130,6 +130,48 @@ def test_a_file_to_write_takes_the_place_of_a_link(name: str, outside: Path, tmp
     assert (tmp_path / name).read_text() == "new"
 
 
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, None])
+def test_a_file_that_is_replaced_keeps_its_mode(mode: int | None, tmp_path: Path) -> None:
+    """And is private while it is written."""
+    path = tmp_path / "out.csv"
+    if mode is not None:
+        path.touch()
+        path.chmod(mode)
+    before = os.umask(0o027)
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_text("new")
+            assert temporary.stat().st_mode & 0o777 == 0o600
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == (0o640 if mode is None else mode)
+
+
+def test_what_is_written_is_on_the_disk_before_its_name_and_the_name_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A loss of power cannot be played: what is asked of the system, in its order, says what it could leave."""
+    calls: list[tuple[str, str]] = []
+    sync, rename = os.fsync, Path.replace
+
+    def synced(number: int) -> None:
+        name = Path(f"/proc/self/fd/{number}").readlink().name
+        calls.append(("sync", name if name == tmp_path.name else (tmp_path / name).read_text()))
+        sync(number)
+
+    def renamed(source: Path, target: Path) -> Path:
+        calls.append(("rename", target.name))
+        return rename(source, target)
+
+    if not Path("/proc/self/fd").exists():
+        pytest.skip("asks Linux for the name of an open file")
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(Path, "replace", renamed)
+    with atomic_write(tmp_path / "out.csv") as temporary:
+        temporary.write_text("new")
+    assert calls == [("sync", "new"), ("rename", "out.csv"), ("sync", tmp_path.name)]
+
+
 @pytest.mark.parametrize("kind", ["simulated", "recordings", "held out"])
 @pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "a" * 81])
 def test_a_plan_names_no_folder_elsewhere(kind: str, name: str, tmp_path: Path) -> None:

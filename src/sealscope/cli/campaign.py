@@ -92,6 +92,10 @@ def run(
     device: Annotated[
         str, typer.Option("--device", metavar="cpu|gpu", help="What batches run on; gpu stands for --batch.")
     ] = "cpu",
+    trust: Annotated[
+        bool,
+        typer.Option("--trust", help="Run the controllers that the plan leads to (FILE.py:NAME): read them first."),
+    ] = False,
     sheet: SheetOption = None,
     data: DataOption = None,
 ) -> None:
@@ -111,8 +115,9 @@ def run(
         say_jobs(jobs)
         with progress_bar() as progress:
             state = carry_out(
-                loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, device=device
-            )
+                loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, device=device,
+                trust=trust,
+            )  # fmt: skip
         typer.echo(_progress_text(state))
     _report(loaded, place, sheet, data)
     if isinstance(loaded, SimulatedPlan) and state.failed:

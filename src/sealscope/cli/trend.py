@@ -163,4 +163,4 @@ def _write(output: Path, text: str) -> None:
     from sealscope.storage.atomic import atomic_write
 
     with atomic_write(output) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")  # a file's name

@@ -1,4 +1,8 @@
-"""Controllers by name: the ones that are built in, and a user's own as `MODULE:NAME` or `FILE.py:NAME`."""
+"""Controllers by name: those that are built in or installed, and a user's own as `MODULE:NAME` or `FILE.py:NAME`.
+
+A distribution installs a controller by an entry point of the group `sealscope.controllers`, of a class or function as
+`controller_named` calls it.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,9 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
+from functools import cache
 from hashlib import sha256
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,12 +35,36 @@ CONTROLLERS: Mapping[str, Callable[[Rig], Controller]] = {
 }
 
 
+GROUP = "sealscope.controllers"
+
+
+@cache
+def _installed() -> Mapping[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def is_installed(name: str) -> bool:
+    """Return whether a controller of this name is built in or installed, and no program that the name leads to."""
+    return name in CONTROLLERS or name in _installed()
+
+
+def check_name(name: str) -> None:
+    """Raise InputError where no controller can be called so; nothing is imported for that."""
+    place, mark, attribute = name.rpartition(":")
+    if not is_installed(name) and not (mark and place and attribute):
+        known = (*CONTROLLERS, *_installed())
+        raise InputError(
+            f"controller must be one of {', '.join(known)}, or MODULE:NAME or FILE.py:NAME of your own, got {name!r}"
+            f"{closest(name, known)}"
+        )
+
+
 def controller_named(name: str, rig: Rig) -> Controller:
     """Return the controller of a name for what a rig is said to be.
 
-    `name`: one of `CONTROLLERS`, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function: called with the rig
-    where it has a method `of`, that is called instead. Raises InputError for an unknown name, and for what is made
-    without `rate`, `delay` and `start`.
+    `name`: one of `CONTROLLERS` or of an installed one, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function:
+    called with the rig; where it has a method `of`, that is called instead. Raises InputError for an unknown name, and
+    for what is made without `rate`, `delay` and `start`.
 
     Examples
     --------
@@ -45,15 +75,10 @@ def controller_named(name: str, rig: Rig) -> Controller:
     """
     if name in CONTROLLERS:
         return CONTROLLERS[name](rig)
-    place, mark, attribute = name.rpartition(":")
-    if not mark or not place or not attribute:
-        known = ", ".join(CONTROLLERS)
-        raise InputError(
-            f"controller must be one of {known}, or MODULE:NAME or FILE.py:NAME of your own, got {name!r}"
-            f"{closest(name, tuple(CONTROLLERS))}"
-        )
+    check_name(name)
+    place, _, attribute = name.rpartition(":")
     try:
-        make: Any = getattr(_module(place), attribute)
+        make: Any = _installed()[name].load() if name in _installed() else getattr(_module(place), attribute)
         made = make.of(rig) if hasattr(make, "of") else make(rig)
     except InputError:
         raise
@@ -66,11 +91,30 @@ def controller_named(name: str, rig: Rig) -> Controller:
 
 
 def source_of(name: str) -> Path | None:
-    """Return the file that a user's own controller is written in, None for a built-in one."""
-    place = name.rpartition(":")[0]
-    if name in CONTROLLERS or not place:
+    """Return the file that a user's own or an installed controller is written in, None for a built-in one.
+
+    Nothing is imported for that. Raises InputError where there is no such file.
+    """
+    if name in CONTROLLERS:
         return None
-    return Path(getattr(_module(place), "__file__", None) or place)
+    place = _installed()[name].module if name in _installed() else name.rpartition(":")[0]
+    path = Path(place) if place.endswith(".py") else _file_of(place)
+    if path is None or not path.is_file():
+        raise InputError(f"a controller's file must exist, got {place}")
+    return path
+
+
+def _file_of(module: str) -> Path | None:
+    """Return the file of a module, whose packages are not imported."""
+    parts, folders = module.split("."), None
+    for count in range(1, len(parts) + 1):
+        name = ".".join(parts[:count])
+        specs = (finder.find_spec(name, folders) for finder in sys.meta_path)
+        spec = next((spec for spec in specs if spec is not None), None)
+        if spec is None:
+            return None
+        folders = spec.submodule_search_locations
+    return Path(spec.origin) if spec is not None and spec.origin else None
 
 
 def _module(place: str) -> Any:

@@ -96,7 +96,7 @@ def compiler() -> tuple[list[str], bool]:
     from importlib.util import find_spec
 
     if find_spec("ziglang") is not None:
-        return [sys.executable, "-m", "ziglang", "cc"], True
+        return [sys.executable, "-P", "-m", "ziglang", "cc"], True
     for name in ("cc", "gcc", "clang"):
         if path := shutil.which(name):
             return [path], False

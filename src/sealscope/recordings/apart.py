@@ -1,29 +1,39 @@
-"""Work that a damaged file can crash or hold for ever, done in a process of its own with a time limit.
+"""Work that a damaged file can crash, hold for ever or fill the memory with, done in a process of its own with limits.
 
-The C libraries of some formats do both, and no signal reaches them. The process is started when it is first needed,
+The C libraries of some formats do all three, and no signal reaches them. A process is started when it is first needed,
 serves one request after the other, and ends with the program. It is a fresh interpreter and not a copy of the program,
-so that scripts need no guard.
+so that scripts need no guard; it imports nothing from the working folder.
 """
 
 from __future__ import annotations
 
 import os
 import pickle
+import signal
 import subprocess
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from threading import Lock, Timer
+from pathlib import Path
+from threading import BoundedSemaphore, Timer
 from typing import Any, TypeVar
 
-from sealscope.errors import SealscopeError
+from sealscope.errors import SealscopeError, UnreadableFile
+from sealscope.storage.unpacking import LARGEST
 
 T = TypeVar("T")
 #: Time that starting the process may take beside the work [s].
 _START = 30.0
 #: Memory that the process may take [bytes]: the values that a recording may have, a few times over.
 MOST_MEMORY = 12 * 2**30
+#: A process that keeps more after its work is not used again [bytes].
+_KEPT_MEMORY = 2**30
+#: Processes that work side by side at most: a file that takes long holds no other thread's files up.
+_MOST_PROCESSES = 4
+#: Threads of libraries take memory each, as many as the machine has cores.
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class CrashedApartError(RuntimeError):
@@ -37,53 +47,69 @@ class _RaisedApart(Exception):  # noqa: N818 - it is raised by nobody: the cause
         return f"\n{self.args[0]}"
 
 
-class _Server:
-    """The process, and the lock that gives it one request at a time."""
+class _Process:
+    """A process that carries out one request after the other."""
 
     def __init__(self) -> None:
-        self.lock = Lock()
-        self.process: subprocess.Popen[bytes] | None = None
+        self.fresh = True
+        self._folder = tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True)
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "sealscope.recordings.apart"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **_ONE_THREAD, "TMPDIR": self._folder.name},  # what it leaves there is removed
+        )
 
-    def ask(self, request: bytes, limit: float) -> Any:
-        with self.lock:
-            fresh = self.process is None or self.process.poll() is not None
-            if fresh:
-                self.process = subprocess.Popen(
-                    [sys.executable, "-m", "sealscope.recordings.apart"],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.DEVNULL,
-                )
-            process = self.process
-            assert process is not None and process.stdin is not None and process.stdout is not None
-            overdue = Timer(limit + _START * fresh, process.kill)
-            overdue.daemon = True
-            overdue.start()
-            try:
-                process.stdin.write(request)
-                process.stdin.flush()
-                return pickle.load(process.stdout)
-            except (EOFError, OSError, pickle.UnpicklingError):
-                what = "crashed" if overdue.is_alive() else f"took over {limit:g} s"
-                self._end()
-                raise CrashedApartError(f"the library that reads it {what}") from None
-            except BaseException:  # an interrupt: the answer would come to the next request
-                self._end()
-                raise
-            finally:
-                overdue.cancel()
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
 
-    def _end(self) -> None:
-        if self.process is not None:
-            self.process.kill()
-            self.process.communicate()
-            self.process = None
+    def ask(self, request: bytes, limit: float) -> tuple[Any, str | None, bool]:
+        """Return what the work gave or raised, the traceback of what it raised, and whether the process is spent."""
+        process = self._process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        overdue = Timer(limit + 1.0 + _START * self.fresh, process.kill)  # it ends itself at its limit
+        overdue.daemon = True
+        overdue.start()
+        try:
+            process.stdin.write(request)
+            process.stdin.flush()
+            value, where = pickle.load(process.stdout)
+            spent = bool(pickle.load(process.stdout))
+        except (EOFError, OSError, pickle.UnpicklingError):
+            late = not overdue.is_alive() or process.wait() == -getattr(signal, "SIGALRM", 0)
+            what = f"took over {limit:g} s" if late else "crashed"
+            raise CrashedApartError(f"the library that reads it {what}") from None
+        finally:
+            overdue.cancel()
+        self.fresh = False
+        return value, where, spent
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+        self._folder.cleanup()
 
 
-_server = _Server()
+_places = BoundedSemaphore(_MOST_PROCESSES)
+_idle: list[_Process] = []
 
 
-def apart(work: Callable[..., T], *arguments: Any, limit: float) -> T:
+def _process() -> _Process:
+    """Return a process that waits for work, else a new one."""
+    while True:
+        try:
+            process = _idle.pop()
+        except IndexError:
+            return _Process()
+        if process.alive:
+            return process
+        process.end()
+
+
+def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST) -> T:
     """Return ``work(*arguments)``, carried out in a process of its own.
 
     Parameters
@@ -94,48 +120,98 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float) -> T:
         What it is called with.
     limit : float
         Longest time that it may take [s].
+    memory : int
+        Most memory that it may take [bytes]; `MOST_MEMORY` and half the machine's at most.
+    disk : int
+        Longest file that it may write [bytes].
 
     Raises
     ------
     CrashedApartError
         The process crashed or took longer.
-    SealscopeError, RuntimeError
+    SealscopeError, MemoryError, RuntimeError
         What the function raised; other kinds are a RuntimeError of the same text.
     """
-    value, where = _server.ask(pickle.dumps((work, arguments)), limit)
+    with _places:
+        process = _process()
+        try:
+            value, where, spent = process.ask(pickle.dumps((work, arguments, (limit, memory, disk))), limit)
+        except BaseException:  # also an interrupt: the answer would come to the next request
+            process.end()
+            raise
+        if spent:
+            process.end()
+        else:
+            _idle.append(process)
     if where is not None:
         raise value from _RaisedApart(where)
     return value  # type: ignore[no-any-return]
 
 
-def _limit_memory() -> None:
-    """Let this process take `MOST_MEMORY` at most, where the system can: a tiny file may ask for any amount."""
+def file_apart(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
+    """Return ``work(file, *arguments)`` as `apart` does; what it raises names the file as it is given here."""
+    place = file.absolute()  # the process may work in another folder
+    try:
+        return apart(work, place, *arguments, **limits)
+    except UnreadableFile as error:
+        raise UnreadableFile(str(error).replace(str(place), str(file))) from error
+
+
+def _limit(seconds: float, memory: int, disk: int) -> None:
+    """Let this process take so much time, memory and disk at most, where the system can.
+
+    The time is kept here, too: a process whose parent was killed ends all the same.
+    """
     with suppress(ImportError, AttributeError, OSError, ValueError):
+        signal.setitimer(signal.ITIMER_REAL, seconds)
         import resource
 
-        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        most = MOST_MEMORY if hard == resource.RLIM_INFINITY else min(MOST_MEMORY, hard)
-        resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
+        machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        for kind, most in (
+            (resource.RLIMIT_DATA, min(memory, MOST_MEMORY, machine // 2)),
+            (resource.RLIMIT_FSIZE, disk),
+        ):
+            _, hard = resource.getrlimit(kind)
+            resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+
+
+def _is_spent() -> bool:
+    """Return whether this process keeps more memory than one that waits for work may hold."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[5])  # of data, which the limit counts
+    except OSError:
+        return False
+    return pages * os.sysconf("SC_PAGE_SIZE") > _KEPT_MEMORY
 
 
 def _serve() -> None:
     """Answer requests on standard input until it ends; what libraries print goes nowhere."""
-    _limit_memory()
     answers = os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 - for the life of the process
     with suppress(EOFError, KeyboardInterrupt, BrokenPipeError):
         while True:
-            work, arguments = pickle.load(sys.stdin.buffer)
-            try:
-                answer: tuple[Any, str | None] = (work(*arguments), None)
-            except SealscopeError as error:
-                answer = (error, traceback.format_exc())
-            except Exception as error:
-                answer = (RuntimeError(" ".join(str(error).split()) or type(error).__name__), traceback.format_exc())
-            answers.write(pickle.dumps(answer, protocol=5))
+            work, arguments, limits = pickle.load(sys.stdin.buffer)
+            _limit(*limits)
+            value, where = _carried_out(work, arguments)
+            _limit(0.0, MOST_MEMORY, LARGEST)
+            answers.write(pickle.dumps((value, where), protocol=5))
+            del work, arguments, value
+            pickle.dump(_is_spent(), answers)
             answers.flush()
+    with suppress(OSError):  # the program may have been killed
+        Path(tempfile.gettempdir()).rmdir()
+
+
+def _carried_out(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, str | None]:
+    """Return what the work gives, and None; or what it raised, as a kind that the program knows, and where."""
+    try:
+        return work(*arguments), None
+    except (SealscopeError, MemoryError) as error:
+        return error, traceback.format_exc()
+    except Exception as error:
+        return RuntimeError(" ".join(str(error).split()) or type(error).__name__), traceback.format_exc()
 
 
 if __name__ == "__main__":

@@ -1,19 +1,26 @@
-"""Recordings in an archive (.gz, .bz2, .xz, .zst, .zip, .tar), unpacked into a private folder while they are read."""
+"""Recordings in an archive (.gz, .bz2, .xz, .zst, .zip, .tar), unpacked into a private folder while they are read.
+
+A process of its own unpacks (`apart`), and stops where more comes out than a file of this size may hold.
+"""
 
 from __future__ import annotations
 
+import shutil
 import tarfile
 import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any, TypeVar, cast
 
 from sealscope.errors import UnreadableFile
+from sealscope.recordings.apart import file_apart
 from sealscope.recordings.formats.libraries import library
 from sealscope.storage.opening import open_regular, whole
+from sealscope.storage.unpacking import check_unpacked
 
+T = TypeVar("T")
 #: First bytes -> archive.
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "xz", b"\x28\xb5\x2f\xfd": "zstd", b"PK\x03\x04": "zip"}
 #: Where a tar archive says that it is one.
@@ -22,9 +29,9 @@ _TAR_AT, _TAR = 257, b"ustar"
 _DOCUMENTS = (".pdf", ".md", ".png", ".jpg", ".jpeg", ".doc", ".docx", ".html", ".xml", ".json", ".toml", ".ini")
 #: A workbook is a ZIP archive with one of these members.
 _WORKBOOK = ("[Content_Types].xml", "mimetype")
-#: Most bytes that an archive may unpack to.
-LARGEST = 8 * 2**30
-_CHUNK = 2**20
+#: Longest time that unpacking may take [s], and what is added for the size of the archive [bytes/s].
+_LONGEST, _SLOWEST = 20.0, 1e6
+_CHUNK, _MEMORY = 2**20, 2**30
 
 
 def archive_of(path: Path) -> str | None:
@@ -37,37 +44,58 @@ def archive_of(path: Path) -> str | None:
     if head[_TAR_AT : _TAR_AT + len(_TAR)] == _TAR:
         return "tar"
     kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
-    return None if kind == "zip" and _is_workbook(path) else kind
+    if kind == "zip":
+        with whole("a zip archive", path):
+            return None if _apart(_is_workbook, path) else kind
+    return kind
+
+
+def _apart(work: Callable[..., T], path: Path, *arguments: Any) -> T:
+    limit = _LONGEST + path.stat().st_size / _SLOWEST
+    return file_apart(work, path, *arguments, limit=limit, memory=_MEMORY)
 
 
 def _is_workbook(path: Path) -> bool:
-    with whole("a zip archive", path), zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(path) as archive:
         return any(name in archive.NameToInfo for name in _WORKBOOK)
 
 
 @contextmanager
-def unpacked(path: Path, kind: str) -> Iterator[Path]:
+def unpacked(path: Path, kind: str, most: int) -> Iterator[Path]:
     """Unpack the single file of an archive, and remove it at the end.
 
     Raises UnreadableFile where a ZIP or tar holds no recording or several, where the archive is damaged, and where it
-    unpacks to more than `LARGEST` bytes; MissingExtra for .zst without pyarrow.
+    unpacks to more than `most` bytes, or half of what the disk has room for; MissingExtra for .zst without pyarrow.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
-        name = path.stem if path.suffix.lower() in (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz") else path.name
-        with whole(f"a {kind} archive", path), _opened(path, kind) as (source, member):
-            last = Path(member or name).name
-            target = Path(folder) / (last if last.strip(".") else "recording")
-            _copy(source, target, path)
+        most = min(most, shutil.disk_usage(folder).free // 2)
+        with whole(f"a {kind} archive", path):
+            target = _apart(_unpack, path, kind, Path(folder), most)
         yield target
 
 
+def _unpack(path: Path, kind: str, folder: Path, most: int) -> Path:
+    """Write the single file of an archive into a folder, and return its path."""
+    name = path.stem if path.suffix.lower() in (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz") else path.name
+    with _opened(path, kind) as (source, member, size):
+        check_unpacked(size, most, path)
+        last = Path(member or name).name
+        target = folder / (last if last.strip(".") else "recording")
+        with target.open("wb") as file:
+            while data := source.read(_CHUNK):
+                check_unpacked(file.tell() + len(data), most, path)
+                file.write(data)
+    return target
+
+
 @contextmanager
-def _opened(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str]]:
+def _opened(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
+    """Open the single file of an archive; its name and size are "" and 0 where the archive does not say."""
     if kind == "zip":
         with zipfile.ZipFile(path) as archive:
             name = _only([info.filename for info in archive.infolist() if not info.is_dir()], path)
             with archive.open(name) as file:
-                yield file, name
+                yield file, name, archive.getinfo(name).file_size
         return
     if kind == "tar":
         with tarfile.open(path) as archive:
@@ -75,10 +103,10 @@ def _opened(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str]]:
             inner = archive.extractfile(name)
             assert inner is not None
             with inner:
-                yield inner, name
+                yield inner, name, archive.getmember(name).size
         return
     with cast("IO[bytes]", _stream(path, kind)) as file:
-        yield file, ""
+        yield file, "", 0
 
 
 def _only(names: Sequence[str], path: Path) -> str:
@@ -108,13 +136,3 @@ def _stream(path: Path, kind: str) -> Any:
 
         return lzma.open(path)
     return library("pyarrow", "a .zst archive", "pyarrow").CompressedInputStream(str(path), "zstd")
-
-
-def _copy(source: IO[bytes], target: Path, path: Path) -> None:
-    written = 0
-    with target.open("wb") as file:
-        while data := source.read(_CHUNK):
-            written += len(data)
-            if written > LARGEST:
-                raise UnreadableFile(f"an archive must unpack to at most {LARGEST} bytes, got more ({path})")
-            file.write(data)

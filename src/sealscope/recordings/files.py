@@ -14,7 +14,7 @@ from typing import cast
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.apart import apart
+from sealscope.recordings.apart import file_apart
 from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
@@ -28,6 +28,7 @@ from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
 from sealscope.recordings.recording import Recording
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
+from sealscope.storage.unpacking import most_unpacked
 
 Reader = Callable[[Path, Choose], RawTable]
 Writer = Callable[..., None]
@@ -125,10 +126,12 @@ _PROPRIETARY = {
     ".wdf": "a file of a Yokogawa recorder: export it as CSV",
     ".trc": "a file of an oscilloscope: export it as CSV",
 }
-#: Formats whose libraries end the process on some damaged files.
-_APART = ("matlab", "mdf", "netcdf")
-#: Longest time that such a file may take [s], and what is added for its size [bytes/s].
-_LONGEST, _SLOWEST = 10.0, 20e6
+#: Formats that are read in the program itself; the others' libraries end it, or fill its memory, on some files.
+_TEXTS = ("text", "lvm", "json")
+#: Longest time that such a file may take [s], and what is added for its size [bytes/s]; most memory [bytes], and so
+#: many times its size.
+_LONGEST, _SLOWEST, _SLOWEST_SHEETS = 10.0, 20e6, 5e5
+_MEMORY, _MEMORY_SHARE = 2**31, 64
 #: Archives within archives that are unpacked.
 _DEEPEST_ARCHIVE = 3
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -168,14 +171,16 @@ def _reader(kind: str) -> Reader:
 
 
 def _table(kind: str, file: Path, choose: Choose) -> RawTable:
-    """Read a table, by a process of its own where the format's C library crashes or loops on damaged files."""
-    if kind in _APART:
-        limit = _LONGEST + file.stat().st_size / _SLOWEST
-        return apart(_read_here, kind, file.absolute(), choose, limit=limit)
-    return _read_here(kind, file, choose)
+    """Read a table, by a process of its own where the format is none of text."""
+    if kind in _TEXTS:
+        return _read_here(file, kind, choose)
+    size = file.stat().st_size
+    limit = _LONGEST + size / (_SLOWEST_SHEETS if kind == "spreadsheet" else _SLOWEST)
+    memory = _MEMORY + _MEMORY_SHARE * size
+    return file_apart(_read_here, file, kind, choose, limit=limit, memory=memory, disk=most_unpacked(file))
 
 
-def _read_here(kind: str, file: Path, choose: Choose) -> RawTable:
+def _read_here(file: Path, kind: str, choose: Choose) -> RawTable:
     return _reader(kind)(file, choose)
 
 
@@ -334,13 +339,15 @@ def _inner(file: Path) -> Iterator[Path]:
         reason = getattr(error, "strerror", None) or error
         raise UnreadableFile(f"a recording must be readable, got: {reason} ({file})") from error
     with ExitStack() as folders:
-        inner, depth = file, 0
-        while archive is not None and depth < _DEEPEST_ARCHIVE:  # a .tar.gz is an archive in an archive
-            inner, depth = folders.enter_context(unpacked(inner, archive)), depth + 1
-            archive = archive_of(inner)
+        inner, depth, most = file, 0, most_unpacked(file)
         try:
+            while archive is not None and depth < _DEEPEST_ARCHIVE:  # a .tar.gz is an archive in an archive
+                inner, depth = folders.enter_context(unpacked(inner, archive, most)), depth + 1
+                archive = archive_of(inner)
             yield inner
         except UnreadableFile as error:
+            if inner == file:
+                raise
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 

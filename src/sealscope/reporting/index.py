@@ -30,7 +30,7 @@ def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagno
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     rows = [
         {
-            "href": quote(page.name),
+            "href": quote(os.fsencode(page.name)),
             "file": Path(diagnosis.file).name,
             "verdict": diagnosis.verdict,
             "summary": diagnosis.summary,

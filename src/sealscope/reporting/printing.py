@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import struct
 import subprocess
 import tempfile
+import zlib
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from sealscope.errors import InputError, MissingExtra
@@ -42,7 +46,8 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
     browser = _browser()
     with atomic_write(path) as temporary:
         if browser is not None:
-            _by_browser(browser, page, temporary, ["--no-pdf-header-footer", f"--print-to-pdf={temporary}"], b"%PDF")
+            options = ["--no-pdf-header-footer", f"--print-to-pdf={temporary}"]
+            _by_browser(browser, page, temporary, options, "PDF", _is_whole_pdf)
             return Path(browser).name
         try:
             from weasyprint import HTML
@@ -52,6 +57,8 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
                 f"write .html ({path})"
             ) from error
         HTML(string=_styles_in_place(page)).write_pdf(temporary)  # without scripts: charts stand as on paper
+        if not _is_whole_pdf(temporary.read_bytes()):
+            raise InputError(f"a PDF must be written to its end, got less: is the disk full? ({path})")
         return "WeasyPrint"
 
 
@@ -67,9 +74,8 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
         picture = temporary.with_name(f"{temporary.name}.png")  # a browser draws only into a name that ends so
         options = ["--hide-scrollbars", "--force-device-scale-factor=1", f"--window-size={width},{height}"]
         try:
-            head = b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4, "big") + b"IHDR"
-            size = width.to_bytes(4, "big") + height.to_bytes(4, "big")
-            _by_browser(browser, page, picture, [*options, f"--screenshot={picture}"], head + size)
+            kind, is_whole = "picture of the size asked for", partial(_is_whole_png, width=width, height=height)
+            _by_browser(browser, page, picture, [*options, f"--screenshot={picture}"], kind, is_whole)
             picture.replace(temporary)
         finally:
             picture.unlink(missing_ok=True)
@@ -96,8 +102,31 @@ def _browser() -> str | None:
     return next(filter(None, map(shutil.which, (*BROWSERS, *_PLACES))), None)
 
 
-def _by_browser(browser: str, page: str, target: Path, options: list[str], begins: bytes) -> None:
-    """Let a browser write `target`, a file that must begin so."""
+def _is_whole_pdf(data: bytes) -> bool:
+    """Return whether a PDF is there to its end, and its table of contents where the end says (ISO 32000-1, 7.5.5)."""
+    end = re.search(rb"startxref\s+(\d+)\s+%%EOF\s*$", data[-1024:])
+    return end is not None and re.match(rb"%PDF.*(xref|\d+ \d+ obj)", data[:4] + data[int(end[1]) :][:20]) is not None
+
+
+def _is_whole_png(data: bytes, width: int, height: int) -> bool:
+    """Return whether a PNG of this size is there to its end: chunks of the right checksum, IEND last."""
+    if not data.startswith(struct.pack(">8sL4sLL", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", width, height)):
+        return False
+    at = 8
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if zlib.crc32(data[at + 4 : end]).to_bytes(4, "big") != data[end : end + 4]:
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end + 4
+    return False
+
+
+def _by_browser(
+    browser: str, page: str, target: Path, options: list[str], kind: str, is_whole: Callable[[bytes], bool]
+) -> None:
+    """Let a browser write `target`, a file of this kind; InputError where it is not there to its end."""
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"
         source.write_text(page, encoding="utf-8", errors="backslashreplace")
@@ -114,7 +143,9 @@ def _by_browser(browser: str, page: str, target: Path, options: list[str], begin
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             raise InputError(f"a browser must end within {_LONGEST:g} s, got: {error} ({browser})") from None
-    if not (target.is_file() and target.read_bytes().startswith(begins)):
+    data = target.read_bytes() if target.is_file() else b""
+    if not is_whole(data):
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
-        kind = "PDF" if begins.startswith(b"%PDF") else "picture of the size asked for"
-        raise InputError(f"a browser must make a {kind}, got status {done.returncode}: {last[0][:160]} ({browser})")
+        got = f"status {done.returncode}: {last[0][:160]}"
+        got += f", and {len(data)} bytes: is the disk full?" if data else ""
+        raise InputError(f"a browser must make a {kind}, got {got} ({browser})")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from base64 import b64encode
 from functools import cache
 from hashlib import sha256
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     import jinja2
     from markupsafe import Markup
 
+#: Signs that a terminal or a browser obeys and nobody sees: controls, and what turns the direction of writing.
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 _SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 
@@ -34,9 +37,13 @@ def _environment() -> jinja2.Environment:
 
 
 def render(template: str, **context: Any) -> str:
-    """Return a template of this room filled in; beside `context` it sees `version` and `page_css`."""
+    """Return a template of this room filled in; beside `context` it sees `version` and `page_css`.
+
+    Control characters that a file's name or description brought are replaced.
+    """
     page_css = packaged("templates/page.css")
-    return _environment().get_template(template).render(context, version=_version(), page_css=page_css)
+    page = _environment().get_template(template).render(context, version=_version(), page_css=page_css)
+    return _CONTROLS.sub("\N{REPLACEMENT CHARACTER}", page)
 
 
 def packaged(name: str) -> Markup:

@@ -28,7 +28,9 @@ def _machine() -> str:
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary file in the folder of `path`: renamed to `path` when the block ends well, else removed.
 
-    Raises InputError where the folder does not exist or cannot be written.
+    The file is on the disk before it is renamed, and its new name when the block has ended: a loss of power leaves the
+    old file or the new one. A file that is replaced keeps its mode. Raises InputError where the folder does not exist
+    or cannot be written.
     """
     target = Path(path)
     try:
@@ -43,15 +45,33 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp makes private files: give the file the mode that any new file of this user gets
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
+        _sync(temporary, os.O_RDWR)
+        temporary.chmod(_mode_of(target))
         temporary.replace(target)
+        with suppress(OSError):  # Windows opens no folder, and some file systems sync none
+            _sync(target.parent, os.O_RDONLY)
     except OSError as error:
         raise InputError(f"cannot write {target}: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _mode_of(target: Path) -> int:
+    """Return the mode of the file, or where there is none the mode that any new file of this user gets."""
+    with suppress(FileNotFoundError):
+        return target.stat().st_mode & 0o777
+    mask = os.umask(0)
+    os.umask(mask)
+    return 0o666 & ~mask
+
+
+def _sync(path: Path, flags: int) -> None:
+    """Have the system write a file, or the names in a folder, to the disk."""
+    number = os.open(path, flags)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
 
 
 def remove_temporaries(folder: Path, target: str | None = None) -> None:

@@ -39,9 +39,14 @@ def kind_of(mode: int) -> str | None:
 def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
     """Open the regular file `path` to read; `what` it is ("a recording") stands in the error.
 
-    Raises InputError for a folder, pipe, socket or device, which may never end; OSError where it cannot be opened.
+    Raises InputError for a folder, pipe, socket or device, which may never end, and for a file of no length, as those
+    of the system in /proc are said to be, which may never end either; OSError where it cannot be opened.
     """
-    return _opened(path, what, "rb", _NO_WAITING)
+    opened = _opened(path, what, "rb", _NO_WAITING)
+    if not os.fstat(opened.fileno()).st_size:
+        opened.close()
+        raise InputError(f"{what} must hold data, got an empty file ({path})")
+    return opened
 
 
 def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:

@@ -16,6 +16,7 @@ from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
 from sealscope.campaigns.execution.cluster import on_cluster
 from sealscope.campaigns.execution.workers import Workers, process_count
+from sealscope.campaigns.plans.duty import check_controllers
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
 from sealscope.storage.folders import inner_folder
@@ -36,18 +37,21 @@ def run(
     task: Task = work,
     batch: bool = False,
     device: str = "cpu",
+    trust: bool = False,
 ) -> store.CampaignProgress:
     """Carry out what is missing of the plan in `folder`, and return how far it is then.
 
     `jobs`: processes of this machine, one a core by default and two a core at most, 1 for this process alone;
     `cluster`: address of a Dask scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side
-    by side (`batches`) on the `device`, cpu (with `jobs` threads) or gpu, which implies `batch`. The rows are the same
+    by side (`batches`) on the `device`, cpu (with `jobs` threads) or gpu, which implies `batch`; `trust`: whether
+    controllers that the plan leads to (`FILE.py:NAME`) are run, which may be a stranger's. The rows are the same
     whoever makes them and in whatever order, those of batches in any batch; kinds of records take turns
-    (`interleaved`). Raises InputError where the folder holds another campaign, another run is at work in it, or a batch
-    cannot do what the plan asks for.
+    (`interleaved`). Raises InputError where a controller is not trusted, the folder holds another campaign, another run
+    is at work in it, or a batch cannot do what the plan asks for.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be >= 1, got {jobs}")
+    check_controllers(plan, trust)
     batch = batch or device != "cpu"
     cases = cases_of(plan)
     mode = store.RUN_BY_RUN

@@ -18,7 +18,11 @@ from typing import Any, Generic, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: Environment of a process: one thread for linear algebra, as processes run side by side, and no module from the
+#: working folder, which may be a stranger's.
+_ENVIRONMENT = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "PYTHONSAFEPATH"), "1"
+)
 
 
 class Workers(Generic[Item, Result]):
@@ -50,8 +54,8 @@ class Workers(Generic[Item, Result]):
 
     def begin(self, item: Item) -> None:
         """Begin an item in an idle process, or in a new one."""
-        pool = self._idle.pop() if self._idle else self._new_process()
-        with one_thread_each():  # a process starts with its first item
+        with _worker_environment():  # a process starts with its first item
+            pool = self._idle.pop() if self._idle else self._new_process()
             self._busy[pool.submit(_carry_out, item)] = pool, item
 
     def ended(self) -> list[tuple[Item, Result | None]]:
@@ -104,16 +108,15 @@ def _end_with(lifeline: Connection[Any, Any]) -> None:
 
 
 @contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Let processes that start in the block keep to one thread for linear algebra: the processes run side by side."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update({name: "1" for name, value in before.items() if value is None})
+def _worker_environment() -> Iterator[None]:
+    """Give processes that start in the block `_ENVIRONMENT`, where the caller has not chosen otherwise."""
+    added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
+    os.environ.update(added)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
+        for name in added:
+            os.environ.pop(name, None)
 
 
 def cores() -> int:

@@ -13,6 +13,7 @@ import numpy as np
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
+    from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.parameters import Rig
     from sealscope.simulation.faults import Fault
 
@@ -24,19 +25,45 @@ _LOOKED = 50.0
 
 def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
     """Raise InputError for a level of `command`, `controller` or `load` that no run of `duration` [s] can have."""
-    from sealscope.control import controller_named
+    from sealscope.control.registry import CONTROLLERS, check_name
     from sealscope.simulation.courses import Position, command_or_target, parse_force
     from sealscope.simulation.experiment import check_target
 
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):
         raise InputError(f"a {name} must be a text such as {examples[name]}, got {level!r}")
-    if name == CONTROLLER:
-        controller_named(level, rig)
+    if name == CONTROLLER and level in CONTROLLERS:
+        CONTROLLERS[level](rig)
+    elif name == CONTROLLER:
+        check_name(level)
     elif name == LOAD:
         parse_force(level)
     elif isinstance(command := command_or_target(level), Position):
         check_target(command, np.arange(0.0, duration, 1.0 / _LOOKED), rig.cylinder.L / 2)
+
+
+def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
+    """Make each controller that is none of Sealscope's, before a campaign begins.
+
+    Raises InputError where one cannot be made, and where one is a program that the plan leads to and the caller does
+    not `trust` it: a plan may come from a stranger. Installed controllers are trusted.
+    """
+    from sealscope.control.registry import CONTROLLERS, controller_named, is_installed
+    from sealscope.simulation.bench.profile import load_profile
+
+    names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
+    if plan.profile:
+        profile = load_profile(plan.profile)
+        duties = (profile.duty, *(family.duty for family in profile.families))
+        names += [name for duty in duties if duty is not None for name in duty.controllers]
+    for name in dict.fromkeys(names):
+        if not (trust or is_installed(name)):
+            raise InputError(
+                f"a controller must be installed, or the plan be trusted to run it (--trust, when you have read it), "
+                f"got {name} ({plan.place})"
+            )
+        if name not in CONTROLLERS:
+            controller_named(name, plan.rig)
 
 
 def voltage_in(commands: tuple[str | float, ...]) -> str | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime as dt
 import tempfile
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,9 +21,11 @@ from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.structured.logs import read_text
 from sealscope.recordings.formats.structured.sheets import joined_sheets
 from sealscope.recordings.formats.table import Choose, RawTable, check_size
+from sealscope.storage.unpacking import check_unpacked, most_unpacked
 
 #: Most sheets that are looked at for more of a run.
 _MOST_SHEETS = 32
+_CHUNK = 2**20
 
 
 def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
@@ -32,6 +35,7 @@ def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
     largest sheet lacks where no sheet holds a log.
     """
     place = str(path)
+    _check_members(path)
     workbook = library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(str(path))
     sheets = [workbook.get_sheet_by_name(name) for name in workbook.sheet_names]
     hidden = {member.name for member in workbook.sheets_metadata if not str(member.visible).endswith(".Visible")}
@@ -61,6 +65,22 @@ def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
         else ()
     )
     return replace(table, kind="spreadsheet", notes=(*notes, *table.notes))
+
+
+def _check_members(path: Path) -> None:
+    """Raise UnreadableFile where the members of a workbook that is a ZIP archive unpack to more than it may hold.
+
+    What they are said to unpack to may be a lie: they are unpacked, and zipfile refuses what is more.
+    """
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        check_unpacked(sum(member.file_size for member in members), most_unpacked(path), path)
+        for member in members:
+            with archive.open(member) as file:
+                while file.read(_CHUNK):
+                    pass
 
 
 def _shared_map(

@@ -50,7 +50,9 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
     require_drawing()
     import matplotlib
 
-    with matplotlib.rc_context({**SETTINGS, "svg.hashsalt": figure.id}):
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()  # not the settings in the working folder, which may be a stranger's and run TeX
+        matplotlib.rcParams.update({**SETTINGS, "svg.hashsalt": figure.id})
         canvas = _canvas(figure)
         long = [line for ax in canvas.axes for line in ax.lines if np.size(line.get_xdata()) > _LONG]
         if sum(np.size(line.get_xdata()) for line in long) * _POINT_BYTES > MOST_SVG_BYTES:
