@@ -40,8 +40,9 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Share of the false-alarm probability that the change within the recording has where there is a baseline, too.
-WITHIN = 0.25
+#: Share of the false-alarm probability that a question has beside another: the change within the recording where there
+#: is a baseline, the level against the rig's file where there is none.
+SECOND = 0.25
 _95 = 1.96
 
 
@@ -103,6 +104,12 @@ class Balance:
         """What turns a flow by the assumed displacement into that of the machine."""
         return _size(self)
 
+    @cached_property
+    def level(self) -> Interval:
+        """What passes pump and piston in all over the recording, as a conductance with its interval."""
+        weights = np.maximum(self.blocks.rows, 0.0)
+        return self.course(step=False).over(weights / weights.sum())
+
     def course(self, step: bool) -> Course:
         """Return the leak's coefficient over the blocks."""
         return course(self.leak, self.test, step)
@@ -160,18 +167,65 @@ def judge(balance: Balance, probability: float, baseline: Sequence[Blocks] = ())
     against = rise(balance.blocks, baseline, balance.columns) if baseline else None
     if test is None and against is None:
         return Evidence("cannot tell", f"too short for a balance: {len(balance.blocks)} blocks say something of a leak")
-    within = probability * (WITHIN if against is not None else 1.0)
-    stepped = test is not None and test.chance < within
-    risen = against is not None and against.chance < probability - (within if test is not None else 0.0)
-    causes = probabilities(balance.hypotheses) if stepped else {}
-    if stepped and _is_leak(causes):
-        evidence = _step(balance, causes)
-    elif risen and not stepped:
-        assert against is not None
-        evidence = _flow(balance, Evidence("leak", "", cause=_together(balance)), *_of_rise(balance, against))
+    questions = _questions(balance, against, probability)
+    answered = next((own for own in questions if own.chance < own.probability), None)
+    if answered is not None and answered.name == WITHIN:
+        causes = probabilities(balance.hypotheses)
+        if not _is_leak(causes):
+            answered = None
+    if answered is None:
+        judging = questions[0]
+        bound = bound_of(balance, against)
+        enough = balance.mean(2) > 0.0 and bound <= priors()["worth"]["share"].value * balance.mean(2)
+        cause = stepped_cause(balance.hypotheses, probability)
+        evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     else:
-        evidence = _none(balance, against, stepped_cause(balance.hypotheses, probability))
-    return _with_figures(balance, evidence, against, probability, within, risen=risen and not stepped)
+        judging = answered
+        evidence = Evidence("leak", "", cause=_together(balance))
+        if answered.name == WITHIN:
+            evidence = _step(balance, causes)
+        elif against is not None:
+            evidence = _flow(balance, evidence, *_of_rise(balance, against))
+        else:
+            level, pressure = balance.level, balance.mean(0)
+            evidence = _flow(balance, evidence, level.value * pressure, (level.high - level.low) * pressure / (2 * _95))
+    return _with_figures(balance, evidence, against, questions, judging)
+
+
+#: The three questions, by name.
+WITHIN, AGAINST, LEVEL = "within the recording", "against the baseline", "against the rig's file"
+
+
+class _Question(NamedTuple):
+    """A question asked: its score and threshold, the chance of the score, its share of the false-alarm probability."""
+
+    name: str
+    score: float
+    threshold: float
+    chance: float
+    probability: float
+
+
+def _questions(balance: Balance, against: Rise | None, probability: float) -> list[_Question]:
+    """Return the questions that can be asked, each with its share of the false-alarm probability."""
+    from scipy.special import ndtr, ndtri
+
+    questions, test = [], balance.test
+    healthy = balance.rig.pump.G_healthy
+    level = healthy > 0.0 and against is None and balance.size.stated and len(balance.columns) == 1
+    second = SECOND * probability if test is not None and (against is not None or level) else 0.0
+    if against is not None:
+        share = probability - second
+        questions.append(_Question(AGAINST, against.score, against.threshold(share), against.chance, share))
+    if test is not None:
+        share = second if against is not None else probability - second
+        questions.insert(0, _Question(WITHIN, test.score, test.threshold(share), test.chance, share))
+    if level:
+        own, share = balance.level, second or probability
+        deviation = float(np.hypot((own.high - own.low) / (2 * _95), own.value * balance.size.deviation))
+        score = (own.value - healthy) / max(deviation, np.finfo(float).tiny)
+        questions.append(_Question(LEVEL, score, float(-ndtri(share)), float(ndtr(-score)), share))
+    return questions
 
 
 def _is_leak(causes: dict[Cause, float]) -> bool:
@@ -240,13 +294,6 @@ def _over(interval: tuple[float, float], unit: float | None) -> tuple[float, flo
     return None if unit is None or not unit > 0.0 else (max(interval[0], 0.0) / unit, interval[1] / unit)
 
 
-def _none(balance: Balance, against: Rise | None, cause: Cause | None) -> Evidence:
-    """Return the evidence where no leak is said to be: `no leak` where one worth finding would have been."""
-    bound, pump = bound_of(balance, against), balance.mean(2)
-    enough = pump > 0.0 and bound <= priors()["worth"]["share"].value * pump
-    return Evidence("no leak" if enough else "cannot tell", "", cause=cause)
-
-
 def bound_of(balance: Balance, against: Rise | None) -> float:
     """Return the 95 % upper bound of a leak that began within the recording, or that came since the baseline [m^3/s]."""
     bounds = []
@@ -258,57 +305,36 @@ def bound_of(balance: Balance, against: Rise | None) -> float:
 
 
 def _with_figures(
-    balance: Balance, evidence: Evidence, against: Rise | None, probability: float, within: float, *, risen: bool
+    balance: Balance, evidence: Evidence, against: Rise | None, questions: Sequence[_Question], judging: _Question
 ) -> Evidence:
     """Return the evidence with scores, thresholds, course, total, bound and the reason in words."""
-    test, size = balance.test, balance.size
-    parts = []
-    if test is not None:
-        parts.append(
-            Evidence(
-                "leak" if evidence.verdict == "leak" and not risen else "no leak",
-                "a step of the leakage within the recording, over all onsets",
-                test.score,
-                test.threshold(within),
-                detector="within the recording",
-                chance=max(test.chance, RAREST),
-            )
+    size = balance.size
+    parts = tuple(
+        Evidence(
+            "leak" if evidence.verdict == "leak" and own is judging else "no leak",
+            f"leakage {own.name}",
+            own.score,
+            own.threshold,
+            detector=own.name,
+            chance=max(own.chance, RAREST),
         )
-    if against is not None:
-        share = probability - (within if test is not None else 0.0)
-        parts.append(
-            Evidence(
-                "leak" if evidence.verdict == "leak" and risen else "no leak",
-                f"the leakage against that of healthy recordings, {against.freedom:g} degrees of freedom",
-                against.score,
-                against.threshold(share),
-                detector="against the baseline",
-                chance=max(against.chance, RAREST),
-            )
-        )
-    judging = parts[-1] if risen or test is None else parts[0]
-    level = _level(balance)
-    flow = size.scale / LITRE_PER_MINUTE
+        for own in questions
+    )
     bound = bound_of(balance, against)
+    stated = size.stated and evidence.verdict != "leak" and np.isfinite(bound)
     evidence = replace(
         evidence,
         score=judging.score,
         threshold=judging.threshold,
-        chance=judging.chance,
-        parts=tuple(parts) if len(parts) > 1 else (),
-        passage=_passage(balance, level, None if evidence.verdict == "leak" else bound),
+        chance=max(judging.chance, RAREST),
+        parts=parts if len(parts) > 1 else (),
+        passage=_passage(balance, balance.level, None if evidence.verdict == "leak" else bound),
         ratio=None if size.ratio is None else size.ratio.value,
         ratio_interval=None if size.ratio is None else (size.ratio.low, size.ratio.high),
-        bound_lpm=bound * flow if size.stated and evidence.verdict != "leak" and np.isfinite(bound) else None,
+        bound_lpm=bound * size.scale / LITRE_PER_MINUTE if stated else None,
         course=_leak_course(balance, evidence) if size.stated else None,
     )
-    return replace(evidence, reason=_reason(balance, evidence, bound))
-
-
-def _level(balance: Balance) -> Interval:
-    """Return what passes in all over the recording, as a conductance with its interval."""
-    weights = np.maximum(balance.blocks.rows, 0.0)
-    return balance.course(step=False).over(weights / weights.sum())
+    return replace(evidence, reason=_reason(balance, evidence, bound, judging.name))
 
 
 def _passage(balance: Balance, level: Interval, findable: float | None) -> Passage:
@@ -317,7 +343,10 @@ def _passage(balance: Balance, level: Interval, findable: float | None) -> Passa
     flow = pressure * size.scale / LITRE_PER_MINUTE
     wide = 1.0 + _95 * size.deviation
     stated = size.stated and len(balance.columns) == 1  # a valve's edges pass as well, by an amount that is not known
-    low, high = (end * flow * (wide if (end > 0.0) == upper else 1.0 / wide) for end, upper in zip(level[1:], (False, True), strict=True))
+    low, high = (
+        end * flow * (wide if (end > 0.0) == upper else 1.0 / wide)
+        for end, upper in zip(level[1:], (False, True), strict=True)
+    )
     return Passage(
         lpm=level.value * flow if stated else None,
         interval_lpm=(low, high) if stated else None,
@@ -345,16 +374,16 @@ def _leak_course(balance: Balance, evidence: Evidence) -> LeakCourse:
     return LeakCourse(time, value * unit, (value - half) * unit, (value + half) * unit, whole=whole)
 
 
-def _reason(balance: Balance, evidence: Evidence, bound: float) -> str:
+def _reason(balance: Balance, evidence: Evidence, bound: float, question: str) -> str:
     """Return why, in one line."""
     share = f"{100.0 * bound / balance.mean(2):.2g} % of the pump's flow" if balance.mean(2) > 0.0 else "any size"
     limit = f"{evidence.bound_lpm:.2g} L/min" if evidence.bound_lpm is not None else share
     if evidence.verdict == "leak":
-        text = (
-            "leakage steps up within the recording, beyond the drift of this machine"
-            if evidence.onset_s is not None
-            else "leakage is above that of the healthy recordings by more than they scatter"
-        )
+        text = {
+            WITHIN: "leakage steps up within the recording, beyond the drift of this machine",
+            AGAINST: "leakage is above that of the healthy recordings by more than they scatter",
+            LEVEL: "pump and piston together pass more than the rig's file says of a healthy machine (pump.G_healthy)",
+        }[question]
         if "leak_lpm" in evidence.refuses:
             text += f"; {NO_RIG}"
     elif evidence.verdict == "no leak":

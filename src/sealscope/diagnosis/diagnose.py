@@ -55,7 +55,9 @@ class Examination:
     `baseline`: leak-free recordings that can be compared with it (`baseline.inspection`); `no_baseline`: why there is
     none where one was asked for: then a leak within the recording is all that can be stated; `rig`: what detectors may
     assume of the machine; `distrust`: why the pressures cannot be judged, None where they can: then no detector is run;
-    `share` of what was to be judged that the recording is: `no leak` needs `WHOLE` of it.
+    `share` of what was to be judged that the recording is: `no leak` needs `WHOLE` of it; `machine`: leak-free
+    recordings of the machine at any operating point, and `doubt`: why the pressures alone cannot be judged: a balance of
+    volumes takes the former and needs no heed of the latter.
     A recording that is to be its own baseline needs pressures that move throughout (`recordings.motion`).
     """
 
@@ -69,13 +71,16 @@ class Examination:
         distrust: str | None = None,
         no_baseline: str | None = None,
         share: float = 1.0,
+        machine: Sequence[Recording] | None = None,
+        doubt: str | None = None,
     ) -> None:
-        self.share = share
+        self.share, self.doubt = share, doubt
+        self.machine = tuple(baseline if machine is None else machine)
         self.recording, self.baseline, self.rig = recording, tuple(baseline), rig
         self.false_alarm_probability = false_alarm_probability
         self.distrust, self.no_baseline = distrust, no_baseline
-        if distrust is None and not self.baseline and (still := does_not_move(recording)) is not None:
-            self.distrust = f"the pressures cannot be trusted: {still}"
+        if doubt is None and not self.baseline and (still := does_not_move(recording)) is not None:
+            self.doubt = f"the pressures cannot be trusted: {still}"
         self._detectors: dict[str, Detector] = {}
         self._evidence: dict[tuple[str, frozenset[str]], Evidence] = {}
 
@@ -90,6 +95,8 @@ class Examination:
             distrust=self.distrust,
             no_baseline=self.no_baseline,
             share=self.share,
+            machine=[own.only(name for name in own.channels if name in wanted) for own in self.machine],
+            doubt=self.doubt,
         )
         view._detectors, view._evidence = self._detectors, self._evidence
         return view
@@ -127,7 +134,11 @@ class Examination:
     def _run(self, name: str, detector: Detector) -> Evidence:
         if detector.name != name:
             raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
-        baseline, reason = self.baseline, unusable(detector, self.recording) or self.distrust
+        reason = unusable(detector, self.recording) or self.distrust
+        if name == ORDER[0] and reason is None:
+            evidence = detector.examine(self.recording, self.machine, self.false_alarm_probability)
+            return replace(checked(evidence), detector=name)
+        baseline, reason = self.baseline, reason or self.doubt
         if reason is None and self.baseline:
             reasons = [unusable(detector, own) for own in self.baseline]
             baseline = tuple(own for own, why in zip(self.baseline, reasons, strict=True) if why is None)
@@ -182,7 +193,12 @@ class Examination:
                 if judges(evidences[-1]):
                     break
         fused = fuse(evidences)
-        if fused.verdict == "leak" or self.distrust is not None or self._signatures is None:
+        if (
+            fused.detector == ORDER[0]
+            or fused.verdict == "leak"
+            or self.distrust is not None
+            or self._signatures is None
+        ):
             return fused
         other = elsewhere(self._signatures)
         if other is not None:  # of two recordings in one, or of swapped channels, nothing is said
@@ -199,7 +215,7 @@ class Examination:
         return replace(fused, cause=other.cause, reason=reason)
 
     def _isolated(self, evidence: Evidence) -> Evidence:
-        if evidence.verdict != "leak" or self._signatures is None:
+        if evidence.verdict != "leak" or evidence.detector == ORDER[0] or self._signatures is None:
             return evidence
         with np.errstate(all="ignore"):
             return isolated(evidence, self._signatures, self._known if evidence.onset_s is None else ())
@@ -311,6 +327,8 @@ def diagnose(
         distrust=judged.distrust,
         no_baseline=compared.refusal,
         share=judged.share,
+        machine=compared.machine,
+        doubt=judged.doubt,
     ).fused(quick)
     return Diagnosis.of(
         fused,
@@ -319,7 +337,7 @@ def diagnose(
         file=os.fspath(file) if file else None,
         false_alarm_probability=false_alarm_probability,
         quality=(*judged.findings, *compared.findings),
-        baselines=len(compared.parts),
+        baselines=len(compared.machine if fused.detector == ORDER[0] else compared.parts),
         limit=repair,
     )
 

@@ -38,13 +38,15 @@ class Inspection:
 
     `part`: its longest uniformly sampled stretch with no chamber pressure and no command missing, gaps bridged where
     they can be (`recordings.gaps`); `findings` on the whole; `distrust`: why the chamber pressures cannot be trusted,
-    None where they can; `share` of the whole that the stretch is.
+    None where they can; `share` of the whole that the stretch is; `doubt`: why the pressures alone, without a balance
+    of volumes, do not look like those of a hydraulic machine, None where they do.
     """
 
     part: Recording
     findings: tuple[Finding, ...]
     distrust: str | None
     share: float
+    doubt: str | None = None
 
     @property
     def defect(self) -> str | None:
@@ -53,7 +55,7 @@ class Inspection:
             return lack
         if len(self.part) < SHORTEST:
             return f"needs {SHORTEST} samples or more without a gap, got {len(self.part)}"
-        return self.distrust
+        return self.distrust or self.doubt
 
     @cached_property
     def point(self) -> OperatingPoint:
@@ -103,10 +105,10 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
             findings.append(Finding("part_analysed", "warning", None, left_out, float(part.t[0]), text))
     spoiled = next((own for own in findings if own.channel in chambers and _spoils(own, len(part))), None)
     distrust = None if spoiled is None else f"the pressures cannot be trusted: {spoiled.text}"
+    doubt = None
     if distrust is None and len(part) >= SHORTEST and does_not_move(part) is None and (reason := no_machine(part)):
-        distrust = f"this is no recording of a hydraulic machine: {reason}"
-        findings.append(Finding("no_machine", "warning", None, len(part), float(part.t[0]), reason))
-    return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1))
+        doubt = f"this is no recording of a hydraulic machine: {reason}"
+    return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1), doubt)
 
 
 def _spoils(finding: Finding, samples: int) -> bool:
@@ -119,12 +121,14 @@ class Baselines:
     """Leak-free recordings that a recording can be compared with.
 
     `parts`: what of them can be analysed; `findings`: which were left out, and why; `refusal`: why none is left, None
-    where some are, or where none was given.
+    where some are, or where none was given; `machine`: all of the same machine that are no copies, whatever their
+    operating point, for what describes speed, load and temperature by terms of its own.
     """
 
     parts: tuple[Recording, ...]
     findings: tuple[Finding, ...]
     refusal: str | None
+    machine: tuple[Recording, ...] = ()
 
 
 def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
@@ -134,7 +138,8 @@ def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
     one copy (that with the most channels) of the same recording.
     """
     if judged.defect is not None:  # nothing is compared, and every detector states why
-        return Baselines(tuple(inspected(recording).part for recording in baseline), (), None)
+        parts = tuple(inspected(recording).part for recording in baseline)
+        return Baselines(parts, (), None, tuple(own.part for own in _distinct(judged, baseline)))
     inspections = [inspected(recording) for recording in baseline]
     chosen: dict[bytes, int] = {}
     left_out: dict[tuple[Severity, str], list[int]] = {}
@@ -155,7 +160,14 @@ def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
     if baseline and not chosen:
         most = max(left_out, key=lambda kind: len(left_out[kind]))
         refusal = f"no baseline recording can be used: {most[1]}"
-    return Baselines(tuple(inspections[k].part for k in sorted(chosen.values())), findings, refusal)
+    parts = tuple(inspections[k].part for k in sorted(chosen.values()))
+    return Baselines(parts, findings, refusal, tuple(own.part for own in _distinct(judged, baseline)))
+
+
+def _distinct(judged: Inspection, baseline: Sequence[Recording]) -> list[Inspection]:
+    """Return the inspections of the baselines that hold other samples than the judged recording and one another."""
+    distinct = {own.digest: own for own in map(inspected, baseline) if own.distrust is None and len(own.part)}
+    return [own for digest, own in distinct.items() if digest != judged.digest]
 
 
 def _refusal(judged: Inspection, own: Inspection) -> tuple[Severity, str | None]:

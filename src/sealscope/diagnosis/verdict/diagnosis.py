@@ -207,6 +207,7 @@ class Diagnosis(Evidence):
             "onset_interval_s": _pair(self.onset_interval_s),
             "leak_lpm": _plain(self.leak_lpm),
             "leak_interval_lpm": _pair(self.leak_interval_lpm),
+            "bound_lpm": _plain(self.bound_lpm),
             "false_alarm_probability": self.false_alarm_probability,
             "score": _plain(self.score),
             "threshold": _plain(self.threshold),

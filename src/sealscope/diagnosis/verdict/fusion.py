@@ -38,6 +38,8 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     if judge is None:
         return replace(_no_judge(ranked, usable), detector="", parts=tuple(ranked), usable=True)
     others = [own for own in usable if own is not judge]
+    if judge.detector == ORDER[0]:  # nothing changes its verdict afterwards
+        return replace(judge, parts=(judge, *(own for own in ranked if own is not judge)))
     first, judge = judge, _doubted(judge, others)
     fused, reasons = judge, [judge.reason]
     if judge.verdict == "leak":
