@@ -23,7 +23,7 @@ from sealscope.diagnosis.causes import Hypothesis, hypotheses, probabilities
 from sealscope.diagnosis.causes import stepped as stepped_cause
 from sealscope.diagnosis.onset import Course, Interval, StepTest, course, step_test
 from sealscope.diagnosis.scatter import Rise, rise
-from sealscope.diagnosis.terms import ORIFICE, Equation, priors
+from sealscope.diagnosis.terms import ORIFICE, PUMP, Equation, priors
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
     NO_RIG,
@@ -106,9 +106,15 @@ class Balance:
 
     @cached_property
     def level(self) -> Interval:
-        """What passes pump and piston in all over the recording, as a conductance with its interval."""
+        """What passes pump and piston in all over the recording, as a conductance with its interval.
+
+        The pressures at the pump's ports hardly differ from those of the chambers: the sum is known, its parts are not.
+        """
+        column = self.columns[0]
+        apart = column.names.index(PUMP) if PUMP in column.names else None
+        both = information(self.blocks, self.columns, column.leak, apart)
         weights = np.maximum(self.blocks.rows, 0.0)
-        return self.course(step=False).over(weights / weights.sum())
+        return course(both, step_test(both), step=False).over(weights / weights.sum())
 
     def course(self, step: bool) -> Course:
         """Return the leak's coefficient over the blocks."""
@@ -363,9 +369,9 @@ def _leak_course(balance: Balance, evidence: Evidence) -> LeakCourse:
     own = balance.course(step=evidence.onset_s is not None)
     time, value = balance.blocks.time, own.mean
     deviation = np.sqrt(np.maximum(np.diag(own.covariance), 0.0))
-    whole = evidence.onset_s is None
-    if not whole:
-        before: Array = (time < evidence.onset_s).astype(float)
+    onset, whole = evidence.onset_s, evidence.onset_s is None
+    if onset is not None:
+        before: Array = (time < onset).astype(float)
         weights = np.eye(len(time)) - before / max(float(before.sum()), 1.0)
         value = weights @ own.mean
         deviation = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", weights, own.covariance, weights), 0.0))

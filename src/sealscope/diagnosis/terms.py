@@ -156,6 +156,8 @@ class Equation(NamedTuple):
 
 #: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
 LEAK, ORIFICE = "leak", "leak through an orifice"
+#: The pump's own leakage, by the pressures at its ports.
+PUMP = "pump leak"
 
 _LEAKS = (
     Term(
@@ -250,7 +252,7 @@ def _lost_outside(side: str) -> Term:
 _LAG = Term("lag", "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
 _BIAS = Term("bias", "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
 _PUMP = Term(
-    "pump leak",
+    PUMP,
     "(p_1 - p_2) dt",
     "m^3/(s Pa)",
     lambda s: (s.mean("p_1") - s.mean("p_2")) * s.dt,

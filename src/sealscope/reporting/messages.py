@@ -84,6 +84,8 @@ def since(diagnosis: Diagnosis) -> str | None:
 def how_much(diagnosis: Diagnosis) -> str | None:
     """Return how much oil leaks [L/min], or at most could where no leak was found; None where nothing is known."""
     interval = diagnosis.leak_interval_lpm
+    if diagnosis.verdict != "leak" and diagnosis.bound_lpm is not None:
+        return f"none above {number(diagnosis.bound_lpm, 2)} L/min (95 % bound)"
     if diagnosis.verdict == "no leak" and diagnosis.leak_lpm is not None and interval is not None and interval[1] > 0:
         return f"none found; at most {number(interval[1], 2)} L/min (95 % interval)"
     if diagnosis.verdict != "leak":

@@ -10,9 +10,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.pressure_model.detector import PressureModel
-from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.baseline.level import DayToDay, Level
 from sealscope.diagnosis.baseline.operating_point import OperatingPoint
@@ -21,9 +22,6 @@ from sealscope.diagnosis.observer.model import G_UNIT
 from sealscope.diagnosis.pressure_model.detector import DAY_TO_DAY, PressureModel, is_followed
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole_log_rms
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
-from sealscope.diagnosis.volume_balance.detector import VolumeBalance
-from sealscope.diagnosis.volume_balance.evidence import level as balance_level
-from sealscope.diagnosis.volume_balance.evidence import states_flow
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
@@ -119,11 +117,12 @@ def _stated(part: Recording, rig: Rig) -> _Stated:
     """Return the most specific level that a recording without a defect allows."""
     balance = VolumeBalance(rig)
     if unusable(balance, part) is None:
-        fit, _ = balance.fit(part)
-        if fit is not None:
-            own = balance_level(fit, float(fit.leaning.mean()))  # beside others of the machine, whose scale errs alike
-            total = Level(own.value + (fit.pump or 0.0), float(np.hypot(own.error, fit.pump_sd)))
-            return _Stated("volume balance", total, states_flow(fit), fit.metres, abs(fit.scale))
+        own = balance.balance(part)
+        if own is not None and len(own.columns) == 1:
+            size, level = own.size, own.level
+            total = Level(level.value * size.scale, (level.high - level.low) * size.scale / 3.92)
+            ratio = None if size.ratio is None else size.ratio.value
+            return _Stated("volume balance", total, size.stated, ("x", "m") in own.units, ratio)
     model = PressureModel(rig)
     if unusable(model, part) is None:
         followed = model.follow(part)
