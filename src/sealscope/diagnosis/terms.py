@@ -133,7 +133,8 @@ class Term(NamedTuple):
 
     `increments` gives f dg over each sampling interval, shape (n - 1,); `unit` is that of its coefficient; `cause` is
     what a step of the coefficient means; `nuisance`: the coefficient is unknown in any machine and drifts as `drift`
-    allows (a table of `terms.toml`), else it is zero unless that cause is present; `needs`: channels.
+    allows (a table of `terms.toml`), else it is zero unless that cause is present; `needs`: channels; `driven`: by a
+    "pressure" or by its "root", so that a zero of the sensors acts on the flow.
     """
 
     name: str
@@ -144,6 +145,7 @@ class Term(NamedTuple):
     drift: str = ""
     nuisance: bool = True
     needs: tuple[str, ...] = ()
+    driven: str = ""
 
 
 class Equation(NamedTuple):
@@ -156,6 +158,8 @@ class Equation(NamedTuple):
 
 #: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
 LEAK, ORIFICE = "leak", "leak through an orifice"
+#: What passes or is read whatever the pressures are; a zero of the pressures acts through it.
+BIAS = "bias"
 
 _LEAKS = (
     Term(
@@ -166,6 +170,7 @@ _LEAKS = (
         "piston or pump leak",
         "leak",
         needs=("p_A", "p_B"),
+        driven="pressure",
     ),
     Term(
         ORIFICE,
@@ -175,6 +180,7 @@ _LEAKS = (
         "piston or pump leak",
         nuisance=False,
         needs=("p_A", "p_B"),
+        driven="root",
     ),
 )
 
@@ -244,11 +250,12 @@ def _lost_outside(side: str) -> Term:
         "external leak",
         nuisance=False,
         needs=(name,),
+        driven="pressure",
     )
 
 
 _LAG = Term("lag", "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
-_BIAS = Term("bias", "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
+_BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
 _PUMP = Term(
     "pump leak",
     "(p_1 - p_2) dt",
@@ -257,6 +264,7 @@ _PUMP = Term(
     "pump leak",
     "leak",
     needs=("p_1", "p_2"),
+    driven="pressure",
 )
 
 _CYLINDER = (
@@ -327,11 +335,11 @@ def _late(term: Term) -> Term:
 def _chamber(side: str, area: float) -> Equation:
     """Return the balance of one chamber behind a valve: what the piston displaces is what its edges pass."""
     edges = (_edge(side, True), _edge(side, False))
-    compliance = _of_side(side)
+    compliance, late = _of_side(side), (_late(edge) for edge in edges)
     return Equation(
         f"chamber {side}",
         lambda s: -area * s.step("x"),
-        (*edges, *(_late(edge) for edge in edges), _overlap(side, True), _overlap(side, False), *compliance, *_LEAKS),
+        (*edges, *late, _overlap(side, True), _overlap(side, False), *compliance, _BIAS, *_LEAKS),
     )
 
 
