@@ -111,12 +111,14 @@ class Blocks:
 class Information(NamedTuple):
     """What K blocks say of one coefficient, one number g_k a block: likelihood exp(vector g - g precision g / 2).
 
-    `time` (K,) [s], `precision` (K, K), `vector` (K,).
+    `time` (K,) [s], `precision` (K, K), `vector` (K,); `level`: standard deviation of what is believed of the
+    coefficient before the first block, infinite where nothing is.
     """
 
     time: Array
     precision: Array
     vector: Array
+    level: float = float("inf")
 
 
 class Columns:
@@ -135,6 +137,15 @@ class Columns:
         self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in ("leak", "bias"))
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.driven = tuple(term.driven for term in equation.terms)
+        self.healthy = priors()["healthy"][equation.healthy].value if equation.healthy else float("inf")
+
+    def level(self, test: int, blocks: Blocks) -> float:
+        """Return the standard deviation of a healthy machine's coefficient of a column; infinite for other columns."""
+        driven = self.driven[test] if test < self.left else ""
+        pressure, root = (float(np.mean(blocks.driving(root=of_root))) for of_root in (False, True))
+        return (
+            self.healthy * {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}[driven]
+        )
 
     def zero(self, test: int, blocks: Blocks) -> float:
         """Return the standard deviation of the zero of the pressures behind a flow, through a column's slope at it;
@@ -241,7 +252,7 @@ def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces:
         part, lead = _eliminated(blocks.gram[:, e], blocks, own, test, others)
         precision += part
         vector += lead
-    return Information(blocks.time, precision, vector)
+    return Information(blocks.time, precision, vector, columns[0].level(test, blocks))
 
 
 def overlap(rate: float = 1000.0) -> float:
