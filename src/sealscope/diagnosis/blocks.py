@@ -327,12 +327,14 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
     cross = normal.cross - (normal.along / energy[:, None]).T @ normal.along
     left = normal.left - normal.along.T @ (normal.lead / energy)
     square = normal.square - float((normal.lead**2 / energy).sum())
-    variance, least = square / rows, 1e-14 * normal.square / rows
+    least = 1e-14 * normal.square / rows
+    variance = max(square / rows, least)
     for _ in range(_TURNS):
         belief, mean = np.zeros((2, len(believed.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
             belief[:, 1:] = (overlap() * variance / believed.drift**2)[:, None]
-        belief[-1, 0], mean[-1, 0] = overlap() * variance / believed.zero**2, -believed.at
+        if believed.zero > 0.0:
+            belief[-1, 0], mean[-1, 0] = overlap() * variance / believed.zero**2, -believed.at
         # a coefficient that is zero drifts by nothing
         precision = np.minimum(belief.ravel(), 1e9 * np.diag(normal.cross))
         lead = precision * mean.ravel()
