@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import SUPPORT, Blocks, Columns, Weighting
+from sealscope.diagnosis.blocks import PRESSURE_PARTS, SMOOTHED, SUPPORT, Blocks, Columns, Weighting
 from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE, Equation, Signals, equations
 from sealscope.diagnosis.weak_form import SPAN, STRIDE, rows, stride_samples
 from sealscope.recordings.recording import Array, Recording
@@ -95,7 +95,8 @@ class BlockStream:
             values.append([block[keep] for block, keep in zip(np.split(own.values, cuts), kept, strict=True)])
         gram, weights = self._weigh(values, first)
         times = cut_rows[0].time.reshape(end - first, self._strides)
-        return Blocks(times[:, 0], times[:, -1], gram, weights, self._means(signals, inner, end - first))
+        means, pressures = self._means(signals, inner, end - first), self._pressures(signals, inner, end - first)
+        return Blocks(times[:, 0], times[:, -1], gram, weights, means, pressures)
 
     def _weigh(self, values: Sequence[Sequence[Array]], first: int) -> tuple[Array, Array]:
         """Return Gram matrices and weights of blocks, those that support a stream together, then one by one."""
@@ -116,6 +117,21 @@ class BlockStream:
         missing = np.isnan(cut[0]) | np.isnan(cut[2])
         number = np.maximum((~missing).sum(axis=1), 1)
         return np.column_stack([np.where(missing, 0.0, of).sum(axis=1) / number for of in cut])
+
+    def _pressures(self, signals: Signals, inner: slice, count: int) -> Array:
+        """Return the distribution of the smoothed p_A - p_B over each block (K, PRESSURE_PARTS)."""
+        piece = max(1, round(SMOOTHED * self._rate))
+        length = self._strides * self._stride
+        cut = signals.pressure_difference[inner][: count * length].reshape(count, length)
+        smooth = cut[:, : length // piece * piece].reshape(count, -1, piece).mean(axis=2)
+        return np.array([_parts(row[~np.isnan(row)]) for row in smooth])
+
+
+def _parts(values: Array) -> Array:
+    """Return the means of PRESSURE_PARTS equal parts of the sorted values, 0 without any."""
+    ends = np.linspace(0.0, len(values), PRESSURE_PARTS + 1)
+    sums = np.interp(ends, np.arange(len(values) + 1), np.concatenate([[0.0], np.cumsum(np.sort(values))]))
+    return np.asarray(np.diff(sums) / max(ends[1], 1e-9))
 
 
 def _zero(pressure: Array) -> float:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.terms import LEAK, Equation, Prior, priors
+from sealscope.diagnosis.terms import BIAS, LEAK, Equation, Prior, priors
 from sealscope.diagnosis.weak_form import SPAN, test_function
 from sealscope.recordings.recording import Array
 
@@ -39,6 +39,8 @@ DRIFT_DEGREE = 2
 RATIOS = (0.0, *(10.0 ** np.arange(-1.0, 5.1, 0.5)))
 #: Standard deviations of the scale of motion between blocks that are tried, and none.
 SCALES = np.concatenate([[0.0], 10.0 ** np.linspace(-5.0, 0.0, 41)])
+#: Parts of a block's distribution of pressure, and the time over which the pressure is averaged for it [s].
+PRESSURE_PARTS, SMOOTHED = 9, 0.025
 _RIDGE = 1e-10  # of a matrix whose diagonal is 1
 _TURNS = 3
 
@@ -57,6 +59,8 @@ class Blocks:
         Number of rows that no missing sample touches.
     means : array of float, shape (K, 3)
         Means of abs(p_A - p_B) [Pa], of its root, and of the size of the left side's rate [m^3/s].
+    pressures : array of float, shape (K, PRESSURE_PARTS)
+        Distribution of p_A - p_B [Pa], averaged over `SMOOTHED` seconds: means of its equal parts, in rising order.
     """
 
     start: Array
@@ -64,6 +68,7 @@ class Blocks:
     gram: Array
     rows: Array
     means: Array
+    pressures: Array
 
     def __len__(self) -> int:
         return len(self.start)
@@ -81,14 +86,21 @@ class Blocks:
         first = np.arange(0, len(self), each)
         last = np.append(first[1:], len(self)) - 1
         rows = np.add.reduceat(self.rows, first)
-        weighted = np.add.reduceat(self.means * self.rows[:, None], first, axis=0)
+        shares = self.rows[:, None] / np.maximum(np.repeat(rows, np.diff(np.append(first, len(self)))), 1.0)[:, None]
         return Blocks(
             self.start[first],
             self.end[last],
             np.add.reduceat(self.gram, first, axis=0),
             rows,
-            weighted / np.maximum(rows, 1.0)[:, None],
+            *(np.add.reduceat(of * shares, first, axis=0) for of in (self.means, self.pressures)),
         )
+
+    def driving(self, zero: float = 0.0, root: bool = False) -> Array:
+        """Return the mean of abs(p_A - p_B - zero) [Pa], or of its root, over each block, shape (K,): what a leak's
+        coefficient is multiplied by to give its mean flow.
+        """
+        size = np.abs(self.pressures - zero)
+        return np.asarray((np.sqrt(size) if root else size).mean(axis=1))
 
     @classmethod
     def joined(cls, parts: Sequence[Blocks]) -> Blocks:
@@ -99,12 +111,14 @@ class Blocks:
 class Information(NamedTuple):
     """What K blocks say of one coefficient, one number g_k a block: likelihood exp(vector g - g precision g / 2).
 
-    `time` (K,) [s], `precision` (K, K), `vector` (K,).
+    `time` (K,) [s], `precision` (K, K), `vector` (K,); `level`: standard deviation of what is believed of the
+    coefficient before the first block, infinite where nothing is.
     """
 
     time: Array
     precision: Array
     vector: Array
+    level: float = float("inf")
 
 
 class Columns:
@@ -121,6 +135,25 @@ class Columns:
         self.between = np.array([differs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in ("leak", "bias"))
+        self.bias = self.names.index(BIAS) if BIAS in self.names else None
+        self.driven = tuple(term.driven for term in equation.terms)
+        self.healthy = priors()["healthy"][equation.healthy].value if equation.healthy else float("inf")
+
+    def level(self, test: int, blocks: Blocks) -> float:
+        """Return the standard deviation of a healthy machine's coefficient of a column; infinite for other columns."""
+        driven = self.driven[test] if test < self.left else ""
+        pressure, root = (float(np.mean(blocks.driving(root=of_root))) for of_root in (False, True))
+        return (
+            self.healthy * {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}[driven]
+        )
+
+    def zero(self, test: int, blocks: Blocks) -> float:
+        """Return the standard deviation of the zero of the pressures behind a flow, through a column's slope at it;
+        0 for a column that no pressure drives.
+        """
+        driven = self.driven[test] if test < self.left and self.bias is not None else ""
+        slope = {"": 0.0, "pressure": 1.0, "root": 0.5 / float(np.mean(blocks.driving(root=True)))}[driven]
+        return priors()["zero"]["pressure"].value * slope
 
 
 class Weighting:
@@ -142,7 +175,7 @@ class Weighting:
         share = min(1.0, SUPPORT / self._count)
         for e, columns in enumerate(self._columns):
             before = self._known[e]
-            weights = _weights(np.concatenate(values[e]), columns, before)
+            weights = _weights(values[e], columns, before)
             pairs = zip(values[e], np.split(weights, np.cumsum(rows[:-1]).astype(int)), strict=True)
             grams.append(np.array([(block * w[:, None]).T @ block for block, w in pairs]))
             # what stands for the blocks before is worth SUPPORT blocks, however many these were
@@ -162,23 +195,38 @@ def _supported(gram: Array, columns: Columns) -> Array:
     return reduced
 
 
-def _weights(values: Array, columns: Columns, known: Array | None) -> Array:
-    """Return Huber's weight of each row, from a fit to the rows and what is known."""
-    weights = np.ones(len(values))
-    if not len(values):
-        return weights
-    chosen = list(columns.nuisance)
-    x, y = values[:, chosen], values[:, columns.left]
-    prior = 0.0 if known is None else known[np.ix_(chosen, chosen)]
-    lead = 0.0 if known is None else known[chosen, columns.left]
-    for _ in range(_TURNS):
-        weighted = x * weights[:, None]
-        residual = np.abs(y - x @ solve(weighted.T @ x + prior, weighted.T @ y + lead))
+def _weights(blocks: Sequence[Array], columns: Columns, known: Array | None) -> Array:
+    """Return Huber's weight of each row, from a fit to the rows and what is known, in which leak and zero of the flow
+    are free in each block: their change is no outlier.
+    """
+    lengths = np.array([len(block) for block in blocks])
+    values, of_block = np.concatenate(blocks), np.repeat(np.arange(len(blocks)), lengths)
+    weights, slow = np.ones(len(values)), list(columns.support)
+    fast = values[:, [k for k in columns.nuisance if k not in columns.support]]
+    own = values[:, [*slow, columns.left]]
+    prior = 0.0 if known is None else known[np.ix_(slow, slow)]
+    lead = 0.0 if known is None else known[slow, columns.left]
+    for _ in range(_TURNS if len(values) else 0):
+        weighted = fast * weights[:, None]
+        inner, cross = (_block_sums(weighted[:, :, None] * of[:, None], lengths) for of in (fast, own))
+        free = np.array([solve(matrix, right) for matrix, right in zip(inner, cross, strict=True)])
+        reduced = own - np.einsum("rf,rfs->rs", fast, free[of_block])
+        x, y = reduced[:, :-1], reduced[:, -1]
+        along = x * weights[:, None]
+        residual = np.abs(y - x @ solve(along.T @ x + prior, along.T @ y + lead))
         scale = 1.4826 * np.median(residual)
         if not scale > 0.0:
             return np.ones(len(values))
         weights = np.minimum(1.0, HUBER * scale / np.maximum(residual, np.finfo(float).tiny))
     return weights
+
+
+def _block_sums(values: Array, lengths: Array) -> Array:
+    """Return the sums of rows (r, ...) over blocks of these lengths, 0 for a block without rows."""
+    sums = np.zeros((len(lengths), *values.shape[1:]))
+    filled = lengths > 0
+    sums[filled] = np.add.reduceat(values, (np.cumsum(lengths) - lengths)[filled], axis=0)
+    return sums
 
 
 def solve(matrix: Array, right: Array) -> Array:
@@ -204,7 +252,7 @@ def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces:
         part, lead = _eliminated(blocks.gram[:, e], blocks, own, test, others)
         precision += part
         vector += lead
-    return Information(blocks.time, precision, vector)
+    return Information(blocks.time, precision, vector, columns[0].level(test, blocks))
 
 
 def overlap(rate: float = 1000.0) -> float:
@@ -252,62 +300,124 @@ def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int)
     )
 
 
-def _fitted(normal: _Normal, width: Array, degrees: int, rows: float) -> tuple[Array, Array, float]:
-    """Return the other coefficients with their drifts (c,), what is believed of the drifts, a precision (c,), and the
-    variance of a row, inflated for the overlap of the rows; the tested column's coefficient is free in each block.
+class _Belief(NamedTuple):
+    """What is believed of the other coefficients: `drift` (c,), standard deviations of each of its drifts; `zero`, that
+    of the last one, and `at`, what that one is counted from.
     """
+
+    drift: Array
+    zero: float
+    at: float = 0.0
+
+
+class _Fitted(NamedTuple):
+    """The other coefficients with their drifts, what is believed of them, a precision and its product with the mean,
+    (c,) each, and the variance of a row, inflated for the overlap of the rows.
+    """
+
+    coefficients: Array
+    precision: Array
+    lead: Array
+    variance: float
+
+
+def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _Fitted:
+    """Return the fit of the other coefficients; the tested column's coefficient is free in each block."""
     energy = np.maximum(normal.energy, np.finfo(float).tiny)
     cross = normal.cross - (normal.along / energy[:, None]).T @ normal.along
     left = normal.left - normal.along.T @ (normal.lead / energy)
     square = normal.square - float((normal.lead**2 / energy).sum())
-    variance, least = square / rows, 1e-14 * normal.square / rows
+    least = 1e-14 * normal.square / rows
+    variance = max(square / rows, least)
     for _ in range(_TURNS):
-        belief = np.zeros((len(width), degrees))
+        belief, mean = np.zeros((2, len(believed.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
-            belief[:, 1:] = (overlap() * variance / width**2)[:, None]
+            belief[:, 1:] = (overlap() * variance / believed.drift**2)[:, None]
+        if believed.zero > 0.0:
+            belief[-1, 0], mean[-1, 0] = overlap() * variance / believed.zero**2, -believed.at
         # a coefficient that is zero drifts by nothing
         precision = np.minimum(belief.ravel(), 1e9 * np.diag(normal.cross))
-        coefficients = solve(cross + np.diag(precision), left)
+        lead = precision * mean.ravel()
+        coefficients = solve(cross + np.diag(precision), left + lead)
         variance = max(square - float(left @ coefficients), least) / rows
-    return coefficients, precision, max(overlap() * variance, np.finfo(float).tiny)
+    return _Fitted(coefficients, precision, lead, max(overlap() * variance, np.finfo(float).tiny))
 
 
 class _Fit(NamedTuple):
-    """Sums (K, m, m) with the scale of motion of each block set aside, what is believed of the drifts (c,), and the
-    variance of a row.
+    """Sums (K, m, m) with the scale of motion of each block set aside; the other coefficients, that of the zero's error
+    last; the zero of the pressures [Pa].
     """
 
     gram: Array
     normal: _Normal
-    belief: Array
-    variance: float
+    fitted: _Fitted
+    zero: float
 
 
 def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int]) -> _Fit:
-    """Return the fit of one equation, the tested column's coefficient free in each block."""
+    """Return the fit of one equation, the tested column's coefficient free in each block.
+
+    A leak g (p_A - p_B - z) has a zero z of the pressures' difference, one number: beside a change of g there is one of
+    the bias, by -g z. It is found by Gauss's and Newton's steps.
+    """
     powers, minutes = _drifts(blocks)
     rows, degrees = max(float(blocks.rows.sum()), 1.0), powers.shape[1]
     total = gram.sum(axis=0)
     level = solve(total[np.ix_(others, others)], total[others, columns.left])
-    width = np.abs(level) * columns.drift[others] * minutes
-    normal = _normal(gram, powers, others, test, columns.left)
-    coefficients, _, variance = _fitted(normal, width, degrees, rows)
-    of_block = np.zeros((len(blocks), gram.shape[1]))
-    of_block[:, others] = powers @ coefficients.reshape(len(others), degrees).T
-    of_block[:, test] = (normal.lead - normal.along @ coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)
-    gram = _downdated(gram, _scale(gram, of_block, variance, columns), of_block, variance, columns)
-    normal = _normal(gram, powers, others, test, columns.left)
-    _, belief, variance = _fitted(normal, width, degrees, rows)
-    return _Fit(gram, normal, belief, variance)
+    width = columns.zero(test, blocks)
+    believed = _Belief(np.append(np.abs(level) * columns.drift[others] * minutes, 0.0), width)
+    chosen, of_block, slope, zero = [*others, gram.shape[1]], np.zeros((len(blocks), gram.shape[1])), 0.0, 0.0
+    for turn in range(_TURNS + 1):
+        about = _about(gram, columns, test, slope, zero)
+        normal = _normal(about, powers, chosen, test, columns.left)
+        fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
+        if turn == _TURNS:
+            break
+        of_zero = fitted.coefficients[-degrees]
+        of_block[:, others] = powers @ fitted.coefficients[:-degrees].reshape(len(others), degrees).T
+        of_test = (normal.lead - normal.along @ fitted.coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)
+        of_block[:, test] = of_test
+        if width > 0.0:
+            slope, zero = of_test, zero + float(of_zero)
+            of_block[:, columns.bias] -= slope * zero
+        if turn == _TURNS - 1:
+            scale = _scale(gram, of_block, fitted.variance, columns)
+            gram = _downdated(gram, scale, of_block, fitted.variance, columns)
+    return _Fit(gram, normal, fitted, zero)
+
+
+def _about(gram: Array, columns: Columns, test: int, slope: Array | float, zero: float) -> Array:
+    """Return the sums with the tested column taken about a zero of the pressures, and last that of the zero's error:
+    -slope dt, of each block.
+    """
+    size = gram.shape[1]
+    turned = np.zeros((len(gram), size, size + 1))
+    turned[:, :, :size] = np.eye(size)
+    if columns.bias is not None:
+        turned[:, columns.bias, test] -= zero
+        turned[:, columns.bias, size] -= slope
+    return np.asarray(turned.transpose(0, 2, 1) @ gram @ turned)
 
 
 def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int]) -> tuple[Array, Array]:
     """Return precision (K, K) and vector (K,) of one equation."""
-    _, normal, belief, variance = _fit(gram, blocks, columns, test, others)
-    solved = solve(normal.cross + np.diag(belief), np.column_stack([normal.along.T, normal.left]))
-    precision = (np.diag(normal.energy) - normal.along @ solved[:, :-1]) / variance
-    vector = (normal.lead - normal.along @ solved[:, -1]) / variance
+    _, normal, fitted, _ = _fit(gram, blocks, columns, test, others)
+    right = np.column_stack([normal.along.T, normal.left + fitted.lead])
+    solved = solve(normal.cross + np.diag(fitted.precision), right)
+    precision = (np.diag(normal.energy) - normal.along @ solved[:, :-1]) / fitted.variance
+    vector = (normal.lead - normal.along @ solved[:, -1]) / fitted.variance
     return 0.5 * (precision + precision.T), vector
+
+
+def zero_of(blocks: Blocks, columns: Sequence[Columns]) -> float:
+    """Return the zero of p_A - p_B [Pa] that a change of the leak within the blocks shows, the equations' mean; near 0
+    where nothing changes.
+    """
+    fits = [
+        _fit(blocks.gram[:, e], blocks, own, own.leak, [k for k in own.nuisance if k != own.leak])
+        for e, own in enumerate(columns)
+    ]
+    return float(np.mean([fit.zero for fit in fits]))
 
 
 def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
@@ -316,7 +426,7 @@ def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
     for e, own in enumerate(columns):
         others = [k for k in own.nuisance if k != own.leak]
         fit = _fit(blocks.gram[:, e], blocks, own, own.leak, others)
-        sums.append(fit.gram.sum(axis=0) / fit.variance)
+        sums.append(fit.gram.sum(axis=0) / fit.fitted.variance)
     return np.array(sums)
 
 

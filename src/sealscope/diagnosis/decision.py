@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Blocks, Columns, Information, information, solve, total
+from sealscope.diagnosis.blocks import Blocks, Columns, Information, information, solve, total, zero_of
 from sealscope.diagnosis.causes import Hypothesis, hypotheses, probabilities
 from sealscope.diagnosis.causes import stepped as stepped_cause
 from sealscope.diagnosis.onset import Course, Interval, StepTest, course, step_test
@@ -92,12 +92,18 @@ class Balance:
         """Tests of all terms' coefficients, the most likely first."""
         return hypotheses(self.blocks, self.equations, self.columns)
 
+    @cached_property
+    def zero(self) -> float:
+        """Zero of p_A - p_B [Pa], as a change of the leak shows it."""
+        return zero_of(self.blocks, self.columns)
+
     def mean(self, column: int, since: float = -np.inf) -> float:
-        """Return a mean over the blocks whose middle is at `since` or later."""
+        """Return a mean over the blocks whose middle is at `since` or later, of pressures about their zero."""
+        values = self.blocks.means[:, 2] if column == 2 else self.blocks.driving(self.zero, root=column == 1)
         chosen = self.blocks.time >= since
         if not chosen.any():
             chosen[-1] = True
-        return float(np.average(self.blocks.means[chosen, column], weights=np.maximum(self.blocks.rows[chosen], 1e-9)))
+        return float(np.average(values[chosen], weights=np.maximum(self.blocks.rows[chosen], 1e-9)))
 
     @cached_property
     def size(self) -> Size:
@@ -375,7 +381,7 @@ def _leak_course(balance: Balance, evidence: Evidence) -> LeakCourse:
         weights = np.eye(len(time)) - before / max(float(before.sum()), 1.0)
         value = weights @ own.mean
         deviation = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", weights, own.covariance, weights), 0.0))
-    unit = balance.blocks.means[:, 0] * balance.size.scale / LITRE_PER_MINUTE
+    unit = balance.blocks.driving(balance.zero) * balance.size.scale / LITRE_PER_MINUTE
     half = _95 * np.hypot(deviation, value * balance.size.deviation)
     return LeakCourse(time, value * unit, (value - half) * unit, (value + half) * unit, whole=whole)
 

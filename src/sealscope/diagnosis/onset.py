@@ -185,7 +185,7 @@ class NullLaw(NamedTuple):
 
 def step_test(information: Information) -> StepTest | None:
     """Return the test of a step; None where too few blocks say anything."""
-    time, precision, vector = information
+    time, precision, vector = _with_level(information)
     count = len(time)
     values, vectors = np.linalg.eigh(precision)
     kept = values > _RANK * max(float(values[-1]), 0.0)
@@ -204,6 +204,16 @@ def step_test(information: Information) -> StepTest | None:
     at = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
     steps = np.clip(index[:, None] + 1.0 - at, 0.0, 1.0)
     return _scan(basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0), _onset_times(time, at), unit)
+
+
+def _with_level(information: Information) -> tuple[Array, Array, Array]:
+    """Return time, precision and vector with what is believed of the level as a block before the first."""
+    time, precision, vector, level = information
+    if not np.isfinite(level) or len(time) < FEWEST:
+        return time, precision, vector
+    before = np.zeros((len(time) + 1, len(time) + 1))
+    before[0, 0], before[1:, 1:] = 1.0 / level**2, precision
+    return np.concatenate([[2.0 * time[0] - time[1]], time]), before, np.concatenate([[0.0], vector])
 
 
 def _onset_times(time: Array, at: Array) -> Array:

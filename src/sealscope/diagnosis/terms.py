@@ -133,7 +133,8 @@ class Term(NamedTuple):
 
     `increments` gives f dg over each sampling interval, shape (n - 1,); `unit` is that of its coefficient; `cause` is
     what a step of the coefficient means; `nuisance`: the coefficient is unknown in any machine and drifts as `drift`
-    allows (a table of `terms.toml`), else it is zero unless that cause is present; `needs`: channels.
+    allows (a table of `terms.toml`), else it is zero unless that cause is present; `needs`: channels; `driven`: by a
+    "pressure" or by its "root", so that a zero of the sensors acts on the flow.
     """
 
     name: str
@@ -144,20 +145,26 @@ class Term(NamedTuple):
     drift: str = ""
     nuisance: bool = True
     needs: tuple[str, ...] = ()
+    driven: str = ""
 
 
 class Equation(NamedTuple):
-    """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last."""
+    """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last;
+    `healthy`: what is believed of a healthy machine's leak (a row of `terms.toml`), where that says more than nothing.
+    """
 
     name: str
     left: Callable[[Signals], Array]
     terms: tuple[Term, ...]
+    healthy: str = ""
 
 
 #: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
 LEAK, ORIFICE = "leak", "leak through an orifice"
 #: The pump's own leakage, by the pressures at its ports.
 PUMP = "pump leak"
+#: What passes or is read whatever the pressures are; a zero of the pressures acts through it.
+BIAS = "bias"
 
 _LEAKS = (
     Term(
@@ -168,6 +175,7 @@ _LEAKS = (
         "piston or pump leak",
         "leak",
         needs=("p_A", "p_B"),
+        driven="pressure",
     ),
     Term(
         ORIFICE,
@@ -177,6 +185,7 @@ _LEAKS = (
         "piston or pump leak",
         nuisance=False,
         needs=("p_A", "p_B"),
+        driven="root",
     ),
 )
 
@@ -246,11 +255,12 @@ def _lost_outside(side: str) -> Term:
         "external leak",
         nuisance=False,
         needs=(name,),
+        driven="pressure",
     )
 
 
 _LAG = Term("lag", "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
-_BIAS = Term("bias", "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
+_BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
 _PUMP = Term(
     PUMP,
     "(p_1 - p_2) dt",
@@ -259,6 +269,7 @@ _PUMP = Term(
     "pump leak",
     "leak",
     needs=("p_1", "p_2"),
+    driven="pressure",
 )
 
 _CYLINDER = (
@@ -274,67 +285,63 @@ _CYLINDER = (
 )
 
 
-def _edge(side: str, rising: bool) -> Term:
-    """Return the flow that one edge of the valve lets into (or out of) a chamber, over its gain."""
-    name, other = f"p_{side}", "p_1" if rising else "p_2"
-    opens = 1.0 if (side == "A") == rising else -1.0
+class _Way(NamedTuple):
+    """One edge of the valve at a chamber: what it connects, and the sign of the command that opens it."""
 
-    def increments(s: Signals) -> Array:
-        drop = (s.mean(other) - s.mean(name)) if rising else (s.mean(name) - s.mean(other))
-        opening = np.maximum(opens * s.mean("u"), 0.0)
-        return opening * np.sign(drop) * np.sqrt(np.abs(drop)) * s.dt
+    name: str
+    drop: tuple[str, str]
+    opens: float
 
-    way = "p_1 - p_" + side if rising else f"p_{side} - p_2"
-    return Term(
-        f"edge {'P' if rising else side} to {side if rising else 'T'}",
-        f"u_{'+' if opens > 0 else '-'} sqrt({way}) dt",
-        "m^3/(s V Pa^0.5)",
-        increments,
-        "sensor fault",
-        "edge",
-        needs=("u", name, other),
-    )
+    @classmethod
+    def of(cls, side: str, rising: bool) -> _Way:
+        """Return the edge from the supply into a chamber (`rising`), or from the chamber to the return."""
+        opens = 1.0 if (side == "A") == rising else -1.0
+        return cls(
+            *((f"P to {side}", ("p_1", f"p_{side}")) if rising else (f"{side} to T", (f"p_{side}", "p_2"))), opens
+        )
 
+    def root(self, s: Signals) -> Array:
+        """Return the root of the pressure drop with its sign [Pa^0.5]."""
+        drop = s.mean(self.drop[0]) - s.mean(self.drop[1])
+        return np.asarray(np.sign(drop) * np.sqrt(np.abs(drop)))
 
-def _overlap(side: str, rising: bool) -> Term:
-    """Return what an edge passes beside its gain: overlap, underlap and wear, open while the command opens it."""
-    name, other = f"p_{side}", "p_1" if rising else "p_2"
-    opens = 1.0 if (side == "A") == rising else -1.0
-
-    def increments(s: Signals) -> Array:
-        drop = (s.mean(other) - s.mean(name)) if rising else (s.mean(name) - s.mean(other))
-        return (opens * s.mean("u") > 0.0) * np.sign(drop) * np.sqrt(np.abs(drop)) * s.dt
-
-    way = "p_1 - p_" + side if rising else f"p_{side} - p_2"
-    return Term(
-        f"overlap {'P' if rising else side} to {side if rising else 'T'}",
-        f"[u {'>' if opens > 0 else '<'} 0] sqrt({way}) dt",
-        "m^3/(s Pa^0.5)",
-        increments,
-        "sensor fault",
-        "edge",
-        needs=("u", name, other),
-    )
+    def term(self, name: str, opening: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
+        """Return a term of this edge's flow."""
+        formula = opening.replace("u", "u" if self.opens > 0 else "-u") + f" sqrt({self.drop[0]} - {self.drop[1]}) dt"
+        return Term(f"{name} {self.name}", formula, unit, increments, "sensor fault", "edge", needs=("u", *self.drop))
 
 
-def _late(term: Term) -> Term:
-    return term._replace(
-        name=f"{term.name}, late",
-        formula=f"d({term.formula})",
-        unit="m^3/(V Pa^0.5)",
-        increments=lambda s: np.gradient(term.increments(s)),
-    )
+def _edges(side: str) -> tuple[Term, ...]:
+    """Return what a chamber's edges pass: over their gain; late, by the spool's lag; by overlap, underlap and wear."""
+    terms = []
+    for way in (_Way.of(side, True), _Way.of(side, False)):
+
+        def gain(s: Signals, way: _Way = way) -> Array:
+            return np.asarray(np.maximum(way.opens * s.mean("u"), 0.0) * way.root(s) * s.dt)
+
+        def late(s: Signals, gain: Callable[[Signals], Array] = gain) -> Array:
+            return np.gradient(gain(s))
+
+        def overlap(s: Signals, way: _Way = way) -> Array:
+            return np.asarray((way.opens * s.mean("u") > 0.0) * way.root(s) * s.dt)
+
+        terms += [
+            way.term("edge", "max(u, 0)", "m^3/(s V Pa^0.5)", gain),
+            way.term("late edge", "d max(u, 0)", "m^3/(V Pa^0.5)", late),
+            way.term("overlap", "[u > 0]", "m^3/(s Pa^0.5)", overlap),
+        ]
+    return tuple(terms)
 
 
-def _chamber(side: str, area: float) -> Equation:
-    """Return the balance of one chamber behind a valve: what the piston displaces is what its edges pass."""
-    edges = (_edge(side, True), _edge(side, False))
-    compliance = _of_side(side)
-    return Equation(
-        f"chamber {side}",
-        lambda s: -area * s.step("x"),
-        (*edges, *(_late(edge) for edge in edges), _overlap(side, True), _overlap(side, False), *compliance, *_LEAKS),
-    )
+def _chamber(side: str, rig: Rig) -> Equation:
+    """Return the balance of one chamber behind a valve: what the piston displaces is what its edges pass.
+
+    An overlap takes from the flow in either direction what a leak under friction's pressure takes: only what is known
+    of a healthy piston tells them apart, and so friction that changes from a leak.
+    """
+    area = rig.cylinder.A_A if side == "A" else rig.cylinder.A_B
+    terms = (*_edges(side), *_of_side(side), _BIAS, *_LEAKS)
+    return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, "piston")
 
 
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
@@ -347,7 +354,7 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
         if not {"x", "u", "p_1", "p_2"} <= channels:
             return ()
         sides = [side for side in "AB" if f"p_{side}" in channels]
-        balances = [_chamber(side, rig.cylinder.A_A if side == "A" else rig.cylinder.A_B) for side in sides]
+        balances = [_chamber(side, rig) for side in sides]
         return tuple(_with_channels(balance, channels) for balance in balances) if len(sides) == 2 else ()
     left = pump_volume(rig, channels)
     if left is None or not {"x", "p_A", "p_B"} <= channels:
