@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.blocks import PRESSURE_PARTS, SMOOTHED, SUPPORT, Blocks, Columns, Weighting
+from sealscope.diagnosis.onset import FEWEST
 from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE, Equation, Signals, equations
 from sealscope.diagnosis.weak_form import SPAN, STRIDE, rows, stride_samples
 from sealscope.recordings.recording import Array, Recording
@@ -139,6 +140,12 @@ def _zero(pressure: Array) -> float:
     finite = pressure[np.isfinite(pressure)]
     lowest = float(np.min(finite)) if finite.size else 0.0
     return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
+
+
+def shortest(rate: float) -> int:
+    """Return the fewest samples of a recording from which a step can be told: `FEWEST` blocks."""
+    stride = stride_samples(rate)
+    return FEWEST * max(SPAN, round(SHORTEST / STRIDE)) * stride + (SPAN - 1) * stride + 1
 
 
 def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ...]] | None:

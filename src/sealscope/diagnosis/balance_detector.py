@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.balance import blocks_of
+from sealscope.diagnosis.balance import blocks_of, shortest
 from sealscope.diagnosis.blocks import Blocks
 from sealscope.diagnosis.decision import Balance, judge
 from sealscope.diagnosis.terms import equations
@@ -38,6 +38,9 @@ class VolumeBalance:
             if self.rig.valve.spool == "present":
                 return "needs x, u, p_A, p_B and the pressures of supply and return, p_1 and p_2"
             return "needs x, p_A, p_B and the pump's theta or omega, or the command u"
+        fewest = shortest(recording.rate)
+        if len(recording) < fewest:
+            return f"needs {fewest} samples or more at {recording.rate:g} Hz, got {len(recording)}"
         for name in ("x", *CHAMBERS):
             values = recording[name][np.isfinite(recording[name])]
             if not values.size or values.min() == values.max():
