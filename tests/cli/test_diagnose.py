@@ -18,6 +18,8 @@ KEYS = {
     "onset_interval_s": list | None,
     "leak_lpm": float | None,
     "leak_interval_lpm": list | None,
+    "bound_lpm": float | None,
+    "unused": list,
     "false_alarm_probability": float,
     "score": float | None,
     "threshold": float | None,
@@ -36,7 +38,6 @@ KEYS = {
     "severity": dict | None,
     "limit": dict,
     "evidence": dict,
-    "unused": list,
 }
 VERDICTS = {"leak", "no leak", "cannot tell"}
 FOREIGN = ("--map", "p_A=PG_1", "--map", "p_B=PG_2", "--rate", "1000")

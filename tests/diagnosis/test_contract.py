@@ -60,7 +60,7 @@ GOOD: dict[str, Change] = {
 HOPELESS: dict[str, tuple[Change, str]] = {
     "no samples": (lambda r: r.samples(slice(0, 0)), "226 samples"),
     "30 samples": (lambda r: r.samples(slice(0, 30)), "226 samples"),
-    "one block": (lambda r: r.between(0.0, 3.0), "too short"),
+    "two seconds": (lambda r: r.between(0.0, 2.0), "samples or more"),
     "no pressure": (lambda r: r.only(["u", "x", "p_1", "p_2"]), "p_A or p_B"),
     "constant pressure": (lambda r: with_channels(r, p_A=np.full(len(r), 3e5)), "p_A is constant"),
     "no value at all": (lambda r: with_channels(r, p_A=np.full(len(r), np.nan)), "226 samples"),
@@ -80,6 +80,9 @@ HOPELESS: dict[str, tuple[Change, str]] = {
     "beyond floating point": (lambda r: with_channels(r, p_A=r["p_A"] * 1e200), "p_A"),
 }
 
+
+#: A balance of volumes leaves the samples at a rail out, and needs no heed of pressures that rest.
+BY_PRESSURES = ("10 s at the rail", "10 s at zero", "a straight line")
 
 #: The detector of the documentation's example, which keeps the contract as well.
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "ringing-energy" / "ringing_energy.py"
@@ -169,7 +172,7 @@ def test_judges_what_it_can(change: str, leaky: Recording) -> None:
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
 def test_cannot_tell_where_it_must_and_says_why(change: str, leaky: Recording) -> None:
     make, named = HOPELESS[change]
-    found = diagnose(make(leaky))
+    found = diagnose(make(leaky.only(["u", "p_A", "p_B"]) if change in BY_PRESSURES else leaky))
     assert found.verdict == "cannot tell"
     assert named in found.reason
     assert "\n" not in found.reason

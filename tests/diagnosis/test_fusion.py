@@ -112,13 +112,19 @@ def test_a_leak_gets_from_others_what_the_judge_lacks() -> None:
 
 
 def test_a_figure_that_is_refused_is_not_lent() -> None:
-    """The balance measured another geometry: nobody knows the flow better."""
     lent = replace(LEAK, onset_s=90.0, leak_lpm=0.031, leak_interval_lpm=(0.03, 0.032), course=COURSE)
     for figure, other in (("leak_lpm", "onset_s"), ("onset_s", "leak_lpm")):
-        found = fused(volume_balance=replace(LEAK, refuses=frozenset({figure})), observer=lent)
+        found = fused(pressure_model=replace(LEAK, refuses=frozenset({figure})), observer=lent)
         assert getattr(found, figure) is None
         assert getattr(found, other) is not None
-    assert fused(volume_balance=replace(LEAK, refuses=frozenset({"leak_lpm"})), observer=lent).course is None
+    assert fused(pressure_model=replace(LEAK, refuses=frozenset({"leak_lpm"})), observer=lent).course is None
+
+
+def test_nothing_changes_the_verdict_of_a_balance() -> None:
+    lent = replace(LEAK, onset_s=90.0, leak_lpm=0.031, course=COURSE)
+    for own in (LEAK, NONE):
+        judged = fused(volume_balance=own, observer=lent, rms_change=lent)
+        assert replace(judged, parts=(), reason=own.reason) == replace(own, detector=BALANCE)
 
 
 @pytest.mark.slow
@@ -140,7 +146,7 @@ def test_no_flow_is_stated_of_a_machine_with_another_geometry() -> None:
 
 def test_no_leak_keeps_its_own_bound_and_dates_nothing() -> None:
     bound = replace(NONE, leak_lpm=1e-5, leak_interval_lpm=(-1e-4, 1e-4), onset_s=5.0, onset_interval_s=(4.0, 6.0))
-    found = fused(volume_balance=bound, rms_change=replace(LEAK, onset_s=90.0, leak_lpm=0.1))
+    found = fused(pressure_model=bound, rms_change=replace(LEAK, onset_s=90.0, leak_lpm=0.1))
     assert (found.leak_lpm, found.onset_s, found.onset_interval_s) == (1e-5, None, None)
 
 

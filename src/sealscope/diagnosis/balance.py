@@ -11,6 +11,7 @@ from sealscope.diagnosis.blocks import PRESSURE_PARTS, SMOOTHED, SUPPORT, Blocks
 from sealscope.diagnosis.onset import FEWEST
 from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE, Equation, Signals, equations
 from sealscope.diagnosis.weak_form import SPAN, STRIDE, rows, stride_samples
+from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
@@ -32,14 +33,21 @@ class BlockStream:
     seconds : float
         Length of a block [s], rounded to whole strides of the weak form.
     support : int, optional
-        Blocks at the beginning whose rows are weighted together; by default all that are pushed at first.
+        Blocks at the beginning whose rows are weighted together; None: all that are pushed at first.
+    start : float, optional
+        Time of the first sample [s].
     """
 
     def __init__(
-        self, balances: Sequence[Equation], rate: float, seconds: float = LONGEST, support: int | None = SUPPORT
+        self,
+        balances: Sequence[Equation],
+        rate: float,
+        seconds: float = LONGEST,
+        support: int | None = SUPPORT,
+        start: float = 0.0,
     ) -> None:
         self.columns = tuple(Columns(balance) for balance in balances)
-        self._balances, self._rate = balances, rate
+        self._balances, self._rate, self._start = balances, rate, start
         self._stride = stride_samples(rate)
         self._strides = max(SPAN, round(seconds / STRIDE))
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
@@ -88,7 +96,7 @@ class BlockStream:
         cut_rows = []
         for balance in self._balances:
             columns = [*(term.increments(signals) for term in balance.terms), balance.left(signals)]
-            cut_rows.append(rows([column[inner] for column in columns], self._rate, start / self._rate))
+            cut_rows.append(rows([column[inner] for column in columns], self._rate, self._start + start / self._rate))
             whole &= cut_rows[-1].whole
         cuts = np.arange(self._strides, len(whole), self._strides)
         kept = np.split(whole, cuts)
@@ -142,6 +150,12 @@ def _zero(pressure: Array) -> float:
     return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
 
 
+def _without_rails(name: str, values: Array) -> Array:
+    """Return the samples, NaN where a pressure is cut off at an end of its sensor's range."""
+    rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
+    return np.where(np.isin(values, rails), np.nan, values) if rails else values
+
+
 def shortest(rate: float) -> int:
     """Return the fewest samples of a recording from which a step can be told: `FEWEST` blocks."""
     stride = stride_samples(rate)
@@ -159,9 +173,9 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
     samples = {name: recording[name] for name in names if name in needed}
     if recording.bridged is not None:
         samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
-    stream = BlockStream(
-        balances, recording.rate, min(LONGEST, max(SHORTEST, recording.duration / WANTED)), support=None
-    )
+    samples = {name: _without_rails(name, values) for name, values in samples.items()}
+    seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
+    stream = BlockStream(balances, recording.rate, seconds, support=None, start=float(recording.t[0]))
     blocks = stream.push(samples, last=True)
     return None if blocks is None else (blocks.merged(), stream.columns)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,11 +13,15 @@ from sealscope.diagnosis.blocks import Blocks
 from sealscope.diagnosis.decision import Balance, judge
 from sealscope.diagnosis.terms import equations
 from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.weak_form import STRIDE, stride_samples
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+
+#: Fewest samples between neighbouring test functions.
+RESOLVED = 2
 
 
 class VolumeBalance:
@@ -38,6 +43,8 @@ class VolumeBalance:
             if self.rig.valve.spool == "present":
                 return "needs x, u, p_A, p_B and the pressures of supply and return, p_1 and p_2"
             return "needs x, p_A, p_B and the pump's theta or omega, or the command u"
+        if stride_samples(recording.rate) < RESOLVED:
+            return f"needs {RESOLVED / STRIDE:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
         fewest = shortest(recording.rate)
         if len(recording) < fewest:
             return f"needs {fewest} samples or more at {recording.rate:g} Hz, got {len(recording)}"
@@ -61,6 +68,11 @@ class VolumeBalance:
             frozenset(recording.units.items()),
         )
 
+    def coherent(self, recording: Recording) -> bool:
+        """Return whether both pressures show in the balance: then they are this machine's, whatever they look like."""
+        own = self.balance(recording)
+        return own is not None and own.coherent
+
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a step of the leakage, and of its rise against the baseline."""
         own = self.balance(recording)
@@ -71,4 +83,5 @@ class VolumeBalance:
             compared = self.balance(other)
             if compared is not None and compared.columns[0].names == own.columns[0].names:
                 healthy.append(compared.blocks)
-        return judge(own, false_alarm_probability, healthy)
+        rows = own.blocks.rows
+        return replace(judge(own, false_alarm_probability, healthy), share=float(rows.mean() / max(rows.max(), 1.0)))

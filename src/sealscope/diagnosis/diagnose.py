@@ -135,9 +135,11 @@ class Examination:
         if detector.name != name:
             raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
         reason = unusable(detector, self.recording) or self.distrust
+        if name == ORDER[0] and reason is None and self.doubt is not None and not _coherent(detector, self.recording):
+            reason = self.doubt
         if name == ORDER[0] and reason is None:
             evidence = detector.examine(self.recording, self.machine, self.false_alarm_probability)
-            return replace(checked(evidence), detector=name)
+            return self._with_share(replace(checked(evidence), detector=name))
         baseline, reason = self.baseline, reason or self.doubt
         if reason is None and self.baseline:
             reasons = [unusable(detector, own) for own in self.baseline]
@@ -240,6 +242,12 @@ class Examination:
     def _known(self) -> list[Signatures]:
         """Signatures of the baseline."""
         return [seen for own in self.baseline if (seen := _signatures(own, self._behind_valve)) is not None]
+
+
+def _coherent(detector: Detector, recording: Recording) -> bool:
+    """Return whether a detector's own balance shows that the pressures are the machine's."""
+    asked = getattr(detector, "coherent", None)
+    return asked is not None and bool(asked(recording))
 
 
 def _signatures(recording: Recording, behind_valve: bool) -> Signatures | None:

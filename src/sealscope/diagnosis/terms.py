@@ -359,7 +359,12 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     left = pump_volume(rig, channels)
     if left is None or not {"x", "p_A", "p_B"} <= channels:
         return ()
-    return (_with_channels(Equation("cylinder", left, _CYLINDER), channels),)
+    # an angle has no zero of a speed: what is lost whatever the pressures are is lost to the outside
+    terms = [
+        term._replace(cause="external leak") if term.name == BIAS and "theta" in channels else term
+        for term in _CYLINDER
+    ]
+    return (_with_channels(Equation("cylinder", left, tuple(terms)), channels),)
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:

@@ -208,6 +208,7 @@ class Diagnosis(Evidence):
             "leak_lpm": _plain(self.leak_lpm),
             "leak_interval_lpm": _pair(self.leak_interval_lpm),
             "bound_lpm": _plain(self.bound_lpm),
+            "unused": list(self.unused),
             "false_alarm_probability": self.false_alarm_probability,
             "score": _plain(self.score),
             "threshold": _plain(self.threshold),
@@ -247,7 +248,6 @@ class Diagnosis(Evidence):
             "severity": None if self.severity is None else self.severity.as_dict(),
             "limit": self.limit.as_dict(),
             "evidence": self._evidence(),
-            "unused": list(self.unused),
         }
 
     def _evidence(self) -> dict[str, Any]:

@@ -38,8 +38,8 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     if judge is None:
         return replace(_no_judge(ranked, usable), detector="", parts=tuple(ranked), usable=True)
     others = [own for own in usable if own is not judge]
-    if judge.detector == ORDER[0]:  # nothing changes its verdict afterwards
-        return replace(judge, parts=(judge, *(own for own in ranked if own is not judge)))
+    if judge.detector == ORDER[0]:
+        return _beside_the_balance(judge, ranked, others)
     first, judge = judge, _doubted(judge, others)
     fused, reasons = judge, [judge.reason]
     if judge.verdict == "leak":
@@ -60,6 +60,15 @@ def fuse(evidences: Sequence[Evidence]) -> Evidence:
     return replace(
         fused, reason="; ".join(reasons), parts=(first, *(own for own in ranked if own is not first)), usable=True
     )
+
+
+def _beside_the_balance(judge: Evidence, ranked: Sequence[Evidence], others: Sequence[Evidence]) -> Evidence:
+    """Return the balance's evidence: nothing changes its verdict or its figures; others name what it cannot see."""
+    naming = next((own for own in others if _other_cause(own)), None)
+    cause = naming.cause if judge.cause is None and judge.verdict != "leak" and naming is not None else judge.cause
+    reasons = [judge.reason, *(text for own in others if (text := _difference(judge, own)) is not None)]
+    parts = (judge, *(own for own in ranked if own is not judge))
+    return replace(judge, cause=cause, reason="; ".join(reasons), parts=parts)
 
 
 def rank(detector: str) -> int:
