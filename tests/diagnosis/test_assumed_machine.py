@@ -76,9 +76,10 @@ def test_area_or_displacement_alone_gives_the_flow_whatever_the_other_is(ratio: 
     both = diagnose(recording, rig="thesis")
     assert by_area.leak_lpm == pytest.approx(flow(recording), rel=0.06)
     assert by_pump.leak_lpm == pytest.approx(by_area.leak_lpm, rel=0.01)
-    assert both.leak_lpm is None
-    assert f"displacement over area is {ratio:.3g} times the assumed one" in both.reason
-    assert f"{ratio:.3g} times that of the default rig: another geometry" in diagnose(recording).reason
+    assert f"displacement over area is {ratio:.2g}" in both.reason
+    for by in (by_area, by_pump):  # either may be wrong: the interval holds what both say
+        assert both.leak_interval_lpm[0] <= by.leak_lpm <= both.leak_interval_lpm[1]
+    assert diagnose(recording).leak_lpm is None
 
 
 def test_pressures_alone_state_no_flow_without_a_rig() -> None:

@@ -60,7 +60,7 @@ GOOD: dict[str, Change] = {
 HOPELESS: dict[str, tuple[Change, str]] = {
     "no samples": (lambda r: r.samples(slice(0, 0)), "226 samples"),
     "30 samples": (lambda r: r.samples(slice(0, 30)), "226 samples"),
-    "two seconds": (lambda r: r.between(0.0, 2.0), "samples or more"),
+    "two seconds": (lambda r: r.between(0.0, 2.0), "too short"),
     "no pressure": (lambda r: r.only(["u", "x", "p_1", "p_2"]), "p_A or p_B"),
     "constant pressure": (lambda r: with_channels(r, p_A=np.full(len(r), 3e5)), "p_A is constant"),
     "no value at all": (lambda r: with_channels(r, p_A=np.full(len(r), np.nan)), "226 samples"),

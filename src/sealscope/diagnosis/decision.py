@@ -59,6 +59,7 @@ class Size(NamedTuple):
     stated: bool
     ratio: Interval | None
     area: float | None
+    disagrees: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +172,9 @@ def _size(balance: Balance) -> Size:
     apart = abs(1.0 / ratio.value - 1.0)
     known = float(np.hypot(beliefs["displacement"].value, beliefs["area"].value))
     if states_displacement:
-        deviation = beliefs["displacement"].value
-        if rig.states("cylinder.A_A", "cylinder.A_B") and apart > _95 * known:
-            deviation = apart
-        return Size(1.0, deviation, pressures, ratio, area.value)
+        disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and apart > _95 * known
+        deviation = apart if disagrees else beliefs["displacement"].value
+        return Size(1.0, deviation, pressures, ratio, area.value, disagrees)
     if rig.states("cylinder.A_A", "cylinder.A_B"):
         return Size(ratio.value, beliefs["area"].value, pressures, ratio, area.value)
     return Size(1.0, known, False, ratio, area.value)
@@ -200,7 +200,7 @@ def judge(balance: Balance, probability: float, baseline: Sequence[Blocks] = ())
     test = balance.test
     against = rise(balance.blocks, baseline, balance.columns) if baseline else None
     if test is None and against is None:
-        return Evidence("cannot tell", f"too short for a balance: {len(balance.blocks)} blocks say something of a leak")
+        return Evidence("cannot tell", "p_A and p_B hardly differ, or too few samples are whole: no leak would show")
     questions = _questions(balance, against, probability)
     answered = next((own for own in questions if own.chance < own.probability), None)
     if answered is not None and answered.name == WITHIN:
@@ -329,7 +329,7 @@ def _over(interval: tuple[float, float], unit: float | None) -> tuple[float, flo
 
 
 def bound_of(balance: Balance, against: Rise | None) -> float:
-    """Return the 95 % upper bound of a leak that began within the recording, or that came since the baseline [m^3/s]."""
+    """Return the 95 % upper bound of a leak that began within the recording or came since the baseline [m^3/s]."""
     bounds = []
     if against is not None:
         bounds.append((against.value + against.threshold(0.05) * against.deviation) * balance.mean(0))
@@ -408,6 +408,16 @@ def _leak_course(balance: Balance, evidence: Evidence) -> LeakCourse:
     return LeakCourse(time, value * unit, (value - half) * unit, (value + half) * unit, whole=whole)
 
 
+def _level_text(passage: Passage | None) -> str:
+    """Return what passes in all beside what a healthy machine passes, in words."""
+    if passage is None or passage.lpm is None or passage.healthy_lpm is None:
+        return "pump and piston together pass more than a healthy machine"
+    return (
+        f"pump and piston together pass {passage.lpm:.3g} L/min, a healthy machine at most {passage.healthy_lpm:.2g} "
+        "L/min by the rig's file (pump.G_healthy)"
+    )
+
+
 def _reason(balance: Balance, evidence: Evidence, bound: float, question: str) -> str:
     """Return why, in one line."""
     share = f"{100.0 * bound / balance.mean(2):.2g} % of the pump's flow" if balance.mean(2) > 0.0 else "any size"
@@ -416,7 +426,7 @@ def _reason(balance: Balance, evidence: Evidence, bound: float, question: str) -
         text = {
             WITHIN: "leakage steps up within the recording, beyond the drift of this machine",
             AGAINST: "leakage is above that of the healthy recordings by more than they scatter",
-            LEVEL: "pump and piston together pass more than the rig's file says of a healthy machine (pump.G_healthy)",
+            LEVEL: _level_text(evidence.passage),
         }[question]
         if "leak_lpm" in evidence.refuses:
             text += f"; {NO_RIG}"
@@ -425,6 +435,9 @@ def _reason(balance: Balance, evidence: Evidence, bound: float, question: str) -
     else:
         text = f"a leak of up to {limit} would not show (95 %)"
         text += "; a longer recording, with the load or direction changing, bounds it closer"
+    size = balance.size
+    if size.ratio is not None and size.disagrees:
+        text += f"; displacement over area is {size.ratio.value:.3g} times the assumed one: flows lie between both"
     if evidence.verdict != "leak" and evidence.cause is not None:
         text += f"; what stepped is rather {evidence.cause}"
     return text

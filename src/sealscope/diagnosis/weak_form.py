@@ -78,7 +78,7 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     for column, own in enumerate(increments):
         cut = own[: pieces * stride].reshape(pieces, stride)
         parts = cut @ phi.T
-        lost = np.isnan(parts[:, 0])
+        lost = ~np.isfinite(parts).all(axis=1)
         if lost.any():
             missing |= lost
             parts[lost] = 0.0
