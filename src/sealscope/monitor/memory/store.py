@@ -6,9 +6,10 @@ SQLite in WAL mode with full synchronisation, or any database that SQLAlchemy kn
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,6 +101,8 @@ class MonitorStore:
         self.tables = tables
         self.sends = True  # False while another monitor that shares the database sends for all
         self._is_file = "://" not in database
+        # of the threads here one at a time writes to a file, which SQLite would let wait and then refuse
+        self._one_writer: AbstractContextManager[object] = threading.RLock() if self._is_file else nullcontext()
         url = f"sqlite:///{Path(database)}" if self._is_file else database
         try:
             self.engine: Engine = sqlalchemy.create_engine(url, **engine_options(sqlalchemy.make_url(url)))
@@ -141,7 +144,7 @@ class MonitorStore:
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """Return a connection whose changes are kept together when the block ends well."""
-        with self.engine.begin() as connection:
+        with self._one_writer, self.engine.begin() as connection:
             yield connection
 
     def known(self, connection: Connection, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
