@@ -45,7 +45,9 @@ def limited_protocol(most: int, silent_s: float = SILENT_S) -> type[asyncio.Prot
             super().connection_made(transport)
             self.heard = self.loop.time()
             if len(self.connections) > most:
-                _longest_silent(self.connections, self).transport.abort()
+                closed = _longest_silent(self.connections, self)
+                closed.transport.abort()
+                self.connections.discard(closed)  # the next one must choose another
             self.loop.call_later(_LOOK_S, self.look)
 
         def is_answered(self) -> bool:

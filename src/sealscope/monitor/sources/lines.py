@@ -20,9 +20,10 @@ def blocks_of_lines(stream: BinaryIO) -> Iterator[SourceBlock | RefusedMessage]:
                 line = stream.readline(LARGEST)
             yield refused
             continue
-        if not line.strip():
+        line = line.strip()
+        if not line:
             continue
         try:
-            yield decoded(line.strip())
+            yield decoded(line)
         except RefusedMessage as error:
             yield RefusedMessage(error.reason, error, line)
