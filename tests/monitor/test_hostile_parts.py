@@ -368,3 +368,19 @@ def test_v_before_the_monitor_is_understood(tmp_path: Path):
     call = [sys.executable, "-m", "sealscope", "-v", "monitor", "m.toml", "--once"]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120.0, check=False)
     assert (done.returncode, done.stdout) == (0, "")
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
+def test_everything_at_once_changes_no_block_mark_or_alarm(tmp_path: Path):
+    """Five minutes of what `benchmarks/monitor_hostility.py` plays for an hour."""
+    script = Path(__file__).parents[2] / "benchmarks" / "monitor_hostility.py"
+    call = [sys.executable, str(script), "--minutes", "5", "--actuators", "20", "-o", str(tmp_path / "result.json")]
+    subprocess.run(call, check=True, timeout=1500.0)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["rows"]["events"] > result["marks"] > 0
+    assert all(count == 0 for table in result["differ"].values() for count in table.values()), result["differ"]
+    assert result["events_untold"] == {"lines": 0, "webhook": 0}
+    assert result["page_troubles"] == []
+    assert result["slowest_end_s"] < 5.0
