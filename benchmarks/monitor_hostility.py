@@ -52,6 +52,8 @@ from tests.monitor.plant import CHANNELS, message
 from tests.monitor.servers import Broker, free_port
 
 RATE, BLOCK_S, ROUND_S, TOKEN = 50.0, 10.0, 60.0, "the page's token"
+#: How long an answer of the page is waited for, and for the blocks of a round to be stored [s], on a busy machine.
+PATIENCE_S = 600.0
 #: One of so many actuators has its samples in files, and one of so many leaks.
 FILES, LEAKS = 10, 3
 SETTINGS = """
@@ -174,8 +176,10 @@ class Monitor:
         if body is not None:
             request.data = json.dumps(body).encode()
             request.add_header("X-Sealscope", "mark")
-        deadline = time.monotonic() + 120.0
+        deadline = time.monotonic() + PATIENCE_S
         while True:
+            if (status := self.process.poll()) is not None:
+                raise RuntimeError(f"the monitor has ended by itself with {status}: {self.log.read_text()[-2000:]}")
             try:
                 with urllib.request.urlopen(request, timeout=timeout) as answer:
                     return json.load(answer)
@@ -183,7 +187,7 @@ class Monitor:
                 if isinstance(error, urllib.error.HTTPError) and error.code not in (429, 503):
                     return {"status": error.code, "body": error.read(1000).decode("utf-8", "replace")}
                 if time.monotonic() > deadline:
-                    raise
+                    raise RuntimeError(f"{path}: {error!r}: {self.log.read_text()[-2000:]}") from None
             time.sleep(0.5)
 
     def rows(self, query: str) -> list[tuple[Any, ...]]:
@@ -341,7 +345,7 @@ class Attacks:
         if lines and self.monitor.process.poll() is None:
             try:
                 self.monitor.ask("/api/fleet", timeout=15.0)
-            except OSError as error:
+            except RuntimeError as error:
                 self.deaf.append(f"{len(lines)} silent connections: {error!r}")
 
     def many_listeners(self) -> None:
@@ -458,7 +462,7 @@ def _send_round(monitor: Monitor, recordings: list[Recording], number: int) -> N
 
 
 def _all_stored(monitors: list[Monitor], wanted: int) -> None:
-    deadline = time.monotonic() + 300.0
+    deadline = time.monotonic() + PATIENCE_S
     while any(monitor.stored() < wanted for monitor in monitors):
         if time.monotonic() > deadline:
             raise RuntimeError(f"{[monitor.stored() for monitor in monitors]} of {wanted} blocks are stored")
@@ -517,10 +521,9 @@ def played(minutes: float, actuators: int, seed: int) -> dict[str, Any]:
             attacks.calm_down()
             _all_stored([calm, attacked], (number + 1) * each)
             marks += _marked([calm, attacked], chance)
-            print(
-                f"round {number + 1}: {(number + 1) * each} blocks, {marks} marks, {attacks.counts.total()} attacks",
-                flush=True,
-            )
+            rows, differ = _differing(calm, attacked)
+            say = f"round {number + 1}: {rows}, {marks} marks, {attacks.counts.total()} attacks"
+            print(f"{say}, lost or doubled: {sum(differ.values())}", flush=True)
         attacked.end()
         attacked.start()
         attacks.calm_down()
@@ -556,8 +559,8 @@ def played(minutes: float, actuators: int, seed: int) -> dict[str, Any]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _compared(calm: Monitor, attacked: Monitor, attacks: Attacks) -> dict[str, Any]:
-    """Return what was compared, and what is missing or too much."""
+def _differing(calm: Monitor, attacked: Monitor) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the rows of each table, and how many the attacked monitor has lost or has too many."""
     columns = "actuator, t, kind, alarm_id, by_whom, text, alarm"
     queries = {
         "estimates": "select * from estimates where actuator not like '%bait'",
@@ -569,12 +572,19 @@ def _compared(calm: Monitor, attacked: Monitor, attacks: Attacks) -> dict[str, A
     differ = {}
     for name, rows in theirs.items():
         lost, doubled = Counter(map(str, rows)), Counter(map(str, ours[name]))
-        differ[name] = {"lost": sum((lost - doubled).values()), "too many": sum((doubled - lost).values())}
+        differ[f"{name} lost"] = sum((lost - doubled).values())
+        differ[f"{name} too many"] = sum((doubled - lost).values())
+    return {name: len(rows) for name, rows in theirs.items()}, differ
+
+
+def _compared(calm: Monitor, attacked: Monitor, attacks: Attacks) -> dict[str, Any]:
+    """Return what was compared, and what is missing or too much."""
+    rows, differ = _differing(calm, attacked)
     numbers = {row[0] for row in attacked.rows("select number from events")}
     told, posted = attacked.told(), attacked.hook.numbers
     calm_told, calm_posted = {*calm.told()}, {*calm.hook.numbers}
     return {
-        "rows": {name: len(rows) for name, rows in theirs.items()},
+        "rows": rows,
         "differ": differ,
         "events_untold": {
             "lines": len(calm_told) - len({*told} & numbers),

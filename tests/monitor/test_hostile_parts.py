@@ -380,7 +380,7 @@ def test_everything_at_once_changes_no_block_mark_or_alarm(tmp_path: Path):
     subprocess.run(call, check=True, timeout=1500.0)
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["rows"]["events"] > result["marks"] > 0
-    assert all(count == 0 for table in result["differ"].values() for count in table.values()), result["differ"]
+    assert not any(result["differ"].values()), result["differ"]
     assert result["events_untold"] == {"lines": 0, "webhook": 0}
     assert result["page_troubles"] == []
     assert result["slowest_end_s"] < 5.0

@@ -36,7 +36,7 @@ def supervisor(stopping: threading.Event) -> tuple[Supervisor, Outages]:
     return Supervisor(outages, stopping, away), outages
 
 
-@pytest.mark.parametrize("error", [KeyError("no such thing"), RecursionError(), MemoryError(), Panic("unwrap")])
+@pytest.mark.parametrize("error", [KeyError("no such thing"), RecursionError(), SystemExit(3), Panic("unwrap")])
 def test_a_part_that_fails_is_an_outage_and_starts_again(monkeypatch, caplog, error):
     monkeypatch.setattr("sealscope.monitor.supervisor.FIRST_PAUSE_S", 0.05)
     monkeypatch.setattr("sealscope.monitor.supervisor._SOUND_S", 0.3)

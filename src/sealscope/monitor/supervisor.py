@@ -54,9 +54,9 @@ class SupervisedPart:
             sound.start()
         try:
             work()
-        except (KeyboardInterrupt, SystemExit):
+        except KeyboardInterrupt:
             raise
-        except BaseException as error:  # extensions in Rust raise a panic, which is no Exception
+        except BaseException as error:  # a panic of an extension in Rust and an exit of uvicorn are no Exception
             sound.cancel()
             self._note(error)
             return False
