@@ -210,7 +210,7 @@ class Monitor:
         rows = self.rows("select actuator, identity from blocks where actuator not like '%bait'")
         return sorted(row for row in rows if not row[1].startswith("stranger"))
 
-    def told(self) -> Counter[int]:
+    def lines_out(self) -> Counter[int]:
         """Return how often each event has gone out by a line."""
         numbers = Counter[int]()
         for line in self.lines.read_text().splitlines():
@@ -581,16 +581,16 @@ def _compared(calm: Monitor, attacked: Monitor, attacks: Attacks) -> dict[str, A
     """Return what was compared, and what is missing or too much."""
     rows, differ = _differing(calm, attacked)
     numbers = {row[0] for row in attacked.rows("select number from events")}
-    told, posted = attacked.told(), attacked.hook.numbers
-    calm_told, calm_posted = {*calm.told()}, {*calm.hook.numbers}
+    lines, posted = attacked.lines_out(), attacked.hook.numbers
+    calm_lines, calm_posted = {*calm.lines_out()}, {*calm.hook.numbers}
     return {
         "rows": rows,
         "differ": differ,
-        "events_untold": {
-            "lines": len(calm_told) - len({*told} & numbers),
+        "events_not_out": {
+            "lines": len(calm_lines) - len({*lines} & numbers),
             "webhook": len(calm_posted) - len({*posted} & numbers),
         },
-        "events_told_again": {"lines": told.total() - len(told), "webhook": posted.total() - len(posted)},
+        "events_out_again": {"lines": lines.total() - len(lines), "webhook": posted.total() - len(posted)},
         "refused": attacked.rows("select count(*) from refused")[0][0],
         "page_troubles": attacks.deaf,
     }

@@ -381,6 +381,45 @@ def test_everything_at_once_changes_no_block_mark_or_alarm(tmp_path: Path):
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["rows"]["events"] > result["marks"] > 0
     assert not any(result["differ"].values()), result["differ"]
-    assert result["events_untold"] == {"lines": 0, "webhook": 0}
+    assert result["events_not_out"] == {"lines": 0, "webhook": 0}
     assert result["page_troubles"] == []
     assert result["slowest_end_s"] < 5.0
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        b"\x32\x05\x00\xffab\x00",  # a message whose topic is longer than it
+        pytest.param(b"\x30\x04\x00\x01\xff\x00", marks=pytest.mark.slow),  # a topic that is no UTF-8
+        pytest.param(b"\x20\x02\x00", marks=pytest.mark.slow),  # the connection is confirmed again, in part
+        pytest.param(b"\x90\x01\x00", marks=pytest.mark.slow),  # a subscription is confirmed without its number
+        pytest.param(
+            b"\x30\x09\x00\x01a\x05\x26\x00\x01\xff\x00\x00", marks=pytest.mark.slow
+        ),  # properties that are no UTF-8
+        pytest.param(b"\xf0\xff\xff\xff\xff\xff", marks=pytest.mark.slow),  # a length without end
+    ],
+)
+def test_a_broker_that_speaks_no_mqtt_is_tried_again(tmp_path: Path, monkeypatch, packet):
+    monkeypatch.setattr("sealscope.monitor.supervisor.FIRST_PAUSE_S", 0.05)
+    connections: list[bytes] = []
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def answer() -> None:
+        while True:
+            line, _ = server.accept()
+            with suppress(OSError), line:
+                connections.append(line.recv(65536))
+                line.sendall(b"\x20\x03\x00\x00\x00" + packet)
+                line.settimeout(1.0)
+                while line.recv(65536):
+                    pass
+
+    threading.Thread(target=answer, daemon=True).start()
+    (tmp_path / "monitor.toml").write_text(SETTINGS.format(port=server.getsockname()[1]))
+    running = Running(read_settings(tmp_path / "monitor.toml"))
+    try:
+        until(lambda: len(connections) >= 2, 20.0)
+        assert running.thread.is_alive()
+        assert running.service.outages.totals()["broker"][1] + running.service.outages.totals()["MQTT client"][1] > 0
+    finally:
+        running.end()

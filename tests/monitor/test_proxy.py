@@ -41,13 +41,13 @@ def proxy(tmp_path: Path) -> Iterator[http.client.HTTPSConnection]:
         Supervisor(Outages(lambda: None), threading.Event()),
     )
     port, (site,) = free_port(), re.findall(r"```nginx\n(.*?)```", GUIDE.read_text("utf-8"), re.DOTALL)
-    for told, here in (
+    for given, here in (
         ("listen 443", f"listen 127.0.0.1:{port}"),
         ("/etc/ssl/monitor", str(tmp_path)),
         ("127.0.0.1:8765", f"127.0.0.1:{page.port}"),
     ):
-        assert site.count(told) >= 1
-        site = site.replace(told, here)
+        assert site.count(given) >= 1
+        site = site.replace(given, here)
     temporary = "".join(f"{name}_temp_path {tmp_path}/{name};\n" for name in ("client_body", "proxy", "fastcgi"))
     more = "".join(f"{name}_temp_path {tmp_path}/{name};\n" for name in ("uwsgi", "scgi"))
     (tmp_path / "nginx.conf").write_text(

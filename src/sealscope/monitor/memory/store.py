@@ -102,7 +102,7 @@ class MonitorStore:
         self.sends = True  # False while another monitor that shares the database sends for all
         self._is_file = "://" not in database
         # of the threads here one at a time writes to a file, which SQLite would let wait and then refuse
-        self._one_writer: AbstractContextManager[object] = threading.RLock() if self._is_file else nullcontext()
+        self._writing_lock: AbstractContextManager[object] = threading.RLock() if self._is_file else nullcontext()
         url = f"sqlite:///{Path(database)}" if self._is_file else database
         try:
             self.engine: Engine = sqlalchemy.create_engine(url, **engine_options(sqlalchemy.make_url(url)))
@@ -144,7 +144,7 @@ class MonitorStore:
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """Return a connection whose changes are kept together when the block ends well."""
-        with self._one_writer, self.engine.begin() as connection:
+        with self._writing_lock, self.engine.begin() as connection:
             yield connection
 
     def known(self, connection: Connection, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
