@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import gzip
-import io
 import json
 import os
 import random
@@ -29,7 +28,6 @@ import threading
 import time
 import urllib.error
 import urllib.request
-import zipfile
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
@@ -50,6 +48,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.diagnosis.balance_machine import machine, step
 from tests.monitor.plant import CHANNELS, message
 from tests.monitor.servers import Broker, free_port
+from tests.recordings.test_packed_files import rows, workbook
 
 RATE, BLOCK_S, ROUND_S, TOKEN = 50.0, 10.0, 60.0, "the page's token"
 #: How long an answer of the page is waited for, and for the blocks of a round to be stored [s], on a busy machine.
@@ -295,18 +294,16 @@ class Attacks:
 
     def latin_name(self) -> None:
         self.stranger(b" pr\xe9sse.csv", b"t [s],x [m]\n0,1\nnot a number")
-        good = io.BytesIO()
-        good.write(("t [s],p_A [Pa]\n" + "".join(f"{k / 50},{k}\n" for k in range(4000))).encode())
-        self.stranger(b" sch\xf6n.csv", good.getvalue(), "bait")
+        good = "t [s],p_A [Pa]\n" + "".join(f"{k / 50},{k}\n" for k in range(4000))
+        self.stranger(b" sch\xf6n.csv", good.encode(), "bait")
 
     def damaged_file(self) -> None:
         suffix = self.chance.choice([b".csv", b".parquet", b".mat", b".h5", b".mf4", b".tdms", b".zip", b".xlsx"])
         self.stranger(suffix, self.chance.randbytes(3000))
 
     def corner_workbook(self) -> None:
-        sheet = '<worksheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"><sheetData>'
-        sheet += '<row r="1"><c r="A1"><v>1</v></c></row><row r="1048576"><c r="XFD1048576"><v>1</v></c></row>'
-        self.stranger(b".xlsx", workbook(sheet + "</sheetData></worksheet>"), "bait")
+        path = self.stranger(b".xlsx", b"", "bait")
+        workbook(path, [rows([("A1", 1), ("XFD1048576", 1)])])
 
     def bomb(self) -> None:
         self.stranger(b".csv.gz", BOMB, "bait")
@@ -406,29 +403,6 @@ ATTACKS: tuple[tuple[str, Callable[[Attacks], None]], ...] = (
 )
 #: 1 GB of zeros in 1 MB.
 BOMB = gzip.compress(bytes(4_000_000), 9) * 250
-
-
-def workbook(sheet: str) -> bytes:
-    """Return a workbook of Excel with one sheet."""
-    kind = "http://schemas.openxmlformats.org"
-    rel = f"{kind}/officeDocument/2006/relationships"
-    parts = {
-        "[Content_Types].xml": f'<Types xmlns="{kind}/package/2006/content-types"><Default Extension="rels" '
-        'ContentType="application/vnd.openxmlformats-package.relationships+xml"/><Default Extension="xml" ContentType='
-        '"application/vnd.openxmlformats-officedocument.spreadsheetml.sheet.main+xml"/></Types>',
-        "_rels/.rels": f'<Relationships xmlns="{kind}/package/2006/relationships"><Relationship Id="r1" '
-        f'Type="{rel}/officeDocument" Target="xl/workbook.xml"/></Relationships>',
-        "xl/workbook.xml": f'<workbook xmlns="{kind}/spreadsheetml/2006/main" xmlns:r="{rel}"><sheets>'
-        '<sheet name="a" sheetId="1" r:id="r1"/></sheets></workbook>',
-        "xl/_rels/workbook.xml.rels": f'<Relationships xmlns="{kind}/package/2006/relationships"><Relationship '
-        f'Id="r1" Type="{rel}/worksheet" Target="worksheets/sheet1.xml"/></Relationships>',
-        "xl/worksheets/sheet1.xml": sheet,
-    }
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, contents in parts.items():
-            archive.writestr(name, contents)
-    return made.getvalue()
 
 
 def _closed(lines: list[socket.socket]) -> bool:

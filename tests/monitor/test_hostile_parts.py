@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import os
@@ -35,6 +36,7 @@ from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import BIRTH_SEQUENCE, INT64, SparkplugMetric, SparkplugPayload, encoded
 from sealscope.recordings import write
 
+from ..recordings.test_packed_files import rows, workbook
 from .plant import CHANNELS, served, settings_in, until
 from .servers import MOSQUITTO, Broker
 from .test_broker import SETTINGS, Running, send
@@ -423,3 +425,25 @@ def test_a_broker_that_speaks_no_mqtt_is_tried_again(tmp_path: Path, monkeypatch
         assert running.service.outages.totals()["broker"][1] + running.service.outages.totals()["MQTT client"][1] > 0
     finally:
         running.end()
+
+
+@pytest.mark.slow
+def test_a_workbook_and_a_bomb_that_end_their_reader_are_named_once(tmp_path: Path, monkeypatch, caplog):
+    """With the readers that there are; after a restart nothing is read."""
+    settings, folder = settings_in(tmp_path, folder_settings(tmp_path, "press 3", "press 4")), tmp_path / "press 3"
+    workbook(folder / "corner.xlsx", [rows([("A1", 1), ("XFD1048576", 2)])])
+    (folder / "bomb.csv.gz").write_bytes(gzip.compress(bytes(4_000_000), 9) * 250)
+    for where in (folder, tmp_path / "press 4"):
+        write(SOUND.only(CHANNELS), where / "sound.csv")
+    service, _ = served(settings)
+    assert service.actuators.counters == {UNREADABLE_FILE: 2}
+    assert len(blocks_of(service)) == 4
+    for name in ("corner.xlsx", "bomb.csv.gz"):
+        assert len([record for record in caplog.records if name in record.getMessage()]) == 1
+
+    def read(*_: object, **__: object) -> None:
+        raise AssertionError("it is read again")
+
+    monkeypatch.setattr("sealscope.monitor.sources.folder.read", read)
+    again, _ = served(settings)
+    assert again.actuators.counters == {} and len(blocks_of(again)) == 4
