@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 _WAITING, _WAITING_BYTES = 512, 256_000_000
 #: How often folders are looked at and lines are written [s], the longest pause after an error of the database, and how
 #: long what is under way at the end is waited for, all together.
-_LOOK_S, _LINES_S, _LONGEST_PAUSE_S, _END_S = 0.5, 0.2, 5.0, 3.5
+_LOOK_S, _LINES_S, _LONGEST_PAUSE_S, _END_S = 0.5, 0.2, 5.0, 2.5
 #: Blocks that are stored in one transaction, at most, and how long the first one waits for others [s].
 _TOGETHER, _GATHER_S = 256, 0.02
 #: What a block is counted under that raised an error.
@@ -103,7 +103,8 @@ class Service:
             if (part := settings.share) is not None:
                 names = [actuator.name for actuator in settings.actuator]
                 self._share = Share(self.store, part.name, names, part.lease_s)
-            self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days, self._share)
+            with threadpool_limits(limits=1):  # as in `run`: sums in another order end in other digits
+                self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days, self._share)
             self.outages = self.actuators.outages
             self.outages.expect(DATABASE)
             self.supervisor = Supervisor(self.outages, self.stopping, away)

@@ -369,6 +369,6 @@ class PageServer:
     def close(self) -> None:
         """End the page."""
         self.leave()
-        self._thread.join(timeout=1.5)
+        self._thread.join(timeout=1.0)
         if self._socket is not None:
             self._socket.close()
