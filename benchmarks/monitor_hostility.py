@@ -6,7 +6,8 @@ Two monitors with the same settings get the same blocks in real time, by MQTT an
 the same alarms of both. One of them is attacked all the time (`ATTACKS`): hostile messages, files, links, connections
 and requests, a webhook and a standard output that misbehave, a broker that restarts, and kills. After each minute both
 must have stored all blocks; then the alarms are marked. At the end the rows of blocks, estimates, alarms and events
-must be the same, numbers to nine digits, and each event must have arrived at the webhook and in the lines. It needs mosquitto.
+must be the same, numbers to nine digits, and each event must have arrived at the webhook and in the lines. It needs
+mosquitto.
 """
 
 from __future__ import annotations
