@@ -501,9 +501,11 @@ def played(minutes: float, actuators: int, seed: int) -> dict[str, Any]:
             attacks.calm_down()
             _all_stored([calm, attacked], (number + 1) * each)
             marks += _marked([calm, attacked], chance)
-            counts, differ = _differing(calm, attacked)
+            counts, differ, digits = _differing(calm, attacked)
             say = f"round {number + 1}: {counts}, {marks} marks, {attacks.counts.total()} attacks"
-            print(f"{say}, lost or doubled: {sum(differ.values())}", flush=True)
+            print(
+                f"{say}, lost or doubled: {sum(differ.values())}, other last digits: {sum(digits.values())}", flush=True
+            )
         attacked.end()
         attacked.start()
         attacks.calm_down()
@@ -539,8 +541,8 @@ def played(minutes: float, actuators: int, seed: int) -> dict[str, Any]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _differing(calm: Monitor, attacked: Monitor) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the rows of each table, and how many the attacked monitor has lost or has too many."""
+def _differing(calm: Monitor, attacked: Monitor) -> tuple[dict[str, int], dict[str, int], dict[str, int]]:
+    """Return the rows of each table, how many are lost or too many, and in how many the last digits differ."""
     columns = "actuator, t, kind, alarm_id, by_whom, text, alarm"
     queries = {
         "estimates": "select * from estimates where actuator not like '%bait'",
@@ -549,23 +551,27 @@ def _differing(calm: Monitor, attacked: Monitor) -> tuple[dict[str, int], dict[s
     }
     ours = {"blocks": attacked.blocks(), **{name: attacked.rows(query) for name, query in queries.items()}}
     theirs = {"blocks": calm.blocks(), **{name: calm.rows(query) for name, query in queries.items()}}
-    differ = {}
+    differ: dict[str, int] = {}
+    digits: dict[str, int] = {}
     for name, sound in theirs.items():
         lost, doubled = Counter(map(_shown, sound)), Counter(map(_shown, ours[name]))
         differ[f"{name} lost"] = sum((lost - doubled).values())
         differ[f"{name} too many"] = sum((doubled - lost).values())
-    return {name: len(each) for name, each in theirs.items()}, differ
+        exact = Counter(map(str, sound)) - Counter(map(str, ours[name]))
+        digits[name] = exact.total() - differ[f"{name} lost"]
+    return {name: len(each) for name, each in theirs.items()}, differ, digits
 
 
 def _compared(calm: Monitor, attacked: Monitor, attacks: Attacks) -> dict[str, Any]:
     """Return what was compared, and what is missing or too much."""
-    counts, differ = _differing(calm, attacked)
+    counts, differ, digits = _differing(calm, attacked)
     numbers = {row[0] for row in attacked.rows("select number from events")}
     lines, posted = attacked.lines_out(), attacked.hook.numbers
     calm_lines, calm_posted = {*calm.lines_out()}, {*calm.hook.numbers}
     return {
         "rows": counts,
         "differ": differ,
+        "last_digits_differ": digits,
         "events_not_out": {
             "lines": len(calm_lines) - len({*lines} & numbers),
             "webhook": len(calm_posted) - len({*posted} & numbers),
