@@ -9,11 +9,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from .messages import MESSAGES
 from .recordings import RECORDINGS
 from .targets import TARGETS
 
 #: What can be attacked: kind -> what makes, in a folder, the use of an input.
-KINDS = TARGETS | RECORDINGS
+KINDS = TARGETS | RECORDINGS | MESSAGES
 #: Longest time that an input may take [s of this process], and most memory [bytes] that all of them may add.
 LONGEST, MOST_MEMORY = 2.0, 1e9
 

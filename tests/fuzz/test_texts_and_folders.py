@@ -7,11 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from .messages import MESSAGES
 from .runs import MOST_MEMORY, attack, peak_memory
 from .targets import TARGETS
 
 FEW = {"options": 300, "rigs": 60, "profiles": 120, "plans": 30, "campaign folders": 15, "kept files": 60}
+FEW |= {"monitor messages": 400, "Sparkplug messages": 400}
 MANY = {"options": 6000, "rigs": 2000, "profiles": 1500, "plans": 1000, "campaign folders": 500, "kept files": 1500}
+MANY |= {"monitor messages": 50_000, "Sparkplug messages": 50_000}
 
 
 def some(kind: str, folder: Path, seeds: range, capfd: pytest.CaptureFixture[str]) -> None:
@@ -26,7 +29,7 @@ def some(kind: str, folder: Path, seeds: range, capfd: pytest.CaptureFixture[str
     assert output.out == output.err == ""
 
 
-@pytest.mark.parametrize("kind", TARGETS)
+@pytest.mark.parametrize("kind", [*TARGETS, *MESSAGES])
 def test_hostile_inputs(
     kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -36,7 +39,7 @@ def test_hostile_inputs(
 
 @pytest.mark.slow
 @pytest.mark.long
-@pytest.mark.parametrize("kind", TARGETS)
+@pytest.mark.parametrize("kind", [*TARGETS, *MESSAGES])
 def test_many_hostile_inputs(
     kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

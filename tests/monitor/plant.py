@@ -73,13 +73,13 @@ def served(settings: MonitorSettings, lines: bytes = b"") -> tuple[Service, str]
 
 
 def rows_of(database: str) -> dict[str, list[tuple[Any, ...]]]:
-    """All rows of a monitor's database but the positions of outputs; the numbers of events are left out."""
+    """All rows of a monitor's database but the positions of outputs and what was refused, without events' numbers."""
     url = database if "://" in database else f"sqlite:///{database}"
     engine = create_engine(url)
     rows = {}
     with engine.connect() as connection:
         for table in inspect(engine).get_table_names():
-            if table == "facts":
+            if table in ("facts", "refused"):
                 continue
             columns = [column["name"] for column in inspect(engine).get_columns(table)]
             chosen = ", ".join(name for name in columns if (table, name) != ("events", "number"))

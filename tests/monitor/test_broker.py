@@ -144,7 +144,7 @@ def test_a_broker_that_is_away_stands_on_page_and_metrics(broker: Broker, tmp_pa
     file.write_text(SETTINGS.format(port=broker.port))
     kept(broker)
     running = Running(read_settings(file))
-    page = TestClient(site(running.service.actuators, PageSettings(), None))
+    page = TestClient(site(running.service.actuators, PageSettings(), None), base_url="http://localhost")
     try:
         send(broker.port, LINES.splitlines()[:1])
         running.until(1)  # it is connected

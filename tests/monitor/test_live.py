@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import threading
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -17,6 +18,7 @@ from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.page.live import MOST_ACTUATORS, MOST_SAMPLES, LiveSamples, machine_of
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import ActuatorSettings, PageSettings
+from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
 from sealscope.signals.streams import DetailStream
 from sealscope.signals.windows import RmsStream
@@ -130,7 +132,7 @@ def page(tmp_path) -> Iterator[tuple[PageServer, LiveSamples]]:
     store = MonitorStore(str(tmp_path / "monitor.db"))
     actuators = WatchedActuators([ActuatorSettings(name="press <1>")], store)
     live = LiveSamples(store.last_samples)
-    server = PageServer(actuators, PageSettings(port=0), live=live)
+    server = PageServer(actuators, PageSettings(port=0), Supervisor(actuators.outages, threading.Event()), live=live)
     yield server, live
     server.close()
     store.engine.dispose()

@@ -57,13 +57,17 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture
 def page(service: Service) -> TestClient:
-    return TestClient(site(service.actuators, PageSettings(), None))
+    return TestClient(site(service.actuators, PageSettings(), None), base_url="http://localhost")
 
 
 def of(name: str) -> str:
     from urllib.parse import quote
 
-    return f"/api/actuator/{quote(name, safe='')}"
+    return f"/api/actuator?name={quote(name, safe='')}"
+
+
+def mark_of(name: str) -> str:
+    return of(name).replace("actuator", "mark", 1)
 
 
 def test_everything_is_served_and_nothing_comes_from_elsewhere(page: TestClient):
@@ -84,7 +88,7 @@ def test_the_leaking_one_comes_first_with_its_life(page: TestClient):
     assert life["name"] == HOSTILE
     assert life["events"][-1]["event"] == "raised"
     assert len(life["course"]) == 41
-    assert 0 < len(page.get(of(HOSTILE), params={"hours": "0.01"}).json()["course"]) < 20
+    assert 0 < len(page.get(of(HOSTILE) + "&hours=0.01").json()["course"]) < 20
     assert page.get(of("no such")).status_code == 404
 
 
@@ -96,7 +100,7 @@ def test_a_course_of_many_blocks_is_means(service: Service):
 
 
 def test_a_mark_needs_the_page_and_an_alarm(page: TestClient):
-    address, header = f"{of('a sound one')}/mark", {"X-Sealscope": "mark"}
+    address, header = mark_of("a sound one"), {"X-Sealscope": "mark"}
     assert page.post(address, json={"mark": "acknowledged"}).status_code == 403
     answer = page.post(address, json={"mark": "acknowledged"}, headers=header)
     assert (answer.status_code, answer.json()) == (
@@ -106,12 +110,10 @@ def test_a_mark_needs_the_page_and_an_alarm(page: TestClient):
     for body in (b"{", b"[]", b'{"mark": 3}', b'{"mark": "' + b"x" * 20_000 + b'"}', b'{"mark": "away"}'):
         assert page.post(address, content=body, headers=header).status_code == 400
     for text in ("a\0b", "\ud800"):
-        unstorable = page.post(
-            f"{of(HOSTILE)}/mark", content=json.dumps({"mark": "comment", "text": text}), headers=header
-        )
+        unstorable = page.post(mark_of(HOSTILE), content=json.dumps({"mark": "comment", "text": text}), headers=header)
         assert (unstorable.status_code, unstorable.json()["error"][:24]) == (400, "a comment must be text, ")
     comment = {"mark": "comment", "text": "<script>alert(1)</script>", "by": "Ada"}
-    assert page.post(f"{of(HOSTILE)}/mark", json=comment, headers=header).status_code == 200
+    assert page.post(mark_of(HOSTILE), json=comment, headers=header).status_code == 200
     assert page.get(of(HOSTILE)).json()["events"][0]["text"] == comment["text"]
 
 
@@ -120,7 +122,10 @@ def test_other_sites_names_for_this_machine_are_refused(page: TestClient):
 
 
 def test_beyond_this_machine_a_token_opens(service: Service, tmp_path: Path):
-    page = TestClient(site(service.actuators, PageSettings(host="0.0.0.0", token_file=tmp_path), "s3cret"))
+    page = TestClient(
+        site(service.actuators, PageSettings(host="0.0.0.0", token_file=tmp_path), "s3cret"),
+        base_url="http://localhost",
+    )
     for address in ("/api/fleet", "/metrics", "/page.js", of(HOSTILE)):
         assert page.get(address).status_code == 401
     assert page.get("/", follow_redirects=False).headers["location"] == "/login"
@@ -158,9 +163,9 @@ def test_the_order_is_error_warning_unseen_then_evidence_then_the_sure_leak():
 
 
 def test_a_port_in_use_is_one_line(service: Service):
-    first = PageServer(service.actuators, PageSettings(port=0))
+    first = PageServer(service.actuators, PageSettings(port=0), service.supervisor)
     with pytest.raises(InputError, match=r"page.port must be free, got .* \(127.0.0.1:\d+\)"):
-        PageServer(service.actuators, PageSettings(port=first.port))
+        PageServer(service.actuators, PageSettings(port=first.port), service.supervisor)
     first.close()
     service.actuators.closed = False
 
@@ -203,7 +208,7 @@ def test_the_page_in_a_browser(service: Service):
     if browser_path is None:
         pytest.skip("chromium is not installed")
     live = LiveSamples(service.store.last_samples)
-    server = PageServer(service.actuators, PageSettings(port=0), live=live)
+    server = PageServer(service.actuators, PageSettings(port=0), service.supervisor, live=live)
     try:
         with playwright.sync_playwright() as player:
             browser = player.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])

@@ -174,7 +174,7 @@ def test_while_postgresql_is_away_the_page_says_so_and_nothing_is_lost(server: P
             try:
                 for line in lines[len(lines) // 2 :]:
                     wire.write(line)
-                for address in ("api/fleet", "api/actuator/press%201"):
+                for address in ("api/fleet", "api/actuator?name=press%201"):
                     status, text_ = asked(address)
                     assert status == 503
                     assert json.loads(text_)["error"].startswith("the database does not answer: ")
@@ -219,7 +219,7 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(server: PostgreSQL, t
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as stream, os.fdopen(writing, "wb", buffering=0) as wire:
         service = Service(settings, stdin=stream, stdout=io.StringIO())
-        page = TestClient(site(service.actuators, PageSettings(), None, service.waits))
+        page = TestClient(site(service.actuators, PageSettings(), None, service.waits), base_url="http://localhost")
         thread = threading.Thread(target=service.run)
         thread.start()
         lines = LINES.splitlines(keepends=True)

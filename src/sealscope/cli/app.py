@@ -133,11 +133,15 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
 
 def arguments_of(words: Sequence[str]) -> list[str]:
     """Return the words of a call as the commands take them: `-v` first, an option for each baseline."""
-    if list(words[:1]) == ["monitor"] and words[1:] and words[1] not in monitoring.COMMANDS:
-        words = ["monitor", "run", *words[1:]]  # `sealscope monitor FILE`
     end = list(words).index("--") if "--" in words else len(words)
     verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
     plain = [word for word in words[:end] if word not in ("-v", "--verbose")]
+    if (
+        plain[:1] == ["monitor"]
+        and [*plain, *words[end:]][1:]
+        and plain[1:2] not in [[name] for name in monitoring.COMMANDS]
+    ):
+        plain[1:1] = ["run"]  # `sealscope monitor FILE`
     return [*verbose[:1], *spread_baselines([*plain, *words[end:]])]
 
 

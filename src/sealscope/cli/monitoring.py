@@ -47,6 +47,11 @@ def run(
     """Watch the actuators of FILE: blocks in, alarms as JSON lines on standard output."""
     if not logging.getLogger("sealscope").handlers:
         logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
+    from sealscope.monitor.supervisor import LimitedLines
+
+    limit = LimitedLines()  # one, for all: what a stranger sends must not fill the disk
+    for handler in (*logging.getLogger().handlers, *logging.getLogger("sealscope").handlers):
+        handler.addFilter(limit)
     _serve(file, once=once)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,8 @@ from sealscope.errors import MissingExtra
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
 
+_log = logging.getLogger(__name__)
+_log.setLevel(logging.WARNING)  # paho tells each packet
 #: Silence after which the broker is asked for a sign of life [s]; half of it later the connection counts as lost.
 KEEP_ALIVE_S = 20
 
@@ -33,4 +36,12 @@ def client_of(client_id: str, user: str | None, password: str | None, tls: bool,
     if tls:
         client.tls_set(ca_certs=None if ca_file is None else str(ca_file))
     client.reconnect_delay_set(1, 30)
+    client.suppress_exceptions = True  # an error of a callback ends no connection; paho logs it
+    client.enable_logger(_log)
     return client
+
+
+def check_running(client: Client) -> None:
+    """Raise RuntimeError where the thread of a client has ended, as after a packet that paho does not understand."""
+    if getattr(client, "_thread", client) is None:  # there is no public way to ask
+        raise RuntimeError("the thread of the connection to the broker has ended")

@@ -1,5 +1,7 @@
 """What the monitor needs and does not reach, such as its database or its broker: since when, why, how often, how long.
 
+A part of its own that raised an error, such as the decoder of messages, is an outage as well.
+
 An outage is said once in the log when it begins and once when it ends, and stands on the page and in the metrics.
 """
 

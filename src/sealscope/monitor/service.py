@@ -9,8 +9,9 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import BinaryIO, TextIO, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -26,16 +27,23 @@ from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import MonitorSettings, secret_of
 from sealscope.monitor.sources.folder import WatchedFolder
 from sealscope.monitor.sources.lines import blocks_of_lines
-from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, SourceBlock, bytes_of
+from sealscope.monitor.sources.source_block import (
+    UNREADABLE_FILE,
+    BlockReceiver,
+    RefusedMessage,
+    SourceBlock,
+    bytes_of,
+)
+from sealscope.monitor.supervisor import Supervisor
 from sealscope.monitor.waiting import Waiting
 from sealscope.storage.folders import locked
 
 _log = logging.getLogger(__name__)
 #: Blocks that wait to be stored and their bytes, at most; sources wait beyond.
 _WAITING, _WAITING_BYTES = 512, 256_000_000
-#: How often folders are looked at [s], the longest pause after an error of the database, and how long a post that is
-#: under way at the end is waited for.
-_LOOK_S, _LONGEST_PAUSE_S, _POST_S = 0.5, 5.0, 30.0
+#: How often folders are looked at and lines are written [s], the longest pause after an error of the database, and how
+#: long what is under way at the end is waited for, all together.
+_LOOK_S, _LINES_S, _LONGEST_PAUSE_S, _END_S = 0.5, 0.2, 5.0, 2.5
 #: Blocks that are stored in one transaction, at most, and how long the first one waits for others [s].
 _TOGETHER, _GATHER_S = 256, 0.02
 #: What a block is counted under that raised an error.
@@ -45,8 +53,11 @@ _LONG_WAIT_S = 5.0
 #: Lines in the log about the same trouble before only each power of two gets one.
 _FIRST_LINES = 3
 
+#: The name of the source of lines.
+_LINES = "standard input"
 #: A source: hands blocks, or errors of messages, over until it has none or the receiver stops.
 Source = Callable[[BlockReceiver], None]
+_Kept = TypeVar("_Kept", SourceBlock, RefusedMessage)
 
 
 class Service:
@@ -74,10 +85,12 @@ class Service:
     ) -> None:
         self.settings, self.once = settings, once
         self.stopping = threading.Event()
-        self._queue: Waiting[SourceBlock | None] = Waiting(_WAITING, _WAITING_BYTES)
-        self._stdin, self._stdout = stdin or sys.stdin.buffer, stdout or sys.stdout
-        self._sources = [*sources]
-        self._refused = self._waits = 0
+        self._queue: Waiting[SourceBlock | RefusedMessage | None] = Waiting(_WAITING, _WAITING_BYTES)
+        self._at_hand: list[SourceBlock | RefusedMessage | None] = []
+        self._stdin = stdin or (sys.stdin.buffer if sys.stdin is not None else BytesIO())
+        self._more_sources = [*sources]
+        self._refused = self._waits = self._left = 0
+        self._blocked = False  # the database does not take what is at hand
         self._hold = ExitStack()
         if "://" not in settings.database:
             if not Path(settings.database).parent.is_dir():
@@ -90,20 +103,22 @@ class Service:
             if (part := settings.share) is not None:
                 names = [actuator.name for actuator in settings.actuator]
                 self._share = Share(self.store, part.name, names, part.lease_s)
-            self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days, self._share)
+            with threadpool_limits(limits=1):  # as in `run`: sums in another order end in other digits
+                self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days, self._share)
             self.outages = self.actuators.outages
             self.outages.expect(DATABASE)
+            self.supervisor = Supervisor(self.outages, self.stopping, away)
             if self._share is not None:
                 self.actuators.renew()
         except BaseException:
             self._hold.close()
             raise
         self._live = LiveSamples(self.store.last_samples)
-        self._lines = EventLines(self.store, self._stdout)
+        self._lines = EventLines(self.store, stdout or sys.stdout)
         self.page: PageServer | None = None
         if settings.page is not None and not once:
             try:
-                self.page = PageServer(self.actuators, settings.page, self.waits, self._live)
+                self.page = PageServer(self.actuators, settings.page, self.supervisor, self.waits, self._live)
             except BaseException:
                 self._hold.close()
                 raise
@@ -113,11 +128,14 @@ class Service:
         if isinstance(block, RefusedMessage):
             self.actuators.count(block.reason)
             self._refused += 1
-            if _worth_a_line(self._refused):
+            if block.reason == UNREADABLE_FILE:
+                _log.warning("%s", block)
+            elif _worth_a_line(self._refused):
                 _log.warning("%s (message %d without a block)", block, self._refused)
-            return
-        self._live.take(block.actuator, block.samples)
-        size = bytes_of(block.samples)
+            size = len(block.beginning)
+        else:
+            self.supervisor.part("picture of samples").attempt(partial(self._live.take, block.actuator, block.samples))
+            size = bytes_of(block.samples)
         if self._queue.put(block, size):
             return
         self._waits += 1
@@ -143,56 +161,23 @@ class Service:
         times as long on a machine with other work.
         """
         self._hold.enter_context(threadpool_limits(limits=1))
-        sources = [*self._sources]
-        if self.settings.lines:
-            sources.append(_lines_of(self._stdin))
-        if any(actuator.folder is not None for actuator in self.settings.actuator):
-            sources.append(partial(_folders_of, once=self.once))
-        if self.settings.mqtt is not None:
-            from sealscope.monitor.sources.broker import broker_of
-
-            sources.append(broker_of(self.settings.mqtt))
-        if self.settings.opcua is not None:
-            from sealscope.monitor.sources.opcua import opcua_of
-
-            sources.append(opcua_of(self.settings.opcua))
-        threads = [threading.Thread(target=self._guarded, args=(source,), daemon=True) for source in sources]
-        if self._share is not None:
-            threading.Thread(target=self._keep_share, args=(self._share,), daemon=True).start()
-        ending = []
-        if (node := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
-            from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
-
-            password = secret_of(broker.password_file, "mqtt.password_file")
-            alarms = SparkplugNode(self.store, self.actuators.plain, self.count, broker, node, password)
-            ending.append(threading.Thread(target=alarms.run, args=(self.stopping,), daemon=True))
-        if (hook := self.settings.webhook) is not None:
-            token = secret_of(hook.token_file, "webhook.token_file")
-            self.outages.expect(WEBHOOK)
-            webhook = Webhook(self.store, hook.url, token, hook.timeout_s, self.outages)
-            ending.append(threading.Thread(target=webhook.run, args=(self.stopping,), daemon=True))
+        sources, ending = self._all_sources(), list[threading.Thread]()
+        storing = self.supervisor.part("storage")
+        self._left = len(sources)
         try:
-            for thread in [*threads, *ending]:
-                thread.start()
-            left = len(threads)
-            while left and not self.stopping.is_set():
-                waiting = self._queue.take(_TOGETHER, 0.2)
-                if 0 < len(waiting) < _TOGETHER and None not in waiting:
-                    self.stopping.wait(_GATHER_S)
-                    waiting += self._queue.take(_TOGETHER - len(waiting), 0.0)
-                left -= waiting.count(None)
-                self._store([block for block in waiting if block is not None])
-                self._queue.settle()
-                if not len(self._queue):
-                    self._pass_on()
-            self._pass_on()
-            while self.page is not None and not self.stopping.wait(0.5):
-                self._pass_on()
+            ending += self._outputs()
+            ending += [self._started(name, source) for name, source in sources]
+            while (self._left or self.page is not None) and not self.stopping.is_set():
+                if not storing.attempt(self._store_next):
+                    self.stopping.wait(storing.pause_s)
         finally:
             self.stop()
+            if self.page is not None:
+                self.page.leave()
+            deadline = time.monotonic() + _END_S
             for thread in ending:
-                if thread.is_alive():
-                    thread.join(_POST_S)
+                if thread.name != _LINES:  # which may wait for a line for ever
+                    thread.join(max(0.0, deadline - time.monotonic()))
             from sqlalchemy.exc import SQLAlchemyError
 
             if self._share is not None:
@@ -202,69 +187,104 @@ class Service:
                 self.page.close()
             self._hold.close()
 
+    def _all_sources(self) -> list[tuple[str, Source]]:
+        """Return the sources of the settings by name; raises InputError for a secret that cannot be read."""
+        sources = [(f"source {number}", source) for number, source in enumerate(self._more_sources, 1)]
+        if self.settings.lines:
+            sources.append((_LINES, _lines_of(self._stdin)))
+        if any(actuator.folder is not None for actuator in self.settings.actuator):
+            sources.append(("folders", partial(_folders_of, once=self.once)))
+        if self.settings.mqtt is not None:
+            from sealscope.monitor.sources.broker import broker_of
+
+            sources.append(("MQTT client", broker_of(self.settings.mqtt)))
+        if self.settings.opcua is not None:
+            from sealscope.monitor.sources.opcua import opcua_of
+
+            sources.append(("OPC UA client", opcua_of(self.settings.opcua)))
+        return sources
+
+    def _started(self, name: str, source: Source) -> threading.Thread:
+        """Start a source, which says when it has ended."""
+
+        def end() -> None:
+            self._queue.put(None, 0, always=True)
+
+        return self.supervisor.start(name, partial(source, self), again=not self.once, ended=end)
+
+    def _outputs(self) -> list[threading.Thread]:
+        """Start what sends, and what renews the share in the actuators."""
+        supervisor = self.supervisor
+        threads = [supervisor.repeat("standard output", self._pass_on, _LINES_S, at_the_end=True)]
+        if self._share is not None:
+            supervisor.repeat("share", self.actuators.renew, self._share.lease_s / 4.0)
+        if (node := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
+            from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
+
+            password = secret_of(broker.password_file, "mqtt.password_file")
+            alarms = SparkplugNode(self.store, self.actuators.plain, self.count, broker, node, password)
+            threads.append(supervisor.start("Sparkplug node", partial(alarms.run, self.stopping)))
+        if (hook := self.settings.webhook) is not None:
+            token = secret_of(hook.token_file, "webhook.token_file")
+            self.outages.expect(WEBHOOK)
+            webhook = Webhook(self.store, hook.url, token, hook.timeout_s, self.outages)
+            threads.append(supervisor.start("posts to the webhook", partial(webhook.run, self.stopping)))
+        return threads
+
+    def _store_next(self) -> None:
+        """Store what comes next; what raises an error is still at hand then."""
+        if not self._at_hand:
+            self._at_hand = self._queue.take(_TOGETHER, 0.2)
+            if 0 < len(self._at_hand) < _TOGETHER and None not in self._at_hand:
+                self.stopping.wait(_GATHER_S)
+                self._at_hand += self._queue.take(_TOGETHER - len(self._at_hand), 0.0)
+        self._store([block for block in self._at_hand if isinstance(block, SourceBlock)], self.actuators.take)
+        refused = [block for block in self._at_hand if isinstance(block, RefusedMessage)]
+        self._store(refused, lambda rows: self.store.keep_refused([row.row() for row in rows]))
+        self._left -= self._at_hand.count(None)
+        self._at_hand = []
+        self._queue.settle()
+
     def stop(self) -> None:
         """End `run` after the block at hand."""
         self.stopping.set()
 
-    def _keep_share(self, share: Share) -> None:
-        """Renew the share in the actuators four times a lease; where the database does not answer, the lease lapses."""
-        while not self.stopping.wait(share.lease_s / 4.0):
-            try:
-                self.actuators.renew()
-            except Exception as error:
-                self._away(error)
+    def _store(self, blocks: list[_Kept], keep: Callable[[list[_Kept]], object]) -> None:
+        """Keep blocks in one transaction, again and again while the database is locked, full or away; acknowledge them.
 
-    def _guarded(self, source: Source) -> None:
-        try:
-            source(self)
-        except Exception:  # a source that fails must not take the others along
-            _log.exception("a source has ended")
-        self._queue.put(None, 0, always=True)
-
-    def _away(self, error: Exception) -> None:
-        """Note that the database is away; raises the error where it is of another kind."""
-        reason = away(error)
-        if reason is None:
-            raise error
-        self.outages.lost(DATABASE, reason)
-
-    def _store(self, blocks: list[SourceBlock]) -> None:
-        """Take blocks in one transaction, again and again while the database is locked, full or away; acknowledge them.
-
-        Where something else fails they are taken one by one, and the one that fails is dropped, for it would fail
+        Where something else fails they are kept one by one, and the one that fails is dropped, for it would fail
         again: the others must not wait for it.
         """
         pause = 0.1
         while blocks and not self.stopping.is_set():
             try:
-                self.actuators.take(blocks)
+                keep(blocks)
             except Exception as error:
                 reason = away(error)
                 if reason is not None:
                     self.count("waits for the database")
+                    self._blocked = True
                     self.outages.lost(DATABASE, reason)
                     self.stopping.wait(pause)
                     pause = min(2.0 * pause, _LONGEST_PAUSE_S)
                     continue
                 if len(blocks) > 1:
                     for block in blocks:
-                        self._store([block])
+                        self._store([block], keep)
                     return
                 self.count(_DROPPED)
                 if _worth_a_line(self.actuators.counters[_DROPPED]):
-                    _log.exception("a block of %s is dropped", blocks[0].actuator[:60])
+                    _log.exception("a block is dropped: %s", str(getattr(blocks[0], "actuator", blocks[0]))[:60])
             else:
+                self._blocked = False
                 self.outages.back(DATABASE)
             for block in blocks:
-                block.done()
+                self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
             return
 
     def _pass_on(self) -> None:
-        try:
-            self._lines.pass_on()
-        except Exception as error:
-            self._away(error)
-        else:
+        self._lines.pass_on()
+        if not self._blocked:  # what can be read may still refuse to be written
             self.outages.back(DATABASE)
 
 
@@ -292,18 +312,16 @@ def _folders_of(service: BlockReceiver, *, once: bool) -> None:
         for actuator in service.settings.actuator
         if actuator.folder is not None
     ]
+    parts = [service.supervisor.part(f"folder of {folder.actuator}") for folder in folders]
     while not service.stopping.is_set():
-        try:
-            for folder in folders:
-                for block in folder.blocks():
-                    service.hand(block)
-                    if service.stopping.is_set():
-                        return
-        except Exception as error:  # what is stored already is asked of the database
-            if (reason := away(error)) is None:
-                raise
-            service.outages.lost(DATABASE, reason)
-        else:
-            if once:
-                return
-        time.sleep(_LOOK_S)
+        done = [part.attempt(partial(_hand_over, service, folder)) for part, folder in zip(parts, folders, strict=True)]
+        if once and (all(done) or DATABASE not in {outage["part"] for outage in service.outages.plain()}):
+            return
+        service.stopping.wait(_LOOK_S)
+
+
+def _hand_over(service: BlockReceiver, folder: WatchedFolder) -> None:
+    for block in folder.blocks():
+        if service.stopping.is_set():
+            return
+        service.hand(block)

@@ -188,12 +188,13 @@ class MonitorSettings(_Part):
             for channel in {**actuator.nodes, **actuator.units}:
                 if channel not in CHANNELS:
                     raise ValueError(f"nodes must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
-        if self.sparkplug is not None:
+        if self.sparkplug is not None or (self.mqtt is not None and self.mqtt.alarms_topic is not None):
             devices = [topic_part(name) for name in names]
             if len({*devices}) < len(devices):
-                raise ValueError("actuators must have names that differ in more than the letters + # / as devices")
-            if any(path.split("/")[:2] == [self.sparkplug.group, self.sparkplug.node] for path in paths):
-                raise ValueError("the node of the alarms must be none of the actuators' nodes")
+                raise ValueError("actuators must have names that differ in more than the letters + # / as topics")
+        own = None if self.sparkplug is None else [self.sparkplug.group, self.sparkplug.node]
+        if any(path.split("/")[:2] == own for path in paths):
+            raise ValueError("the node of the alarms must be none of the actuators' nodes")
         if self.share is not None and "://" not in self.database:
             raise ValueError(f"monitors that share actuators need a database by URL, got the file {self.database!r}")
         if self.share is not None and self.mqtt is not None and self.mqtt.host_id is not None:

@@ -6,9 +6,10 @@ SQLite in WAL mode with full synchronisation, or any database that SQLAlchemy kn
 from __future__ import annotations
 
 import json
+import threading
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: Identities of blocks that are kept for each actuator: more than a day of messages of 1 s.
 KEPT_IDENTITIES = 100_000
+#: Refused messages that are kept, the last ones.
+KEPT_REFUSED = 1000
 #: How often the tables are tried to be made where several monitors begin at once.
 _ATTEMPTS = 10
 #: What makes tables of a version those of the next.
@@ -98,6 +101,8 @@ class MonitorStore:
         self.tables = tables
         self.sends = True  # False while another monitor that shares the database sends for all
         self._is_file = "://" not in database
+        # of the threads here one at a time writes to a file, which SQLite would let wait and then refuse
+        self._writing_lock: AbstractContextManager[object] = threading.RLock() if self._is_file else nullcontext()
         url = f"sqlite:///{Path(database)}" if self._is_file else database
         try:
             self.engine: Engine = sqlalchemy.create_engine(url, **engine_options(sqlalchemy.make_url(url)))
@@ -139,7 +144,7 @@ class MonitorStore:
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """Return a connection whose changes are kept together when the block ends well."""
-        with self.engine.begin() as connection:
+        with self._writing_lock, self.engine.begin() as connection:
             yield connection
 
     def known(self, connection: Connection, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
@@ -196,6 +201,25 @@ class MonitorStore:
             if old:
                 chosen = (table.c.actuator == of) & (table.c.number <= bindparam("last"))
                 connection.execute(table.delete().where(chosen), old)
+
+    def keep_refused(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Store what was refused, `KEPT_REFUSED` at most with those before, in a transaction of its own."""
+        from sqlalchemy import func, select
+
+        table = self.tables.refused
+        with self.writing() as connection:
+            connection.execute(table.insert(), rows[-KEPT_REFUSED:])
+            last = int(connection.execute(select(func.max(table.c.number))).scalar() or 0)
+            connection.execute(table.delete().where(table.c.number <= last - KEPT_REFUSED))
+
+    def refused(self, most: int = KEPT_REFUSED) -> list[dict[str, Any]]:
+        """Return what was refused, the last one first."""
+        from sqlalchemy import select
+
+        table = self.tables.refused
+        with self.engine.connect() as connection:
+            rows = connection.execute(select(table).order_by(table.c.number.desc()).limit(most))
+            return [dict(row._mapping) for row in rows]
 
     def _put_all(self, connection: Connection, table: Table, values: dict[str, dict[str, Any]]) -> None:
         """Change the rows of actuators, or insert those that are missing."""

@@ -77,6 +77,17 @@ events = Table(
     Column("text", Text, nullable=False),
     Column("alarm", Text, nullable=False),
 )
+#: The last messages and files that could not be taken: when [s], from where, why, their size and how they begin.
+refused = Table(
+    "refused",
+    metadata,
+    Column("number", Integer, primary_key=True),
+    Column("at", Float(53), nullable=False),
+    Column("reason", String(120), nullable=False),
+    Column("message", Text, nullable=False),
+    Column("size", Integer, nullable=False),
+    Column("beginning", LargeBinary, nullable=False),
+)
 #: Monitors that share the database, and whose each actuator is, until when [s].
 monitors = Table(
     "monitors", metadata, Column("name", String(120), primary_key=True), Column("until", Float(53), nullable=False)

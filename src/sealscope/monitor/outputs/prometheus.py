@@ -19,7 +19,7 @@ _METRICS = (
 )
 #: Place in the values of a part -> name, kind and help of its metric.
 _REACHED = (
-    (0, "sealscope_reached", "gauge", "1 while the database, the broker or the webhook is reached, 0 during an outage"),
+    (0, "sealscope_reached", "gauge", "1 while a part of the monitor or what it needs is reached, 0 during an outage"),
     (1, "sealscope_outages_total", "counter", "Outages since the start"),
     (2, "sealscope_outage_seconds_total", "counter", "How long outages lasted since the start"),
 )

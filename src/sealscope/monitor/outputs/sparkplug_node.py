@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from sealscope.monitor.memory.store import MonitorStore, away
-from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, client_of
+from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of
 from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, topic_part
 from sealscope.monitor.sparkplug import (
     BIRTH_SEQUENCE,
@@ -131,8 +131,10 @@ class SparkplugNode:
                     elif online and not self._store.sends:
                         self._offline()
                         online = False
-                    if online and self._client.is_connected():
-                        self._pass_on()
+                    if online:
+                        check_running(self._client)
+                        if self._client.is_connected():
+                            self._pass_on()
                 except Exception as error:
                     if away(error) is None:
                         raise

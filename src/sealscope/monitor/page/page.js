@@ -235,8 +235,8 @@ async function refresh() {
   showFleet(fleet);
   listen();
   if (chosen === null) return;
-  const query = hours ? `?hours=${hours}` : "";
-  showLife(await asked(`/api/actuator/${encodeURIComponent(chosen)}${query}`));
+  const query = hours ? `&hours=${hours}` : "";
+  showLife(await asked(`/api/actuator?name=${encodeURIComponent(chosen)}${query}`));
 }
 
 function choose(name) {
@@ -254,7 +254,7 @@ function choose(name) {
 byId("marks").addEventListener("submit", async (event) => {
   event.preventDefault();
   const mark = event.submitter ? event.submitter.value : "comment";
-  const answer = await asked(`/api/actuator/${encodeURIComponent(chosen)}/mark`, {
+  const answer = await asked(`/api/mark?name=${encodeURIComponent(chosen)}`, {
     method: "POST",
     headers: { "Content-Type": "application/json", "X-Sealscope": "mark" },
     body: JSON.stringify({ mark, text: byId("comment").value }),

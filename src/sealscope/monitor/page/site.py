@@ -6,11 +6,10 @@ Nothing is loaded from elsewhere, and whatever comes from the wire is shown as t
 from __future__ import annotations
 
 import asyncio
-import hashlib
-import hmac
 import json
+import math
+import re
 import socket
-import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import ExitStack
 from importlib import resources
@@ -22,9 +21,12 @@ from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.store import away
 from sealscope.monitor.outages import DATABASE
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
+from sealscope.monitor.page.admission import Admission
+from sealscope.monitor.page.connections import BACKLOG, limited_protocol, most_connections
 from sealscope.monitor.page.live import DRAWN, PRESSURES, LiveSamples, machine_of
 from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.settings import PageSettings, secret_of
+from sealscope.monitor.supervisor import Supervisor
 from sealscope.reporting.template import packaged
 from sealscope.storage.plain_values import parse_json
 
@@ -45,6 +47,9 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+_HOURS = re.compile(r"[0-9]{1,8}(\.[0-9]{1,8})?")
+#: How long a request may take to send its body [s].
+_BODY_S = 10.0
 #: When to ask again [s].
 _LATER = {"Retry-After": "5"}
 _COOKIE = "sealscope"
@@ -86,7 +91,8 @@ def site(
     store = actuators.store
     live = live or LiveSamples(store.last_samples)
     machines = {name: machine_of(rig) for name, rig in actuators.rigs.items()}
-    listeners = 0
+    listeners, most_listeners = 0, min(_MOST_LISTENERS, most_connections() // 2)
+    admission = None if token is None else Admission(token)
 
     def file(request: Request) -> Response:
         path = request.url.path
@@ -103,11 +109,11 @@ def site(
         return JSONResponse({**shown, "outages": actuators.outages.plain(), "false_alarms_per_1000_h": budget})
 
     def actuator(request: Request) -> Response:
-        name = request.path_params["name"]
+        name = request.query_params.get("name", "")
         if name not in actuators.plain():
             return JSONResponse({"error": "no such actuator"}, 404)
         span = request.query_params.get("hours", "")
-        seconds = float(span) * 3600.0 if span.replace(".", "", 1).isdigit() and len(span) < 10 else None
+        seconds = float(span) * 3600.0 if _HOURS.fullmatch(span) else None
         return JSONResponse(
             {
                 "name": name,
@@ -128,18 +134,20 @@ def site(
                 raise InputError("a mark must be a mapping of texts")
             alarm = await asyncio.to_thread(
                 actuators.mark,
-                request.path_params["name"],
+                request.query_params.get("name", ""),
                 values.get("mark", ""),
                 by_whom=values.get("by", ""),
                 text=values.get("text", ""),
             )
+        except TimeoutError:
+            return JSONResponse({"error": f"a request must have come within {_BODY_S:g} s"}, 408)
         except ValueError as error:
             return JSONResponse({"error": str(error)}, 400)
         return JSONResponse(alarm.plain())
 
     async def changes(request: Request) -> Response:
         nonlocal listeners
-        if listeners >= _MOST_LISTENERS:
+        if listeners >= most_listeners:
             return JSONResponse({"error": "too many listeners"}, 503)
         asked = request.query_params
         name, pressure, drawn = asked.get("actuator", ""), asked.get("pressure", "p_A"), asked.get("drawn", "rms")
@@ -149,8 +157,6 @@ def site(
             return JSONResponse({"error": f"pressure must be one of {PRESSURES}, drawn one of {DRAWN}"}, 400)
 
         async def lines() -> AsyncIterator[str]:
-            nonlocal listeners
-            listeners += 1
             looking = ExitStack()
             try:
                 room = bool(name) and await asyncio.to_thread(looking.enter_context, live.looked_at(name))
@@ -167,10 +173,20 @@ def site(
                     await asyncio.sleep(_LOOK_S)
                     silent += _LOOK_S
             finally:
-                listeners -= 1
                 looking.close()
 
-        return StreamingResponse(lines(), media_type="text/event-stream")
+        class Listening(StreamingResponse):
+            """Counts as a listener until it ends, however it ends."""
+
+            async def __call__(self, *connection: Any) -> None:
+                nonlocal listeners
+                try:
+                    await super().__call__(*connection)
+                finally:
+                    listeners -= 1
+
+        listeners += 1
+        return Listening(lines(), media_type="text/event-stream")
 
     def metrics(request: Request) -> Response:
         return Response(measured(actuators.plain()), headers={"Content-Type": CONTENT_TYPE})
@@ -191,41 +207,72 @@ def site(
         return JSONResponse({"error": text, **known}, 503, _LATER)
 
     async def login(request: Request) -> Response:
-        if request.method == "POST" and token is not None:
+        status = 200
+        if request.method == "POST" and admission is not None:
+            address = _address(request)
+            if wait := admission.pause_s(address):
+                return later(wait)
             try:
                 given = parse_qs((await _body(request)).decode("utf-8", "replace")).get("token", [""])[0]
-            except InputError:
+            except (InputError, TimeoutError):
                 given = ""
-            if _same(given, token):
+            if admission.admits(address, given):
                 answer = RedirectResponse("/", 303)
-                answer.set_cookie(_COOKIE, _session(token), httponly=True, samesite="strict", max_age=30 * 86_400)
+                answer.set_cookie(
+                    _COOKIE,
+                    admission.session,
+                    max_age=30 * 86_400,
+                    secure=request.url.scheme == "https",
+                    httponly=True,
+                    samesite="strict",
+                )
                 return answer
-            await asyncio.sleep(1.0)
+            status = 401
         text = (resources.files("sealscope.monitor.page") / "login.html").read_text("utf-8")
-        return Response(text, 401 if request.method == "POST" else 200, media_type="text/html")
+        return Response(text, status, media_type="text/html")
+
+    def later(wait: float) -> Response:
+        error = f"too many wrong tokens: wait {wait:.0f} s"
+        return JSONResponse({"error": error}, 429, {"Retry-After": str(math.ceil(wait))})
+
+    def refused(request: Request) -> Response | None:
+        """Return the answer to a request without the token, None where it has it."""
+        if admission is None or request.url.path in ("/login", "/login.css"):
+            return None
+        given, session = request.headers.get("authorization"), request.cookies.get(_COOKIE)
+        if given is not None or session is not None:
+            address = _address(request)
+            if wait := admission.pause_s(address):
+                return later(wait)
+            if given is not None and admission.admits(address, given.removeprefix("Bearer ")):
+                return None
+            if session is not None and admission.admits(address, session, session=True):
+                return None
+        answer: Response
+        if request.url.path == "/":
+            answer = RedirectResponse("/login", 303)
+        else:
+            answer = JSONResponse({"error": "a token is needed"}, 401)
+        if session is not None:  # of an earlier token: the browser must not go on with it
+            answer.delete_cookie(_COOKIE)
+        return answer
 
     routes = [Route(path, file) for path in (*_FILES, *_VENDORED)]
     routes += [
         Route("/login", login, methods=["GET", "POST"]),
         Route("/api/fleet", fleet),
-        Route("/api/actuator/{name}", actuator),
-        Route("/api/actuator/{name}/mark", mark, methods=["POST"]),
+        Route("/api/actuator", actuator),
+        Route("/api/mark", mark, methods=["POST"]),
         Route("/api/changes", changes),
         Route("/metrics", metrics),
     ]
     middleware = []
     if settings.host in _LOCAL:  # a name of another site that leads to this machine is refused
-        middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*_LOCAL, "[::1]", "testserver"]))
+        middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*_LOCAL, "[::1]"]))
     application = Starlette(routes=routes, middleware=middleware, exception_handlers={SQLAlchemyError: not_answering})
 
     async def guard(request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
-        answer: Response
-        if token is None or request.url.path in ("/login", "/login.css") or _admitted(request, token):
-            answer = await call_next(request)
-        elif request.url.path == "/":
-            answer = RedirectResponse("/login", 303)
-        else:
-            answer = JSONResponse({"error": "a token is needed"}, 401)
+        answer = refused(request) or await call_next(request)
         for name, value in _HEADERS.items():
             answer.headers[name] = value
         return answer
@@ -241,26 +288,17 @@ def _event(kind: str, values: Mapping[str, Any]) -> str:
     return f"event: {kind}\ndata: {json.dumps(values, allow_nan=False)}\n\n"
 
 
-def _same(given: str, token: str) -> bool:
-    return hmac.compare_digest(given.encode(), token.encode())
-
-
-def _session(token: str) -> str:
-    """Return what a browser keeps in place of the token."""
-    return hmac.new(token.encode(), b"sealscope session", hashlib.sha256).hexdigest()
-
-
-def _admitted(request: Request, token: str) -> bool:
-    given = request.headers.get("authorization", "").removeprefix("Bearer ")
-    return _same(given, token) or _same(request.cookies.get(_COOKIE, ""), _session(token))
+def _address(request: Request) -> str:
+    return "" if request.client is None else request.client.host
 
 
 async def _body(request: Request) -> bytes:
     data = b""
-    async for part in request.stream():
-        data += part
-        if len(data) > _LARGEST_BODY:
-            raise InputError(f"a request must have at most {_LARGEST_BODY} bytes")
+    async with asyncio.timeout(_BODY_S):
+        async for part in request.stream():
+            data += part
+            if len(data) > _LARGEST_BODY:
+                raise InputError(f"a request must have at most {_LARGEST_BODY} bytes")
     return data
 
 
@@ -274,37 +312,63 @@ class PageServer:
         self,
         actuators: WatchedActuators,
         settings: PageSettings,
+        supervisor: Supervisor,
         waits: Callable[[], tuple[int, int, int]] = lambda: (0, 0, 0),
         live: LiveSamples | None = None,
     ) -> None:
         try:
             import starlette  # noqa: F401 (asked for before the port is taken)
-            import uvicorn
+            import uvicorn  # noqa: F401
         except ImportError:
             raise MissingExtra("the page needs starlette and uvicorn: pip install 'sealscope[serve]'") from None
         token = secret_of(settings.token_file, "page.token_file")
-        self._actuators = actuators
-        family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-        try:
-            self._socket = socket.create_server((settings.host, settings.port), family=family)
-        except OSError as error:
-            place = f"{settings.host}:{settings.port}"
-            raise InputError(f"page.port must be free, got {error.strerror or error} ({place})") from None
+        self._actuators, self._host, self.port = actuators, settings.host, settings.port
+        self._application = site(actuators, settings, token, waits, live)
+        self._socket: socket.socket | None = self._opened()
         self.port = int(self._socket.getsockname()[1])
         self.address = f"http://{settings.host}:{self.port}/"
+        self._server: Any = None
+        self._thread = supervisor.start("page", self._serve)
+
+    def _opened(self) -> socket.socket:
+        try:
+            family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
+            return socket.create_server((self._host, self.port), family=family, backlog=BACKLOG)
+        except OSError as error:
+            place = f"{self._host}:{self.port}"
+            raise InputError(f"page.port must be free, got {error.strerror or error} ({place})") from None
+
+    def _serve(self) -> None:
+        """Serve the page until `leave`; uvicorn closes the socket."""
+        import uvicorn
+
+        opened, self._socket = self._socket or self._opened(), None
         config = uvicorn.Config(
-            site(actuators, settings, token, waits, live),
-            log_level="warning",
+            self._application,
+            http=limited_protocol(most_connections()),
+            ws="none",
+            lifespan="off",
+            log_config=None,
             access_log=False,
-            timeout_graceful_shutdown=2,
+            backlog=BACKLOG,
+            timeout_graceful_shutdown=1,
+            forwarded_allow_ips=",".join(_LOCAL),
         )
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [self._socket]}, daemon=True)
-        self._thread.start()
+        self._server.should_exit = self._actuators.closed
+        self._server.run(sockets=[opened])
+        if not self._actuators.closed:
+            raise RuntimeError("the page's server has ended")
+
+    def leave(self) -> None:
+        """Ask the page to end."""
+        self._actuators.closed = True
+        if self._server is not None:
+            self._server.should_exit = True
 
     def close(self) -> None:
         """End the page."""
-        self._actuators.closed = True
-        self._server.should_exit = True
-        self._thread.join(timeout=5.0)
-        self._socket.close()
+        self.leave()
+        self._thread.join(timeout=1.0)
+        if self._socket is not None:
+            self._socket.close()

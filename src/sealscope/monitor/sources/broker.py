@@ -24,11 +24,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from sealscope.monitor.memory.store import away
-from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, client_of
-from sealscope.monitor.outages import BROKER, DATABASE
+from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of
+from sealscope.monitor.outages import BROKER
 from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
-from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, decoded
+from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, SourceBlock, decoded
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import NAMESPACE
 from sealscope.monitor.waiting import Waiting
@@ -40,6 +39,8 @@ _SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 64, 16_000_000
 _ROOM, _ROOM_BYTES = 256, 64_000_000
 _ASSURED_ROOM, _ASSURED_BYTES = 2048, 192_000_000
 _NAME = "mqtt"
+#: How long a published alarm is waited for, and the decoder at the end [s].
+_SENT_S, _END_S = 2.0, 2.0
 #: What messages are counted under that find no room.
 _NO_ROOM = "messages of QoS 0 that found no room"
 _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
@@ -68,6 +69,7 @@ class _Connection:
         self._connection = 0
         self._refusing = -1  # the connection whose further messages are left to the broker
         self._to_close: Any = None  # the line of that connection
+        self._ended = threading.Event()
         self._arrived: Waiting[Any] = Waiting(_ROOM, _ROOM_BYTES)
         self._client.on_connect_fail = self._unreached
         self._client.on_connect = self._connected
@@ -89,15 +91,18 @@ class _Connection:
         self._client.connect_async(
             self._settings.host, self._settings.port, KEEP_ALIVE_S, clean_start=False, properties=properties
         )
-        decoding = threading.Thread(target=self._decode, daemon=True)
-        decoding.start()
+        supervisor = self._service.supervisor
+        decoding = supervisor.start("MQTT decoder", self._decode)
+        alarms = supervisor.part("MQTT alarms")
         self._client.loop_start()
         try:
             while not self._service.stopping.wait(0.2):
-                self._pass_on()
-            self._pass_on()
+                check_running(self._client)
+                alarms.attempt(self._pass_on)
+            alarms.attempt(self._pass_on)
         finally:
-            decoding.join()
+            self._ended.set()
+            decoding.join(_END_S)
             if self._settings.host_id is not None and self._client.is_connected():
                 self._say_state(online=False)
             self._client.disconnect()
@@ -159,7 +164,7 @@ class _Connection:
 
     def _decode(self) -> None:
         """Hand the messages over that were taken in, in their order."""
-        while not self._service.stopping.is_set():
+        while not (self._service.stopping.is_set() or self._ended.is_set()):
             arrived = self._arrived.take(1, 0.5)
             for connection, message in arrived:
                 if message is not None:
@@ -183,37 +188,36 @@ class _Connection:
             topic = message.topic
         except UnicodeDecodeError:
             topic = ""
+        block: SourceBlock | RefusedMessage | None
         try:
             if self._host is None or not self._host.owns(topic):
-                self._service.hand(decoded(message.payload, self._names.get(topic), done))
-            elif (block := self._host.taken(topic, message.payload, done)) is not None:
-                self._service.hand(block)
+                block = decoded(message.payload, self._names.get(topic), done)
             else:
-                done()
-        except RefusedMessage as error:
-            self._service.hand(RefusedMessage(error.reason, f"{topic[:100]}: {error}"))
-            done()  # it would be no better a second time
+                block = self._host.taken(topic, message.payload, done)
+        except RefusedMessage as error:  # it would be no better a second time: it is kept, and acknowledged
+            block = RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, done)
+        if block is None:
+            done()
+        else:
+            self._service.hand(block)
 
     def _pass_on(self) -> None:
         """Publish the alarms of new events, each retained."""
         topic, store = self._settings.alarms_topic, self._service.store
         if topic is None or not store.sends or not self._client.is_connected():
             return
-        try:
-            for number, event in store.events_since(store.position(_NAME)):
-                alarm = event["alarm"]
-                name = topic_part(alarm["actuator"])
-                sent = self._client.publish(f"{topic}/{name}/alarm", json.dumps(alarm), qos=1, retain=True)
-                sent.wait_for_publish(timeout=5.0)
-                if not sent.is_published():
-                    return
-                store.keep_position(_NAME, number)
-        except (RuntimeError, ValueError) as error:
-            _log.warning("alarms wait for the broker: %s", str(error).splitlines()[0])
-        except Exception as error:
-            if (lost := away(error)) is None:
-                raise
-            self._service.outages.lost(DATABASE, lost)
+        for number, event in store.events_since(store.position(_NAME)):
+            alarm = event["alarm"]
+            name = topic_part(alarm["actuator"])
+            sent = self._client.publish(f"{topic}/{name}/alarm", json.dumps(alarm), qos=1, retain=True)
+            try:
+                sent.wait_for_publish(timeout=_SENT_S)
+            except (RuntimeError, ValueError) as error:  # the connection is lost, or its queue is full
+                _log.warning("alarms wait for the broker: %s", str(error).splitlines()[0])
+                return
+            if not sent.is_published():
+                return
+            store.keep_position(_NAME, number)
 
 
 def _why(error: BaseException | None) -> str:

@@ -7,11 +7,13 @@ import time
 from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path
+from stat import S_ISREG
 
 import numpy as np
 
-from sealscope.errors import InputError
-from sealscope.monitor.sources.source_block import SourceBlock
+from sealscope.errors import SealscopeError
+from sealscope.monitor.sources.source_block import UNREADABLE_FILE, RefusedMessage, SourceBlock
+from sealscope.monitor.supervisor import PartAway, place_of
 from sealscope.recordings import Recording, read
 from sealscope.recordings.formats.columns import ChannelMap
 from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
@@ -19,8 +21,10 @@ from sealscope.recordings.formats.headings.oil_temperature import stated_oil_tem
 _log = logging.getLogger(__name__)
 #: Names of files that are still being written.
 _UNFINISHED = (".part", ".tmp", ".temp", ".crdownload", "~")
-#: A file that cannot be read is tried again until it has not changed for so many times the time to settle.
+#: A file that cannot be read is tried once more when it has not changed for so many times the time to settle.
 _PATIENCE = 6.0
+#: A file that is dated so much later than now [s] is dated in the future.
+_AHEAD_S = 60.0
 
 
 class WatchedFolder:
@@ -52,46 +56,75 @@ class WatchedFolder:
         self.actuator, self.folder, self.pattern, self.settle_s = actuator, folder, pattern, settle_s
         self._known, self._channel_map = known, channel_map
         self._handed: set[str] = set()
+        self._met: dict[str, float] = {}
+        self._tried: set[str] = set()
+        self._led_out: set[str] = set()
 
-    def blocks(self) -> Iterator[SourceBlock]:
+    def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
         """Yield the blocks of the files that are whole and not stored yet.
 
-        A file's samples get the clock at which it was written last. A file that cannot be read is waited for, and given
-        up with a line in the log when it has not changed for long.
+        A file's samples get the clock at which it was written last. One that cannot be read is tried once more when it
+        has not changed for long, then refused: it is stored as a block without samples, and never read again. Raises
+        PartAway where the folder cannot be read.
         """
-        now = time.time()
-        for at, path, identity in sorted(self._files()):
-            age = now - at
-            if identity in self._handed or age < self.settle_s:
+        files = sorted(self._files())
+        self._met = {identity: self._met.get(identity, time.monotonic()) for _, _, identity in files}
+        self._handed &= self._met.keys()
+        self._tried &= self._met.keys()
+        for at, path, identity in files:
+            # of a file that is dated in the future, how long it was not seen to change
+            age = max(time.time() - at, time.monotonic() - self._met[identity])
+            patient = age < _PATIENCE * self.settle_s
+            if identity in self._handed or age < self.settle_s or (patient and identity in self._tried):
                 continue
             if self._known(self.actuator, identity):
                 self._handed.add(identity)
                 continue
-            samples = None
             try:
                 samples = _on_the_clock(read(path, map=self._channel_map), at)
-            except InputError as error:
-                if age < _PATIENCE * self.settle_s:
+            except (SealscopeError, OSError, MemoryError) as error:
+                self._tried.add(identity)
+                if patient:
                     continue
-                _log.warning("%s: %s", self.actuator, error)
+                yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {_shown(str(error)) or type(error).__name__}")
+                samples = None
+            except Exception as error:  # what no reader foresees: it would be no better a second time
+                yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {_shown(path.name)}: {place_of(error)}")
+                samples = None
+            if samples is not None and at > time.time() + _AHEAD_S:
+                _log.warning("%s: %s is dated in the future", self.actuator, _shown(path.name))
             self._handed.add(identity)
             yield SourceBlock(self.actuator, identity, samples, follows=False)
 
     def _files(self) -> Iterator[tuple[float, Path, str]]:
         try:
+            root = self.folder.resolve()
             entries = list(self.folder.iterdir())
         except OSError as error:
-            _log.warning("%s: cannot read the folder %s: %s", self.actuator, self.folder, error.strerror)
-            return
+            raise PartAway(f"{self.folder}: {error.strerror}") from None
         for path in entries:
             if path.name.startswith(".") or path.name.endswith(_UNFINISHED) or not fnmatch(path.name, self.pattern):
                 continue
             try:
+                if path.is_symlink() and not path.resolve().is_relative_to(root):
+                    self._leave(path)
+                    continue
                 status = path.stat()
-            except OSError:  # gone meanwhile
+            except (OSError, RuntimeError):  # gone meanwhile, or links in a circle
                 continue
-            if path.is_file():
-                yield status.st_mtime, path, f"{path.name[:60]} {status.st_size} {status.st_mtime_ns}"
+            if S_ISREG(status.st_mode):
+                yield status.st_mtime, path, f"{_shown(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
+
+    def _leave(self, path: Path) -> None:
+        """Say once of a link that it leads out of the folder: what is there is nobody's recording."""
+        if path.name not in self._led_out:
+            self._led_out.add(path.name)
+            _log.warning("%s: %s is a link out of the folder, and is not read", self.actuator, _shown(path.name))
+
+
+def _shown(name: str) -> str:
+    """Return a name as text that a log and a database can hold, whatever its bytes are."""
+    return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in name)
 
 
 def _on_the_clock(recording: Recording, written: float) -> Recording:

@@ -15,13 +15,15 @@ def blocks_of_lines(stream: BinaryIO) -> Iterator[SourceBlock | RefusedMessage]:
         if not line:
             return
         if len(line) > LARGEST:
+            refused = RefusedMessage(OVERSIZED, f"a line must have at most {LARGEST} bytes, got more", line)
             while line and not line.endswith(b"\n"):
                 line = stream.readline(LARGEST)
-            yield RefusedMessage(OVERSIZED, f"a line must have at most {LARGEST} bytes, got more")
+            yield refused
             continue
-        if not line.strip():
+        line = line.strip()
+        if not line:
             continue
         try:
-            yield decoded(line.strip())
+            yield decoded(line)
         except RefusedMessage as error:
-            yield error
+            yield RefusedMessage(error.reason, error, line)

@@ -73,8 +73,10 @@ class _OpcUaSession:
         handing = asyncio.create_task(self._hand())
         try:
             while not self._service.stopping.is_set():
+                if handing.done():
+                    handing.result()
                 try:
-                    await self._connected()
+                    await self._connected(handing)
                 except Exception as error:  # whatever the library and the server make of a lost connection
                     reason = " ".join(str(error).split()) or type(error).__name__
                     self._service.outages.lost(OPCUA, f"{self._settings.url}: {reason}")
@@ -94,8 +96,8 @@ class _OpcUaSession:
                 return
             await asyncio.sleep(_LOOK_S)
 
-    async def _connected(self) -> None:
-        """Connect, subscribe, and stay until the connection is lost (which raises) or the service stops."""
+    async def _connected(self, handing: asyncio.Task[None]) -> None:
+        """Connect, subscribe, and stay until the connection is lost (which raises), or handing or the service ends."""
         from asyncua import Client
 
         client = Client(self._settings.url, timeout=self._settings.timeout_s)
@@ -119,7 +121,7 @@ class _OpcUaSession:
                         raise ConnectionError(f"{actuator.name}: {channel} is no node, got {node.nodeid} ({answer})")
             self._service.outages.back(OPCUA)
             self._pause = _FIRST_PAUSE_S
-            while not self._service.stopping.is_set():
+            while not (self._service.stopping.is_set() or handing.done()):
                 await client.check_connection()
                 await asyncio.sleep(_LOOK_S)
 

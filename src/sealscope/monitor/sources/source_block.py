@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from sealscope.errors import InputError
+from sealscope.errors import InputError, MissingExtra
 from sealscope.monitor.stream.joining import CHANNELS
+from sealscope.monitor.supervisor import place_of
 from sealscope.recordings.channels import CHANNEL_UNITS, SLOW
 from sealscope.recordings.recording import Recording
 from sealscope.units import to_si
@@ -24,11 +27,14 @@ if TYPE_CHECKING:
     from sealscope.monitor.memory.store import MonitorStore
     from sealscope.monitor.outages import Outages
     from sealscope.monitor.settings import MonitorSettings
+    from sealscope.monitor.supervisor import Supervisor
 
 #: Largest message [bytes], and most samples of a channel in it.
 LARGEST, MOST_SAMPLES = 16_000_000, 1_000_000
 #: Tags of CBOR for arrays of numbers (RFC 8746) -> how their bytes are to be read.
 _TYPED = {81: ">f4", 82: ">f8", 85: "<f4", 86: "<f8"}
+#: Bytes of a refused message that are kept.
+_BEGINNING = 4000
 _KNOWN = {"actuator", "t", "rate", "units", "id", *CHANNELS}
 
 
@@ -39,6 +45,7 @@ class BlockReceiver(Protocol):
     store: MonitorStore
     settings: MonitorSettings
     outages: Outages
+    supervisor: Supervisor
 
     def hand(self, block: SourceBlock | RefusedMessage) -> None:
         """Take a block, or the error of a message that holds none; may wait."""
@@ -47,12 +54,29 @@ class BlockReceiver(Protocol):
         """Count something that was dropped."""
 
 
-class RefusedMessage(InputError):  # noqa: N818 (says what happened)
-    """A message holds no block; `reason` is one of `REASONS`."""
+def nothing() -> None:
+    """Do nothing."""
 
-    def __init__(self, reason: str, message: object) -> None:
+
+class RefusedMessage(InputError):  # noqa: N818 (says what happened)
+    """A message or a file holds no block.
+
+    `reason`: one of `REASONS`; `size` of its `contents`, of which the beginning is kept; `done`: called when that is
+    stored.
+    """
+
+    def __init__(
+        self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] | None = None
+    ) -> None:
         super().__init__(message)
-        self.reason = reason
+        self.reason, self.done = reason, done or nothing
+        self.size, self.beginning = len(contents), contents[:_BEGINNING]
+
+    def row(self) -> dict[str, Any]:
+        """Return it as a row of the table of what was refused; any database can hold its texts."""
+        message = str(self).encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
+        values = {"reason": self.reason, "message": message, "size": self.size, "beginning": self.beginning}
+        return {"at": time.time(), **values}
 
 
 #: Why a message holds no block: what it is counted under.
@@ -67,11 +91,20 @@ REASONS = (
     UNBORN := "Sparkplug messages without a birth",
     OUT_OF_SEQUENCE := "Sparkplug messages out of sequence",
     STALE_DEATH := "Sparkplug deaths of an earlier connection",
+    UNFORESEEN := "messages whose decoding raised an error",
+    UNREADABLE_FILE := "files that could not be read",
 )
 
 
-def nothing() -> None:
-    """Do nothing."""
+@contextmanager
+def refusing() -> Iterator[None]:
+    """Make a RefusedMessage of whatever else decoding raises: a message must end no decoder."""
+    try:
+        yield
+    except (RefusedMessage, MissingExtra):
+        raise
+    except Exception as error:
+        raise RefusedMessage(UNFORESEEN, f"a message must raise no error, got {place_of(error)}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +123,7 @@ class SourceBlock:
     done: Callable[[], None] = nothing
 
 
+@refusing()
 def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None] = nothing) -> SourceBlock:
     """Return the block of a message, JSON where it begins with ``{``, else CBOR.
 
@@ -157,10 +191,10 @@ def _identity(given: Any) -> str:
 
 
 def _brief(value: Any) -> str:
-    """Return the beginning of a value as text; CBOR has whole numbers of more digits than Python writes."""
+    """Return the beginning of a text or a number as text, of anything else its kind: it may be deep, or endless."""
     try:
-        return str(value)[:40]
-    except ValueError:
+        return str(value)[:40] if isinstance(value, (str, int, float, type(None))) else type(value).__name__
+    except ValueError:  # CBOR has whole numbers of more digits than Python writes
         return type(value).__name__
 
 

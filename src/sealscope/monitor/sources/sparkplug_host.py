@@ -37,6 +37,7 @@ from sealscope.monitor.sources.source_block import (
     SourceBlock,
     digest_of,
     nothing,
+    refusing,
 )
 from sealscope.monitor.sparkplug import (
     BIRTH_SEQUENCE,
@@ -155,6 +156,7 @@ class SparkplugHost:
         """Return whether a topic is one of Sparkplug's."""
         return topic.startswith(f"{NAMESPACE}/")
 
+    @refusing()
     def taken(self, topic: str, data: bytes, done: Callable[[], None] = nothing) -> SourceBlock | None:
         """Take a message; return the block that it brings, None where it brings none.
 
@@ -205,16 +207,13 @@ class SparkplugHost:
 
     @staticmethod
     def _died(state: _EdgeState, payload: SparkplugPayload) -> None:
-        given = named(payload.metrics, BIRTH_SEQUENCE)
-        if state.birth_sequence is not None and (given is None or given.value != state.birth_sequence):
+        if state.birth_sequence is not None and _birth_sequence(payload) != state.birth_sequence:
             raise RefusedMessage(STALE_DEATH, "a death must bear the bdSeq of the last birth")
         state.births, state.birth_sequence, state.seq, state.whole = {}, None, None, False
 
     @staticmethod
     def _born(state: _EdgeState, payload: SparkplugPayload) -> None:
-        given = named(payload.metrics, BIRTH_SEQUENCE)
-        sequence = given.value if given is not None and isinstance(given.value, int) else None
-        state.births, state.birth_sequence, state.seq, state.whole = {}, sequence, payload.seq, True
+        state.births, state.birth_sequence, state.seq, state.whole = {}, _birth_sequence(payload), payload.seq, True
 
     def _in_order(self, group: str, node: str, state: _EdgeState, payload: SparkplugPayload) -> None:
         """Look at the sequence number; where some are missing the node is asked for its birth."""
@@ -327,6 +326,12 @@ class SparkplugHost:
         if not 0.0 < rate < float("inf"):
             raise RefusedMessage(NO_CLOCK, f"{name} must be > 0 Hz, got {rate:g}")
         return rate
+
+
+def _birth_sequence(payload: SparkplugPayload) -> int | None:
+    """Return the number that ties a death to its birth, None where there is none, or no whole number."""
+    given = named(payload.metrics, BIRTH_SEQUENCE)
+    return given.value if given is not None and isinstance(given.value, int) else None
 
 
 def _piece(group: Mapping[str, SparkplugMetric], birth: _Birth, by_name: Mapping[str, str]) -> dict[str, Array]:

@@ -1,0 +1,183 @@
+"""The supervisor: every source, decoder and output of a monitor runs under it, and starts again after an error.
+
+An error of a part is its outage: it is logged once, with its place, stands on page and metrics while it lasts, and the
+part starts again after a pause that doubles. An error of the database is the database's outage.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+from sealscope.monitor.outages import DATABASE, Outages
+
+_log = logging.getLogger(__name__)
+#: Pauses after errors [s]: the first one, the longest one, and the longest one where the database is away.
+FIRST_PAUSE_S, LONGEST_PAUSE_S, DATABASE_PAUSE_S = 0.2, 60.0, 5.0
+#: A part that has run for so long [s] since it was started again counts as reached.
+_SOUND_S = 2.0
+#: Lines in a minute from one place in the code: of this package, and of the libraries that it uses.
+_OWN_LINES, _LIBRARY_LINES, _MINUTE_S, _MOST_PLACES = 300, 10, 60.0, 1000
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+class PartAway(Exception):  # noqa: N818 (says what happened)
+    """What a part needs is not there, such as a folder: an outage with this reason, and nothing to trace."""
+
+
+class SupervisedPart:
+    """A source, a decoder or an output; `attempt` runs it. Of one thread at a time."""
+
+    def __init__(self, name: str, outages: Outages, away: Callable[[BaseException], str | None]) -> None:
+        self.name, self._outages, self._away = name, outages, away
+        self._pause, self._due, self._failed = 0.0, 0.0, -math.inf
+        self._out = False
+
+    @property
+    def pause_s(self) -> float:
+        """How long the part still pauses [s]."""
+        return max(0.0, self._due - time.monotonic())
+
+    def attempt(self, work: Callable[[], object], *, at_once: bool = False) -> bool:
+        """Run work, unless the part pauses; return whether it ended without an error. `at_once`: without the pause."""
+        if self.pause_s and not at_once:
+            return False
+        sound = threading.Timer(_SOUND_S, self._works)
+        sound.daemon = True
+        if self._out:
+            sound.start()
+        try:
+            work()
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # a panic of an extension in Rust and an exit of uvicorn are no Exception
+            sound.cancel()
+            self._note(error)
+            return False
+        sound.cancel()
+        self._works()
+        return True
+
+    def _works(self) -> None:
+        if self._out:
+            self._out = False
+            self._outages.back(self.name)
+
+    def _note(self, error: BaseException) -> None:
+        """Set the pause after an error, and state the outage."""
+        now, reason = time.monotonic(), self._away(error)
+        if now - self._failed > 2.0 * self._pause + _SOUND_S:  # it has worked since
+            self._pause = 0.0
+        longest = LONGEST_PAUSE_S if reason is None else DATABASE_PAUSE_S
+        self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), longest)
+        self._failed, self._due = now, now + self._pause
+        if reason is not None:
+            self._outages.lost(DATABASE, reason)
+            return
+        self._out = True
+        self._outages.lost(self.name, error if isinstance(error, PartAway) else place_of(error))
+        _log.debug("the %s raised an error", self.name, exc_info=error)
+
+
+class Supervisor:
+    """The parts of a monitor that run in threads of their own until `stopping` is set.
+
+    `away`: returns of an error why the database does not answer, None for one of another kind.
+    """
+
+    def __init__(
+        self,
+        outages: Outages,
+        stopping: threading.Event,
+        away: Callable[[BaseException], str | None] = lambda error: None,
+    ) -> None:
+        self.outages, self._stopping, self._away = outages, stopping, away
+        self._parts: dict[str, SupervisedPart] = {}
+
+    def part(self, name: str) -> SupervisedPart:
+        """Return the part of a name, which counts as reached until it fails."""
+        if name not in self._parts:
+            self.outages.expect(name)
+            self._parts[name] = SupervisedPart(name, self.outages, self._away)
+        return self._parts[name]
+
+    def start(
+        self,
+        name: str,
+        work: Callable[[], object],
+        *,
+        again: bool = True,
+        ended: Callable[[], None] = lambda: None,
+    ) -> threading.Thread:
+        """Start a thread that runs work, again after each error, until it ends without one, then `ended`.
+
+        `again`: False where an error ends it as well.
+        """
+        part = self.part(name)
+
+        def keep() -> None:
+            while not part.attempt(work) and again and not self._stopping.wait(part.pause_s):
+                pass
+            ended()
+
+        return _started(keep, name)
+
+    def repeat(
+        self, name: str, step: Callable[[], object], every_s: float, *, at_the_end: bool = False
+    ) -> threading.Thread:
+        """Start a thread that runs a step every so many seconds; `at_the_end`: once more when `stopping` is set."""
+        part = self.part(name)
+
+        def keep() -> None:
+            while not self._stopping.wait(max(every_s, part.pause_s)):
+                part.attempt(step)
+            if at_the_end:
+                part.attempt(step, at_once=True)
+
+        return _started(keep, name)
+
+
+class LimitedLines(logging.Filter):
+    """Lets through so many lines a minute from one place in the code, and says how many it has left out."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._places: dict[tuple[str, str, int], tuple[float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a record is one of the first of its place in this minute."""
+        place = (record.name, record.pathname, record.lineno)
+        now, most = time.monotonic(), _OWN_LINES if record.name.startswith("sealscope") else _LIBRARY_LINES
+        began, count = self._places.get(place, (now, 0))
+        if now - began >= _MINUTE_S:
+            if count > most:
+                record.msg, record.args = f"{record.getMessage()} ({count - most} lines like it were left out)", None
+            began, count = now, 0
+        if len(self._places) >= _MOST_PLACES and place not in self._places:
+            self._places.clear()
+        self._places[place] = began, count + 1
+        return count < most
+
+
+def place_of(error: BaseException) -> str:
+    """Return in one line what an error is, and the last place of this package that it passed."""
+    kind = "".join(traceback.format_exception_only(error)[-1:]).strip()
+    where, step = "", error.__traceback__
+    while isinstance(step, TracebackType):
+        file = Path(step.tb_frame.f_code.co_filename)
+        if file.is_relative_to(_PACKAGE):
+            where = f" ({file.relative_to(_PACKAGE).as_posix()}, line {step.tb_lineno})"
+        step = step.tb_next
+    return f"{' '.join(kind.split())[:120]}{where}"
+
+
+def _started(work: Callable[[], None], name: str) -> threading.Thread:
+    thread = threading.Thread(target=work, name=name, daemon=True)
+    thread.start()
+    return thread
