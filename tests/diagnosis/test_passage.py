@@ -67,7 +67,7 @@ def test_the_smallest_step_is_found_and_half_of_it_is_not() -> None:
         assert smallest is not None
         assert smallest.findable_lpm is not None
         G = smallest.findable_lpm / LPM / smallest.pressure
-        assert detector.examine(machine(seed, G=step(0.0, 3.0 * G)), [], P).verdict == "leak"
+        assert detector.examine(machine(seed, G=step(0.0, 1.3 * G)), [], P).verdict == "leak"
         assert detector.examine(machine(seed, G=step(0.0, 0.4 * G)), [], P).verdict == "no leak"
 
 

@@ -362,13 +362,21 @@ def _with_figures(
         threshold=judging.threshold,
         chance=max(judging.chance, RAREST),
         parts=parts if len(parts) > 1 else (),
-        passage=_passage(balance, balance.level, None if evidence.verdict == "leak" else bound),
+        passage=_passage(balance, balance.level, None if evidence.verdict == "leak" else _findable(balance, questions)),
         ratio=None if size.ratio is None else size.ratio.value,
         ratio_interval=None if size.ratio is None else (size.ratio.low, size.ratio.high),
         bound_lpm=bound * size.scale / LITRE_PER_MINUTE if stated else None,
         course=_leak_course(balance, evidence) if size.stated else None,
     )
     return replace(evidence, reason=_reason(balance, evidence, bound, judging.name))
+
+
+def _findable(balance: Balance, questions: Sequence[_Question]) -> float | None:
+    """Return the smallest step within the recording that would have been found [m^3/s]."""
+    share = next((own.probability for own in questions if own.name == WITHIN), None)
+    if balance.test is None or share is None:
+        return None
+    return balance.test.findable(share) * balance.mean(0)
 
 
 def _passage(balance: Balance, level: Interval, findable: float | None) -> Passage:

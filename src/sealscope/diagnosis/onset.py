@@ -114,6 +114,12 @@ class StepTest:
             low, high = (middle, high) if beyond > (1.0 - probability) * above.sum() else (low, middle)
         return high
 
+    def findable(self, chance: float, power: float = 0.9) -> float:
+        """Return the step that is found with probability `power` at a false-alarm probability, at the median onset."""
+        from scipy.special import ndtri
+
+        return float((np.sqrt(self.threshold(chance)) + ndtri(power)) * np.median(self.deviation))
+
     def threshold(self, chance: float) -> float:
         """Return the score that a coefficient without a step exceeds with a probability."""
         low, high = 0.0, 1e4
