@@ -117,11 +117,16 @@ class Balance:
 
         The pressures at the pump's ports hardly differ from those of the chambers: the sum is known, its parts are not.
         """
+        weights = np.maximum(self.blocks.rows, 0.0)
+        return self.whole.over(weights / weights.sum())
+
+    @cached_property
+    def whole(self) -> Course:
+        """What passes pump and piston in all over the blocks, as a conductance."""
         column = self.columns[0]
         apart = column.names.index(PUMP) if PUMP in column.names else None
         both = information(self.blocks, self.columns, column.leak, apart)
-        weights = np.maximum(self.blocks.rows, 0.0)
-        return course(both, step_test(both), step=False).over(weights / weights.sum())
+        return course(both, step_test(both), step=False)
 
     @cached_property
     def coherent(self) -> bool:
@@ -402,7 +407,7 @@ def _passage(balance: Balance, level: Interval, findable: float | None) -> Passa
 
 def _leak_course(balance: Balance, evidence: Evidence) -> LeakCourse:
     """Return the leak over the recording: what came with it, or what passes in all where none began."""
-    own = balance.course(step=evidence.onset_s is not None)
+    own = balance.whole if evidence.onset_s is None else balance.course(step=True)
     time, value = balance.blocks.time, own.mean
     deviation = np.sqrt(np.maximum(np.diag(own.covariance), 0.0))
     onset, whole = evidence.onset_s, evidence.onset_s is None
