@@ -19,13 +19,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.terms import BIAS, LEAK, Equation, Prior, priors
 from sealscope.diagnosis.weak_form import SPAN, test_function
+from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
+from sealscope.storage.plain_state import array_of, part_of, plain_array
 
 #: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
 HUBER = 1.345
@@ -163,6 +165,22 @@ class Weighting:
         self._columns = columns
         self._known: list[Array | None] = [None] * len(columns)
         self._count = 0
+
+    @property
+    def begun(self) -> bool:
+        """Whether blocks were closed."""
+        return self._count > 0
+
+    def state(self) -> dict[str, Any]:
+        """Return what is known as plain values that JSON holds."""
+        return {"count": self._count, "known": [None if of is None else plain_array(of) for of in self._known]}
+
+    def recall(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state`; raises InputError where it does not fit."""
+        self._count = int(part_of(state, "count", int))
+        self._known = [None if of is None else array_of(of, "known") for of in part_of(state, "known", list)]
+        if len(self._known) != len(self._columns):
+            raise InputError(f"saved state's known must be {len(self._columns)} matrices, got {len(self._known)}")
 
     def close(self, values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
         """Return the Gram matrices (K, E, m, m) and the sums of weights (K,) of K blocks that are weighted together.

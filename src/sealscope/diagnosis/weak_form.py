@@ -73,19 +73,12 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     stride = phi.shape[1]
     pieces = len(increments[0]) // stride
     count = max(0, pieces - SPAN + 1)
-    values = np.zeros((count, len(increments)))
-    missing = np.zeros(pieces, dtype=bool)
-    for column, own in enumerate(increments):
-        cut = own[: pieces * stride].reshape(pieces, stride)
-        parts = cut @ phi.T
-        lost = np.isnan(parts[:, 0])
-        if lost.any():
-            missing |= lost
-            parts[lost] = 0.0
-        for piece in range(SPAN):
-            values[:, column] += parts[piece : piece + count, piece]
-    touched = np.zeros(count, dtype=bool)
-    for piece in range(SPAN):
-        touched |= missing[piece : piece + count]
+    cut = np.stack([own[: pieces * stride] for own in increments]).reshape(len(increments) * pieces, stride)
+    parts = (cut @ phi.T).reshape(len(increments), pieces, SPAN)
+    missing = np.isnan(parts[:, :, 0]).any(axis=0)
+    if missing.any():
+        parts[:, missing] = 0.0
+    values = sum(parts[:, piece : piece + count, piece] for piece in range(SPAN)).T
+    touched = np.any([missing[piece : piece + count] for piece in range(SPAN)], axis=0)
     time = start + (np.arange(count) + 0.5 * SPAN) * stride / rate
     return Rows(time, values, ~touched)

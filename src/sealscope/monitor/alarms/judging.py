@@ -11,7 +11,7 @@ from sealscope.monitor.alarms.alarm import NEXT_CHECKS, Alarm, AlarmState, Level
 from sealscope.monitor.stream.baseline import plain_dataclass
 from sealscope.monitor.stream.decisions import rarity
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
-from sealscope.monitor.stream.plain_state import plain_fields
+from sealscope.storage.plain_state import plain_fields
 
 
 @dataclass(frozen=True)

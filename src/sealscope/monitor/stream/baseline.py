@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sealscope.errors import InputError
-from sealscope.monitor.stream.plain_state import plain_fields
 from sealscope.recordings.recording import Array
+from sealscope.storage.plain_state import plain_fields
 from sealscope.storage.plain_values import as_type
 
 _T = TypeVar("_T")

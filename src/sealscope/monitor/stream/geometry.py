@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.volume_balance.blocks import FLOW, I_AB, THETA, BalanceBlocks
 from sealscope.diagnosis.volume_balance.evidence import states_flow
 from sealscope.diagnosis.volume_balance.fit import BalanceFit
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.recordings.recording import Array
+from sealscope.storage.plain_state import array_of, part_of, plain_array
 from sealscope.units import LITRE_PER_MINUTE
 
 #: A block stands where the integral of dp has under this many times the sum of squares that noise makes of it.

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array
 
 #: Channels by which an actuator is watched, and with those that are kept beside the estimates.
 _WATCHED = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u")

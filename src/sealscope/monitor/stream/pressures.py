@@ -25,12 +25,12 @@ from sealscope.diagnosis.observer.model import G_UNIT, assume
 from sealscope.diagnosis.observer.stream import Formulation, ObserverStream
 from sealscope.monitor.stream.decisions import WINDOW, ConductanceRise, other_duty, rise_of
 from sealscope.monitor.stream.estimator import PAUSE_S, BlockConductance, NotJudged, RecentBlocks
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.physics.rig import CHOICES, LAWS, NUMBERS, RigNumbers
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Array, Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:

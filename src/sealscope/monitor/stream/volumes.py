@@ -22,8 +22,8 @@ from sealscope.diagnosis.volume_balance.fit import fit_balance
 from sealscope.monitor.stream.decisions import WINDOW, ConductanceRise, step_of
 from sealscope.monitor.stream.estimator import PAUSE_S, BlockConductance, NotJudged, RecentBlocks
 from sealscope.monitor.stream.geometry import LEVEL, FrozenBalance, duty_of, in_motion
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.recordings.recording import Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig

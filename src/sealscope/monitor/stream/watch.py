@@ -28,10 +28,10 @@ from sealscope.monitor.stream.decisions import (
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 from sealscope.monitor.stream.estimator import PAUSE_S, BlockConductance, ConductanceEstimator, NotJudged, RecentBlocks
 from sealscope.monitor.stream.joining import SampleJoiner
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array, plain_fields
 from sealscope.monitor.stream.pressures import PressureEstimator
 from sealscope.monitor.stream.volumes import VolumeEstimator
 from sealscope.recordings.recording import Array, Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array, plain_fields
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig

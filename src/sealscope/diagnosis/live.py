@@ -1,0 +1,316 @@
+"""The volume balance of a running machine, block by block: what each block says of the leakage conductance.
+
+The sums are those of a recording (`balance.BlockStream`). All coefficients but the leak's are what the last blocks say of
+them: the leak's column is eliminated from the sums M_k of each block, which are added up and forgotten over `MEMORY`
+blocks; with C, m these sums over the other columns and their products with the left side,
+
+    c = C^-1 m,    g_k = (n_k - b_k' c) / N_k,    Var g_k = s^2 / N_k,
+
+N_k, n_k and b_k the products of the leak's column with itself, the left side and the others over the rows of block k,
+s^2 the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step of the leak. What passes the
+pump beside the piston is part of g: piston and pump lie in parallel. Whether g stepped is for `sequential` to say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.balance import BlockStream
+from sealscope.diagnosis.blocks import Blocks, Columns, overlap, solve
+from sealscope.diagnosis.terms import equations
+from sealscope.diagnosis.weak_form import STRIDE
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.units import LITRE_PER_MINUTE
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: About how long a block is [s].
+BLOCK_SECONDS = 3.0
+#: Blocks after which what they said of the other coefficients counts for 1/e, and blocks before anything is said.
+MEMORY, LEARNED = 60.0, 20
+#: A block that leaves more than this many deviations counts for less.
+JUMP = 4.0
+#: A block rests whose motion is below this share of the usual one, unless it tells of the leak more than so much of it.
+_RESTS, _TELLS = 1e-4, 0.1
+#: Two samples follow each other where their times differ by so many steps.
+_FOLLOWS = (0.5, 1.5)
+#: A recorded share of a flow that areas and displacement leave uncertain, as a part of the whole conductance.
+LEVEL = 0.02
+
+
+@dataclass(frozen=True)
+class BlockConductance:
+    """What a block shows of the machine.
+
+    `begin`, `end`: of its samples [s]; `g`, `sd`: conductance of what passes pump and piston, and its deviation
+    [m^3/(s Pa)]; `wander`: deviation of what moved since the block before in what all conductances share, and `offset`
+    the deviation of that itself; `flow`: mean flow of one unit of conductance [L/min]; `duty`: logarithms of the mean
+    pressure difference [Pa] and of the size of the motion.
+    """
+
+    begin: float
+    end: float
+    g: float
+    sd: float
+    wander: float
+    offset: float
+    flow: float
+    duty: tuple[float, float]
+
+
+class NotJudged(NamedTuple):
+    """Why a block that ends at the clock `end` [s] shows nothing: its status, and under what it is counted.
+
+    `apart`: what comes after it is compared with nothing before it.
+    """
+
+    end: float
+    status: str
+    counted: str = ""
+    apart: bool = False
+
+
+class _Said(NamedTuple):
+    """What a block says of the leak's coefficient: `precision`, that times its estimate `lead`, and `leaning`, the
+    variance that the other coefficients leave, times the precision squared.
+    """
+
+    precision: float
+    lead: float
+    leaning: float
+
+
+class _Known:
+    """What the last blocks say of all coefficients of one equation but the leak's."""
+
+    def __init__(self, columns: Columns) -> None:
+        self.leak, self.left = columns.leak, columns.left
+        self.others = [k for k in columns.nuisance if k != columns.leak and columns.names[k] != "pump leak"]
+        self.chosen = np.array([*self.others, columns.left])
+        self.relearn()
+
+    def relearn(self) -> None:
+        self.sums = np.zeros((len(self.chosen), len(self.chosen)))
+        self.rows = self.motion = self.noise = 0.0
+
+    def add(self, gram: Array, rows: float, weight: float = 1.0) -> None:
+        """Add what a block says whatever its leak is; forget a part of what those before said."""
+        keep = math.exp(-1.0 / MEMORY)
+        self.sums = keep * self.sums + weight * self._without_leak(gram)
+        self.rows = keep * self.rows + weight * rows
+        self.motion = keep * self.motion + float(gram[self.left, self.left])
+
+    def _without_leak(self, gram: Array) -> Array:
+        along = gram[self.chosen, self.leak]
+        energy = max(float(gram[self.leak, self.leak]), np.finfo(float).tiny)
+        return np.asarray(gram[np.ix_(self.chosen, self.chosen)] - np.outer(along, along) / energy)
+
+    def begin(self) -> None:
+        """Take the variance of a row from all that was added."""
+        count = len(self.others)
+        lead, square = self.sums[:count, count], float(self.sums[count, count])
+        left = square - float(lead @ solve(self.sums[:count, :count], lead))
+        self.noise = max(left, 1e-14 * square, np.finfo(float).tiny) / self.rows
+
+    def says(self, gram: Array, rows: float, adds: bool = True) -> _Said:
+        """Return what a block says; with `adds` it is among the last ones from now on."""
+        weight, count = 1.0, len(self.others)
+        if adds:
+            weight = min(1.0, JUMP**2 * self.noise / max(self._left(gram) / rows, np.finfo(float).tiny))
+            self.add(gram, rows, weight)
+        along = gram[self.others, self.leak]
+        solved = solve(self.sums[:count, :count], np.column_stack([self.sums[:count, count], along]))
+        if adds:
+            # the block's own coefficients are as good as any: what they leave is what the last blocks leave of it
+            left = max(self._left(gram, solved[:, 0]), 0.0) * weight / rows
+            self.noise += (1.0 - math.exp(-1.0 / MEMORY)) * (left - self.noise)
+        variance = overlap() * self.noise / weight
+        precision = float(gram[self.leak, self.leak]) / variance
+        lead = float(gram[self.leak, self.left] - along @ solved[:, 0]) / variance
+        return _Said(precision, lead, float(along @ solved[:, 1]) * overlap() * self.noise / variance**2)
+
+    def _left(self, gram: Array, coefficients: Array | None = None) -> float:
+        """Return the sum of squares that the coefficients leave of a block."""
+        count = len(self.others)
+        if coefficients is None:
+            coefficients = solve(self.sums[:count, :count], self.sums[:count, count])
+        vector = np.append(-coefficients, 1.0)
+        return float(vector @ self._without_leak(gram) @ vector)
+
+    def rests(self, gram: Array, rows: float) -> bool:
+        return float(gram[self.left, self.left]) * self.rows < _RESTS * self.motion * rows
+
+
+class LiveBalance:
+    """The balance of a running machine: samples in, conductances of blocks out, the same for pieces of any size.
+
+    Parameters
+    ----------
+    rig : Rig
+        Gives the pump's displacement and the circuit.
+    names : sequence of str
+        Channels of the samples.
+
+    Raises
+    ------
+    InputError
+        Where the channels allow no balance.
+    """
+
+    def __init__(self, rig: Rig, names: Sequence[str]) -> None:
+        self._balances = equations(rig, frozenset(names))
+        if not self._balances:
+            raise InputError(f"a live balance must have {_needed(rig)}, got {', '.join(names) or 'nothing'}")
+        needed = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
+        needed |= {next(name for name in ("theta", "omega", "u") if name in names)}
+        self.names = tuple(name for name in names if name in needed)
+        columns = [Columns(balance) for balance in self._balances]
+        self._known = [_Known(own) for own in columns]
+        self._precision = self._shared = 0.0  # of the first blocks; deviation that the other coefficients leave
+        self._waiting: Blocks | None = None
+        self._stream: BlockStream | None = None
+        self._rate, self._next = 0.0, -math.inf
+
+    def take(self, t: Array, samples: Mapping[str, Array], rate: float) -> list[BlockConductance | NotJudged]:
+        """Take samples that follow each other at the times `t` [s]; return what the blocks say that they complete.
+
+        After a gap the balance goes on with what it knew; what lay before the gap and fills no block is dropped.
+        """
+        shown = []
+        steps = (float(t[0]) - self._next) * rate + 1.0
+        if self._stream is None or rate != self._rate or not _FOLLOWS[0] < steps < _FOLLOWS[1]:
+            shown += self.finish()
+            if self._stream is None or rate != self._rate:
+                before = self._stream
+                self._stream, self._rate = BlockStream(self._balances, rate, BLOCK_SECONDS), rate
+                if before is not None:
+                    self._stream.recall({**before.state(), "samples": {}, "first": 0, "done": 0})
+            self._stream.restart(float(t[0]))
+        self._next = float(t[-1]) + 1.0 / rate
+        return shown + self._said(self._stream.push({name: samples[name] for name in self.names}))
+
+    def finish(self) -> list[BlockConductance | NotJudged]:
+        """Return what the blocks say that are whole though nothing follows."""
+        return [] if self._stream is None else self._said(self._stream.push({}, last=True))
+
+    def _said(self, blocks: Blocks | None) -> list[BlockConductance | NotJudged]:
+        if blocks is None:
+            return []
+        shown: list[BlockConductance | NotJudged] = []
+        for block in _parts(blocks):
+            shown += self._taken(block)
+        return shown
+
+    def _taken(self, block: Blocks) -> list[BlockConductance | NotJudged]:
+        end, rows = float(block.end[0]) + 0.5 * STRIDE, float(block.rows[0])
+        if not rows:
+            return [NotJudged(end, "missing values", "blocks: missing values")]
+        if self._precision > 0.0:
+            return [self._shown(block)]
+        if not block.gram[0, 0, -1, -1] > 0.0 and self._waiting is None:
+            return [NotJudged(end, "at rest", "blocks: at rest")]
+        self._waiting = block if self._waiting is None else Blocks.joined([self._waiting, block])
+        if len(self._waiting) < LEARNED:
+            return [NotJudged(end, "learning")]
+        waiting, self._waiting = self._waiting, None
+        for e, known in enumerate(self._known):
+            for gram, own in zip(waiting.gram[:, e], waiting.rows, strict=True):
+                known.add(gram, own)
+            known.begin()
+        self._precision = float(np.median([self._says(part, adds=False).precision for part in _parts(waiting)]))
+        return [self._shown(part, adds=False) for part in _parts(waiting)]
+
+    def _says(self, block: Blocks, adds: bool = True) -> _Said:
+        """Return what a block says by all equations."""
+        rows = float(block.rows[0])
+        said = [known.says(gram, rows, adds) for known, gram in zip(self._known, block.gram[0], strict=True)]
+        return _Said(*(sum(values) for values in zip(*said, strict=True)))
+
+    def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
+        begin, end = float(block.start[0]) - 0.5 * STRIDE, float(block.end[0]) + 0.5 * STRIDE
+        at_rest = self._known[0].rests(block.gram[0, 0], float(block.rows[0]))
+        precision, lead, leaning = self._says(block, adds)
+        if not precision > (_TELLS * self._precision if at_rest else 0.0):
+            return NotJudged(end, "at rest", "blocks: at rest")
+        g, sd, shared = lead / precision, 1.0 / math.sqrt(precision), math.sqrt(max(leaning, 0.0)) / precision
+        before, self._shared = self._shared, shared
+        wander = math.sqrt(max(before**2 - shared**2, 0.0) + 2.0 / MEMORY * shared**2) if adds else 0.0
+        pressure, _, rate = (max(float(value), np.finfo(float).tiny) for value in block.means[0])
+        duty = math.log(pressure), math.log(rate)
+        offset = math.hypot(shared, LEVEL * g)
+        return BlockConductance(begin, end, g, sd, wander, offset, pressure / LITRE_PER_MINUTE, duty)
+
+    def relearn(self) -> None:
+        """Forget all coefficients: the machine was repaired, or is another."""
+        for known in self._known:
+            known.relearn()
+        self._precision, self._waiting = 0.0, None
+
+    def state(self) -> dict[str, Any]:
+        """Return all of it as plain values that JSON holds."""
+        waiting, stream = self._waiting, self._stream
+        return {
+            "names": list(self.names),
+            "known": [
+                {"sums": plain_array(of.sums), "rows": of.rows, "motion": of.motion, "noise": of.noise}
+                for of in self._known
+            ],
+            "precision": self._precision,
+            "shared": self._shared,
+            "waiting": None
+            if waiting is None
+            else {name: plain_array(getattr(waiting, name)) for name in _BLOCK_FIELDS},
+            "rate": self._rate,
+            "next": self._next if math.isfinite(self._next) else None,
+            "stream": None if stream is None else stream.state(),
+        }
+
+    @classmethod
+    def from_state(cls, rig: Rig, state: Mapping[str, Any]) -> LiveBalance:
+        """Return the balance that `state` was of; raises InputError where it does not fit."""
+        live = cls(rig, tuple(part_of(state, "names", list)))
+        known = part_of(state, "known", list)
+        if len(known) != len(live._known):
+            raise InputError(f"saved state's known must be of {len(live._known)} equations, got {len(known)}")
+        for own, saved in zip(live._known, known, strict=True):
+            sums = array_of(part_of(saved, "sums", Mapping), "sums")
+            if sums.shape != own.sums.shape:
+                raise InputError(f"saved state's sums must have the shape {own.sums.shape}, got {sums.shape}")
+            own.sums = sums
+            own.rows, own.motion, own.noise = (_number(saved, name) for name in ("rows", "motion", "noise"))
+        live._precision, live._shared, live._rate = (_number(state, name) for name in ("precision", "shared", "rate"))
+        waiting, stream = (part_of(state, name, (Mapping, type(None))) for name in ("waiting", "stream"))
+        after = part_of(state, "next", (float, int, type(None)))
+        if waiting is not None:
+            live._waiting = Blocks(*(array_of(part_of(waiting, name, Mapping), name) for name in _BLOCK_FIELDS))
+        live._next = -math.inf if after is None else float(after)
+        if stream is not None:
+            live._stream = BlockStream(live._balances, live._rate, BLOCK_SECONDS)
+            live._stream.recall(stream)
+        return live
+
+
+_BLOCK_FIELDS = tuple(Blocks.__dataclass_fields__)
+
+
+def _parts(blocks: Blocks) -> list[Blocks]:
+    """Return the blocks one by one."""
+    return [Blocks(*(getattr(blocks, name)[k : k + 1] for name in _BLOCK_FIELDS)) for k in range(len(blocks))]
+
+
+def _number(state: Any, name: str) -> float:
+    return float(part_of(state, name, (float, int)))
+
+
+def _needed(rig: Rig) -> str:
+    if rig.valve.spool == "present":
+        return "x, u, p_A, p_B, p_1 and p_2"
+    return "x, p_A, p_B and theta, omega or u"
