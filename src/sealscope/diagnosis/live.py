@@ -1,14 +1,14 @@
-"""The volume balance of a running machine, block by block: what each block says of the leakage conductance.
+"""The volume balance of a running machine: what each block says of the leakage conductance.
 
-The sums are those of a recording (`balance.BlockStream`). All coefficients but the leak's are what the last blocks say of
-them: the leak's column is eliminated from the sums M_k of each block, which are added up and forgotten over `MEMORY`
+The sums are those of a recording (`balance.BlockStream`). All coefficients but the leak's are what the last blocks say
+of them: the leak's column is eliminated from the sums M_k of each block, which are added up and forgotten over `MEMORY`
 blocks; with C, m these sums over the other columns and their products with the left side,
 
     c = C^-1 m,    g_k = (n_k - b_k' c) / N_k,    Var g_k = s^2 / N_k,
 
-N_k, n_k and b_k the products of the leak's column with itself, the left side and the others over the rows of block k,
-s^2 the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step of the leak. What passes the
-pump beside the piston is part of g: piston and pump lie in parallel. Whether g stepped is for `sequential` to say.
+N_k, n_k and b_k the products of the leak's column with itself, the left side and the others over the rows of block
+k, s^2 the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step of the leak. What passes
+the pump beside the piston is part of g: piston and pump lie in parallel. Whether g stepped is for `sequential` to say.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from sealscope.diagnosis.balance import BlockStream
 from sealscope.diagnosis.blocks import Blocks, Columns, overlap, solve
-from sealscope.diagnosis.terms import equations
+from sealscope.diagnosis.terms import Term, equations
 from sealscope.diagnosis.weak_form import STRIDE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -40,6 +40,8 @@ MEMORY, LEARNED = 60.0, 20
 JUMP = 4.0
 #: A block rests whose motion is below this share of the usual one, unless it tells of the leak more than so much of it.
 _RESTS, _TELLS = 1e-4, 0.1
+#: ... and after so many that move so much more, all before were of a machine at rest.
+_WAKES = 3
 #: Two samples follow each other where their times differ by so many steps.
 _FOLLOWS = (0.5, 1.5)
 #: A recorded share of a flow that areas and displacement leave uncertain, as a part of the whole conductance.
@@ -78,9 +80,15 @@ class NotJudged(NamedTuple):
     apart: bool = False
 
 
+#: What a block says, or why nothing.
+Shown = Sequence[BlockConductance] | NotJudged
+
+
 class _Said(NamedTuple):
-    """What a block says of the leak's coefficient: `precision`, that times its estimate `lead`, and `leaning`, the
-    variance that the other coefficients leave, times the precision squared.
+    """What a block says of the leak's coefficient.
+
+    `precision`; that times its estimate, `lead`; the variance that the other coefficients leave, times the precision
+    squared, `leaning`.
     """
 
     precision: float
@@ -93,7 +101,7 @@ class _Known:
 
     def __init__(self, columns: Columns) -> None:
         self.leak, self.left = columns.leak, columns.left
-        self.others = [k for k in columns.nuisance if k != columns.leak and columns.names[k] != "pump leak"]
+        self.others = [k for k in columns.nuisance if k != columns.leak]
         self.chosen = np.array([*self.others, columns.left])
         self.relearn()
 
@@ -106,7 +114,7 @@ class _Known:
         keep = math.exp(-1.0 / MEMORY)
         self.sums = keep * self.sums + weight * self._without_leak(gram)
         self.rows = keep * self.rows + weight * rows
-        self.motion = keep * self.motion + float(gram[self.left, self.left])
+        self.motion = keep * self.motion + weight * float(gram[self.left, self.left])
 
     def _without_leak(self, gram: Array) -> Array:
         along = gram[self.chosen, self.leak]
@@ -145,7 +153,12 @@ class _Known:
         vector = np.append(-coefficients, 1.0)
         return float(vector @ self._without_leak(gram) @ vector)
 
+    def wakes(self, gram: Array, rows: float) -> bool:
+        """Return whether a block moves so much more that those before were of a machine at rest."""
+        return _RESTS * float(gram[self.left, self.left]) * self.rows > self.motion * rows
+
     def rests(self, gram: Array, rows: float) -> bool:
+        """Return whether a block moves so much less that its machine stands."""
         return float(gram[self.left, self.left]) * self.rows < _RESTS * self.motion * rows
 
 
@@ -166,7 +179,8 @@ class LiveBalance:
     """
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:
-        self._balances = equations(rig, frozenset(names))
+        balances = equations(rig, frozenset(names))
+        self._balances = [own._replace(terms=tuple(filter(_is_told, own.terms))) for own in balances]
         if not self._balances:
             raise InputError(f"a live balance must have {_needed(rig)}, got {', '.join(names) or 'nothing'}")
         needed = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
@@ -175,16 +189,19 @@ class LiveBalance:
         columns = [Columns(balance) for balance in self._balances]
         self._known = [_Known(own) for own in columns]
         self._precision = self._shared = 0.0  # of the first blocks; deviation that the other coefficients leave
+        self._woken = 0
         self._waiting: Blocks | None = None
         self._stream: BlockStream | None = None
         self._rate, self._next = 0.0, -math.inf
 
-    def take(self, t: Array, samples: Mapping[str, Array], rate: float) -> list[BlockConductance | NotJudged]:
-        """Take samples that follow each other at the times `t` [s]; return what the blocks say that they complete.
+    def take(self, t: Array, samples: Mapping[str, Array], rate: float) -> list[Shown]:
+        """Take samples that follow each other at the times `t` [s]; return what each block says that they complete.
+
+        The first blocks say nothing until there are `LEARNED`; the last of these says what all of them do.
 
         After a gap the balance goes on with what it knew; what lay before the gap and fills no block is dropped.
         """
-        shown = []
+        shown: list[Shown] = []
         steps = (float(t[0]) - self._next) * rate + 1.0
         if self._stream is None or rate != self._rate or not _FOLLOWS[0] < steps < _FOLLOWS[1]:
             shown += self.finish()
@@ -197,36 +214,43 @@ class LiveBalance:
         self._next = float(t[-1]) + 1.0 / rate
         return shown + self._said(self._stream.push({name: samples[name] for name in self.names}))
 
-    def finish(self) -> list[BlockConductance | NotJudged]:
+    def interrupt(self) -> None:
+        """Take the next samples as those after a gap, whatever their time is."""
+        self._next = -math.inf
+
+    def finish(self) -> list[Shown]:
         """Return what the blocks say that are whole though nothing follows."""
         return [] if self._stream is None else self._said(self._stream.push({}, last=True))
 
-    def _said(self, blocks: Blocks | None) -> list[BlockConductance | NotJudged]:
+    def _said(self, blocks: Blocks | None) -> list[Shown]:
         if blocks is None:
             return []
-        shown: list[BlockConductance | NotJudged] = []
-        for block in _parts(blocks):
-            shown += self._taken(block)
-        return shown
+        return [self._taken(block) for block in _parts(blocks)]
 
-    def _taken(self, block: Blocks) -> list[BlockConductance | NotJudged]:
+    def _taken(self, block: Blocks) -> Shown:
         end, rows = float(block.end[0]) + 0.5 * STRIDE, float(block.rows[0])
         if not rows:
-            return [NotJudged(end, "missing values", "blocks: missing values")]
+            return NotJudged(end, "missing values", "blocks: missing values")
         if self._precision > 0.0:
-            return [self._shown(block)]
+            self._woken = self._woken + 1 if self._known[0].wakes(block.gram[0, 0], rows) else 0
+            if self._woken >= _WAKES:
+                self.relearn()
+                return NotJudged(end, "learning", "blocks: moves as never before", True)
+            shown = self._shown(block)
+            return shown if isinstance(shown, NotJudged) else [shown]
         if not block.gram[0, 0, -1, -1] > 0.0 and self._waiting is None:
-            return [NotJudged(end, "at rest", "blocks: at rest")]
+            return NotJudged(end, "at rest", "blocks: at rest")
         self._waiting = block if self._waiting is None else Blocks.joined([self._waiting, block])
         if len(self._waiting) < LEARNED:
-            return [NotJudged(end, "learning")]
+            return NotJudged(end, "learning")
         waiting, self._waiting = self._waiting, None
         for e, known in enumerate(self._known):
             for gram, own in zip(waiting.gram[:, e], waiting.rows, strict=True):
                 known.add(gram, own)
             known.begin()
         self._precision = float(np.median([self._says(part, adds=False).precision for part in _parts(waiting)]))
-        return [self._shown(part, adds=False) for part in _parts(waiting)]
+        parts = [self._shown(part, adds=False) for part in _parts(waiting)]
+        return [part for part in parts if not isinstance(part, NotJudged)] or NotJudged(end, "at rest")
 
     def _says(self, block: Blocks, adds: bool = True) -> _Said:
         """Return what a block says by all equations."""
@@ -240,7 +264,7 @@ class LiveBalance:
         precision, lead, leaning = self._says(block, adds)
         if not precision > (_TELLS * self._precision if at_rest else 0.0):
             return NotJudged(end, "at rest", "blocks: at rest")
-        g, sd, shared = lead / precision, 1.0 / math.sqrt(precision), math.sqrt(max(leaning, 0.0)) / precision
+        g, sd, shared = (float(of) for of in (lead / precision, precision**-0.5, max(leaning, 0.0) ** 0.5 / precision))
         before, self._shared = self._shared, shared
         wander = math.sqrt(max(before**2 - shared**2, 0.0) + 2.0 / MEMORY * shared**2) if adds else 0.0
         pressure, _, rate = (max(float(value), np.finfo(float).tiny) for value in block.means[0])
@@ -252,7 +276,7 @@ class LiveBalance:
         """Forget all coefficients: the machine was repaired, or is another."""
         for known in self._known:
             known.relearn()
-        self._precision, self._waiting = 0.0, None
+        self._precision, self._woken, self._waiting = 0.0, 0, None
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values that JSON holds."""
@@ -265,6 +289,7 @@ class LiveBalance:
             ],
             "precision": self._precision,
             "shared": self._shared,
+            "woken": self._woken,
             "waiting": None
             if waiting is None
             else {name: plain_array(getattr(waiting, name)) for name in _BLOCK_FIELDS},
@@ -287,6 +312,7 @@ class LiveBalance:
             own.sums = sums
             own.rows, own.motion, own.noise = (_number(saved, name) for name in ("rows", "motion", "noise"))
         live._precision, live._shared, live._rate = (_number(state, name) for name in ("precision", "shared", "rate"))
+        live._woken = int(part_of(state, "woken", int))
         waiting, stream = (part_of(state, name, (Mapping, type(None))) for name in ("waiting", "stream"))
         after = part_of(state, "next", (float, int, type(None)))
         if waiting is not None:
@@ -308,6 +334,11 @@ def _parts(blocks: Blocks) -> list[Blocks]:
 
 def _number(state: Any, name: str) -> float:
     return float(part_of(state, name, (float, int)))
+
+
+def _is_told(term: Term) -> bool:
+    """Return whether a term has a column: what may be zero, or lies beside the leak, has none."""
+    return term.nuisance and term.name != "pump leak"
 
 
 def _needed(rig: Rig) -> str:

@@ -2,8 +2,9 @@
 
 Each block gives an estimate g_k of the coefficient with a variance V_k. In a healthy machine g has a level that walks:
 the innovations e_k of its Kalman filter, of variance kappa S_k with kappa unknown, are Student t given those before. A
-step of size delta at block j adds f_k delta to e_k, f the filter's answer to a step, of which block j may have a part only (`PARTS`). With a = sum f e / S, b = sum
-f^2 / S, T = sum e^2 / S and n innovations the ratio of the likelihoods, delta ~ N(0, v kappa) and kappa integrated, is
+step of size delta at block j adds f_k delta to e_k, f the filter's answer to a step, of which block j may have a part
+only (`PARTS`). With a = sum f e / S, b = sum f^2 / S, T = sum e^2 / S and n innovations the ratio of the likelihoods,
+delta ~ N(0, v kappa) and kappa integrated, is
 
     R_j = (1 + v b)^(-1/2) (1 - a^2 / ((b + 1/v) T))^(-n/2),
 

@@ -26,6 +26,8 @@ from sealscope.recordings.recording import Array
 #: Distance of neighbouring test functions [s], and how many of these distances a test function spans.
 STRIDE = 0.125
 SPAN = 4
+#: Sums of increments beyond it are no values of a sensor: their squares would overflow.
+LARGEST = 1e100
 
 
 class Rows(NamedTuple):
@@ -75,7 +77,7 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     count = max(0, pieces - SPAN + 1)
     cut = np.stack([own[: pieces * stride] for own in increments]).reshape(len(increments) * pieces, stride)
     parts = (cut @ phi.T).reshape(len(increments), pieces, SPAN)
-    missing = np.isnan(parts[:, :, 0]).any(axis=0)
+    missing = ~(np.abs(parts) < LARGEST).all(axis=(0, 2))
     if missing.any():
         parts[:, missing] = 0.0
     values = sum(parts[:, piece : piece + count, piece] for piece in range(SPAN)).T
