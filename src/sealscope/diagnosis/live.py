@@ -22,7 +22,7 @@ import numpy as np
 
 from sealscope.diagnosis.balance import BlockStream
 from sealscope.diagnosis.blocks import Blocks, Columns, overlap, solve
-from sealscope.diagnosis.terms import Term, equations
+from sealscope.diagnosis.terms import Term, equations, priors
 from sealscope.diagnosis.weak_form import STRIDE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -44,8 +44,6 @@ _RESTS, _TELLS = 1e-4, 0.1
 _WAKES = 3
 #: Two samples follow each other where their times differ by so many steps.
 _FOLLOWS = (0.5, 1.5)
-#: A recorded share of a flow that areas and displacement leave uncertain, as a part of the whole conductance.
-LEVEL = 0.02
 
 
 @dataclass(frozen=True)
@@ -189,6 +187,7 @@ class LiveBalance:
         columns = [Columns(balance) for balance in self._balances]
         self._known = [_Known(own) for own in columns]
         self._precision = self._shared = 0.0  # of the first blocks; deviation that the other coefficients leave
+        self._size_error = size_error(rig)
         self._woken = 0
         self._waiting: Blocks | None = None
         self._stream: BlockStream | None = None
@@ -269,7 +268,7 @@ class LiveBalance:
         wander = math.sqrt(max(before**2 - shared**2, 0.0) + 2.0 / MEMORY * shared**2) if adds else 0.0
         pressure, _, rate = (max(float(value), np.finfo(float).tiny) for value in block.means[0])
         duty = math.log(pressure), math.log(rate)
-        offset = math.hypot(shared, LEVEL * g)
+        offset = math.hypot(shared, self._size_error * g)
         return BlockConductance(begin, end, g, sd, wander, offset, pressure / LITRE_PER_MINUTE, duty)
 
     def relearn(self) -> None:
@@ -334,6 +333,16 @@ def _parts(blocks: Blocks) -> list[Blocks]:
 
 def _number(state: Any, name: str) -> float:
     return float(part_of(state, name, (float, int)))
+
+
+def size_error(rig: Rig) -> float:
+    """Return how far a flow by the rig's size is known, relative."""
+    return priors()["size"]["area" if rig.valve.spool == "present" else "displacement"].value
+
+
+def states_flow(rig: Rig) -> bool:
+    """Return whether a rig states what turns the balance into L/min."""
+    return rig.states(*(("cylinder.A_A", "cylinder.A_B") if rig.valve.spool == "present" else ("pump.q_b",)))
 
 
 def _is_told(term: Term) -> bool:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.live import BLOCK_SECONDS, LEARNED, LEVEL, BlockConductance, LiveBalance, NotJudged, Shown
+from sealscope.diagnosis.live import BLOCK_SECONDS, LEARNED, BlockConductance, LiveBalance, NotJudged, Shown, size_error, states_flow
 from sealscope.diagnosis.sequential import RECENT, StepDetector
 from sealscope.diagnosis.terms import priors
 from sealscope.errors import InputError
@@ -103,7 +103,7 @@ class Watch:
         probability_of("step", false_alarms_per_1000_h, BLOCK_SECONDS)
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
-        self._rig, self._litres = rig, rig.states("cylinder.A_A", "cylinder.A_B", "pump.q_b")
+        self._rig, self._litres = rig, states_flow(rig)
         self._samples = SampleJoiner(valved=rig.valve.spool == "present")
         self._live: LiveBalance | None = None
         self._pressures: PressureEstimator | None = None
@@ -343,7 +343,7 @@ class Watch:
 
     @property
     def _size_error(self) -> float:
-        return LEVEL if self.by == "volumes" else PressureEstimator.size_error
+        return size_error(self._rig) if self.by == "volumes" else PressureEstimator.size_error
 
     @property
     def _orifice(self) -> float:
