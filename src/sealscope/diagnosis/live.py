@@ -51,16 +51,16 @@ class BlockConductance:
     """What a block shows of the machine.
 
     `begin`, `end`: of its samples [s]; `g`, `sd`: conductance of what passes pump and piston, and its deviation
-    [m^3/(s Pa)]; `wander`: deviation of what moved since the block before in what all conductances share, and `offset`
-    the deviation of that itself; `flow`: mean flow of one unit of conductance [L/min]; `duty`: logarithms of the mean
-    pressure difference [Pa] and of the size of the motion.
+    [m^3/(s Pa)], of a series that does not move as the other coefficients become known; `total`: as these are known
+    now, and its deviation `offset` beside `sd`; `flow`: mean flow of one unit of conductance [L/min]; `duty`:
+    logarithms of the mean pressure difference [Pa] and of the size of the motion.
     """
 
     begin: float
     end: float
     g: float
     sd: float
-    wander: float
+    total: float
     offset: float
     flow: float
     duty: tuple[float, float]
@@ -78,86 +78,128 @@ class NotJudged(NamedTuple):
     apart: bool = False
 
 
+_TINY = float(np.finfo(float).tiny)
+#: What is left after a block of how far the series stands from the level that the coefficients give now.
+_RETURNS = math.exp(-1.0 / 1200.0)
+#: Where the leak's column stands in the sums.
+_LEAK = -2
 #: What a block says, or why nothing.
 Shown = Sequence[BlockConductance] | NotJudged
 
 
 class _Said(NamedTuple):
-    """What a block says of the leak's coefficient.
+    """What a block says of the leak's coefficient, sums over the equations.
 
-    `precision`; that times its estimate, `lead`; the variance that the other coefficients leave, times the precision
-    squared, `leaning`.
+    `precision`; that times its estimate, `lead`, and times what is to be taken from it so that the series does not move
+    with the other coefficients, `shift`; `leaning`: the variance that these leave, times the precision squared.
     """
 
     precision: float
     lead: float
+    shift: float
     leaning: float
 
 
+_SUMS, _NUMBERS = ("sums", "coefficients", "along"), ("rows", "motion", "noise", "energy", "shift")
+
+
 class _Known:
-    """What the last blocks say of all coefficients of one equation but the leak's."""
+    """What the last blocks say of all coefficients of one equation: sums over its columns, the leak's next to last."""
 
     def __init__(self, columns: Columns) -> None:
-        self.leak, self.left = columns.leak, columns.left
         self.others = [k for k in columns.nuisance if k != columns.leak]
-        self.chosen = np.array([*self.others, columns.left])
+        self._place = np.ix_(*2 * ([*self.others, columns.leak, columns.left],))
         self.relearn()
 
     def relearn(self) -> None:
-        self.sums = np.zeros((len(self.chosen), len(self.chosen)))
-        self.rows = self.motion = self.noise = 0.0
+        """Forget all."""
+        count = len(self.others)
+        self.sums = np.zeros((count + 2, count + 2))
+        self.coefficients, self.along = np.zeros(count), np.zeros(count)
+        self.rows = self.motion = self.noise = self.energy = self.shift = 0.0
 
-    def add(self, gram: Array, rows: float, weight: float = 1.0) -> None:
-        """Add what a block says whatever its leak is; forget a part of what those before said."""
-        keep = math.exp(-1.0 / MEMORY)
-        self.sums = keep * self.sums + weight * self._without_leak(gram)
+    def add(self, gram: Array, rows: float, weight: float = 1.0, stepped: bool = False) -> None:
+        """Add what a block says; forget a part of what those before said.
+
+        The leak walks between blocks by as much as a block tells of it, or any distance where it `stepped`.
+        """
+        own, keep = gram[self._place], math.exp(-1.0 / MEMORY)
+        along = self.sums[_LEAK]
+        walked = float(along[_LEAK]) + (0.0 if stepped else max(float(own[_LEAK, _LEAK]), _TINY))
+        if walked > 0.0:
+            self.sums = self.sums - np.outer(along, along) / walked
+        self.sums = keep * self.sums + weight * own
+        self.along, self.energy = keep * self.along + own[:_LEAK, _LEAK], keep * self.energy + float(own[_LEAK, _LEAK])
         self.rows = keep * self.rows + weight * rows
-        self.motion = keep * self.motion + weight * float(gram[self.left, self.left])
-
-    def _without_leak(self, gram: Array) -> Array:
-        along = gram[self.chosen, self.leak]
-        energy = max(float(gram[self.leak, self.leak]), np.finfo(float).tiny)
-        return np.asarray(gram[np.ix_(self.chosen, self.chosen)] - np.outer(along, along) / energy)
+        self.motion = keep * self.motion + weight * float(own[-1, -1])
 
     def begin(self) -> None:
-        """Take the variance of a row from all that was added."""
-        count = len(self.others)
-        lead, square = self.sums[:count, count], float(self.sums[count, count])
-        left = square - float(lead @ solve(self.sums[:count, :count], lead))
-        self.noise = max(left, 1e-14 * square, np.finfo(float).tiny) / self.rows
+        """Take coefficients and the variance of a row from all that was added."""
+        self.coefficients = self._solved(np.zeros((len(self.others), 0)))[:, 0]
+        left = self._left(self.sums, self.coefficients)
+        self.noise = max(left, 1e-14 * float(self.sums[-1, -1]), _TINY) / self.rows
 
     def says(self, gram: Array, rows: float, adds: bool = True) -> _Said:
-        """Return what a block says; with `adds` it is among the last ones from now on."""
-        weight, count = 1.0, len(self.others)
+        """Return what a block says, beside what those before it say; with `adds` it is one of these from now on."""
+        own = gram[self._place]
+        along, energy = own[:_LEAK, _LEAK], max(float(own[_LEAK, _LEAK]), _TINY)
+        usual = self.along / max(self.energy, _TINY)
+        apart = along - energy * usual
+        solved = self._solved(np.column_stack([along, apart]))
+        coefficients, weight = solved[:, 0], 1.0
+        g = float(own[_LEAK, -1] - along @ coefficients) / energy
+        self.shift = _RETURNS * self.shift - float(usual @ (coefficients - self.coefficients))
+        self.coefficients = coefficients
         if adds:
-            weight = min(1.0, JUMP**2 * self.noise / max(self._left(gram) / rows, np.finfo(float).tiny))
-            self.add(gram, rows, weight)
-        along = gram[self.others, self.leak]
-        solved = solve(self.sums[:count, :count], np.column_stack([self.sums[:count, count], along]))
-        if adds:
-            # the block's own coefficients are as good as any: what they leave is what the last blocks leave of it
-            left = max(self._left(gram, solved[:, 0]), 0.0) * weight / rows
-            self.noise += (1.0 - math.exp(-1.0 / MEMORY)) * (left - self.noise)
-        variance = overlap() * self.noise / weight
-        precision = float(gram[self.leak, self.leak]) / variance
-        lead = float(gram[self.leak, self.left] - along @ solved[:, 0]) / variance
-        return _Said(precision, lead, float(along @ solved[:, 1]) * overlap() * self.noise / variance**2)
+            left = max(self._left(own, coefficients), 0.0) / rows
+            weight = min(1.0, JUMP**2 * self.noise / max(left, _TINY))
+            before, known = self.sums[_LEAK], max(float(self.sums[_LEAK, _LEAK]), _TINY)
+            moved = g - float(before[-1] - before[:_LEAK] @ coefficients) / known
+            spread = overlap() * self.noise * (2.0 / (energy * weight) + 1.0 / known)
+            self.add(gram, rows, weight, moved**2 > JUMP**2 * spread)
+            self.noise += (1.0 - math.exp(-1.0 / MEMORY)) * (left * weight - self.noise)
+        # beside its rows' noise a block has what it leans on the others otherwise than the usual one
+        variance = overlap() * self.noise * (1.0 / weight + max(float(apart @ solved[:, 2]), 0.0) / energy)
+        precision = energy / variance
+        leaning = max(float(along @ solved[:, 1]), 0.0) * overlap() * self.noise / variance**2
+        return _Said(precision, precision * g, precision * self.shift, leaning)
 
-    def _left(self, gram: Array, coefficients: Array | None = None) -> float:
-        """Return the sum of squares that the coefficients leave of a block."""
-        count = len(self.others)
-        if coefficients is None:
-            coefficients = solve(self.sums[:count, :count], self.sums[:count, count])
-        vector = np.append(-coefficients, 1.0)
-        return float(vector @ self._without_leak(gram) @ vector)
+    def _solved(self, right: Array) -> Array:
+        """Return the other coefficients, whatever the leak is, and C^-1 times further right sides."""
+        leak = self.sums[_LEAK]
+        sums = self.sums - np.outer(leak, leak) / max(float(leak[_LEAK]), _TINY)
+        return solve(sums[:_LEAK, :_LEAK], np.column_stack([sums[:_LEAK, -1], right]))
+
+    @staticmethod
+    def _left(sums: Array, coefficients: Array) -> float:
+        """Return the sum of squares that the other coefficients leave, whatever the leak is."""
+        vector = np.concatenate([-coefficients, [0.0, 1.0]])
+        of = sums @ vector
+        return float(vector @ of - of[_LEAK] ** 2 / max(float(sums[_LEAK, _LEAK]), _TINY))
+
+    def state(self) -> dict[str, Any]:
+        """Return all of it as plain values."""
+        return {name: plain_array(getattr(self, name)) for name in _SUMS} | {
+            name: getattr(self, name) for name in _NUMBERS
+        }
+
+    def recall(self, state: Any) -> None:
+        """Continue from a `state`; raises InputError where it does not fit."""
+        for name in _SUMS:
+            values = array_of(part_of(state, name, Mapping), name)
+            if values.shape != getattr(self, name).shape:
+                raise InputError(f"saved state's {name} must be {getattr(self, name).shape}, got {values.shape}")
+            setattr(self, name, values)
+        for name in _NUMBERS:
+            setattr(self, name, _number(state, name))
 
     def wakes(self, gram: Array, rows: float) -> bool:
         """Return whether a block moves so much more that those before were of a machine at rest."""
-        return _RESTS * float(gram[self.left, self.left]) * self.rows > self.motion * rows
+        return _RESTS * float(gram[-1, -1]) * self.rows > self.motion * rows
 
     def rests(self, gram: Array, rows: float) -> bool:
         """Return whether a block moves so much less that its machine stands."""
-        return float(gram[self.left, self.left]) * self.rows < _RESTS * self.motion * rows
+        return float(gram[-1, -1]) * self.rows < _RESTS * self.motion * rows
 
 
 class LiveBalance:
@@ -186,7 +228,7 @@ class LiveBalance:
         self.names = tuple(name for name in names if name in needed)
         columns = [Columns(balance) for balance in self._balances]
         self._known = [_Known(own) for own in columns]
-        self._precision = self._shared = 0.0  # of the first blocks; deviation that the other coefficients leave
+        self._precision = 0.0  # of the usual block
         self._size_error = size_error(rig)
         self._woken = 0
         self._waiting: Blocks | None = None
@@ -260,16 +302,17 @@ class LiveBalance:
     def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
         begin, end = float(block.start[0]) - 0.5 * STRIDE, float(block.end[0]) + 0.5 * STRIDE
         at_rest = self._known[0].rests(block.gram[0, 0], float(block.rows[0]))
-        precision, lead, leaning = self._says(block, adds)
+        precision, lead, shift, leaning = self._says(block, adds)
         if not precision > (_TELLS * self._precision if at_rest else 0.0):
             return NotJudged(end, "at rest", "blocks: at rest")
-        g, sd, shared = (float(of) for of in (lead / precision, precision**-0.5, max(leaning, 0.0) ** 0.5 / precision))
-        before, self._shared = self._shared, shared
-        wander = math.sqrt(max(before**2 - shared**2, 0.0) + 2.0 / MEMORY * shared**2) if adds else 0.0
-        pressure, _, rate = (max(float(value), np.finfo(float).tiny) for value in block.means[0])
+        total, offset = (
+            lead / precision,
+            math.hypot(math.sqrt(leaning) / precision, self._size_error * lead / precision),
+        )
+        pressure, _, rate = (max(float(value), _TINY) for value in block.means[0])
         duty = math.log(pressure), math.log(rate)
-        offset = math.hypot(shared, self._size_error * g)
-        return BlockConductance(begin, end, g, sd, wander, offset, pressure / LITRE_PER_MINUTE, duty)
+        g, sd = total - shift / precision, precision**-0.5
+        return BlockConductance(begin, end, g, sd, total, offset, pressure / LITRE_PER_MINUTE, duty)
 
     def relearn(self) -> None:
         """Forget all coefficients: the machine was repaired, or is another."""
@@ -282,12 +325,8 @@ class LiveBalance:
         waiting, stream = self._waiting, self._stream
         return {
             "names": list(self.names),
-            "known": [
-                {"sums": plain_array(of.sums), "rows": of.rows, "motion": of.motion, "noise": of.noise}
-                for of in self._known
-            ],
+            "known": [known.state() for known in self._known],
             "precision": self._precision,
-            "shared": self._shared,
             "woken": self._woken,
             "waiting": None
             if waiting is None
@@ -305,12 +344,8 @@ class LiveBalance:
         if len(known) != len(live._known):
             raise InputError(f"saved state's known must be of {len(live._known)} equations, got {len(known)}")
         for own, saved in zip(live._known, known, strict=True):
-            sums = array_of(part_of(saved, "sums", Mapping), "sums")
-            if sums.shape != own.sums.shape:
-                raise InputError(f"saved state's sums must have the shape {own.sums.shape}, got {sums.shape}")
-            own.sums = sums
-            own.rows, own.motion, own.noise = (_number(saved, name) for name in ("rows", "motion", "noise"))
-        live._precision, live._shared, live._rate = (_number(state, name) for name in ("precision", "shared", "rate"))
+            own.recall(saved)
+        live._precision, live._rate = (_number(state, name) for name in ("precision", "rate"))
         live._woken = int(part_of(state, "woken", int))
         waiting, stream = (part_of(state, name, (Mapping, type(None))) for name in ("waiting", "stream"))
         after = part_of(state, "next", (float, int, type(None)))

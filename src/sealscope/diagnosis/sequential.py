@@ -80,19 +80,16 @@ class StepDetector:
         self._onsets = np.zeros((len(_FIELDS), len(WALKS), 0))
         self._places = np.zeros((0, len(_PLACES)))
 
-    def take(self, begin: float, end: float, g: float, deviation: float, wander: float = 0.0) -> None:
-        """Take a block from `begin` to `end` [s]: its estimate with its deviation, and by how much it may have moved.
-
-        `wander`: deviation of what is known to have moved since the block before, beside the walk.
-        """
+    def take(self, begin: float, end: float, g: float, deviation: float) -> None:
+        """Take a block from `begin` to `end` [s]: its estimate and the deviation of this."""
         self._unit = self._unit or deviation
-        g, variance, wander = g / self._unit, (deviation / self._unit) ** 2, wander / self._unit
+        g, variance = g / self._unit, (deviation / self._unit) ** 2
         self._blocks += 1
         elapsed, self._last = (begin - self._last) / (end - begin) + 1.0, end
         if not np.isfinite(elapsed):
             self._level[:], self._spread[:] = g, variance
             return
-        spread = self._spread + WALKS * max(elapsed, 1.0) + wander**2
+        spread = self._spread + WALKS * max(elapsed, 1.0)
         sigma, error = spread + variance, g - self._level
         own, gain = error**2 / sigma, spread / sigma
         begins = self._known >= _FEWEST
@@ -214,13 +211,6 @@ class StepDetector:
         """Variance of a block's estimate over what was stated of it, by the likeliest walk; 1 before it is known."""
         best = int(self._weight.argmax())
         return float(self._total[best, 0] / self._known) if self._known >= _FEWEST else 1.0
-
-    def level(self) -> tuple[float, float]:
-        """Return the coefficient as of the last block, and its deviation."""
-        weights = np.exp(self._weight)
-        mean = float((weights * self._level).sum())
-        spread = self._spread * self.noise + (self._level - mean) ** 2
-        return mean * self._unit, self._unit * float(np.sqrt((weights * spread).sum()))
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""

@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.live import BLOCK_SECONDS, BlockConductance, LiveBalance, NotJudged, Shown, size_error, states_flow
+from sealscope.diagnosis.live import (
+    BLOCK_SECONDS,
+    BlockConductance,
+    LiveBalance,
+    NotJudged,
+    Shown,
+    size_error,
+    states_flow,
+)
 from sealscope.diagnosis.sequential import Rise, StepDetector
 from sealscope.diagnosis.terms import priors
 from sealscope.diagnosis.verdict.evidence import NO_RIG, Cause, Evidence, without_flow
@@ -160,7 +168,7 @@ class SequentialBalance:
             return None
         alarm = before.alarm
         for block in shown:
-            self._detector.take(block.begin, block.end, block.g, block.sd, block.wander)
+            self._detector.take(block.begin, block.end, block.g, block.sd)
             least = self._threshold if alarm is None else 0.5 * (alarm.score or 0.0)
             if self._detector.log_e(least) > least:
                 alarm = self._leak(self._detector.rise(), block)
@@ -205,7 +213,7 @@ class SequentialBalance:
         )
 
     def _total(self, block: BlockConductance) -> float | None:
-        return self._detector.level()[0] * block.flow if self._size[1] else None
+        return block.total * block.flow if self._size[1] else None
 
 
 def _waits(what: str) -> Evidence:

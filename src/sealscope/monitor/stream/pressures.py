@@ -168,7 +168,7 @@ class PressureEstimator:
         sd = min(max(sd, self._usual / _EVEN), self._usual * _EVEN)  # a single block shall not count for many
         self._usual *= (sd / self._usual) ** (1.0 / _SETTLING)
         begin, end = float(samples.t[0]), float(samples.t[-1]) + 1.0 / samples.rate
-        return BlockConductance(begin, end, g, sd, 0.0, _LEVEL_SD, dp / LITRE_PER_MINUTE, duty)
+        return BlockConductance(begin, end, g, sd, g, _LEVEL_SD, dp / LITRE_PER_MINUTE, duty)
 
     def relearn(self) -> None:
         """Search the machine's stiffness again."""

@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.live import BLOCK_SECONDS, LEARNED, BlockConductance, LiveBalance, NotJudged, Shown, size_error, states_flow
+from sealscope.diagnosis.live import (
+    BLOCK_SECONDS,
+    LEARNED,
+    BlockConductance,
+    LiveBalance,
+    NotJudged,
+    Shown,
+    size_error,
+    states_flow,
+)
 from sealscope.diagnosis.sequential import RECENT, StepDetector
 from sealscope.diagnosis.terms import priors
 from sealscope.errors import InputError
@@ -248,7 +257,7 @@ class Watch:
             return BlockEstimate(self.blocks, block.end, "another duty")
         if self._last and not 0.0 <= block.begin - self._last[-1][0] + block.end - block.begin <= _PAUSE_S:
             self._forget()
-        self._detector.take(block.begin, block.end, block.g, block.sd, block.wander)
+        self._detector.take(block.begin, block.end, block.g, block.sd)
         self._last.append((block.end, block.g, block.sd, block.flow, *block.duty))
         self._test_step(block)
         self._test_level(block)
@@ -362,8 +371,8 @@ class Watch:
         total = total_interval = leak = leak_interval = None
         if self.by == "volumes":
             half = 1.96 * math.hypot(sd, block.offset)
-            total = block.g * flow
-            total_interval = max(0.0, block.g - half) * flow, max(0.0, block.g + half) * flow
+            total = block.total * flow
+            total_interval = max(0.0, block.total - half) * flow, max(0.0, block.total + half) * flow
         if beyond is not None:
             leak, low, high = (value * flow for value in beyond)
             leak_interval = max(0.0, low), self._orifice * max(0.0, high)
