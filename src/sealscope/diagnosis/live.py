@@ -23,7 +23,7 @@ import numpy as np
 from sealscope.diagnosis.balance import BlockStream
 from sealscope.diagnosis.blocks import Blocks, Columns, overlap, solve
 from sealscope.diagnosis.terms import Term, equations, priors
-from sealscope.diagnosis.weak_form import STRIDE
+from sealscope.diagnosis.weak_form import stride_samples
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import array_of, part_of, plain_array
@@ -255,6 +255,11 @@ class LiveBalance:
         self._next = float(t[-1]) + 1.0 / rate
         return shown + self._said(self._stream.push({name: samples[name] for name in self.names}))
 
+    @property
+    def _stride(self) -> float:
+        """Time between rows [s]."""
+        return stride_samples(self._rate) / self._rate
+
     def interrupt(self) -> None:
         """Take the next samples as those after a gap, whatever their time is."""
         self._next = -math.inf
@@ -269,7 +274,7 @@ class LiveBalance:
         return [self._taken(block) for block in _parts(blocks)]
 
     def _taken(self, block: Blocks) -> Shown:
-        end, rows = float(block.end[0]) + 0.5 * STRIDE, float(block.rows[0])
+        end, rows = float(block.end[0]) + 0.5 * self._stride, float(block.rows[0])
         if not rows:
             return NotJudged(end, "missing values", "blocks: missing values")
         if self._precision > 0.0:
@@ -300,7 +305,7 @@ class LiveBalance:
         return _Said(*(sum(values) for values in zip(*said, strict=True)))
 
     def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
-        begin, end = float(block.start[0]) - 0.5 * STRIDE, float(block.end[0]) + 0.5 * STRIDE
+        begin, end = float(block.start[0]) - 0.5 * self._stride, float(block.end[0]) + 0.5 * self._stride
         at_rest = self._known[0].rests(block.gram[0, 0], float(block.rows[0]))
         precision, lead, shift, leaning = self._says(block, adds)
         if not precision > (_TELLS * self._precision if at_rest else 0.0):

@@ -47,6 +47,8 @@ JUMP = 4.0
 MEMORY = 0.998
 #: Share of the prior of a walk that all sizes have in equal parts: it may change.
 ANY_WALK = 1e-3
+#: Blocks that the stated variance counts as in `StepDetector.noise`.
+STATED = 20.0
 #: Innovations from which the noise is known at all.
 _FEWEST = 4
 #: What is kept of each onset and walk, and of each onset.
@@ -208,9 +210,8 @@ class StepDetector:
 
     @property
     def noise(self) -> float:
-        """Variance of a block's estimate over what was stated of it, by the likeliest walk; 1 before it is known."""
-        best = int(self._weight.argmax())
-        return float(self._total[best, 0] / self._known) if self._known >= _FEWEST else 1.0
+        """Variance of a block's estimate over what was stated of it, beside a walk of a tenth."""
+        return float((self._total[3, 0] + STATED) / (self._known + STATED))
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""

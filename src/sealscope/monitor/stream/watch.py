@@ -281,7 +281,7 @@ class Watch:
         leak = self.leak
         if leak is not None and (leak.test != "step" or block.end - leak.raised_s > RECENT * self.block_seconds):
             return
-        threshold = -math.log(probability_of("step", self.false_alarms_per_1000_h, self.block_seconds))
+        threshold = -math.log(probability_of("step", self.false_alarms_per_1000_h, block.end - block.begin))
         least = threshold if leak is None else 0.5 * leak.score
         if not self._detector.log_e(least) > least:
             return
