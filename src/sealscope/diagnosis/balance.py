@@ -83,9 +83,8 @@ class BlockStream:
         if self._support is not None:  # those that support the stream together, then one by one, whatever the pieces
             first = self._done + 1 if self._weighting.begun else min(self._support, count)
             ends = list(range(first, count + 1))
-        blocks = Blocks.joined(
-            [self._close(joined, *pair) for pair in zip([self._done, *ends[:-1]], ends, strict=True)]
-        )
+        parts = [self._close(joined, *pair) for pair in zip([self._done, *ends[:-1]], ends, strict=True)]
+        blocks = parts[0] if len(parts) == 1 else Blocks.joined(parts)
         self._done = count
         keep = max(0, count * length - self._margin)
         self._pieces = [{name: values[keep - self._first :] for name, values in joined.items()}]

@@ -232,7 +232,8 @@ def _weights(blocks: Sequence[Array], columns: Columns, known: Array | None) -> 
         x, y = reduced[:, :-1], reduced[:, -1]
         along = x * weights[:, None]
         residual = np.abs(y - x @ solve(along.T @ x + prior, along.T @ y + lead))
-        scale = 1.4826 * np.median(residual)
+        ordered = np.sort(residual)
+        scale = 1.4826 * 0.5 * float(ordered[(len(y) - 1) // 2] + ordered[len(y) // 2])  # the median
         if not scale > 0.0:
             return np.ones(len(values))
         weights = np.minimum(1.0, HUBER * scale / np.maximum(residual, np.finfo(float).tiny))
@@ -249,13 +250,13 @@ def _block_sums(values: Array, lengths: Array) -> Array:
 
 def solve(matrix: Array, right: Array) -> Array:
     """Return matrix^-1 right of a symmetric matrix >= 0; directions that nothing is known of are left at zero."""
-    size = np.sqrt(np.diag(matrix))
-    size = np.where(size > 0.0, size, 1.0)
-    scaled = matrix / np.outer(size, size)
-    scaled[np.diag_indices_from(scaled)] += _RIDGE
-    shaped = right / (size if right.ndim == 1 else size[:, None])
-    solved = np.linalg.solve(scaled, shaped)
-    return np.asarray(solved / (size if right.ndim == 1 else size[:, None]))
+    size = np.sqrt(matrix.diagonal())
+    size[~(size > 0.0)] = 1.0
+    column = size[:, None]
+    scaled = matrix / column / size
+    scaled.flat[:: len(size) + 1] += _RIDGE
+    beside = size if right.ndim == 1 else column
+    return np.asarray(np.linalg.solve(scaled, right / beside) / beside)
 
 
 def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces: int | None = None) -> Information:

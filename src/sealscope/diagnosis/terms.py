@@ -68,6 +68,8 @@ class Signals:
 
     def __init__(self, channels: Mapping[str, Array], rate: float, zeros: Mapping[str, float]) -> None:
         self._channels, self.rate, self._zeros = channels, rate, zeros
+        self._steps: dict[str, Array] = {}
+        self._means: dict[str, Array] = {}
 
     def __contains__(self, name: object) -> bool:
         return name in self._channels
@@ -77,11 +79,16 @@ class Signals:
 
     def step(self, name: str) -> Array:
         """Return the increments of a channel, shape (n - 1,)."""
-        return np.diff(self._channels[name])
+        if name not in self._steps:
+            values = self._channels[name]
+            self._steps[name] = values[1:] - values[:-1]
+        return self._steps[name]
 
     def mean(self, name: str) -> Array:
         """Return the means of neighbouring samples, shape (n - 1,)."""
-        return _middle(self._channels[name])
+        if name not in self._means:
+            self._means[name] = _middle(self._channels[name])
+        return self._means[name]
 
     @cached_property
     def dt(self) -> Array:
@@ -121,7 +128,7 @@ class Signals:
 
     def acceleration_step(self) -> Array:
         """Return the increments of the piston's speed [m/s], by which a delay between channels shows."""
-        return np.gradient(np.diff(self._channels["x"]) * self.rate)
+        return np.gradient(self.step("x") * self.rate)
 
 
 def _middle(values: Array) -> Array:
