@@ -87,7 +87,7 @@ class BlockStream:
         blocks = parts[0] if len(parts) == 1 else Blocks.joined(parts)
         self._done = count
         keep = max(0, count * length - self._margin)
-        self._pieces = [{name: values[keep - self._first :] for name, values in joined.items()}]
+        self._pieces = [{name: values[keep - self._first :].copy() for name, values in joined.items()}]
         self._first = keep
         return blocks
 

@@ -217,35 +217,28 @@ def _weights(blocks: Sequence[Array], columns: Columns, known: Array | None) -> 
     """Return Huber's weight of each row, from a fit to the rows and what is known, in which leak and zero of the flow
     are free in each block: their change is no outlier.
     """
-    lengths = np.array([len(block) for block in blocks])
-    values, of_block = np.concatenate(blocks), np.repeat(np.arange(len(blocks)), lengths)
+    values = np.concatenate(blocks)
+    ends = np.cumsum([len(block) for block in blocks])
+    places = [slice(end - len(block), end) for block, end in zip(blocks, ends, strict=True) if len(block)]
     weights, slow = np.ones(len(values)), list(columns.support)
     fast = values[:, [k for k in columns.nuisance if k not in columns.support]]
     own = values[:, [*slow, columns.left]]
+    reduced = np.empty_like(own)
     prior = 0.0 if known is None else known[np.ix_(slow, slow)]
     lead = 0.0 if known is None else known[slow, columns.left]
     for _ in range(_TURNS if len(values) else 0):
-        weighted = fast * weights[:, None]
-        inner, cross = (_block_sums(weighted[:, :, None] * of[:, None], lengths) for of in (fast, own))
-        free = np.array([solve(matrix, right) for matrix, right in zip(inner, cross, strict=True)])
-        reduced = own - np.einsum("rf,rfs->rs", fast, free[of_block])
+        for at in places:
+            weighted = (fast[at] * weights[at, None]).T
+            reduced[at] = own[at] - fast[at] @ solve(weighted @ fast[at], weighted @ own[at])
         x, y = reduced[:, :-1], reduced[:, -1]
-        along = x * weights[:, None]
-        residual = np.abs(y - x @ solve(along.T @ x + prior, along.T @ y + lead))
+        along = (x * weights[:, None]).T
+        residual = np.abs(y - x @ solve(along @ x + prior, along @ y + lead))
         ordered = np.sort(residual)
         scale = 1.4826 * 0.5 * float(ordered[(len(y) - 1) // 2] + ordered[len(y) // 2])  # the median
         if not scale > 0.0:
             return np.ones(len(values))
         weights = np.minimum(1.0, HUBER * scale / np.maximum(residual, np.finfo(float).tiny))
     return weights
-
-
-def _block_sums(values: Array, lengths: Array) -> Array:
-    """Return the sums of rows (r, ...) over blocks of these lengths, 0 for a block without rows."""
-    sums = np.zeros((len(lengths), *values.shape[1:]))
-    filled = lengths > 0
-    sums[filled] = np.add.reduceat(values, (np.cumsum(lengths) - lengths)[filled], axis=0)
-    return sums
 
 
 def solve(matrix: Array, right: Array) -> Array:

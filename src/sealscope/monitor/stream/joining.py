@@ -177,6 +177,12 @@ class SampleJoiner:
             self.pieces[0] = [_rest(values, length) for values in self.pieces[0]]
         return block
 
+    def drained(self) -> tuple[Array, dict[str, Array]]:
+        """Return times and channels of all samples, and drop them here."""
+        t, *channels = self._joined(len(self))
+        self.pieces = []
+        return t, dict(zip(self.names, channels, strict=True))
+
     def first(self, length: int) -> Recording:
         """Return the first `length` samples, which stay."""
         t, *channels = self._joined(length)

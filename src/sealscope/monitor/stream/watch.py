@@ -172,12 +172,12 @@ class Watch:
                 yield self.judged(shown), self.leak
 
     def _by_volumes(self) -> list[Shown]:
-        piece = self._samples.taken(len(self._samples))
+        t, channels = self._samples.drained()
         if self._live is None:
             self._live = LiveBalance(self._rig, self._samples.names)
             self._samples.settled = True
         with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-            return self._live.take(piece.t, piece.channels, piece.rate)
+            return self._live.take(t, channels, self._samples.rate)
 
     def _by_pressures(self) -> Iterator[Shown]:
         if not self._seconds and not self._find_duty():
