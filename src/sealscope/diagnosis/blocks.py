@@ -17,8 +17,9 @@ Source: P. J. Huber, Ann. Math. Statist. 35 (1964) 73 (weights).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -204,12 +205,11 @@ class Weighting:
 
 def _supported(gram: Array, columns: Columns) -> Array:
     """Return what a Gram matrix says of the columns that change slowly, whatever leak and zero of the flow are."""
-    slow = [*columns.support, columns.left]
-    fast = [k for k in columns.nuisance if k not in columns.support]
-    inner = gram[np.ix_(fast, fast)]
-    cross = gram[np.ix_(slow, fast)]
+    slow = np.array([*columns.support, columns.left])
+    fast = np.array([k for k in columns.nuisance if k not in columns.support], dtype=int)
+    inner, cross = gram[fast[:, None], fast], gram[slow[:, None], fast]
     reduced = np.zeros_like(gram)
-    reduced[np.ix_(slow, slow)] = gram[np.ix_(slow, slow)] - cross @ solve(inner, cross.T)
+    reduced[slow[:, None], slow] = gram[slow[:, None], slow] - cross @ solve(inner, cross.T)
     return reduced
 
 
@@ -248,8 +248,19 @@ def solve(matrix: Array, right: Array) -> Array:
     column = size[:, None]
     scaled = matrix / column / size
     scaled.flat[:: len(size) + 1] += _RIDGE
-    beside = size if right.ndim == 1 else column
-    return np.asarray(np.linalg.solve(scaled, right / beside) / beside)
+    shaped = right / (size if right.ndim == 1 else column)
+    _, solved, failed = _cholesky()(scaled, shaped) if shaped.size else (None, shaped, 0)
+    if failed:  # rounding made it no longer positive
+        solved = np.linalg.solve(scaled, shaped)
+    return np.asarray(solved / (size if right.ndim == 1 else column))
+
+
+@cache
+def _cholesky() -> Callable[[Array, Array], tuple[Array, Array, int]]:
+    """Return LAPACK's solution of a positive definite system: a third of the time of NumPy's for a few columns."""
+    from scipy.linalg.lapack import dposv
+
+    return dposv  # type: ignore[no-any-return]
 
 
 def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces: int | None = None) -> Information:
