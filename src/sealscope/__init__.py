@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from sealscope import datasets
     from sealscope.diagnosis.diagnose import diagnose
     from sealscope.diagnosis.fleet.fleet import Fleet
+    from sealscope.diagnosis.stream import SequentialBalance
     from sealscope.diagnosis.trend.trend import Trend, trend
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-    from sealscope.diagnosis.stream import SequentialBalance
     from sealscope.fmu.build import write_fmu, write_sensor_fmu
     from sealscope.fmu.recording import record_fmu
     from sealscope.monitor.stream.watch import Watch, watch

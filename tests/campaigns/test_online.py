@@ -37,7 +37,5 @@ def test_only_detectors_with_a_stream_are_online():
     parsed = plan_detector("volume balance, online @ some")
     assert (parsed.of, parsed.online, parsed.key) == ("volume balance", True, "volume balance, online @ some")
     check_detector("volume balance, online", {})
-    with pytest.raises(
-        InputError, match="online must be one of volume balance, got 'observer, online'"
-    ):
+    with pytest.raises(InputError, match="online must be one of volume balance, got 'observer, online'"):
         check_detector("observer, online", {})

@@ -157,7 +157,7 @@ class StepDetector:
         ratio = -0.5 * (np.log1p(widest * square) + number * np.log1p(-rising))
         healthy = lead - 0.5 * (number * np.log(total) + self._widths)
         prior = np.logaddexp.reduce(healthy, axis=0) + np.log(len(SIZES) * len(PARTS))
-        return np.where(along > 0.0, ratio, -np.inf) + healthy - prior
+        return np.asarray(np.where(along > 0.0, ratio, -np.inf) + healthy - prior)
 
     def rise(self) -> Rise:
         """Return the step that the blocks show: its onset and size, averaged over all that may be."""
@@ -216,8 +216,8 @@ class StepDetector:
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
         numbers = {name: float(getattr(self, f"_{name}")) for name in _NUMBERS}
-        numbers["last"] = None if np.isinf(self._last) else numbers["last"]
-        return {**{name: plain_array(getattr(self, f"_{name}")) for name in _ARRAYS}, **numbers}
+        last = {"last": None} if np.isinf(self._last) else {}
+        return {**{name: plain_array(getattr(self, f"_{name}")) for name in _ARRAYS}, **numbers, **last}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> StepDetector:

@@ -18,7 +18,7 @@ _PORTION = 1.0
 
 
 def online(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
-    """Return the alarm of the volume balance's stream as it stands at the record's end, or its last word without an alarm.
+    """Return the alarm of the volume balance's stream as it stands at the record's end, or its last word without one.
 
     Its rate of alarms is the one at which a healthy machine alarms within the record with the probability
     `false_alarm` at most. An alarm that was raised stays, whatever came later. A record without its channels is

@@ -162,13 +162,13 @@ class PressureEstimator:
         if self._drive == "theta":
             driven = np.diff(driven) * samples.rate
         dp = float(rows.dp[-1])
-        duty = tuple(float(np.log(max(value, np.finfo(float).tiny))) for value in (dp, np.sqrt(np.mean(driven**2))))
+        pressure, drive = np.log(np.maximum([dp, np.sqrt(np.mean(driven**2))], np.finfo(float).tiny))
         g, sd = (G_UNIT * float(values[-1]) for values in (rows.G, rows.sd))
         self._usual = self._usual or sd
         sd = min(max(sd, self._usual / _EVEN), self._usual * _EVEN)  # a single block shall not count for many
         self._usual *= (sd / self._usual) ** (1.0 / _SETTLING)
         begin, end = float(samples.t[0]), float(samples.t[-1]) + 1.0 / samples.rate
-        return BlockConductance(begin, end, g, sd, g, _LEVEL_SD, dp / LITRE_PER_MINUTE, duty)
+        return BlockConductance(begin, end, g, sd, g, _LEVEL_SD, dp / LITRE_PER_MINUTE, (float(pressure), float(drive)))
 
     def relearn(self) -> None:
         """Search the machine's stiffness again."""
