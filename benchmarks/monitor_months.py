@@ -7,8 +7,8 @@ each block), at three charge pressures and two levels of the pressures' noise. A
 conductance g is added to what a block's own is off the level, and friction scales dp, and with it what noise makes of a
 conductance. So an hour costs a third of a second in place of minutes, and no sample is shared with what the tests were
 made on. Each actuator works in two shifts of 8 h a day. Of these, `--minutes-a-day` in one piece, drawn anew for each
-day, are watched: time is compressed by that, and a delay is stated in watched hours too. Of the first day it is the first
-shift, over which the baseline is learned. The conductance is
+day, are watched: time is compressed by that, and a delay is stated in watched hours too. Of the first day it is the
+first shift, over which the baseline is learned. The conductance is
 
     g(t) = g_0 4^((T - 20 K)/30 K) (1 + slow(t)),
 
