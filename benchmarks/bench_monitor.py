@@ -8,8 +8,8 @@ to the database in a temporary folder with full synchronisation, restored from a
 threads are fed as fast as they take; with `--paced N` N actuators then send a message each second for a minute, and the
 time from the instant when a message is due to its being stored is what an alarm waits. They begin to send one after
 another within three seconds, as machines do that nobody started at one instant; with `--in-phase` all begin together,
-and every third second or so all blocks of the detectors are complete at once. The share of blocks that were searched
-for a rise is part of the cost. The load of the machine is printed beside the times.
+and every third second or so all blocks of the detectors are complete at once. The load of the machine is printed beside
+the times.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings
 from sealscope.monitor.sources.source_block import decoded
-from sealscope.monitor.stream import decisions
 
 CHANNELS = {"volumes": ("p_A", "p_B", "x", "theta"), "pressures": ("p_A", "p_B", "u")}
 LEARN_H = 100.0 / 3600.0
@@ -64,24 +63,14 @@ def main() -> None:
     warm = LEARNED[chosen.by] + 20
     for samples in messages[:warm]:
         watch.update(samples)
-    searched, search = 0, "fit_balance" if chosen.by == "volumes" else "find_step"
-    fit = getattr(decisions, search)
-
-    def counted(*arguments: object, **options: object) -> object:
-        nonlocal searched
-        searched += 1
-        return fit(*arguments, **options)  # type: ignore[arg-type]
-
-    setattr(decisions, search, counted)
     blocks, start = watch.blocks, time.process_time()
     for samples in messages[warm:]:
         watch.update(samples)
     spent, blocks = time.process_time() - start, watch.blocks - blocks
-    setattr(decisions, search, fit)
     state = json.dumps(watch.state())
     print(f"library: {1e3 * spent / blocks:.2f} ms a block of {(len(messages) - warm) / blocks:.2f} s", end="; ")
     print(f"{blocks / spent:.0f} blocks/s, {(len(messages) - warm) / spent:.0f} actuators a core", end="; ")
-    print(f"{searched} of {blocks} blocks searched; state {len(state)} bytes as JSON")
+    print(f"state {len(state)} bytes as JSON")
 
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

@@ -2,13 +2,13 @@
 
     python benchmarks/monitor_months.py [--actuators 50] [--days 30] [--minutes-a-day 96] [--rate 1] [--stop-after 8]
 
-Libraries of blocks are cut from simulated recordings of the thesis's rig (20 min each, other noise in each block), at
-three charge pressures and two levels of the pressures' noise. An operating hour is made of them by their sums of
-products: a conductance g takes g times the integral of dp from the displaced volume, and friction scales dp, both
-exactly. So an hour costs a third of a second in place of minutes, and no sample is shared with what the tests were made
-on. Each actuator works in two shifts of 8 h a day. Of these, `--minutes-a-day` in one piece, drawn anew for each day,
-are watched: time is compressed by that, and a delay is stated in watched hours too. Of the first day it is the first
-shift, over which the baseline is learned. The conductance is
+Libraries of blocks' conductances are made from simulated recordings of the thesis's rig (20 min each, other noise in
+each block), at three charge pressures and two levels of the pressures' noise. An operating hour is made of them: a
+conductance g is added to what a block's own is off the level, and friction scales dp, and with it what noise makes of a
+conductance. So an hour costs a third of a second in place of minutes, and no sample is shared with what the tests were
+made on. Each actuator works in two shifts of 8 h a day. Of these, `--minutes-a-day` in one piece, drawn anew for each
+day, are watched: time is compressed by that, and a delay is stated in watched hours too. Of the first day it is the
+first shift, over which the baseline is learned. The conductance is
 
     g(t) = g_0 4^((T - 20 K)/30 K) (1 + slow(t)),
 
@@ -40,10 +40,8 @@ from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
 import sealscope as ss
-from sealscope.diagnosis.volume_balance.blocks import I_AB, I_ROOT, BalanceBlocks, Y, balance_channels, block_samples
-from sealscope.diagnosis.volume_balance.detector import VolumeBalance
-from sealscope.diagnosis.volume_balance.growth import WARMEST
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.diagnosis.live import BlockConductance, LiveBalance, NotJudged, size_error
+from sealscope.diagnosis.terms import priors
 
 RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0
@@ -60,7 +58,8 @@ COLUMNS = (
     *("seed", "actuator", "rate", "days", "minutes_a_day", "kind", "operating_hours", "false_alarms", "by_test"),
     *("delay_h", "delay_watched_h", "test", "true_lpm", "stated_lpm", "stated_low_lpm", "stated_high_lpm"),
 )
-Libraries = dict[tuple[float, float] | str, list[BalanceBlocks]]
+Libraries = dict[tuple[float, float] | str, list[BlockConductance]]
+WARMEST = priors()["oil"]["warmest"].value
 
 
 def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:
@@ -68,9 +67,10 @@ def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:
 
     The outer leak is stated at the charge pressure, and flows under that of its chamber.
     """
-    detector, made, outside_lpm = VolumeBalance(ss.load_rig("thesis")), Libraries(), 0.0
+    made, outside_lpm = Libraries(), 0.0
     first = None
-    for number, key in enumerate([*((charge, noise) for charge in CHARGES for noise in NOISES), OUTSIDE]):
+    keys: list[tuple[float, float] | str] = [*((charge, noise) for charge in CHARGES for noise in NOISES), OUTSIDE]
+    for number, key in enumerate(keys):
         charge, noise = key if isinstance(key, tuple) else (CHARGES[1], NOISES[0])
         recording = ss.simulate(
             command="3 sin(4t)",
@@ -86,26 +86,26 @@ def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:
         first = first or recording
         if key == OUTSIDE:
             outside_lpm = OUTSIDE_LPM * float(recording["p_A"].mean()) / (1e6 * charge)
-        length = block_samples(recording.between(0.0, 60.0), 3.0)
-        blocks = detector.blocks(recording, length, balance_channels(recording))
-        made[key] = [blocks.chosen(np.array([k])) for k in range(25, len(blocks))]
+        live = LiveBalance(ss.load_rig("thesis"), tuple(recording.channels))
+        shown = live.take(recording.t, recording.channels, recording.rate)
+        made[key] = [block for blocks in shown if not isinstance(blocks, NotJudged) for block in blocks][25:]
     assert first is not None
     return first, made, outside_lpm
 
 
-def changed(block: BalanceBlocks, t: float, g: float, friction: float) -> BalanceBlocks:
-    """Return a block as of the clock t, with a conductance and with dp scaled."""
-    turn = np.eye(block.gram.shape[1])
-    turn[I_AB, I_AB], turn[I_ROOT, I_ROOT] = friction, math.sqrt(friction)
-    turn[Y, I_AB] = -g * friction
+def changed(block: BlockConductance, begin: float, g: float, friction: float, level: float) -> BlockConductance:
+    """Return a block as of the clock `begin`, with g in place of a level of conductance, and with dp scaled."""
+    conductance = g + (block.g - level) / friction
     return replace(
         block,
-        t=np.array([t]),
-        gram=turn @ block.gram @ turn.T,
-        slope=block.slope @ turn.T,
-        stored=block.stored @ turn.T,
-        abs_dp=block.abs_dp * friction,
-        root_dp=block.root_dp * math.sqrt(friction),
+        begin=begin,
+        end=begin + block.end - block.begin,
+        g=conductance,
+        total=conductance,
+        offset=math.hypot(block.offset, size_error(ss.load_rig("thesis")) * conductance),
+        sd=block.sd / friction,
+        flow=block.flow * friction,
+        duty=(block.duty[0] + math.log(friction), block.duty[1]),
     )
 
 
@@ -136,8 +136,10 @@ class Life:
     ) -> None:
         self.random = np.random.default_rng([chosen.seed, number])
         usual = made[CHARGES[1], NOISES[0]]
-        self.seconds = usual[0].seconds
-        self.flow = float(np.mean([block.abs_dp[0] for block in usual])) / LITRE_PER_MINUTE
+        self.seconds = usual[0].end - usual[0].begin
+        self.flow = float(np.mean([block.flow for block in usual]))
+        self.levels = {key: float(np.mean([block.g for block in blocks])) for key, blocks in made.items()}
+        self.levels[OUTSIDE] = self.levels[CHARGES[1], NOISES[0]]
         self.made, self.outside_lpm, self.chosen = made, outside_lpm, chosen
         self.kind = KINDS[number] if number < len(KINDS) else ""
         self.watch = ss.watch("thesis", false_alarms_per_1000_h=chosen.rate, learn_hours=LEARN_H)
@@ -177,12 +179,12 @@ class Life:
                 level = CHARGES[1] * (1.0 + charge.after(passed))
                 nearest = min(CHARGES, key=lambda value: abs(value - level))
                 outside = self.kind == OUTSIDE and clock > onset
-                blocks = self.made[OUTSIDE if outside else (nearest, noise)]
+                key: tuple[float, float] | str = OUTSIDE if outside else (nearest, noise)
+                blocks = self.made[key]
                 lpm = self.lpm(clock - onset)
                 g = cold * WARMEST**warm * (1.0 + slow.after(passed)) + lpm / flow
-                block = changed(blocks[random.integers(len(blocks))], 1000.0 + clock, g, scaled)
-                shown = watch.estimator.readings(block, watch.to_learn)
-                estimate = watch.judged(shown, 1000.0 + clock + 0.5 * self.seconds)
+                drawn = blocks[random.integers(len(blocks))]
+                estimate = watch.judged([changed(drawn, 1000.0 + clock, g, scaled, self.levels[key])])
                 leaked = ran if clock <= onset else leaked
                 ran += self.seconds
                 if watch.leak is None:

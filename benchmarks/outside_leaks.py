@@ -2,7 +2,6 @@
 
     python benchmarks/outside_leaks.py [--development] [--pressures]
 
-The factors of `monitor.stream.decisions.SHOWN` were chosen on the records of `--development`; the others judge them.
 The flow of a rod seal is stated at the charge pressure; what leaves is that flow times the chamber's mean pressure over
 it. The circuit has a make-up, without which it would run empty. With `--pressures` the watch gets the chamber pressures
 and the command alone, and longer records.

@@ -14,10 +14,9 @@ if TYPE_CHECKING:
     from sealscope import datasets
     from sealscope.diagnosis.diagnose import diagnose
     from sealscope.diagnosis.fleet.fleet import Fleet
+    from sealscope.diagnosis.stream import SequentialBalance
     from sealscope.diagnosis.trend.trend import Trend, trend
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-    from sealscope.diagnosis.volume_balance.over_cycles.stream import SequentialCycles
-    from sealscope.diagnosis.volume_balance.stream import SequentialBalance
     from sealscope.fmu.build import write_fmu, write_sensor_fmu
     from sealscope.fmu.recording import record_fmu
     from sealscope.monitor.stream.watch import Watch, watch
@@ -38,8 +37,7 @@ _HOMES = {
     "Recording": "recordings.recording",
     "Rig": "parameters",
     "RmsStream": "signals.windows",
-    "SequentialBalance": "diagnosis.volume_balance.stream",
-    "SequentialCycles": "diagnosis.volume_balance.over_cycles.stream",
+    "SequentialBalance": "diagnosis.stream",
     "Trend": "diagnosis.trend.trend",
     "Watch": "monitor.stream.watch",
     "diagnose": "diagnosis.diagnose",
@@ -69,7 +67,6 @@ __all__ = [
     "Rig",
     "RmsStream",
     "SequentialBalance",
-    "SequentialCycles",
     "Trend",
     "Watch",
     "__version__",

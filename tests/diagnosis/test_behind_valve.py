@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.campaigns.cases.online import online
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.isolation import other_cause, signatures
 from sealscope.diagnosis.pressure_model.behind_valve import stalled
@@ -23,7 +22,6 @@ from sealscope.diagnosis.pressure_model.model import (
     nominal,
 )
 from sealscope.diagnosis.volume_balance import behind_valve as balance
-from sealscope.diagnosis.volume_balance.stream import SequentialBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
@@ -155,32 +153,6 @@ def test_what_else_changes_is_no_leak_to_the_balance_behind_a_valve(fault: str) 
     """Oil that leaves one chamber alone, and the zero of a transducer, which makes the edges' gains step."""
     assert balance.examined(balanced(fault=fault), RIG, 0.01).verdict != "leak"
 
-
-@pytest.mark.slow
-def test_a_stream_behind_a_valve_is_that_balance_on_its_window() -> None:
-    """Whatever the portions; an alarm soon after the onset, none of a sound machine, and what is missing is said."""
-    leaking, hourly = balanced(100.0, leak="0.02 L/min from 70 s"), 0.4
-    states = []
-    for portion in (1.0, 17.0):
-        stream = SequentialBalance(RIG, alarms_per_hour=hourly)
-        raised = None
-        for start in np.arange(0.0, 100.0, portion):
-            state = stream.update(leaking.between(start, start + portion))
-            raised = start + portion if raised is None and state.alarm is not None else raised
-        states.append(state)
-        assert 70.0 < raised < 70.0 + 20.0 + portion
-    assert states[0].t == states[1].t
-    assert states[0].evidence.score == states[1].evidence.score
-    assert states[0].alarm.onset_s == pytest.approx(70.0, abs=3.2)
-    assert states[0].alarm.leak_interval_lpm[0] < 0.02 < states[0].alarm.leak_interval_lpm[1]
-    window = leaking.between(0.0, states[0].t)
-    probability = hourly * np.pi / 3600.0  # a window of one cycle
-    assert states[0].evidence.score == balance.examined(window, RIG, probability).score
-    stream.acknowledge()
-    assert stream.state.alarm is None
-    assert online("volume balance", balanced(100.0), RIG, 0.01).verdict == "no leak"
-    few = leaking.only([name for name in leaking.channels if name != "p_1"])
-    assert "p_1" in online("volume balance", few, RIG, 0.01).reason
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import sealscope as ss
 from sealscope.diagnosis.volume_balance.blocks import STORED_A
 from sealscope.diagnosis.volume_balance.detector import VolumeBalance
 from sealscope.diagnosis.volume_balance.fit import BalanceFit
-from sealscope.diagnosis.volume_balance.stream import SequentialBalance
+from sealscope.diagnosis.stream import SequentialBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.changes import ParameterDrift, Wander

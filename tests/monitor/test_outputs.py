@@ -123,7 +123,7 @@ def test_what_a_person_said_labels_the_estimates(watched, tmp_path):
     counts = export_labels(watched.store, tmp_path)
     alarms = list(csv.DictReader((tmp_path / "alarms.csv").open()))
     estimates = list(csv.DictReader((tmp_path / "estimates.csv").open()))
-    assert counts == (len(alarms), len(estimates)) == (1, 41)
+    assert counts == (len(alarms), len(estimates)) == (1, 44)
     assert alarms[0]["mark"] == "repaired"
     assert alarms[0]["marked_by"] == "ann"
     assert alarms[0]["comments"] == "ann: =looks real; ann: seal changed"

@@ -87,7 +87,7 @@ def test_the_leaking_one_comes_first_with_its_life(page: TestClient):
     life = page.get(of(HOSTILE)).json()
     assert life["name"] == HOSTILE
     assert life["events"][-1]["event"] == "raised"
-    assert len(life["course"]) == 41
+    assert len(life["course"]) == 44
     assert 0 < len(page.get(of(HOSTILE) + "&hours=0.01").json()["course"]) < 20
     assert page.get(of("no such")).status_code == 404
 

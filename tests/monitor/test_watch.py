@@ -11,10 +11,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.changepoint.smooth_drift import find_step, share_of_threshold
 from sealscope.errors import InputError
 from sealscope.monitor.stream.baseline import WatchBaseline
-from sealscope.monitor.stream.decisions import level_rise_of, near_an_alarm, worth_a_search
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.monitor.stream.watch import Watch
 from sealscope.recordings.recording import Recording
@@ -59,7 +57,7 @@ def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
     assert [estimate.number for estimate in estimates] == list(range(1, len(estimates) + 1))
     assert {estimate.status for estimate in estimates} == {"learning", "watched", "alarm"}
     watched = [estimate for estimate in estimates if estimate.status == "watched" and estimate.t < OPENS]
-    assert all(estimate.leak_interval_lpm[0] == 0.0 for estimate in watched[2:])
+    assert np.mean([estimate.leak_interval_lpm[0] == 0.0 for estimate in watched]) > 0.9  # a 95 % interval
 
 
 @settings(
@@ -125,7 +123,6 @@ def test_disorder_is_counted_by_reason_and_never_raised():
         watch.update(piece)
     assert set(watch.counters) == {
         "gap",
-        "blocks: missing values",
         "blocks: another duty",  # the last piece, played at double speed
         "clock set back",
         "rate changed",
@@ -165,12 +162,12 @@ def test_a_level_is_stated_with_what_warm_oil_may_have_of_it():
     place = {"version": 1, "learned_s": 0.0, "hours": 8.0, "lpm": None, "low_lpm": None, "high_lpm": None}
     duty = {"duty_low": (0.0, 0.0), "duty_high": (0.0, 0.0)}
     baseline = WatchBaseline(level=2e-13, low=1e-13, high=3e-13, **place, **duty)
-    rise = level_rise_of(1e5, 6e-13, 1e-15, baseline, 1e-6)
+    rise = baseline.rise(1e5, 6e-13, 1e-15, 1e-6)
     assert rise is not None
     assert rise.size == pytest.approx(4e-13)
-    assert rise.size - 1.96 * rise.size_sd <= 2e-13  # the oil may be as warm as it gets, or as cold as it was
-    assert rise.size + 1.96 * rise.size_sd >= 5e-13
-    assert level_rise_of(1e5, 3.9e-13, 1e-15, baseline, 1e-6) is None
+    assert rise.size - 1.96 * rise.deviation <= 2e-13  # the oil may be as warm as it gets, or as cold as it was
+    assert rise.size + 1.96 * rise.deviation >= 5e-13
+    assert baseline.rise(1e5, 3.9e-13, 1e-15, 1e-6) is None
 
 
 def test_a_machine_at_rest_is_not_judged():
@@ -205,11 +202,14 @@ def test_a_dismissed_leak_is_compared_with_nothing_before():
     "damage",
     [
         {"version": 99},
-        {"estimators": {"volumes": {"area": 1}}},
+        {"live": {"names": []}},
+        {"live": 1},
+        {"rig": "{}"},
+        {"detector": {}},
         {"samples": None},
         {"leak": {"raised_s": "x"}},
-        {"means": {"shape": [1e12, 4], "f8": ""}},
-        {"means": {"shape": [1, 4], "f8": "AAAA"}},
+        {"last": {"shape": [1e12, 6], "f8": ""}},
+        {"group": {"shape": [1, 4], "f8": "AAAA"}},
         {"blocks": None},
     ],
 )
@@ -224,40 +224,3 @@ def test_wrong_settings_are_refused():
         ss.watch("thesis", false_alarms_per_1000_h=1e-6)
     with pytest.raises(InputError, match="learn_hours must be"):
         ss.watch("thesis", learn_hours=0.0)
-
-
-def test_no_alarm_is_lost_by_searching_only_where_it_is_worth_it():
-    """Steps in noise and random walks: whatever the search would raise passes the cheap contrasts before it."""
-    random, alarms = np.random.default_rng(0), 0
-    for k in range(70):
-        walk, n = (0.0, 1e-2, 0.1, 1.0, 4.0)[k % 5], (20, 40, 50, 60)[k % 4]
-        g = random.standard_normal(n) + np.sqrt(walk) * np.cumsum(random.standard_normal(n))
-        g[random.integers(3, n - 2) :] += random.uniform(3.0, 14.0) * (1.0 + np.sqrt(walk))
-        step = find_step(t := np.arange(n, dtype=float), g, np.ones(n), 1e-6)
-        if n % 4 == 0 and step.score > 0.0:
-            assert share_of_threshold(g, 1e-6) >= step.score / step.threshold - 1e-9
-        if step.alarm:
-            alarms += 1
-            assert worth_a_search(g)
-            assert near_an_alarm(t, g, 1e-6)
-    assert alarms > 30
-    quiet = [worth_a_search(random.standard_normal(60)) for _ in range(200)]
-    assert np.mean(quiet) < 0.05
-    quiet = [near_an_alarm(np.arange(60.0), 10.0 + random.standard_normal(60), 4e-7) for _ in range(50)]
-    assert np.mean(quiet) < 0.05
-
-
-@pytest.mark.slow
-def test_a_leak_to_the_outside_is_within_its_interval_though_the_balance_shows_half_of_it():
-    fault = "rod seal A 0.0042 L/min from 110 s"  # at the charge pressure
-    valves = {"makeup.check_valves": "present", "p_charge": "0.3 MPa"}
-    recording = ss.simulate(command="3 sin(4t)", duration=160.0, seed=20, set=valves, fault=fault)
-    watch, estimates = run(recording, [500])
-    assert watch.leak is not None and watch.leak.cause == "external leak"
-    true = 0.0042 * float(recording.between(OPENS, 160.0)["p_A"].mean()) / 0.3e6
-    for stated, (low, high) in (
-        (watch.leak.leak_lpm, watch.leak.leak_interval_lpm),
-        (estimates[-1].leak_lpm, estimates[-1].leak_interval_lpm),
-    ):
-        assert low <= true <= high
-        assert stated == pytest.approx(true, rel=0.25)

@@ -155,12 +155,12 @@ def test_oil_that_warms_is_no_leak():
     assert estimates[-1].status == "watched"
 
 
-@pytest.mark.parametrize("damage", ["machine", "observer", "recent", "drive"])
+@pytest.mark.parametrize("damage", ["machine", "observer", "usual", "drive"])
 def test_a_damaged_state_is_refused_in_one_line(damage: str):
     state = whole()[0].state()
-    pressures = {**state["estimators"]["pressures"], damage: {"x": 1}}
+    pressures = {**state["pressures"], damage: {"x": 1}}
     with pytest.raises(InputError) as raised:
-        Watch.from_state({**state, "estimators": {"pressures": pressures}})
+        Watch.from_state({**state, "pressures": pressures})
     assert "\n" not in str(raised.value)
 
 

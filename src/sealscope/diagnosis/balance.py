@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUT
 from sealscope.diagnosis.weak_form import SPAN, STRIDE, rows, stride_samples
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -47,48 +48,89 @@ class BlockStream:
         start: float = 0.0,
     ) -> None:
         self.columns = tuple(Columns(balance) for balance in balances)
-        self._balances, self._rate, self._start = balances, rate, start
+        self._balances, self._rate = balances, rate
         self._stride = stride_samples(rate)
         self._strides = max(SPAN, round(seconds / STRIDE))
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._weighting, self._support = Weighting(self.columns), support
-        self._samples: dict[str, Array] = {}
-        self._first = 0  # index, in the stream, of the first sample that is kept
-        self._done = 0  # blocks that are closed
         self._zeros: dict[str, float] | None = None
+        self.restart(start)
+
+    def restart(self, begin: float) -> None:
+        """Take samples from the clock `begin` [s] on, after a gap; what was pushed before it is dropped."""
+        self._begin = begin
+        self._pieces: list[Mapping[str, Array]] = []  # joined only when they complete a block
+        self._first = 0  # index, since `begin`, of the first sample that is kept
+        self._have = 0  # ... and one past the last
+        self._done = 0  # blocks since then that are closed
 
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
         """Take the next samples, each channel of the same length; return the blocks they complete, None for none.
 
         A missing sample is NaN. `last`: nothing follows, so that what remains is closed as well.
         """
-        for name, values in samples.items():
-            before = self._samples.get(name)
-            self._samples[name] = values if before is None else np.concatenate([before, values])
-        have = self._first + len(next(iter(self._samples.values()), ()))
+        if samples:
+            self._pieces.append(samples)
+            self._have += len(next(iter(samples.values())))
         length = self._strides * self._stride
         beyond = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
-        count = max(0, (have - beyond) // length)
-        if count <= self._done or (not last and self._done == 0 and count < (self._support or 1)):
+        count = max(0, (self._have - beyond) // length)
+        waits = 1 if last or self._weighting.begun else self._support or 1
+        if count <= self._done or (self._done == 0 and count < waits):
             return None
-        blocks = self._close(self._done, count)
+        joined = self._joined()
+        ends = [count]
+        if self._support is not None:  # those that support the stream together, then one by one, whatever the pieces
+            first = self._done + 1 if self._weighting.begun else min(self._support, count)
+            ends = list(range(first, count + 1))
+        parts = [self._close(joined, *pair) for pair in zip([self._done, *ends[:-1]], ends, strict=True)]
+        blocks = parts[0] if len(parts) == 1 else Blocks.joined(parts)
         self._done = count
         keep = max(0, count * length - self._margin)
-        self._samples = {name: values[keep - self._first :] for name, values in self._samples.items()}
+        self._pieces = [{name: values[keep - self._first :].copy() for name, values in joined.items()}]
         self._first = keep
         return blocks
 
-    def _close(self, first: int, end: int) -> Blocks:
+    def _joined(self) -> dict[str, Array]:
+        if len(self._pieces) == 1:
+            return dict(self._pieces[0])
+        names = self._pieces[0] if self._pieces else ()
+        return {name: np.concatenate([piece[name] for piece in self._pieces]) for name in names}
+
+    def state(self) -> dict[str, Any]:
+        """Return all that the stream knows as plain values that JSON holds."""
+        return {
+            "samples": {name: plain_array(values) for name, values in self._joined().items()},
+            "begin": self._begin,
+            "first": self._first,
+            "done": self._done,
+            "zeros": self._zeros,
+            "weighting": self._weighting.state(),
+        }
+
+    def recall(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state` with the same bits; raises InputError where it does not fit."""
+        samples = part_of(state, "samples", Mapping)
+        self.restart(float(part_of(state, "begin", (float, int))))
+        self._pieces = [{name: array_of(values, name) for name, values in samples.items()}] if samples else []
+        self._first, self._done = (int(part_of(state, name, int)) for name in ("first", "done"))
+        self._have = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
+        zeros = part_of(state, "zeros", (Mapping, type(None)))
+        self._zeros = None if zeros is None else {name: float(value) for name, value in zeros.items()}
+        self._weighting.recall(part_of(state, "weighting", Mapping))
+
+    def _close(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Return blocks `first` to `end`."""
         length = self._strides * self._stride
         start = first * length
         begin = max(self._first, start - self._margin)
         stop = end * length + (SPAN - 1) * self._stride + 1
         reach = stop + self._margin - self._first
-        cut = {name: values[begin - self._first : reach] for name, values in self._samples.items()}
+        cut = {name: values[begin - self._first : reach] for name, values in samples.items()}
         if self._zeros is None:
             early = slice(0, (self._support or end) * length)
             self._zeros = {name: _zero(cut[name][early]) for name in ("p_A", "p_B") if name in cut}
+        begins = self._begin + start / self._rate
         signals = Signals(cut, self._rate, self._zeros)
         inner = slice(start - begin, stop - 1 - begin)
         values: list[list[Array]] = []
@@ -96,26 +138,16 @@ class BlockStream:
         cut_rows = []
         for balance in self._balances:
             columns = [*(term.increments(signals) for term in balance.terms), balance.left(signals)]
-            cut_rows.append(rows([column[inner] for column in columns], self._rate, self._start + start / self._rate))
+            cut_rows.append(rows([column[inner] for column in columns], self._rate, begins))
             whole &= cut_rows[-1].whole
         cuts = np.arange(self._strides, len(whole), self._strides)
         kept = np.split(whole, cuts)
         for own in cut_rows:
             values.append([block[keep] for block, keep in zip(np.split(own.values, cuts), kept, strict=True)])
-        gram, weights = self._weigh(values, first)
+        gram, weights = self._weighting.close(values)
         times = cut_rows[0].time.reshape(end - first, self._strides)
         means, pressures = self._means(signals, inner, end - first), self._pressures(signals, inner, end - first)
         return Blocks(times[:, 0], times[:, -1], gram, weights, means, pressures)
-
-    def _weigh(self, values: Sequence[Sequence[Array]], first: int) -> tuple[Array, Array]:
-        """Return Gram matrices and weights of blocks, those that support a stream together, then one by one."""
-        count = len(values[0])
-        together = min(self._support or count, count) if first == 0 else 1
-        parts, at = [], 0
-        while at < count:
-            parts.append(self._weighting.close([own[at : at + together] for own in values]))
-            at, together = at + together, 1
-        return np.concatenate([gram for gram, _ in parts]), np.concatenate([rows for _, rows in parts])
 
     def _means(self, signals: Signals, inner: slice, count: int) -> Array:
         """Return the means of abs(p_A - p_B), of its root and of the left side's rate over each block."""
@@ -138,6 +170,8 @@ class BlockStream:
 
 def _parts(values: Array) -> Array:
     """Return the means of PRESSURE_PARTS equal parts of the sorted values, 0 without any."""
+    if len(values) and len(values) % PRESSURE_PARTS == 0:
+        return np.asarray(np.sort(values).reshape(PRESSURE_PARTS, -1).mean(axis=1))
     ends = np.linspace(0.0, len(values), PRESSURE_PARTS + 1)
     sums = np.interp(ends, np.arange(len(values) + 1), np.concatenate([[0.0], np.cumsum(np.sort(values))]))
     return np.asarray(np.diff(sums) / max(ends[1], 1e-9))

@@ -68,6 +68,8 @@ class Signals:
 
     def __init__(self, channels: Mapping[str, Array], rate: float, zeros: Mapping[str, float]) -> None:
         self._channels, self.rate, self._zeros = channels, rate, zeros
+        self._steps: dict[str, Array] = {}
+        self._means: dict[str, Array] = {}
 
     def __contains__(self, name: object) -> bool:
         return name in self._channels
@@ -77,11 +79,15 @@ class Signals:
 
     def step(self, name: str) -> Array:
         """Return the increments of a channel, shape (n - 1,)."""
-        return np.diff(self._channels[name])
+        if name not in self._steps:
+            self._steps[name] = _steps(self._channels[name])
+        return self._steps[name]
 
     def mean(self, name: str) -> Array:
         """Return the means of neighbouring samples, shape (n - 1,)."""
-        return _middle(self._channels[name])
+        if name not in self._means:
+            self._means[name] = _middle(self._channels[name])
+        return self._means[name]
 
     @cached_property
     def dt(self) -> Array:
@@ -115,17 +121,31 @@ class Signals:
 
     def moved(self, outward: bool, by_A: bool) -> Array:
         """Return the increments of x of one direction while one side carries the pressure [m]."""
-        way = self.outward if outward else 1.0 - self.outward
-        side = self.carried_by_A if by_A else 1.0 - self.carried_by_A
-        return _middle(way * side) * self.step("x")
+        out_A, out, by = self._ways
+        if outward:
+            share = out_A if by_A else out - out_A
+        else:
+            share = by - out_A if by_A else 1.0 - out - by + out_A
+        return share * self.step("x")
+
+    @cached_property
+    def _ways(self) -> tuple[Array, Array, Array]:
+        """Shares of each interval in which the piston moves outward while A carries, moves outward, and A carries."""
+        return _middle(self.outward * self.carried_by_A), _middle(self.outward), _middle(self.carried_by_A)
 
     def acceleration_step(self) -> Array:
         """Return the increments of the piston's speed [m/s], by which a delay between channels shows."""
-        return np.gradient(np.diff(self._channels["x"]) * self.rate)
+        return np.gradient(self.step("x") * self.rate)
 
 
 def _middle(values: Array) -> Array:
-    return 0.5 * (values[1:] + values[:-1])
+    middle = values[1:] + values[:-1]
+    middle *= 0.5
+    return middle
+
+
+def _steps(values: Array) -> Array:
+    return values[1:] - values[:-1]
 
 
 class Term(NamedTuple):
@@ -228,7 +248,7 @@ def _of_side(side: str) -> tuple[Term, ...]:
             f"free air {side}",
             f"d(1/p_{side})",
             "m^3 Pa",
-            lambda s: np.diff(1.0 / s.absolute[name]),
+            lambda s: _steps(1.0 / s.absolute[name]),
             "air in the oil",
             "air",
             needs=(name,),
@@ -237,7 +257,7 @@ def _of_side(side: str) -> tuple[Term, ...]:
             f"dissolving air {side}",
             f"d(log p_{side})",
             "m^3",
-            lambda s: np.diff(np.log(s.absolute[name])),
+            lambda s: _steps(np.log(s.absolute[name])),
             "air in the oil",
             "air",
             needs=(name,),

@@ -26,6 +26,8 @@ from sealscope.recordings.recording import Array
 #: Distance of neighbouring test functions [s], and how many of these distances a test function spans.
 STRIDE = 0.125
 SPAN = 4
+#: Sums of increments beyond it are no values of a sensor: their squares would overflow.
+LARGEST = 1e100
 
 
 class Rows(NamedTuple):
@@ -73,19 +75,12 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     stride = phi.shape[1]
     pieces = len(increments[0]) // stride
     count = max(0, pieces - SPAN + 1)
-    values = np.zeros((count, len(increments)))
-    missing = np.zeros(pieces, dtype=bool)
-    for column, own in enumerate(increments):
-        cut = own[: pieces * stride].reshape(pieces, stride)
-        parts = cut @ phi.T
-        lost = ~np.isfinite(parts).all(axis=1)
-        if lost.any():
-            missing |= lost
-            parts[lost] = 0.0
-        for piece in range(SPAN):
-            values[:, column] += parts[piece : piece + count, piece]
-    touched = np.zeros(count, dtype=bool)
-    for piece in range(SPAN):
-        touched |= missing[piece : piece + count]
+    cut = np.stack([own[: pieces * stride] for own in increments]).reshape(len(increments) * pieces, stride)
+    parts = (cut @ phi.T).reshape(len(increments), pieces, SPAN)
+    missing = ~(np.abs(parts) < LARGEST).all(axis=(0, 2))
+    if missing.any():
+        parts[:, missing] = 0.0
+    values = sum(parts[:, piece : piece + count, piece] for piece in range(SPAN)).T
+    touched = np.any([missing[piece : piece + count] for piece in range(SPAN)], axis=0)
     time = start + (np.arange(count) + 0.5 * SPAN) * stride / rate
     return Rows(time, values, ~touched)

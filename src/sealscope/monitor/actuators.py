@@ -24,9 +24,9 @@ from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.stream.baseline import plain_dataclass
 from sealscope.monitor.stream.estimates import BlockEstimate
-from sealscope.monitor.stream.plain_state import part_of, plain_fields
 from sealscope.monitor.stream.watch import STATE_VERSION, Watch, watch
 from sealscope.recordings.recording import Recording
+from sealscope.storage.plain_state import part_of, plain_fields
 
 _log = logging.getLogger(__name__)
 #: What a person may say of an alarm.

@@ -17,18 +17,16 @@ if TYPE_CHECKING:
 _PORTION = 1.0
 
 
-def online(detector: str, recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
-    """Return the alarm of a detector's stream as it stands at the record's end, or its last word without an alarm.
+def online(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
+    """Return the alarm of the volume balance's stream as it stands at the record's end, or its last word without one.
 
     Its rate of alarms is the one at which a healthy machine alarms within the record with the probability
     `false_alarm` at most. An alarm that was raised stays, whatever came later. A record without its channels is
     `cannot tell`.
     """
-    from sealscope.diagnosis.volume_balance.over_cycles.stream import SequentialCycles
-    from sealscope.diagnosis.volume_balance.stream import SequentialBalance
+    from sealscope.diagnosis.stream import SequentialBalance
 
-    made = SequentialCycles if detector == "cycle balance" else SequentialBalance
-    stream: SequentialBalance | SequentialCycles = made(rig, alarms_per_hour=false_alarm * 3600.0 / recording.duration)
+    stream = SequentialBalance(rig, alarms_per_hour=false_alarm * 3600.0 / recording.duration)
     begin = float(recording.t[0])
     try:
         for second in range(math.ceil(recording.duration / _PORTION)):

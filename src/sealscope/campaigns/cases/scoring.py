@@ -23,7 +23,7 @@ def stated(look: Look, names: Sequence[str], views: Views) -> tuple[Scores, dict
         if detector.detector and detector.key not in statements:
             examination = seen.examination
             if detector.online:
-                evidence = online(detector.of, seen.recording, examination.rig, examination.false_alarm_probability)
+                evidence = online(seen.recording, examination.rig, examination.false_alarm_probability)
             elif detector.of == DIAGNOSE:
                 evidence = examination.fused(detector.quick)
             else:

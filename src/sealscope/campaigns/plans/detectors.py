@@ -24,7 +24,7 @@ from sealscope.recordings.recording import CHANNEL_UNITS
 DIAGNOSE = "diagnose"
 _OWN, _QUICK, _ONLINE = ", own threshold", ", quick", ", online"
 #: Detectors that have a stream which raises alarms at a stated rate.
-_STREAMED = ("volume balance", "cycle balance")
+_STREAMED = ("volume balance",)
 #: name -> channels; the name "" stands for what detectors see that name no view.
 Views = Mapping[str, tuple[str, ...]]
 #: Channels that detectors see by default: all but the flow meter of the bypass, which is no part of the machine.

@@ -9,9 +9,8 @@ from typing import Any
 from sealscope.errors import InputError
 from sealscope.monitor.alarms.alarm import NEXT_CHECKS, Alarm, AlarmState, Level
 from sealscope.monitor.stream.baseline import plain_dataclass
-from sealscope.monitor.stream.decisions import rarity
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
-from sealscope.monitor.stream.plain_state import plain_fields
+from sealscope.storage.plain_state import plain_fields
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Thresholds:
 
     def by_chance(self, leak: WatchedLeak) -> float:
         """Return how many alarms as strong as a leak's a healthy machine raises per 1000 h, at most."""
-        return self.false_alarms_per_1000_h * rarity(leak.test, leak.score, leak.threshold)
+        return self.false_alarms_per_1000_h * leak.rarity
 
 
 @dataclass

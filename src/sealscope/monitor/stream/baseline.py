@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
-
+from sealscope.diagnosis.terms import priors
 from sealscope.errors import InputError
-from sealscope.monitor.stream.plain_state import plain_fields
-from sealscope.recordings.recording import Array
+from sealscope.storage.plain_state import plain_fields
 from sealscope.storage.plain_values import as_type
 
 _T = TypeVar("_T")
 #: Logarithm by which pressure and flow of a duty may lie outside what was learned.
 _DUTY_MARGIN = 0.2
+#: ... and by which a leak may lower the pressure difference.
+_DAMPED = 0.7
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,55 @@ class WatchBaseline:
     duty_low: tuple[float, float]
     duty_high: tuple[float, float]
 
-    def knows(self, duty: Array) -> bool:
-        """Return whether a duty (2,) is among those learned, within 20 %."""
-        low, high = np.array(self.duty_low) - _DUTY_MARGIN, np.array(self.duty_high) + _DUTY_MARGIN
-        return bool(np.all((duty >= low) & (duty <= high)))
+    def knows(self, duty: tuple[float, float]) -> bool:
+        """Return whether a duty is among those learned."""
+        return within(duty, self.duty_low, self.duty_high)
+
+    def rise(self, at: float, g: float, deviation: float, probability: float) -> WatchedRise | None:
+        """Return the rise where a mean conductance is over what warm oil makes of the baseline's least; None where not.
+
+        `deviation`: of `g`; `probability`: of a look at a healthy machine as warm as that.
+        """
+        from scipy.special import ndtri
+
+        warmest = priors()["oil"]["warmest"].value
+        ceiling = warmest * max(self.low, 0.0)
+        score, threshold = (g - ceiling) / deviation, -float(ndtri(probability))
+        if score <= threshold:
+            return None
+        reason = (
+            f"the leakage conductance is {g:.3g} m^3/(s Pa), over {warmest:g} times the least of the baseline: more "
+            f"than the warmest oil makes of it (score {score:.1f}, threshold {threshold:.1f})"
+        )
+        # what is healthy may be anywhere from the least of the baseline to the ceiling
+        healthy = max(self.level - self.low, ceiling - self.level, 0.0) / 1.96
+        size = g - max(self.level, 0.0)
+        onset = at, self.learned_s, at
+        return WatchedRise("level", onset, size, math.hypot(deviation, healthy), reason, score, threshold)
+
+
+class WatchedRise(NamedTuple):
+    """A rise of the conductance that a test shows.
+
+    `test`: which one; `onset`: value, low and high [s]; `size`, `deviation` [m^3/(s Pa)]; `reason`: in words; `score`,
+    `threshold`.
+    """
+
+    test: str
+    onset: tuple[float, float, float]
+    size: float
+    deviation: float
+    reason: str
+    score: float
+    threshold: float
+
+
+def within(duty: tuple[float, float], low: tuple[float, float], high: tuple[float, float]) -> bool:
+    """Return whether a duty lies between two others, give or take; a leak may take more of the pressure."""
+    return all(
+        least - below <= value <= most + _DUTY_MARGIN
+        for value, least, most, below in zip(duty, low, high, (_DAMPED, _DUTY_MARGIN), strict=True)
+    )
 
 
 @dataclass
@@ -70,13 +115,13 @@ class BaselineLearning:
     duty_high: tuple[float, float] = (-math.inf, -math.inf)
     group: list[float] = field(default_factory=list)
 
-    def add(self, g: float, flow: float, duty: Array, group: int) -> None:
+    def add(self, g: float, flow: float, duty: tuple[float, float], group: int) -> None:
         """Take a block's conductance, flow of a unit of it [L/min] and duty; means are of `group` blocks."""
         self.blocks += 1
         self.total += g
         self.flow += flow
-        self.duty_low = (min(self.duty_low[0], float(duty[0])), min(self.duty_low[1], float(duty[1])))
-        self.duty_high = (max(self.duty_high[0], float(duty[0])), max(self.duty_high[1], float(duty[1])))
+        self.duty_low = (min(self.duty_low[0], duty[0]), min(self.duty_low[1], duty[1]))
+        self.duty_high = (max(self.duty_high[0], duty[0]), max(self.duty_high[1], duty[1]))
         self.group.append(g)
         if len(self.group) == group:
             mean = sum(self.group) / group

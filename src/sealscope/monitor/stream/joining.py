@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array
 
 #: Channels by which an actuator is watched, and with those that are kept beside the estimates.
 _WATCHED = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u")
@@ -30,22 +30,25 @@ _PIECES = 16
 _RATES = (10.0, 100_000.0)
 
 
-def channels_to_watch(samples: Recording) -> tuple[str, ...]:
+def channels_to_watch(samples: Recording, valved: bool = False) -> tuple[str, ...]:
     """Return the channels by which an actuator is watched, of those of its samples; () where they do not suffice.
 
-    The balance of volumes reads position, angle or speed, and all pressures; without a position the chamber pressures
-    and what moves the machine suffice.
+    The balance of volumes reads position, angle or speed, and the chambers' pressures, or, behind a servo valve
+    (`valved`), the command and all pressures; without a position the chamber pressures and what moves the machine
+    suffice.
     """
-    return _channels_to_watch(tuple(name for name in _WATCHED if name in samples.channels))
+    return _channels_to_watch(tuple(name for name in _WATCHED if name in samples.channels), valved)
 
 
 @cache
-def _channels_to_watch(names: tuple[str, ...]) -> tuple[str, ...]:
+def _channels_to_watch(names: tuple[str, ...], valved: bool) -> tuple[str, ...]:
     there = {*names}
     if not {"p_A", "p_B"} <= there:
         return ()
-    if "x" in there and {"theta", "omega"} & there:
-        return tuple(name for name in _WATCHED if name in there - {"u"})
+    if valved and {"x", "u", "p_1", "p_2"} <= there:
+        return tuple(name for name in _WATCHED if name in there - {"theta", "omega"})
+    if not valved and "x" in there and {"theta", "omega"} & there:
+        return tuple(name for name in _WATCHED if name in there - {"u", "p_1", "p_2"})
     if {"u", "theta", "omega"} & there:
         return tuple(name for name in _WATCHED if name in there - {"x", "p_1", "p_2"})
     return ()
@@ -56,11 +59,13 @@ class SampleJoiner:
     """The samples of one actuator since the last whole block, without holes.
 
     `late_s`: samples up to this much older than the newest are late or repeated, and dropped; older ones show that the
-    clock was set back. `settled`: a position that is recorded later is left out. `counters`: samples that were dropped
-    and interruptions, by reason. `pieces`: the samples as they came, of each piece the times and the channels.
+    clock was set back. `valved`: the machine moves by a servo valve. `settled`: a position that is recorded later is
+    left out. `counters`: samples that were dropped and interruptions, by reason. `pieces`: the samples as they came, of
+    each piece the times and the channels.
     """
 
     late_s: float = 60.0
+    valved: bool = False
     settled: bool = False
     names: tuple[str, ...] = ()
     rate: float = 0.0
@@ -109,7 +114,7 @@ class SampleJoiner:
 
     def _fits(self, samples: Recording) -> bool:
         """Return whether the samples have the stream's channels and SI units; count them where they do not."""
-        names, offered = self.names, channels_to_watch(samples)
+        names, offered = self.names, channels_to_watch(samples, self.valved)
         if not names or ("x" in offered and "x" not in names and not self.settled):
             names = offered
         missing = [name for name in names if name not in samples]
@@ -172,6 +177,12 @@ class SampleJoiner:
             self.pieces[0] = [_rest(values, length) for values in self.pieces[0]]
         return block
 
+    def drained(self) -> tuple[Array, dict[str, Array]]:
+        """Return times and channels of all samples, and drop them here."""
+        t, *channels = self._joined(len(self))
+        self.pieces = []
+        return t, dict(zip(self.names, channels, strict=True))
+
     def first(self, length: int) -> Recording:
         """Return the first `length` samples, which stay."""
         t, *channels = self._joined(length)
@@ -197,6 +208,7 @@ class SampleJoiner:
         t, *channels = self._joined(len(self))
         return {
             "late_s": self.late_s,
+            "valved": self.valved,
             "settled": self.settled,
             "names": list(self.names),
             "rate": self.rate,
@@ -216,6 +228,7 @@ class SampleJoiner:
         piece += [array_of(part_of(channels, name, Mapping), name) for name in names]
         return cls(
             float(part_of(state, "late_s", (float, int))),
+            bool(part_of(state, "valved", bool)),
             bool(part_of(state, "settled", bool)),
             names,
             float(part_of(state, "rate", (float, int))),

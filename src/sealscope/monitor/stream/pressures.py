@@ -13,29 +13,30 @@ searches the oil's stiffness anew, and nothing before is compared with what come
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sealscope.diagnosis.live import BlockConductance, NotJudged, Shown
 from sealscope.diagnosis.observer.detector import SLOWEST, block_length
 from sealscope.diagnosis.observer.estimates import Estimates
 from sealscope.diagnosis.observer.evidence import SIZE_ERROR, described, states_flow
 from sealscope.diagnosis.observer.model import G_UNIT, assume
 from sealscope.diagnosis.observer.stream import Formulation, ObserverStream
-from sealscope.monitor.stream.decisions import WINDOW, ConductanceRise, other_duty, rise_of
-from sealscope.monitor.stream.estimator import PAUSE_S, BlockConductance, NotJudged, RecentBlocks
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array
 from sealscope.physics.rig import CHOICES, LAWS, NUMBERS, RigNumbers
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Array, Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: The observer goes on after a gap up to this [s].
+PAUSE_S = 300.0
 #: What moves the machine, in the order of preference: an encoder's steps are noise in the speed.
 DRIVES = ("u", "omega", "theta")
 #: Deviation of the level of all conductances [m^3/(s Pa)].
@@ -46,19 +47,19 @@ _AT_REST = 3.0
 _SETTLING, _RESUMING = 60, 3
 #: Successive blocks that the model does not describe, after which the observer begins anew.
 _LOST = 10
-#: Deviations are within this factor of their median.
+#: Deviations are within this factor of the usual one.
 _EVEN = 3.0
-#: Columns of the last blocks: middle, conductance, deviation, flow, duty.
-_COLUMNS = 6
 
 
 class PressureEstimator:
-    """The observer by the pressures; see `estimator.ConductanceEstimator`.
+    """Conductances by the observer, block by block.
 
-    `a`: the assumed machine; `litres`: whether its rig states what turns a conductance into L/min.
+    `a`: the assumed machine; `litres`: whether its rig states what turns a conductance into L/min. The conductance
+    itself is not stated (`levels`), only its changes, to `size_error`; an orifice that shows as the same conductance
+    passes `orifice` times what a laminar leak does, by which the upper end of an interval is wider.
     """
 
-    levels, size_error, orifice, pace = False, SIZE_ERROR["command"], 2.0, 4
+    levels, size_error, orifice = False, SIZE_ERROR["command"], 2.0
 
     def __init__(self, a: RigNumbers, litres: bool) -> None:
         self._a, self.litres = a, litres
@@ -69,8 +70,7 @@ class PressureEstimator:
         self._mean = float("nan")  # mean of both pressures when the observer began
         self._next = float("nan")  # clock at which the next block begins if it follows
         self._settling, self._lost = 0, 0
-        self._appended = 0
-        self._recent = np.empty((0, _COLUMNS))
+        self._usual = 0.0  # deviation of a block's conductance
 
     @classmethod
     def of(cls, rig: Rig) -> PressureEstimator:
@@ -90,18 +90,19 @@ class PressureEstimator:
     def _formulation(self) -> Formulation:
         return "command" if self._drive == "u" else "speed"
 
-    def take(self, block: Recording, to_learn: int) -> Sequence[BlockConductance] | NotJudged:
+    def take(self, block: Recording) -> Shown:
         """Return what a block shows."""
+        end = float(block.t[-1]) + 1.0 / block.rate
         if self._a.valved:
-            return _passed_over("behind a servo valve a position is needed")
+            return _passed_over(end, "behind a servo valve a position is needed")
         slowest = SLOWEST[self._formulation]
         if block.rate < slowest:
-            return _passed_over(f"sampled at less than {slowest:g} Hz")
+            return _passed_over(end, f"sampled at less than {slowest:g} Hz")
         samples = block.only((*CHAMBERS, self._drive))
         if not all(np.isfinite(samples[name]).all() for name in samples.channels):
-            return _passed_over("missing values")
+            return _passed_over(end, "missing values")
         begun, apart = self._follow(float(block.t[0]), block.rate)
-        self._next = float(block.t[-1]) + 1.0 / block.rate
+        self._next = end
         assert self._stream is not None
         samples = self._levelled(samples, apart)
         if begun:  # the first sample only sets the observer's states
@@ -112,16 +113,16 @@ class PressureEstimator:
             self._stream.update(samples)
         rows = self._stream.drained()
         if rows.G.size == 0:
-            return _passed_over("settling", apart)
+            return _passed_over(end, "settling", apart)
         self._settling -= rows.G.size
         if not described(rows, self._formulation)[-1]:
-            return self._not_described(rows)
+            return self._not_described(end, rows)
         self._lost = 0
         if self._settling >= 0:
-            return _passed_over("settling", apart)
+            return _passed_over(end, "settling", apart)
         self._known = rows.parameters[-1].copy()
         if rows.sd[-1] > _AT_REST:
-            return _passed_over("at rest")
+            return _passed_over(end, "at rest")
         return [self._shown(rows, samples)]
 
     def _follow(self, begins: float, rate: float) -> tuple[bool, bool]:
@@ -148,59 +149,30 @@ class PressureEstimator:
         channels = {name: samples[name] - (mean - self._mean) * (name in CHAMBERS) for name in samples.channels}
         return Recording(samples.t, channels, samples.units, samples.rate)
 
-    def _not_described(self, rows: Estimates) -> NotJudged:
+    def _not_described(self, end: float, rows: Estimates) -> NotJudged:
         """Count a block that the model does not describe; after some of them, or where it diverged, begin anew."""
         self._lost += 1
         if self._lost < _LOST and np.isfinite(rows.parameters[-1]).all():
-            return _passed_over("settling" if self._settling >= 0 else "not described by the model")
+            return _passed_over(end, "settling" if self._settling >= 0 else "not described by the model")
         self._stream = None
-        return _passed_over("not described by the model", True)
+        return _passed_over(end, "not described by the model", True)
 
     def _shown(self, rows: Estimates, samples: Recording) -> BlockConductance:
         driven = samples[self._drive]
         if self._drive == "theta":
             driven = np.diff(driven) * samples.rate
         dp = float(rows.dp[-1])
-        duty = np.log(np.maximum([dp, float(np.sqrt(np.mean(driven**2)))], np.finfo(float).tiny))
-        middle = 0.5 * float(samples.t[0] + samples.t[-1])
+        pressure, drive = np.log(np.maximum([dp, np.sqrt(np.mean(driven**2))], np.finfo(float).tiny))
         g, sd = (G_UNIT * float(values[-1]) for values in (rows.G, rows.sd))
-        return BlockConductance(middle, g, sd, _LEVEL_SD, dp / LITRE_PER_MINUTE, duty, None)
-
-    def append(self, block: BlockConductance) -> RecentBlocks:
-        """Keep a block that is judged; return the last ones, up to a pause."""
-        if len(self._recent) and not 0.0 < block.t - float(self._recent[-1, 0]) <= PAUSE_S:
-            self.forget()
-        row = np.array([block.t, block.g, block.sd, block.flow, *block.duty])
-        self._recent = np.concatenate([self._recent, row[None]])[-self.pace * WINDOW :]
-        self._appended += 1
-        return self.series()
-
-    def series(self) -> RecentBlocks:
-        """Return the last blocks."""
-        t, g, _, flow = self._recent.T[:4]
-        return RecentBlocks(t, g, flow)
-
-    def step(self, probability: float, *, again: bool) -> tuple[ConductanceRise | None, str | None]:
-        """Return the rise that the last blocks show, and what forbids to compare them."""
-        if self._appended % self.pace or len(self._recent) < self.pace:
-            return None, None
-        rows = self._recent[len(self._recent) % self.pace :].reshape(-1, self.pace, _COLUMNS)
-        means, duty = rows.mean(axis=1), rows[:, :, 4:].mean(axis=1)
-        t, g, sd = means.T[:3]
-        rise = rise_of("step", t, g, _evened(sd), probability, again=again)
-        if rise is None:
-            return None, None
-        other = other_duty(t, duty, rise.onset_s, damped=True)
-        return (None, other) if other is not None else (rise, None)
-
-    def forget(self, keep: int = 0) -> None:
-        """Compare with nothing before the last `keep` blocks."""
-        self._recent = self._recent[len(self._recent) - keep :] if keep else np.empty((0, _COLUMNS))
+        self._usual = self._usual or sd
+        sd = min(max(sd, self._usual / _EVEN), self._usual * _EVEN)  # a single block shall not count for many
+        self._usual *= (sd / self._usual) ** (1.0 / _SETTLING)
+        begin, end = float(samples.t[0]), float(samples.t[-1]) + 1.0 / samples.rate
+        return BlockConductance(begin, end, g, sd, g, _LEVEL_SD, dp / LITRE_PER_MINUTE, (float(pressure), float(drive)))
 
     def relearn(self) -> None:
         """Search the machine's stiffness again."""
         self._stream, self._known = None, None
-        self.forget()
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
@@ -216,8 +188,7 @@ class PressureEstimator:
             "next": None if np.isnan(self._next) else self._next,
             "settling": self._settling,
             "lost": self._lost,
-            "appended": self._appended,
-            "recent": plain_array(self._recent),
+            "usual": self._usual,
             "rate": None if stream is None else stream.rate,
             "observer": None
             if stream is None
@@ -245,10 +216,8 @@ class PressureEstimator:
         )
         estimator._known = None if known is None else array_of(known, "known")
         estimator._mean, estimator._next = (float("nan") if value is None else float(value) for value in (mean, after))
-        estimator._settling, estimator._lost, estimator._appended = (
-            int(part_of(state, name, int)) for name in ("settling", "lost", "appended")
-        )
-        estimator._recent = array_of(part_of(state, "recent", Mapping), "recent")
+        estimator._settling, estimator._lost = (int(part_of(state, name, int)) for name in ("settling", "lost"))
+        estimator._usual = float(part_of(state, "usual", (float, int)))
         if observer is not None:
             channels = (*CHAMBERS, estimator._drive)
             stream = ObserverStream(estimator._a, channels, float(rate or 0.0), estimator._seconds)
@@ -262,14 +231,8 @@ class PressureEstimator:
         return estimator
 
 
-def _evened(sd: Array) -> Array:
-    """Return deviations within a factor of their median: a single block shall not count for many."""
-    middle = float(np.median(sd))
-    return np.clip(sd, middle / _EVEN, middle * _EVEN)
-
-
-def _passed_over(status: str, apart: bool = False) -> NotJudged:
-    return NotJudged(status, f"blocks: {status}", apart=apart)
+def _passed_over(end: float, status: str, apart: bool = False) -> NotJudged:
+    return NotJudged(end, status, f"blocks: {status}", apart)
 
 
 def _numbers_of(state: Mapping[str, Any]) -> RigNumbers:

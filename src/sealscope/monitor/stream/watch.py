@@ -2,56 +2,74 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
-from sealscope.diagnosis.volume_balance.blocks import BLOCK_SECONDS
-from sealscope.diagnosis.volume_balance.growth import WARMEST
-from sealscope.errors import InputError
-from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, plain_dataclass
-from sealscope.monitor.stream.decisions import (
-    GROUP,
-    INSIDE_OR_OUTSIDE,
-    SHOWN,
-    WINDOW,
-    ConductanceRise,
-    level_rise_of,
-    probability_of,
-    rise_of,
+from sealscope.diagnosis.live import (
+    BLOCK_SECONDS,
+    LEARNED,
+    BlockConductance,
+    LiveBalance,
+    NotJudged,
+    Shown,
+    size_error,
+    states_flow,
 )
+from sealscope.diagnosis.sequential import RECENT, StepDetector
+from sealscope.diagnosis.terms import priors
+from sealscope.errors import InputError
+from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, plain_dataclass, within
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
-from sealscope.monitor.stream.estimator import PAUSE_S, BlockConductance, ConductanceEstimator, NotJudged, RecentBlocks
 from sealscope.monitor.stream.joining import SampleJoiner
-from sealscope.monitor.stream.plain_state import array_of, part_of, plain_array, plain_fields
 from sealscope.monitor.stream.pressures import PressureEstimator
-from sealscope.monitor.stream.volumes import VolumeEstimator
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array, plain_fields
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 6
-#: The duty's cycle is looked for in so long a run without a hole [s].
+STATE_VERSION = 7
+#: The duty's cycle is looked for in so long a run without a hole [s], where there is no position.
 _LEARN_SECONDS = 60.0
-#: Means of blocks are not compared across a pause of over so many seconds.
-_LONGEST_PAUSE_S = 3600.0
-#: Oil warms by 30 K in a shift of so many hours, at most.
-_SHIFT_HOURS = 8.0
-#: Blocks whose mean is the leak after an alarm.
+#: Blocks are not compared across a pause of over so many seconds.
+_PAUSE_S = 300.0
+#: Blocks of one mean that is compared with the baseline.
+GROUP = 16
+#: Blocks whose mean is the leak after an alarm, or what passed before it.
 _RECENT = 8
+#: Share of the rate of false alarms that each test takes.
+_SHARES = {"step": 0.9, "level": 0.1}
+#: Probabilities of a false alarm of a block for which a test can be set.
+_PROBABILITIES = (1e-12, 0.05)
+#: Where the oil goes that either way of watching shows, and the share of it that is surely inside: by pressures an
+#: external leak shows as 2.6 to 4.1 times what it is.
+_CAUSES = {"volumes": ("piston or pump leak", 1.0), "pressures": ("leak inside or outside", 0.2)}
+#: Columns of the last blocks: end, conductance, deviation, flow of a unit of it, duty.
+_COLUMNS = 6
 
 
-_ESTIMATORS: dict[str, type[VolumeEstimator] | type[PressureEstimator]] = {
-    "volumes": VolumeEstimator,
-    "pressures": PressureEstimator,
-}
+def probability_of(test: str, false_alarms_per_1000_h: float, seconds: float) -> float:
+    """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
+
+    Raises InputError where the test cannot be set for it.
+    """
+    probability = _SHARES[test] * false_alarms_per_1000_h / 1000.0 * seconds / 3600.0
+    low, high = _PROBABILITIES
+    if not low <= probability <= high:
+        scale = 1000.0 * 3600.0 / (_SHARES[test] * seconds)
+        raise InputError(
+            f"false_alarms_per_1000_h must be {low * scale:.2g} to {high * scale:.2g}, got {false_alarms_per_1000_h:g}"
+        )
+    return probability
 
 
 class Watch:
@@ -94,27 +112,25 @@ class Watch:
         probability_of("step", false_alarms_per_1000_h, BLOCK_SECONDS)
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
-        self._estimators: dict[str, ConductanceEstimator] = {by: kind.of(rig) for by, kind in _ESTIMATORS.items()}
+        self._rig, self._litres = rig, states_flow(rig)
+        self._samples = SampleJoiner(valved=rig.valve.spool == "present")
+        self._live: LiveBalance | None = None
+        self._pressures: PressureEstimator | None = None
         self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
         self.blocks = 0
         self._version = 1
-        self._samples = SampleJoiner()
         self._seconds = 0.0
         self._learning = BaselineLearning()
-        self._means = np.empty((0, 4))  # t, g, sd, offset of means of GROUP blocks
-        self._group = np.empty((0, 4))  # the same of the blocks of the mean to come
+        self._detector = StepDetector()
+        self._last: deque[tuple[float, ...]] = deque(maxlen=RECENT)
+        self._group: list[tuple[float, ...]] = []
 
     @property
     def by(self) -> str:
         """Way of watching, "volumes" where the position is recorded, else "pressures"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
-
-    @property
-    def estimator(self) -> ConductanceEstimator:
-        """What turns blocks into conductances."""
-        return self._estimators[self.by]
 
     @property
     def counters(self) -> dict[str, int]:
@@ -132,9 +148,9 @@ class Watch:
         Parameters
         ----------
         samples : Recording
-            The next samples, in SI units: ``p_A``, ``p_B``, ``x``, ``theta`` or ``omega``, and ``p_1``, ``p_2`` where
-            there are any; or ``p_A``, ``p_B`` and ``u``, ``omega`` or ``theta``. What does not fit is dropped and
-            counted (`counters`).
+            The next samples, in SI units: ``p_A``, ``p_B``, ``x``, ``theta`` or ``omega``; or ``p_A``, ``p_B`` and
+            ``u``, ``omega`` or ``theta``; behind a servo valve ``x``, ``u`` and all four pressures. What does not fit
+            is dropped and counted (`counters`).
         follows : bool, default True
             False where the clock begins anew, as with a file of its own.
 
@@ -149,14 +165,29 @@ class Watch:
         """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
         if not follows:
             self._samples.restart("restart")
+            if self._live is not None:
+                self._live.interrupt()
         for _ in self._samples.runs(samples):
-            if not self._seconds and not self._find_duty():
-                continue
-            length = round(self._seconds * self._samples.rate)
-            while len(self._samples) >= length:
-                with np.errstate(all="ignore"):  # a block whose sums overflow is passed over
-                    estimate = self._taken(self._samples.taken(length))
-                yield estimate, self.leak
+            for shown in self._by_volumes() if self.by == "volumes" else self._by_pressures():
+                yield self.judged(shown), self.leak
+
+    def _by_volumes(self) -> list[Shown]:
+        t, channels = self._samples.drained()
+        if self._live is None:
+            self._live = LiveBalance(self._rig, self._samples.names)
+            self._samples.settled = True
+        with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
+            return self._live.take(t, channels, self._samples.rate)
+
+    def _by_pressures(self) -> Iterator[Shown]:
+        if not self._seconds and not self._find_duty():
+            return
+        assert self._pressures is not None
+        length = round(self._seconds * self._samples.rate)
+        while len(self._samples) >= length:
+            with np.errstate(all="ignore"):
+                shown = self._pressures.take(self._samples.taken(length))
+            yield shown
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
         """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
@@ -171,138 +202,147 @@ class Watch:
         """Learn a new baseline from now on: the machine was repaired, or is another."""
         self._version += 1
         self.baseline, self._learning = None, BaselineLearning()
-        self.estimator.relearn()
+        for estimator in (self._live, self._pressures):
+            if estimator is not None:
+                estimator.relearn()
         self.dismiss()
 
     def dismiss(self) -> None:
         """Take the leak back and compare with nothing before now; the baseline stays."""
         self.leak = None
-        self._forget(0)
+        self._forget()
 
-    def _forget(self, keep: int) -> None:
-        self.estimator.forget(keep)
-        self._means, self._group = np.empty((0, 4)), np.empty((0, 4))
+    def _forget(self) -> None:
+        self._detector.forget()
+        self._last.clear()
+        self._group = []
 
     def _find_duty(self) -> bool:
         """Set the length of a block from the first minute in which every value is known and the machine moves."""
         count = round(_LEARN_SECONDS * self._samples.rate)
+        self._pressures = self._pressures or PressureEstimator.of(self._rig)
         while len(self._samples) >= count:
             first = self._samples.first(count)
             if all(np.isfinite(first[name]).all() for name in first.channels):
-                seconds = self.estimator.seconds_of(first)
+                seconds = self._pressures.seconds_of(first)
                 if seconds is not None:
                     self._seconds = seconds
                     self._samples.settled = True
-                    self._estimators = {self.by: self.estimator}
                     return True
             self._samples.taken(count // 2)
             self._samples.count("half minutes at rest or with missing values before the first block")
         return False
 
-    def _taken(self, block: Recording) -> BlockEstimate:
-        return self.judged(self.estimator.take(block, self.to_learn), float(block.t[-1]) + 1.0 / block.rate)
-
     @property
     def to_learn(self) -> int:
         """Blocks of the baseline."""
-        return max(FEWEST + 4, math.ceil(self.learn_hours * 3600.0 / self.block_seconds))
+        return max(LEARNED, math.ceil(self.learn_hours * 3600.0 / self.block_seconds))
 
-    def judged(self, shown: Sequence[BlockConductance] | NotJudged, end: float) -> BlockEstimate:
-        """Return the estimate of a block that ends at the clock `end` [s], from what the estimator shows of it."""
+    def judged(self, shown: Shown) -> BlockEstimate:
+        """Return the estimate of a block, from what is shown of it."""
         self.blocks += 1
         if isinstance(shown, NotJudged):
             if shown.apart:
-                self._forget(0)
+                self._forget()
             if shown.counted:
-                self._samples.count(shown.counted, shown.number)
-            return BlockEstimate(self.blocks, end, shown.status)
+                self._samples.count(shown.counted)
+            return BlockEstimate(self.blocks, shown.end, shown.status)
         for block in shown:
-            estimate = self._judge(block, end)
+            estimate = self._judge(block)
         return estimate
 
-    def _judge(self, block: BlockConductance, end: float) -> BlockEstimate:
+    def _judge(self, block: BlockConductance) -> BlockEstimate:
         if self.baseline is not None and not self.baseline.knows(block.duty):
             self._samples.count("blocks: another duty")
-            return BlockEstimate(self.blocks, end, "another duty")
-        estimator = self.estimator
-        series = estimator.append(block)
-        self._test(series, end)
-        self._group_of(np.array([block.t, block.g, block.sd, block.offset]), end)
+            return BlockEstimate(self.blocks, block.end, "another duty")
+        if self._last and not 0.0 <= block.begin - self._last[-1][0] + block.end - block.begin <= _PAUSE_S:
+            self._forget()
+        self._detector.take(block.begin, block.end, block.g, block.sd)
+        self._last.append((block.end, block.g, block.sd, block.flow, *block.duty))
+        self._test_step(block)
+        self._test_level(block)
         if self.baseline is None and self.leak is None:
             self._learning.add(block.g, block.flow, block.duty, GROUP)
             if self._learning.blocks >= self.to_learn:
                 hours = self._learning.blocks * self.block_seconds / 3600.0
-                self.baseline = self._learning.frozen(self._version, end, hours, estimator.litres and estimator.levels)
+                litres = self._litres and self.by == "volumes"
+                self.baseline = self._learning.frozen(self._version, block.end, hours, litres)
                 self._learning = BaselineLearning()
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
-        if not estimator.litres:
-            return BlockEstimate(self.blocks, end, status)
-        return self._estimate(status, end, series, block)
+        return self._estimate(status, block) if self.litres else BlockEstimate(self.blocks, block.end, status)
 
-    def _test(self, series: RecentBlocks, end: float) -> None:
-        """Search the last blocks for a rise; an alarm that stands is stated anew while more blocks sharpen it."""
+    @property
+    def litres(self) -> bool:
+        """Whether L/min can be stated."""
+        return self._litres if self._pressures is None or self.by == "volumes" else self._pressures.litres
+
+    def _test_step(self, block: BlockConductance) -> None:
+        """Test for a step; an alarm that stands is stated anew while more blocks sharpen it."""
         leak = self.leak
-        again = leak is not None and leak.test == "step" and leak.onset_s > float(series.t[0])
-        if leak is not None and not again:
+        if leak is not None and (leak.test != "step" or block.end - leak.raised_s > RECENT * self.block_seconds):
             return
-        probability = probability_of("step", self.false_alarms_per_1000_h, self.estimator.pace * self.block_seconds)
-        rise, other = self.estimator.step(probability, again=again)
-        if other is not None and leak is None:
-            self._samples.count(f"blocks not compared: {other}"[:120])
-            if other in ("changed duty", "sensor fault"):
-                self._forget(3)
-        if rise is not None and (leak is None or rise.score > leak.score):
-            before = series.g[series.t < rise.onset_s - 0.5 * self.block_seconds][-GROUP:]
-            level = float(before.mean()) if before.size else float(series.g[0])
-            raised = end if leak is None else leak.raised_s
-            self._raise(rise, raised, level, float(np.median(series.flow)))
+        threshold = -math.log(probability_of("step", self.false_alarms_per_1000_h, block.end - block.begin))
+        least = threshold if leak is None else 0.5 * leak.score
+        if not self._detector.log_e(least) > least:
+            return
+        rise = self._detector.rise()
+        if leak is None and self._other_duty(rise.onset[0], rise.size):
+            self._samples.count("blocks not compared: changed duty")
+            self._forget()
+            return
+        score, threshold = 2.0 * rise.log_e, 2.0 * threshold
+        reason = (
+            f"the leakage conductance rises at {rise.onset[0]:.0f} s beyond its random walk (score {score:.1f}, "
+            f"threshold {threshold:.1f})"
+        )
+        self._raise(WatchedRise("step", rise.onset, rise.size, rise.deviation, reason, score, threshold), block)
 
-    def _group_of(self, block: Array, end: float) -> None:
-        """Gather blocks to means, and test these."""
-        last = float(self._group[-1, 0]) if len(self._group) else float("nan")
-        if not np.isnan(last) and not 0.0 < float(block[0]) - last <= PAUSE_S:
-            self._group = np.empty((0, 4))
-        self._group = np.concatenate([self._group, block[None]])
+    def _other_duty(self, onset: float, size: float) -> bool:
+        """Return whether the duty changed with a rise, beyond what it was before and what a leak makes of it."""
+        ends, *_, pressure, motion = np.array(self._last).T
+        after = ends > onset
+        if np.count_nonzero(~after) < _RECENT or not after.any():
+            return False
+        low, high = ((float(f(pressure[~after])), float(f(motion[~after]))) for f in (np.min, np.max))
+        now = float(np.median(pressure[after])), float(np.median(motion[after]))
+        lost = 1.0 - size * math.exp(now[0] - now[1]) if self.by == "volumes" else 1.0
+        net = now[0], now[1] + math.log(max(lost, np.finfo(float).tiny))  # the pump may give what leaks
+        return not (within(now, low, high) or within(net, low, high))
+
+    def _test_level(self, block: BlockConductance) -> None:
+        """Gather blocks to means, and compare these with the baseline."""
+        self._group.append((block.end, block.g, block.sd, block.offset))
         if len(self._group) < GROUP:
             return
-        mean = self._group.mean(axis=0)
-        mean[2] = float(np.sqrt(np.sum(self._group[:, 2] ** 2))) / GROUP
-        self._group = np.empty((0, 4))
-        if len(self._means) and not 0.0 < float(mean[0] - self._means[-1, 0]) <= _LONGEST_PAUSE_S:
-            self._means = np.empty((0, 4))
-        self._means = np.concatenate([self._means, mean[None]])[-WINDOW:]
-        if self.leak is not None:
+        at, g, _, offset = np.mean(self._group, axis=0)
+        sd = math.sqrt(sum(row[2] ** 2 for row in self._group)) / GROUP
+        self._group = []
+        if self.leak is not None or self.baseline is None:
             return
-        t, g, sd, offset = self._means.T
-        seconds = GROUP * self.block_seconds
-        rise = rise_of("rise", t, g, sd, probability_of("rise", self.false_alarms_per_1000_h, seconds))
-        before = g[:-1]
+        levels = self.by == "volumes"
+        deviation = math.hypot(sd, float(offset) * (1.0 if levels else priors()["oil"]["warmest"].value - 1.0))
+        probability = probability_of("level", self.false_alarms_per_1000_h, GROUP * self.block_seconds)
+        rise = self.baseline.rise(float(at), float(g), deviation, probability)
         if rise is not None:
-            before = g[t < rise.onset_s][-4:]
-        elif self.baseline is not None:
-            deviation = math.hypot(float(sd[-1]), float(offset[-1]) * (1.0 if self.estimator.levels else WARMEST - 1.0))
-            probability = probability_of("level", self.false_alarms_per_1000_h, seconds)
-            rise = level_rise_of(float(mean[0]), float(mean[1]), deviation, self.baseline, probability)
-            before = np.array([self.baseline.level])
-        if rise is not None:
-            level = float(before.mean()) if before.size else float(g[0])
-            self._raise(rise, end, level, float(np.median(self.estimator.series().flow)))
+            self._raise(rise, block, self.baseline.level)
 
-    def _raise(self, rise: ConductanceRise, raised: float, before: float, flow: float) -> None:
-        size = rise.size * flow
-        half = 1.96 * math.hypot(rise.size_sd, self.estimator.size_error * rise.size) * flow
-        cause = rise.cause if self.by == "volumes" else INSIDE_OR_OUTSIDE
-        least, usual, most = _share_shown(cause)
-        upper = most * self.estimator.orifice * (size + half)
-        lpm, interval = usual * size, (least * max(0.0, size - half), upper)
+    def _raise(self, rise: WatchedRise, block: BlockConductance, before: float | None = None) -> None:
+        onset, low, high = rise.onset
+        if before is None:
+            earlier = [row[1] for row in self._last if row[0] <= low] or [block.g - rise.size]
+            before = self.leak.before if self.leak is not None else float(np.mean(earlier[-GROUP:]))
+        cause, inside = _CAUSES[self.by]
+        size, half = rise.size, 1.96 * math.hypot(rise.deviation, self._size_error * rise.size)
+        lpm = size * block.flow
+        interval = inside * max(0.0, size - half) * block.flow, self._orifice * (size + half) * block.flow
         self.leak = WatchedLeak(
-            raised,
-            rise.onset_s,
-            rise.onset_interval_s,
-            lpm if self.estimator.litres else None,
-            interval if self.estimator.litres else None,
+            block.end if self.leak is None else self.leak.raised_s,
+            onset,
+            (low, high),
+            lpm if self.litres else None,
+            interval if self.litres else None,
             before,
-            rise.size_sd,
+            rise.deviation,
             rise.test,
             cause,
             rise.reason,
@@ -310,35 +350,47 @@ class Watch:
             rise.threshold,
         )
 
-    def _estimate(self, status: str, end: float, series: RecentBlocks, block: BlockConductance) -> BlockEstimate:
+    @property
+    def _size_error(self) -> float:
+        return size_error(self._rig) if self.by == "volumes" else PressureEstimator.size_error
+
+    @property
+    def _orifice(self) -> float:
+        return 1.0 if self.by == "volumes" else PressureEstimator.orifice
+
+    def _estimate(self, status: str, block: BlockConductance) -> BlockEstimate:
         """Return the block's estimate: total flow, and flow beyond the baseline's, or since the onset of the leak."""
-        t, g, _ = series
-        sd, flow = block.sd, block.flow
-        total, half = float(g[-1]), 1.96 * math.hypot(sd, block.offset)
+        flow = block.flow
         beyond: tuple[float, float, float] | None = None
+        sd = block.sd * math.sqrt(self._detector.noise)
         if self.leak is not None:
-            recent = g[t > self.leak.onset_interval_s[1]][-_RECENT:]
-            recent = recent if recent.size else g[-1:]
-            now = float(recent.mean())
-            warmed = WARMEST ** min(1.0, max(0.0, end - self.leak.onset_s) / (_SHIFT_HOURS * 3600.0))
-            before = max(self.leak.before, 0.0)
-            spread = 1.96 * math.hypot(
-                sd / math.sqrt(recent.size), self.leak.before_sd, self.estimator.size_error * (now - self.leak.before)
-            )
-            least, usual, most = _share_shown(self.leak.cause)
-            low, high = now - before * warmed - spread, now - before / warmed + spread
-            beyond = usual * (now - self.leak.before), least * low, most * high
+            beyond = self._beyond_leak(self.leak, block, sd)
         elif self.baseline is not None:
-            base = self.baseline
-            beyond = total - base.level, total - base.high - 1.96 * sd, total - base.low + 1.96 * sd
-        estimator = self.estimator
-        total_lpm = leak_lpm = total_interval = leak_interval = None
-        if estimator.levels:
-            total_lpm, total_interval = total * flow, (max(0.0, total - half) * flow, max(0.0, total + half) * flow)
+            base, half = self.baseline, 1.96 * sd
+            beyond = block.g - base.level, block.g - base.high - half, block.g - base.low + half
+        total = total_interval = leak = leak_interval = None
+        if self.by == "volumes":
+            half = 1.96 * math.hypot(sd, block.offset)
+            total = block.total * flow
+            total_interval = max(0.0, block.total - half) * flow, max(0.0, block.total + half) * flow
         if beyond is not None:
-            leak_lpm, low, high = (value * flow for value in beyond)
-            leak_interval = max(0.0, low), estimator.orifice * max(0.0, high)
-        return BlockEstimate(self.blocks, end, status, total_lpm, total_interval, leak_lpm, leak_interval)
+            leak, low, high = (value * flow for value in beyond)
+            leak_interval = max(0.0, low), self._orifice * max(0.0, high)
+        return BlockEstimate(self.blocks, block.end, status, total, total_interval, leak, leak_interval)
+
+    def _beyond_leak(self, leak: WatchedLeak, block: BlockConductance, sd: float) -> tuple[float, float, float]:
+        """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
+        recent = [row[1] for row in self._last if row[0] - self.block_seconds >= leak.onset_interval_s[1]][-_RECENT:]
+        now = float(np.mean(recent or [block.g]))
+        oil = priors()["oil"]
+        hours = max(0.0, block.end - leak.onset_s) / 3600.0
+        warmed = oil["warmest"].value ** min(1.0, hours / oil["shift"].value)
+        before = max(leak.before, 0.0)
+        spread = 1.96 * math.hypot(
+            sd / math.sqrt(max(len(recent), 1)), leak.before_sd, self._size_error * (now - leak.before)
+        )
+        inside = _CAUSES[self.by][1]
+        return now - leak.before, inside * (now - before * warmed - spread), now - before / warmed + spread
 
     def state(self) -> dict[str, Any]:
         """Return all that the watch knows as plain values that JSON holds; `from_state` continues with the same bits.
@@ -350,18 +402,22 @@ class Watch:
         """
         return {
             "version": STATE_VERSION,
+            "rig": json.dumps(self._rig.model_dump()),
+            "litres": self._litres,
             "false_alarms_per_1000_h": self.false_alarms_per_1000_h,
             "learn_hours": self.learn_hours,
             "blocks": self.blocks,
             "baseline_version": self._version,
             "seconds": self._seconds,
             "samples": self._samples.state(),
-            "estimators": {by: estimator.state() for by, estimator in self._estimators.items()},
+            "live": None if self._live is None else self._live.state(),
+            "pressures": None if self._pressures is None else self._pressures.state(),
             "learning": self._learning.state(),
             "baseline": None if self.baseline is None else plain_fields(self.baseline),
             "leak": None if self.leak is None else plain_fields(self.leak),
-            "means": plain_array(self._means),
-            "group": plain_array(self._group),
+            "detector": self._detector.state(),
+            "last": plain_array(np.array(self._last).reshape(-1, _COLUMNS)),
+            "group": plain_array(np.array(self._group).reshape(-1, 4)),
         }
 
     @classmethod
@@ -388,31 +444,39 @@ class Watch:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")
         watch = cls.__new__(cls)
         number = {name: part_of(state, name, (float, int)) for name in _NUMBERS}
+        watch._rig, watch._litres = _rig_of(part_of(state, "rig", str)), bool(part_of(state, "litres", bool))
         watch.false_alarms_per_1000_h, watch.learn_hours = number["false_alarms_per_1000_h"], number["learn_hours"]
         watch.blocks, watch._version = int(number["blocks"]), int(number["baseline_version"])
         watch._seconds = number["seconds"]
         watch._samples = SampleJoiner.from_state(part_of(state, "samples", Mapping))
-        estimators = part_of(state, "estimators", Mapping)
-        watch._estimators = {
-            by: kind.from_state(part_of(estimators, by, Mapping))
-            for by, kind in _ESTIMATORS.items()
-            if not watch._samples.settled or by == watch.by
-        }
+        live, pressures = (part_of(state, name, (Mapping, type(None))) for name in ("live", "pressures"))
+        watch._live = None if live is None else LiveBalance.from_state(watch._rig, live)
+        watch._pressures = None if pressures is None else PressureEstimator.from_state(pressures)
         watch._learning = BaselineLearning.from_state(part_of(state, "learning", Mapping))
         baseline, leak = (part_of(state, name, (Mapping, type(None))) for name in ("baseline", "leak"))
         watch.baseline = None if baseline is None else plain_dataclass(WatchBaseline, baseline, "baseline")
         watch.leak = None if leak is None else plain_dataclass(WatchedLeak, leak, "leak")
-        watch._means = array_of(part_of(state, "means", Mapping), "means")
-        watch._group = array_of(part_of(state, "group", Mapping), "group")
+        watch._detector = StepDetector.from_state(part_of(state, "detector", Mapping))
+        last, group = (array_of(part_of(state, name, Mapping), name) for name in ("last", "group"))
+        if last.shape[1:] != (_COLUMNS,) or group.shape[1:] != (4,):
+            raise InputError(f"saved state's last blocks must have {_COLUMNS} columns, got {last.shape}, {group.shape}")
+        watch._last = deque((tuple(row) for row in last.tolist()), maxlen=RECENT)
+        watch._group = [tuple(row) for row in group.tolist()]
         return watch
 
 
 _NUMBERS = ("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "seconds")
 
 
-def _share_shown(cause: str) -> tuple[float, float, float]:
-    """Return what leaks over what the conductance shows of it: least, usual and most."""
-    return SHOWN.get(cause, (1.0, 1.0, 1.0))
+@lru_cache(maxsize=256)
+def _rig_of(text: str) -> Rig:
+    """Return the rig of a saved state; raises InputError where it is none."""
+    from sealscope.parameters import Rig
+
+    try:
+        return Rig.model_validate(json.loads(text))
+    except ValueError as error:
+        raise InputError(f"saved state's rig does not fit: {str(error).splitlines()[0][:200]}") from None
 
 
 @checked_call

@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.errors import InputError
-from sealscope.recordings.recording import Array
 
 #: Most numbers of one array: what is larger is no state of a stream.
 _LARGEST = 50_000_000
 
 
-def plain_array(values: Array) -> dict[str, Any]:
+def plain_array(values: NDArray[Any]) -> dict[str, Any]:
     """Return an array of numbers as a mapping of its shape and its bytes (little endian, base64)."""
     values = np.ascontiguousarray(values, dtype="<f8")
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
@@ -26,7 +26,7 @@ def plain_fields(values: Any) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, list) else value for name, value in vars(values).items()}
 
 
-def array_of(value: Any, name: str) -> Array:
+def array_of(value: Any, name: str) -> NDArray[np.float64]:
     """Return the array that `plain_array` made a mapping of; `name` stands in the error.
 
     Raises InputError where it is none.

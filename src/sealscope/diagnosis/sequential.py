@@ -1,0 +1,245 @@
+"""Did a coefficient step while it was watched? An e-detector over all onsets, beside a random walk of any size.
+
+Each block gives an estimate g_k of the coefficient with a variance V_k. In a healthy machine g has a level that walks:
+the innovations e_k of its Kalman filter, of variance kappa S_k with kappa unknown, are Student t given those before. A
+step of size delta at block j adds f_k delta to e_k, f the filter's answer to a step, of which block j may have a part
+only (`PARTS`). With a = sum f e / S, b = sum f^2 / S, T = sum e^2 / S and n innovations the ratio of the likelihoods,
+delta ~ N(0, v kappa) and kappa integrated, is
+
+    R_j = (1 + v b)^(-1/2) (1 - a^2 / ((b + 1/v) T))^(-n/2),
+
+counted where a > 0 only, which makes it smaller. The walk's size q is one of `WALKS`; what was known of it before j is
+its prior pi_j, in which each keeps a share, for the walk may change. Both sides average over it,
+
+    M_k = sum_j  sum_q pi_j(q) p_q(e_j..e_k) mean_v R_j  /  sum_q pi_j(q) p_q(e_j..e_k),
+
+an e-detector, whatever level and noise are: E[M at a stopping time] <= E[blocks until then]. An alarm where M > 1/alpha
+comes once in 1/alpha blocks of a healthy machine, at most. Fewer onsets only make M smaller: they are thinned with
+their age, so that memory is bounded.
+
+Sources: J. Shin, A. Ramdas, A. Rinaldo, arXiv 2203.03532 (e-detectors); A. S. Willsky and H. L. Jones, IEEE
+Trans. Automat. Contr. 21 (1976) 108 (step in a filter).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+from sealscope.storage.plain_state import array_of, part_of, plain_array
+
+#: Variances of the walk in a block that are tried, over that of a block's estimate.
+WALKS = np.array([0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0])[:, None]
+#: Variances of the step, over that of a block's estimate.
+SIZES = 10.0 ** np.arange(0.0, 9.0, 2.0)
+#: Onsets are all kept for `RECENT` blocks, then `RECENT / 4` of every doubling of age, up to `HORIZON` blocks.
+RECENT, HORIZON = 32, 4096
+#: Parts of the block that an onset lies in which leak.
+PARTS = np.array([0.25, 0.5, 0.75, 1.0])
+#: Deviations beyond which an innovation says nothing more of noise and walk: it may be a step.
+JUMP = 4.0
+#: What a block's noise, and the weights of the walks, are remembered by for each block that follows.
+MEMORY = 0.998
+#: Share of the prior of a walk that all sizes have in equal parts: it may change.
+ANY_WALK = 1e-3
+#: Blocks that the stated variance counts as in `StepDetector.noise`.
+STATED = 20.0
+#: Innovations from which the noise is known at all.
+_FEWEST = 4
+#: What is kept of each onset and walk, and of each onset.
+_FIELDS = ("answer", "along", "square", "total", "lead")
+_PLACES = ("number", "born", "onset", "begin")
+_ARRAYS = ("level", "spread", "total", "weight", "widths", "onsets", "places")
+_NUMBERS = ("unit", "known", "blocks", "last")
+
+
+class Rise(NamedTuple):
+    """A step that the blocks show: `log_e` = log M; `onset` (value, low, high) [s]; `size` and its `deviation`."""
+
+    log_e: float
+    onset: tuple[float, float, float]
+    size: float
+    deviation: float
+
+
+class StepDetector:
+    """An e-detector for a rise of one coefficient, block by block, in bounded memory."""
+
+    def __init__(self) -> None:
+        self._unit, self._known, self._blocks = 0.0, 0.0, 0
+        self._level, self._spread, self._total, self._widths = (np.zeros(WALKS.shape) for _ in range(4))
+        self._weight = np.full(WALKS.shape, -np.log(len(WALKS)))
+        self.forget()
+
+    def forget(self) -> None:
+        """Compare with nothing before now; what is known of noise and walk stays."""
+        self._last = -np.inf
+        self._onsets = np.zeros((len(_FIELDS), len(WALKS), 0))
+        self._places = np.zeros((0, len(_PLACES)))
+
+    def take(self, begin: float, end: float, g: float, deviation: float) -> None:
+        """Take a block from `begin` to `end` [s]: its estimate and the deviation of this."""
+        self._unit = self._unit or deviation
+        g, variance = g / self._unit, (deviation / self._unit) ** 2
+        self._blocks += 1
+        elapsed, self._last = (begin - self._last) / (end - begin) + 1.0, end
+        if not np.isfinite(elapsed):
+            self._level[:], self._spread[:] = g, variance
+            return
+        spread = self._spread + WALKS * max(elapsed, 1.0)
+        sigma, error = spread + variance, g - self._level
+        own, gain = error**2 / sigma, spread / sigma
+        begins = self._known >= _FEWEST
+        if begins:
+            self._begin_onset(begin, end)
+        if len(self._places):
+            self._follow(error, sigma, gain, begins)
+        self._learn(sigma, own)
+        self._level = self._level + gain * error
+        self._spread = gain * variance
+
+    def _learn(self, sigma: Array, own: Array) -> None:
+        """Learn noise and walk from an innovation of square `own` over `sigma`."""
+        if self._known >= _FEWEST:
+            own = np.minimum(own, JUMP**2 * self._total / self._known)
+            weight = MEMORY * self._weight - 0.5 * np.log(sigma * self._total)
+            weight -= 0.5 * (self._known + 1.0) * np.log1p(own / self._total)
+            self._weight = weight - np.logaddexp.reduce(weight, axis=0)
+        self._total = MEMORY * self._total + own
+        self._known = MEMORY * self._known + 1.0
+        self._widths = self._widths + np.log(sigma)
+
+    def _begin_onset(self, begin: float, end: float) -> None:
+        fresh = np.zeros((len(_FIELDS), len(WALKS), len(PARTS)))
+        weight = np.logaddexp(np.log1p(-ANY_WALK) + self._weight, np.log(ANY_WALK / len(WALKS)))
+        # p_q(e_j..e_k) = lead T_k^(-n/2) prod S^(-1/2) times what is the same for all q
+        fresh[3], fresh[4] = self._total, weight + 0.5 * (self._known * np.log(self._total) + self._widths)
+        places = np.array([[self._known, self._blocks, end - part * (end - begin), begin] for part in PARTS])
+        self._onsets = np.concatenate([self._onsets, fresh], axis=2)
+        self._places = np.concatenate([self._places, places])
+        if self._blocks % 8 == 0:
+            kept = _kept(self._blocks, self._places)
+            self._onsets, self._places = self._onsets[:, :, kept], self._places[kept]
+
+    def _follow(self, error: Array, sigma: Array, gain: Array, begins: bool) -> None:
+        answer, along, square, total, _ = self._onsets
+        part = 1.0 - answer
+        if begins:
+            part[:, -len(PARTS) :] = PARTS
+        scaled = part / sigma
+        along += scaled * error
+        square += scaled * part
+        total += error**2 / sigma
+        answer += gain * part
+        self._places[:, 0] += 1.0
+
+    def log_e(self, least: float = -np.inf) -> float:
+        """Return log M; minus infinity where it is surely not over `least`."""
+        if not len(self._places):
+            return -np.inf
+        _, along, square, total, _ = self._onsets
+        rising = np.maximum(along, 0.0) ** 2 / (square * total)
+        most = float(np.max(-0.5 * self._places[:, 0] * np.log1p(-np.minimum(rising, 1.0 - 1e-15))))
+        if most + np.log(len(self._places) / len(PARTS)) <= least:
+            return -np.inf
+        return float(np.logaddexp.reduce(self._terms().ravel()))
+
+    def _terms(self) -> Array:
+        """Return log of each part of M, by size, walk and onset, shape (v, q, j)."""
+        _, along, square, total, lead = self._onsets
+        number, widest = self._places[:, 0], SIZES[:, None, None]
+        rising = np.maximum(along, 0.0) ** 2 / ((square + 1.0 / widest) * total)
+        ratio = -0.5 * (np.log1p(widest * square) + number * np.log1p(-rising))
+        healthy = lead - 0.5 * (number * np.log(total) + self._widths)
+        prior = np.logaddexp.reduce(healthy, axis=0) + np.log(len(SIZES) * len(PARTS))
+        return np.asarray(np.where(along > 0.0, ratio, -np.inf) + healthy - prior)
+
+    def rise(self) -> Rise:
+        """Return the step that the blocks show: its onset and size, averaged over all that may be."""
+        terms = self._terms()
+        log_e = float(np.logaddexp.reduce(terms.ravel()))
+        weights = np.exp(terms - log_e)
+        mean, variance = self._sizes()
+        value = float((weights * mean).sum())
+        deviation = float(np.sqrt((weights * (variance + (mean - value) ** 2)).sum()))
+        scale = self._unit
+        return Rise(log_e, self._onset(weights.sum(axis=(0, 1))), scale * value, scale * deviation)
+
+    def _sizes(self) -> tuple[Array, Array]:
+        """Return mean and variance of the step's size, by size, walk and onset."""
+        _, along, square, total, _ = self._onsets
+        precision = square + 1.0 / SIZES[:, None, None]
+        mean = along / precision
+        freedom = np.maximum(self._places[:, 0] - 2.0, 1.0)
+        return mean, np.maximum(total - along * mean, 0.0) / freedom / precision
+
+    def _onset(self, weights: Array) -> tuple[float, float, float]:
+        """Return the mean onset with its 95 % interval, from the probability of each."""
+        onset, begin = self._places[:, 2:].T
+        order = np.argsort(onset, kind="stable")
+        low, high = np.searchsorted(np.cumsum(weights[order]), [0.025, 0.975])
+        last = order[min(high, len(order) - 1)]
+        apart = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
+        return float(weights @ onset), float(onset[order[low]]) - apart, float(onset[last]) + apart
+
+    def bound(self, probability: float = 0.95) -> float:
+        """Return the rise that is exceeded with probability 1 - `probability`, given that there is one."""
+        from scipy.special import ndtr
+
+        if not len(self._places):
+            return np.inf
+        _, along, square, total, lead = self._onsets
+        number = self._places[:, 0]
+        healthy = lead - 0.5 * (number * np.log(total) + self._widths)
+        size = along / square
+        deviation = np.sqrt(np.maximum(total - along * size, np.finfo(float).tiny) / number / square)
+        above = np.exp(healthy - np.logaddexp.reduce(healthy, axis=0)) * np.maximum(ndtr(size / deviation), 1e-300)
+        low, high = 0.0, float(np.max(size + 8.0 * deviation))
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            beyond = float(
+                (above * ndtr((size - middle) / deviation) / np.maximum(ndtr(size / deviation), 1e-300)).sum()
+            )
+            low, high = (middle, high) if beyond > (1.0 - probability) * above.sum() else (low, middle)
+        return self._unit * high
+
+    @property
+    def noise(self) -> float:
+        """Variance of a block's estimate over what was stated of it, beside a walk of a tenth."""
+        return float((self._total[3, 0] + STATED) / (self._known + STATED))
+
+    def state(self) -> dict[str, Any]:
+        """Return all of it as plain values."""
+        numbers = {name: float(getattr(self, f"_{name}")) for name in _NUMBERS}
+        last = {"last": None} if np.isinf(self._last) else {}
+        return {**{name: plain_array(getattr(self, f"_{name}")) for name in _ARRAYS}, **numbers, **last}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> StepDetector:
+        """Return the detector that `state` was of; raises InputError where it does not fit."""
+        detector = cls()
+        for name in _ARRAYS:
+            values = array_of(part_of(state, name, Mapping), name)
+            shape = getattr(detector, f"_{name}").shape
+            if values.ndim != len(shape) or any(a != b for a, b in zip(values.shape, shape, strict=True) if b):
+                raise InputError(f"saved state's {name} must have the shape {shape}, got {values.shape}")
+            setattr(detector, f"_{name}", values)
+        if detector._onsets.shape[2] != len(detector._places):
+            raise InputError(f"saved state's onsets must be {len(detector._places)}, got {detector._onsets.shape[2]}")
+        for name in _NUMBERS:
+            value = part_of(state, name, (float, int, type(None)))
+            setattr(detector, f"_{name}", -np.inf if value is None else value)
+        return detector
+
+
+def _kept(now: int, places: Array) -> NDArray[np.bool_]:
+    """Return which onsets are kept of those that are old: of fewer and fewer blocks, and at their beginning only."""
+    _, born, onset, begin = places.T
+    age = now - born
+    step = 2.0 ** np.ceil(np.log2(np.maximum(age / RECENT, 1.0))) * 2.0
+    return np.asarray((age < RECENT) | ((born % step == 0) & (age < HORIZON) & (onset <= begin)))
