@@ -23,7 +23,7 @@ from sealscope.campaigns.prediction.responses import instrument_noise, noise_res
 from sealscope.cli import prediction
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.diagnosis.pressure_model.detector import PressureModel
-from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.faults import From, Leak

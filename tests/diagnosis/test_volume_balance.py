@@ -8,9 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.volume_balance.detector import VolumeBalance
-from sealscope.diagnosis.volume_balance.evidence import level
-from sealscope.diagnosis.volume_balance.fit import discriminate
+from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import COUNTS, Recording
 from sealscope.simulation.bench.machines import draw
@@ -46,33 +44,6 @@ def with_channels(recording: Recording, **channels: np.ndarray) -> Recording:
 def flow_of(recording: Recording, G: float, start: float = 60.0) -> float:
     after = recording.t >= start
     return G * float(np.mean(np.abs(recording["p_A"] - recording["p_B"])[after])) * LPM
-
-
-def fitted(detector: VolumeBalance, recording: Recording):  # type: ignore[no-untyped-def]
-    fit, problem = detector.fit(recording)
-    assert fit is not None, problem
-    return fit
-
-
-@pytest.mark.parametrize("ratio", [1.0, 0.93, 1.08])
-def test_fit_gives_back_what_was_put_in(detector: VolumeBalance, ratio: float) -> None:
-    """Without noise: the conductance, the ratio of displacement and area, and nothing left over."""
-    exact = machine(ratio=ratio, G=2.0e-13, p_noise=0.0, bias=0.0, x_step=0.0, rate=1000.0)
-    fit = fitted(detector, exact)
-    assert fit.scale == pytest.approx(ratio, rel=1e-4)
-    assert fit.g == pytest.approx(4.4e-13, rel=0.01)
-    assert fit.residual < 1e-9
-    assert fit.sense == 1
-
-
-def test_deviations_are_those_of_repeated_records(detector: VolumeBalance) -> None:
-    """The scatter of a block's conductance over records, and of their mean, is what each record states of itself."""
-    fits = [fitted(detector, machine(seed, G=1.0e-13)) for seed in range(25)]
-    within = np.mean([np.std(np.diff(one.g)) / np.sqrt(2) for one in fits])
-    assert within == pytest.approx(np.mean([one.sd.mean() for one in fits]), rel=0.15)
-    levels = [level(one) for one in fits]
-    assert np.std([one.value for one in levels]) < 1.5 * np.mean([one.error for one in levels])
-    assert np.mean([one.value for one in levels]) == pytest.approx(3.4e-13, rel=0.04)
 
 
 def test_finds_a_leak_its_onset_and_its_size(detector: VolumeBalance, worn: Recording) -> None:
@@ -224,28 +195,6 @@ def test_under_a_load_a_leak_is_a_steady_flow(
     assert detector.examine(sound, [], P).verdict == "no leak"
 
 
-@pytest.mark.parametrize("seed", [102, 104, 105])
-def test_a_weight_that_is_held_shows_what_pump_and_piston_pass(seed: int) -> None:
-    """Held, the pressure difference is one constant, and a steady flow beside it took any share of what leaks.
-
-    What zeros of the transducers make of the leakage bounds that flow; levels were -13 to 9 times the truth.
-    """
-    drawn = draw("load", seed, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
-    balance = VolumeBalance(load_rig("thesis-closed-loop"))
-    sound = simulate_with_truth(drawn.experiment(seed=seed))
-    shown = {name: sound.truth.outputs[name] for name in ("omega", "p_1", "p_2", "Q_1")}
-    dp = shown["p_1"] - shown["p_2"]
-    leaked = drawn.experiment().rig.pump.q_b / (2.0 * np.pi) * shown["omega"] - shown["Q_1"]
-    fit = fitted(balance, sound.recording)
-    assert level(fit).value == pytest.approx(float(leaked @ dp / (dp @ dp)), rel=0.04)
-    assert balance.examine(sound.recording, [], P).verdict == "no leak"
-    leaks = simulate_with_truth(drawn.experiment(seed=seed, leak="0.0042 L/min from 60 s"))
-    found = balance.examine(leaks.recording, [], P)
-    assert (found.verdict, found.cause) == ("leak", "piston or pump leak")
-    assert found.leak_interval_lpm is not None
-    assert found.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= found.leak_interval_lpm[1]
-
-
 def test_under_a_weight_that_is_held_a_leak_inside_is_none_to_the_outside() -> None:
     """What swings alone showed a steady flow of 0.02 L/min to the outside beside it: `no leak` for 14 of 96 leaks."""
     drawn = draw("load", 100, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
@@ -270,27 +219,6 @@ def test_throttles_tell_the_pump_from_the_piston(detector: VolumeBalance) -> Non
     assert pump.score is not None and pump.threshold is not None and pump.score > pump.threshold
     blind = detector.examine(machine(5, G=step(0.0, 1.0e-12)).only(["x", "theta", "p_A", "p_B"]), [], P)
     assert (blind.verdict, blind.cause) == ("leak", "piston or pump leak")
-
-
-def test_throttles_give_both_conductances(detector: VolumeBalance) -> None:
-    fit = fitted(detector, machine(5, drop=2.0, G=2.0e-13))
-    piston = level(fit)
-    assert fit.pump is not None
-    assert fit.pump == pytest.approx(2.4e-13, abs=3 * fit.pump_sd + 0.1e-13)
-    assert piston.value == pytest.approx(2.0e-13, rel=0.15)
-    assert abs(piston.value - 2.0e-13) <= 1.96 * piston.error
-    assert "the pump 0.00" in detector.examine(machine(5, drop=2.0, G=2.0e-13), [], P).reason
-    assert fitted(detector, machine(5)).pump is None
-
-
-def test_law_of_the_leak_where_the_pressure_tells(detector: VolumeBalance) -> None:
-    def load(t: np.ndarray) -> np.ndarray:
-        return 4.0e5 * np.sin(0.9 * t)
-
-    laminar = fitted(detector, machine(6, G=step(0.0, 1.5e-12), load=load))
-    orifice = fitted(detector, machine(6, C=step(0.0, 8.0e-10), load=load))
-    assert discriminate(laminar, 60.0, 0.0, within=60.0)["orifice"] < -10.0
-    assert discriminate(orifice, 60.0, 0.0, within=60.0)["orifice"] > 10.0
 
 
 def test_an_encoder_that_slips_is_no_leak(detector: VolumeBalance) -> None:

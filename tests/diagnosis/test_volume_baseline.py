@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.volume_balance.detector import VolumeBalance
+from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 

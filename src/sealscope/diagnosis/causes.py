@@ -8,11 +8,12 @@ terms, all equally likely beforehand; hypotheses that the channels cannot tell a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Blocks, Columns, information
+from sealscope.diagnosis.blocks import Blocks, Columns, information, solve, total
 from sealscope.diagnosis.onset import StepTest, step_test
 from sealscope.diagnosis.terms import ORIFICE, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
@@ -34,18 +35,34 @@ class Hypothesis(NamedTuple):
 def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns]) -> tuple[Hypothesis, ...]:
     """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak."""
     coarse = blocks.merged(COARSE)
-    terms = [(term.name, term.cause) for term in balances[0].terms]
-    terms.append((SCALE, "sensor fault"))
     tested = []
-    for index, (name, cause) in enumerate(terms):
-        replaced = columns[0].leak if name == ORIFICE else None
-        own = information(coarse, columns, index, replaced)
+    for index, term in enumerate(balances[0].terms):
+        replaced = columns[0].leak if term.name == ORIFICE else None
+        tested.append((term.name, term.cause, information(coarse, columns, index, replaced)))
+    orifice = columns[0].names.index(ORIFICE)
+    tested.append((SCALE, "sensor fault", information(_with_scale(coarse, columns, orifice), columns, orifice)))
+    stepped = []
+    for name, cause, own in tested:
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
         tests = [step_test(own._replace(vector=sign * own.vector)) for sign in signs]
         best = max((test for test in tests if test is not None), key=lambda test: test.score, default=None)
         if best is not None:
-            tested.append(Hypothesis(name, cause, best))
-    return tuple(sorted(tested, key=lambda own: -own.test.score))
+            stepped.append(Hypothesis(name, cause, best))
+    return tuple(sorted(stepped, key=lambda own: -own.test.score))
+
+
+def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Blocks:
+    """Return the blocks with the fitted motion in place of one column: a step of its coefficient is one of its scale."""
+    gram = blocks.gram.copy()
+    for e, (column, sums) in enumerate(zip(columns, total(blocks, columns), strict=True)):
+        chosen, motion = list(column.nuisance), list(column.motion)
+        coefficients = np.zeros(len(sums))
+        coefficients[chosen] = solve(sums[np.ix_(chosen, chosen)], sums[chosen, column.left])
+        turn = np.eye(len(sums))
+        turn[:, index] = 0.0
+        turn[motion, index] = coefficients[motion]
+        gram[:, e] = turn.T @ gram[:, e] @ turn
+    return replace(blocks, gram=gram)
 
 
 def probabilities(tested: Sequence[Hypothesis]) -> dict[Cause, float]:

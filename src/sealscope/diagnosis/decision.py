@@ -272,7 +272,7 @@ def _is_leak(causes: dict[Cause, float]) -> bool:
     leak = sum(causes.get(cause, 0.0) for cause in LEAKS)
     pump = causes.get("pump leak", 0.0)
     others = max((share for cause, share in causes.items() if cause not in (*LEAKS, "pump leak")), default=0.0)
-    return leak + pump > others and leak > RAREST * pump
+    return max(leak, pump) > others and leak > RAREST * pump
 
 
 def _together(balance: Balance) -> Cause:

@@ -27,10 +27,10 @@ from sealscope.diagnosis.verdict.evidence import (
     Passage,
     without_flow,
 )
-from sealscope.diagnosis.volume_balance.over_cycles.holds import hold_flows
-from sealscope.diagnosis.volume_balance.over_cycles.series import BLOCK, CycleFlows, cycle_flows
-from sealscope.diagnosis.volume_balance.over_cycles.shaft import shaft_shown
-from sealscope.diagnosis.volume_balance.over_cycles.stretches import stretch_flows
+from sealscope.diagnosis.cycle_balance.holds import hold_flows
+from sealscope.diagnosis.cycle_balance.series import BLOCK, CycleFlows, cycle_flows
+from sealscope.diagnosis.cycle_balance.shaft import shaft_shown
+from sealscope.diagnosis.cycle_balance.stretches import stretch_flows
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Recording

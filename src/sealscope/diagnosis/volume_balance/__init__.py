@@ -1,1 +1,0 @@
-"""The volume balance: pump flow that the piston does not displace has leaked."""
