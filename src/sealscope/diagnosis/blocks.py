@@ -153,10 +153,14 @@ class Columns:
         )
 
     def zero(self, test: int, blocks: Blocks) -> float:
-        """Return the standard deviation of the zero of a column's pressure, by its slope; 0 where none drives it."""
+        """Return the standard deviation of the zero of a column's pressure, by its slope; 0 where none drives it.
+
+        No more than the pressure itself, which may be in counts.
+        """
         driven = self.driven[test] if test < self.left and self.bias is not None else ""
-        slope = {"": 0.0, "pressure": 1.0, "root": 0.5 / float(np.mean(blocks.driving(root=True)))}[driven]
-        return priors()["zero"]["pressure"].value * slope
+        root = float(np.mean(blocks.driving(root=True)))
+        slope = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}[driven]
+        return min(priors()["zero"]["pressure"].value, float(np.mean(blocks.driving()))) * slope
 
 
 class Weighting:
