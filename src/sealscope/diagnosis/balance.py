@@ -9,7 +9,7 @@ import numpy as np
 
 from sealscope.diagnosis.blocks import PRESSURE_PARTS, SMOOTHED, SUPPORT, Blocks, Columns, Weighting
 from sealscope.diagnosis.onset import FEWEST
-from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE, Equation, Signals, equations
+from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE, START, Equation, Signals, equations
 from sealscope.diagnosis.weak_form import SPAN, STRIDE, rows, stride_samples
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
@@ -54,6 +54,7 @@ class BlockStream:
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._weighting, self._support = Weighting(self.columns), support
         self._zeros: dict[str, float] | None = None
+        self._signs: tuple[float, ...] = ()
         self.restart(start)
 
     def restart(self, begin: float) -> None:
@@ -63,6 +64,8 @@ class BlockStream:
         self._first = 0  # index, since `begin`, of the first sample that is kept
         self._have = 0  # ... and one past the last
         self._done = 0  # blocks since then that are closed
+        self._pushed = 0
+        self._loop: tuple[float, float] | None = None  # state of the drive's speed loop
 
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
         """Take the next samples, each channel of the same length; return the blocks they complete, None for none.
@@ -70,7 +73,7 @@ class BlockStream:
         A missing sample is NaN. `last`: nothing follows, so that what remains is closed as well.
         """
         if samples:
-            self._pieces.append(samples)
+            self._pieces.append(self._with_drive(samples))
             self._have += len(next(iter(samples.values())))
         length = self._strides * self._stride
         beyond = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
@@ -105,6 +108,9 @@ class BlockStream:
             "first": self._first,
             "done": self._done,
             "zeros": self._zeros,
+            "signs": list(self._signs),
+            "pushed": self._pushed,
+            "loop": None if self._loop is None else list(self._loop),
             "weighting": self._weighting.state(),
         }
 
@@ -117,7 +123,34 @@ class BlockStream:
         self._have = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
         zeros = part_of(state, "zeros", (Mapping, type(None)))
         self._zeros = None if zeros is None else {name: float(value) for name, value in zeros.items()}
+        self._signs = tuple(float(sign) for sign in part_of(state, "signs", Sequence))
+        self._pushed, loop = int(part_of(state, "pushed", int)), part_of(state, "loop", (Sequence, type(None)))
+        self._loop = None if loop is None else (float(loop[0]), float(loop[1]))
         self._weighting.recall(part_of(state, "weighting", Mapping))
+
+    def _with_drive(self, samples: Mapping[str, Array]) -> Mapping[str, Array]:
+        """Return the samples, with a speed made of the command where none is recorded."""
+        drive = self._balances[0].drive
+        if drive is None or not len(samples["u"]):
+            return samples
+        speed, self._loop = drive.speed(samples["u"], self._rate, self._loop)
+        index = self._pushed + np.arange(len(speed))
+        self._pushed += len(speed)
+        return {**samples, "omega": speed, START: np.exp(-drive.pace * index / self._rate)}
+
+    def _oriented(self, signals: Signals) -> tuple[float, ...]:
+        """Return the sign of each left side: friction takes work, so that p_A - p_B goes with the flow into A.
+
+        An encoder, or the sides, may be connected the other way round.
+        """
+        pressure = signals.pressure_difference
+        signs = []
+        for balance in self._balances:
+            left = balance.left(signals)
+            known = ~np.isnan(pressure + left)
+            work = float(np.sum((pressure[known] - pressure[known].mean()) * left[known])) if known.any() else 0.0
+            signs.append(-1.0 if work * balance.takes < 0.0 else 1.0)
+        return tuple(signs)
 
     def _close(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Return blocks `first` to `end`."""
@@ -130,14 +163,15 @@ class BlockStream:
         if self._zeros is None:
             early = slice(0, (self._support or end) * length)
             self._zeros = {name: _zero(cut[name][early]) for name in ("p_A", "p_B") if name in cut}
+            self._signs = self._oriented(Signals({name: cut[name][early] for name in cut}, self._rate, self._zeros))
         begins = self._begin + start / self._rate
         signals = Signals(cut, self._rate, self._zeros)
         inner = slice(start - begin, stop - 1 - begin)
         values: list[list[Array]] = []
         whole = np.ones((end - first) * self._strides, dtype=bool)
         cut_rows = []
-        for balance in self._balances:
-            columns = [*(term.increments(signals) for term in balance.terms), balance.left(signals)]
+        for balance, sign in zip(self._balances, self._signs, strict=True):
+            columns = [*(term.increments(signals) for term in balance.terms), sign * balance.left(signals)]
             cut_rows.append(rows([column[inner] for column in columns], self._rate, begins))
             whole &= cut_rows[-1].whole
         cuts = np.arange(self._strides, len(whole), self._strides)
@@ -203,7 +237,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
     if not balances:
         return None
     needed = {"x", "p_A", "p_B", *(name for balance in balances for term in balance.terms for name in term.needs)}
-    needed |= {next(name for name in ("theta", "omega", "u") if name in names)}
+    needed |= {next(name for name in ("theta", "omega", "q_pump", "u") if name in names)}
     samples = {name: recording[name] for name in names if name in needed}
     if recording.bridged is not None:
         samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
@@ -214,4 +248,4 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
     return None if blocks is None else (blocks.merged(), stream.columns)
 
 
-_READ = ("u", "omega", "theta", "x", "p_1", "p_2", "p_A", "p_B")
+_READ = ("u", "omega", "theta", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")

@@ -9,8 +9,8 @@ are a level with a slow drift, c_j(t) = sum_p c_jp P_p(t), whose size is believe
 
     Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2,
 
-with the sums N_k of d^2 and n_k of d y, B_k of d o, M of o o' (plus the beliefs) and m of o y over the rows of block k
-(d the column of g, o the others with their drifts, y the left side); the likelihood of g is exp(eta' g - g' Lambda g/2).
+with the sums N_k of d^2 and n_k of d y, B_k of d o, M of o o' (plus the beliefs) and m of o y over the rows of block
+k (d the column of g, o the others with their drifts, y the left side); its likelihood is exp(eta' g - g' Lambda g/2).
 
 Source: P. J. Huber, Ann. Math. Statist. 35 (1964) 73 (weights).
 """
@@ -57,7 +57,8 @@ class Blocks:
     start, end : array of float, shape (K,)
         Times of the first and the last row of each block [s].
     gram : array of float, shape (K, E, m, m)
-        Sums of the products, over the rows' variances, of the m columns over the rows of each of E equations, the left side last.
+        Sums of the products, over the rows' variances, of the m columns over the rows of each of E equations, the left
+        side last.
     rows : array of float, shape (K,)
         Number of rows that no missing sample touches.
     means : array of float, shape (K, 3)
@@ -99,8 +100,9 @@ class Blocks:
         )
 
     def driving(self, zero: float = 0.0, root: bool = False) -> Array:
-        """Return the mean of abs(p_A - p_B - zero) [Pa], or of its root, over each block, shape (K,): what a leak's
-        coefficient is multiplied by to give its mean flow.
+        """Return the mean of abs(p_A - p_B - zero) [Pa], or of its root, over each block, shape (K,).
+
+        A leak's coefficient times it is the leak's mean flow.
         """
         size = np.abs(self.pressures - zero)
         return np.asarray((np.sqrt(size) if root else size).mean(axis=1))
@@ -137,7 +139,7 @@ class Columns:
         differs = priors()["between"]
         self.between = np.array([differs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
-        self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in ("leak", "bias"))
+        self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in ("leak", "pump", "bias"))
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.driven = tuple(term.driven for term in equation.terms)
         self.healthy = priors()["healthy"][equation.healthy].value if equation.healthy else float("inf")
@@ -151,12 +153,14 @@ class Columns:
         )
 
     def zero(self, test: int, blocks: Blocks) -> float:
-        """Return the standard deviation of the zero of the pressures behind a flow, through a column's slope at it;
-        0 for a column that no pressure drives.
+        """Return the standard deviation of the zero of a column's pressure, by its slope; 0 where none drives it.
+
+        No more than the pressure itself, which may be in counts.
         """
         driven = self.driven[test] if test < self.left and self.bias is not None else ""
-        slope = {"": 0.0, "pressure": 1.0, "root": 0.5 / float(np.mean(blocks.driving(root=True)))}[driven]
-        return priors()["zero"]["pressure"].value * slope
+        root = float(np.mean(blocks.driving(root=True)))
+        slope = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}[driven]
+        return min(priors()["zero"]["pressure"].value, float(np.mean(blocks.driving()))) * slope
 
 
 class Weighting:
@@ -214,8 +218,9 @@ def _supported(gram: Array, columns: Columns) -> Array:
 
 
 def _weights(blocks: Sequence[Array], columns: Columns, known: Array | None) -> Array:
-    """Return Huber's weight of each row, from a fit to the rows and what is known, in which leak and zero of the flow
-    are free in each block: their change is no outlier.
+    """Return Huber's weight of each row, from a fit to the rows and what is known.
+
+    Leak and zero of the flow are free in each block: their change is no outlier.
     """
     values = np.concatenate(blocks)
     ends = np.cumsum([len(block) for block in blocks])
@@ -324,8 +329,9 @@ def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int)
 
 
 class _Belief(NamedTuple):
-    """What is believed of the other coefficients: `drift` (c,), standard deviations of each of its drifts; `zero`, that
-    of the last one, and `at`, what that one is counted from.
+    """What is believed of the other coefficients.
+
+    `drift` (c,), standard deviations of each one's drifts; `zero`, that of the last one; `at`: what it is counted from.
     """
 
     drift: Array
@@ -334,8 +340,9 @@ class _Belief(NamedTuple):
 
 
 class _Fitted(NamedTuple):
-    """The other coefficients with their drifts, what is believed of them, a precision and its product with the mean,
-    (c,) each, and the variance of a row, inflated for the overlap of the rows.
+    """The other coefficients with their drifts, and what is believed of them, (c,) each.
+
+    `precision` and `lead`, its product with the mean; `variance` of a row, inflated for the overlap of the rows.
     """
 
     coefficients: Array
@@ -367,8 +374,9 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
 
 
 class _Fit(NamedTuple):
-    """Sums (K, m, m) with the scale of motion of each block set aside; the other coefficients, that of the zero's error
-    last; the zero of the pressures [Pa].
+    """Sums (K, m, m) with the scale of motion of each block set aside, and the fit to them.
+
+    The coefficient of the zero's error is the last one; `zero` of the pressures [Pa].
     """
 
     gram: Array
@@ -381,15 +389,40 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     """Return the fit of one equation, the tested column's coefficient free in each block.
 
     A leak g (p_A - p_B - z) has a zero z of the pressures' difference, one number: beside a change of g there is one of
-    the bias, by -g z. It is found by Gauss's and Newton's steps.
+    the bias, by -g z. It is believed to be small, or with some odds far off (`terms.toml`), and found by Gauss's and
+    Newton's steps: from 0, or, far off, from the mean of p_A - p_B.
     """
+    width, beliefs = columns.zero(test, blocks), priors()["zero"]
+    near = _fit_from(gram, blocks, columns, test, others, 0.0, width)
+    if not width > 0.0:
+        return near
+    mean = float(
+        gram[:, columns.bias, test].sum() / max(gram[:, columns.bias, columns.bias].sum(), np.finfo(float).tiny)
+    )
+    ratio = beliefs["far"].value / beliefs["pressure"].value
+    if abs(mean) < width:
+        return near
+    far = _fit_from(gram, blocks, columns, test, others, mean, width * ratio)
+    unlikely = 2.0 * float(np.log(ratio / beliefs["odds"].value))
+    costs = [
+        len(blocks) * np.log(own.fitted.variance)  # what the model leaves is alike within a block
+        + (own.zero / of) ** 2
+        + cost
+        for own, of, cost in ((near, width, 0.0), (far, width * ratio, unlikely))
+    ]
+    return far if costs[1] < costs[0] else near
+
+
+def _fit_from(
+    gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int], zero: float, width: float
+) -> _Fit:
+    """Return the fit of one equation by Gauss's and Newton's steps from a zero of the pressures."""
     powers, minutes = _drifts(blocks)
     rows, degrees = max(float(blocks.rows.sum()), 1.0), powers.shape[1]
     total = gram.sum(axis=0)
     level = solve(total[np.ix_(others, others)], total[others, columns.left])
-    width = columns.zero(test, blocks)
     believed = _Belief(np.append(np.abs(level) * columns.drift[others] * minutes, 0.0), width)
-    chosen, of_block, slope, zero = [*others, gram.shape[1]], np.zeros((len(blocks), gram.shape[1])), 0.0, 0.0
+    chosen, of_block, slope = [*others, gram.shape[1]], np.zeros((len(blocks), gram.shape[1])), np.zeros(len(blocks))
     for turn in range(_TURNS + 1):
         about = _about(gram, columns, test, slope, zero)
         normal = _normal(about, powers, chosen, test, columns.left)
@@ -409,9 +442,10 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     return _Fit(gram, normal, fitted, zero)
 
 
-def _about(gram: Array, columns: Columns, test: int, slope: Array | float, zero: float) -> Array:
-    """Return the sums with the tested column taken about a zero of the pressures, and last that of the zero's error:
-    -slope dt, of each block.
+def _about(gram: Array, columns: Columns, test: int, slope: Array, zero: float) -> Array:
+    """Return the sums with the tested column taken about a zero of the pressures.
+
+    Last the column of the zero's error: -slope dt, of each block.
     """
     size = gram.shape[1]
     turned = np.zeros((len(gram), size, size + 1))
@@ -433,9 +467,7 @@ def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others
 
 
 def zero_of(blocks: Blocks, columns: Sequence[Columns]) -> float:
-    """Return the zero of p_A - p_B [Pa] that a change of the leak within the blocks shows, the equations' mean; near 0
-    where nothing changes.
-    """
+    """Return the zero of p_A - p_B [Pa] that a change of the leak shows, the equations' mean; near 0 without one."""
     fits = [
         _fit(blocks.gram[:, e], blocks, own, own.leak, [k for k in own.nuisance if k != own.leak])
         for e, own in enumerate(columns)

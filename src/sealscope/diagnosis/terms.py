@@ -100,6 +100,11 @@ class Signals:
         return self.mean("p_A") - self.mean("p_B")
 
     @cached_property
+    def port_difference(self) -> Array:
+        """p_1 - p_2 [Pa] in the middle of each interval."""
+        return self.mean("p_1") - self.mean("p_2")
+
+    @cached_property
     def absolute(self) -> Mapping[str, Array]:
         """Absolute pressure [Pa] of each chamber, at least `LEAST_ABSOLUTE`."""
         return {
@@ -148,6 +153,44 @@ def _steps(values: Array) -> Array:
     return values[1:] - values[:-1]
 
 
+class Drive(NamedTuple):
+    """The speed loop of the pump's motor without a load: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d -
+    omega, omega_d = `per_volt` u (eqs. 4.2-4.5); what the load adds is a droop with p_A - p_B, in the leak's level.
+
+    `gain`: k_p / (k_p + C_e); `pace`: K_i / (k_p + C_e) [1/s].
+    """
+
+    per_volt: float
+    gain: float
+    pace: float
+
+    @classmethod
+    def of(cls, rig: Rig) -> Drive:
+        """Return the drive that a rig's file describes."""
+        motor = rig.motor
+        total = motor.k_p + motor.C_e
+        return cls(motor.omega_per_volt, motor.k_p / total, motor.K_i / total)
+
+    def speed(
+        self, u: Array, rate: float, state: tuple[float, float] | None = None
+    ) -> tuple[Array, tuple[float, float]]:
+        """Return the speed [rad/s] for a command, missing where it is, and the state to go on from (None: at rest).
+
+        A missing command is held; the state is the filter's and the command that is held.
+        """
+        from scipy.signal import lfilter
+
+        half = 0.5 * self.pace / rate
+        numerator = np.array([self.gain + half, half - self.gain]) / (1.0 + half)
+        missing = np.isnan(u)
+        before = 0.0 if state is None else state[1]
+        last = np.maximum.accumulate(np.where(missing, -1, np.arange(len(u))))
+        held = np.where(last < 0, before, self.per_volt * np.where(missing, 0.0, u)[last])
+        start = (1.0 - numerator[0]) * held[0] if state is None else state[0]
+        speed, end = lfilter(numerator, np.array([1.0, (half - 1.0) / (1.0 + half)]), held, zi=[start])
+        return np.where(missing, np.nan, speed), (float(end[0]), float(held[-1]))
+
+
 class Term(NamedTuple):
     """A term of a balance: a row of data.
 
@@ -170,13 +213,17 @@ class Term(NamedTuple):
 
 class Equation(NamedTuple):
     """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last;
-    `healthy`: what is believed of a healthy machine's leak (a row of `terms.toml`), where that says more than nothing.
+    `healthy`: what is believed of a healthy machine's leak (a row of `terms.toml`), where that says more than nothing;
+    `drive`: what makes a speed of the command, and `START`, where none is recorded; `takes`: 1 where a flow into A is
+    positive on the left, -1 where it is negative.
     """
 
     name: str
     left: Callable[[Signals], Array]
     terms: tuple[Term, ...]
     healthy: str = ""
+    drive: Drive | None = None
+    takes: float = 1.0
 
 
 #: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
@@ -185,6 +232,8 @@ LEAK, ORIFICE = "leak", "leak through an orifice"
 PUMP = "pump leak"
 #: What passes or is read whatever the pressures are; a zero of the pressures acts through it.
 BIAS = "bias"
+#: What remains of a speed loop's state at the first sample, which nothing recorded tells.
+START = "start"
 
 _LEAKS = (
     Term(
@@ -285,11 +334,33 @@ _PUMP = Term(
     PUMP,
     "(p_1 - p_2) dt",
     "m^3/(s Pa)",
-    lambda s: (s.mean("p_1") - s.mean("p_2")) * s.dt,
+    lambda s: s.port_difference * s.dt,
     "pump leak",
-    "leak",
+    nuisance=False,
     needs=("p_1", "p_2"),
     driven="pressure",
+)
+#: With it the leak's coefficient is that of pump and piston together, and what the lines add is the pump's alone;
+#: without lines it is zero.
+_LINES = Term(
+    "pump leak by the lines",
+    "((p_1 - p_2) - (p_A - p_B)) dt",
+    "m^3/(s Pa)",
+    lambda s: (s.port_difference - s.pressure_difference) * s.dt,
+    "pump leak",
+    "pump",
+    needs=("p_1", "p_2", "p_A", "p_B"),
+    driven="pressure",
+)
+
+_START = Term(
+    "start of the drive",
+    "exp(-t/tau) dt",
+    "m^3/s",
+    lambda s: s.mean(START) * s.dt,
+    "sensor fault",
+    "bias",
+    needs=(START,),
 )
 
 _CYLINDER = (
@@ -298,6 +369,7 @@ _CYLINDER = (
     *_of_side("B"),
     _LAG,
     _BIAS,
+    _LINES,
     _PUMP,
     _lost_outside("A"),
     _lost_outside("B"),
@@ -361,41 +433,49 @@ def _chamber(side: str, rig: Rig) -> Equation:
     """
     area = rig.cylinder.A_A if side == "A" else rig.cylinder.A_B
     terms = (*_edges(side), *_of_side(side), _BIAS, *_LEAKS)
-    return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, "piston")
+    return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, "piston", takes=-1.0)
 
 
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     """Return the balances of a machine that its recorded channels allow, empty where they allow none.
 
-    Behind a servo valve that of each chamber; else that of the cylinder, with the pump's angle, its speed or, for want
-    of both, the command as the source of its flow.
+    Behind a servo valve that of each chamber; else that of the cylinder, with the pump's angle, its speed, a flow meter
+    or, for want of these, the command as the source of its flow.
     """
-    if rig.valve.spool == "present":
-        if not {"x", "u", "p_1", "p_2"} <= channels:
-            return ()
+    if rig.valve.spool == "present" and {"x", "u", "p_1", "p_2"} <= channels:
         sides = [side for side in "AB" if f"p_{side}" in channels]
         balances = [_chamber(side, rig) for side in sides]
         return tuple(_with_channels(balance, channels) for balance in balances) if len(sides) == 2 else ()
     left = pump_volume(rig, channels)
     if left is None or not {"x", "p_A", "p_B"} <= channels:
         return ()
+    by_command = channels.isdisjoint(_SOURCES)
     # an angle has no zero of a speed: what is lost whatever the pressures are is lost to the outside
     terms = [
         term._replace(cause="external leak") if term.name == BIAS and "theta" in channels else term
-        for term in _CYLINDER
+        for term in ((_START, *_CYLINDER) if by_command else _CYLINDER)
     ]
-    return (_with_channels(Equation("cylinder", left, tuple(terms)), channels),)
+    balance = Equation("cylinder", left, tuple(terms), drive=Drive.of(rig) if by_command else None)
+    return (_with_channels(balance, channels | {START}),)
+
+
+#: Channels that give what the pump delivers, the first recorded one is taken.
+_SOURCES = ("theta", "omega", "q_pump")
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
-    """Return what gives the increments of the volume that the pump delivers [m^3]; None where nothing recorded does."""
+    """Return what gives the increments of the volume that the pump delivers [m^3]; None where nothing recorded does.
+
+    By its angle, its speed, a flow meter, or the speed that the drive makes of the command. A meter's scale for each
+    direction is in the areas of that direction.
+    """
     displacement = rig.pump.q_b / (2.0 * np.pi)
     if "theta" in channels:
         return lambda s: displacement * s.step("theta")
-    if "omega" in channels:
+    if "q_pump" in channels and "omega" not in channels:
+        return lambda s: s.mean("q_pump") * s.dt
+    if {"omega", "u"} & channels and (rig.valve.spool != "present" or "omega" in channels):
         return lambda s: displacement * s.mean("omega") * s.dt
-    if "u" in channels:
-        return lambda s: displacement * rig.motor.omega_per_volt * s.mean("u") * s.dt
     return None
 
 

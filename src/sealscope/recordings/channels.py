@@ -23,6 +23,7 @@ CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
         "p_B": "Pa",
         "q_leak": "m^3/s",
         "q_comp": "m^3/s",
+        "q_pump": "m^3/s",
         "T_oil": "K",
     }
 )
@@ -42,6 +43,7 @@ LONG_NAMES: Mapping[str, str] = MappingProxyType(
         "p_B": "pressure in chamber B",
         "q_leak": "leakage flow",
         "q_comp": "leakage flow that the controller makes good",
+        "q_pump": "flow to the cylinder by a meter",
         "T_oil": "oil temperature",
     }
 )

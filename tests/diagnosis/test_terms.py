@@ -1,0 +1,180 @@
+"""The terms of each circuit: a leak put into a balance in closed form is found again, with its size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.balance import BlockStream, blocks_of
+from sealscope.diagnosis.blocks import information, zero_of
+from sealscope.diagnosis.onset import StepTest, step_test
+from sealscope.diagnosis.terms import Drive, equations, priors
+from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.channels import CHANNEL_UNITS
+from sealscope.recordings.recording import Array, Recording
+
+RATE, DURATION, ONSET = 200.0, 60.0, 30.0
+LEAK = 5e-12
+NOISE = np.random.default_rng(43)
+
+
+def recording(channels: Mapping[str, Array]) -> Recording:
+    """Return channels in SI units as a recording."""
+    n = len(next(iter(channels.values())))
+    return Recording(np.arange(n) / RATE, dict(channels), {name: CHANNEL_UNITS[name] for name in channels}, RATE)
+
+
+def step_of(channels: Mapping[str, Array], rig: Rig) -> StepTest:
+    """Return the test of a step of the leak."""
+    made = blocks_of(recording(channels), rig)
+    assert made is not None
+    blocks, columns = made
+    test = step_test(information(blocks, columns, columns[0].leak))
+    assert test is not None
+    return test
+
+
+def cylinder(rig: Rig, u: Array, leak: float = LEAK) -> dict[str, Array]:
+    """Return the channels of a pump-controlled cylinder whose piston leaks from ONSET on.
+
+    A dx = D omega dt - (V/K) dp_A/2 + (V/K) dp_B/2 - G (p_A - p_B) dt, with the speed that the drive makes of u.
+    """
+    omega, _ = Drive.of(rig).speed(u, RATE, None)
+    true = [3e6 + sign * (5e4 * np.tanh(omega / 5.0) + 300.0 * omega) for sign in (1.0, -1.0)]
+    conductance = leak * (np.arange(len(u)) / RATE >= ONSET)
+    flow = rig.pump.q_b / (2.0 * np.pi) * omega
+    compliance = 0.5 * rig.cylinder.V / rig.fluid.K_oil
+    rate = flow - conductance * (true[0] - true[1]) - compliance * np.gradient(true[0] - true[1]) * RATE
+    area = 0.5 * (rig.cylinder.A_A + rig.cylinder.A_B)
+    x, theta = (np.concatenate([[0.0], np.cumsum(0.5 * (of[1:] + of[:-1])) / RATE]) for of in (rate / area, omega))
+    p_A, p_B = (own + NOISE.normal(0.0, 1e3, len(u)) for own in true)
+    return {"u": u, "omega": omega, "theta": theta, "x": x, "p_A": p_A, "p_B": p_B, "q_pump": flow}
+
+
+def command() -> Array:
+    """Return a command [V] of strokes that differ."""
+    t = np.arange(0.0, DURATION, 1.0 / RATE)
+    return 3.0 * np.sin(2.0 * t) + 1.5 * np.sin(3.1 * t)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("thesis")
+
+
+@pytest.fixture(scope="module")
+def leaking(rig: Rig) -> dict[str, Array]:
+    return cylinder(rig, command())
+
+
+@pytest.mark.parametrize("source", ["theta", "omega", "q_pump", "u"])
+def test_any_source_of_the_pump_s_flow_gives_the_leak(source: str, rig: Rig, leaking: dict[str, Array]) -> None:
+    test = step_of({name: leaking[name] for name in ("x", "p_A", "p_B", source)}, rig)
+    assert test.chance < 1e-4
+    assert test.fitted[0] == pytest.approx(LEAK, rel=0.05)
+    assert test.onset().value == pytest.approx(ONSET, abs=1.5)
+
+
+@pytest.mark.parametrize("source", ["theta", "omega", "q_pump", "u"])
+def test_without_a_leak_none_is_found(source: str, rig: Rig) -> None:
+    healthy = cylinder(rig, command(), leak=0.0)
+    assert step_of({name: healthy[name] for name in ("x", "p_A", "p_B", source)}, rig).chance > 0.01
+
+
+def test_connections_change_nothing(rig: Rig, leaking: dict[str, Array]) -> None:
+    """Swapped sides, with the directions or without, and encoders that count backwards: the same leak."""
+    read = {name: leaking[name] for name in ("x", "p_A", "p_B", "theta")}
+    plain = step_of(read, rig)
+    swapped = {"p_A": read["p_B"], "p_B": read["p_A"]}
+    for other in (
+        {**read, **swapped, "x": -read["x"], "theta": -read["theta"]},
+        {**read, "theta": -read["theta"]},
+        {**read, "x": -read["x"]},
+        {**read, **swapped},
+    ):
+        test = step_of(other, rig)
+        assert test.fitted[0] == pytest.approx(plain.fitted[0], rel=0.01)
+        assert test.score == pytest.approx(plain.score, rel=0.05)
+
+
+def test_the_zero_of_a_pressure_changes_neither_leak_nor_chance(rig: Rig, leaking: dict[str, Array]) -> None:
+    """p_A reads too much by one prior width: the leak is the same, and its flow's change tells the zero."""
+    read = {name: leaking[name] for name in ("x", "p_A", "p_B", "theta")}
+    width = priors()["zero"]["pressure"].value
+    shifted = {**read, "p_A": read["p_A"] + width}
+    assert step_of(shifted, rig).fitted[0] == pytest.approx(LEAK, rel=0.05)
+    blocks, columns = blocks_of(recording(shifted), rig) or pytest.fail("no blocks")
+    assert zero_of(blocks, columns) == pytest.approx(width, rel=0.1)
+    mean = np.abs(np.diff([leaking["p_B"], leaking["p_A"]], axis=0)).mean()
+    assert blocks.driving(zero_of(blocks, columns)).mean() == pytest.approx(mean, rel=0.05)
+
+
+def test_the_command_s_speed_is_the_same_in_pieces(rig: Rig) -> None:
+    """The drive's state goes on from piece to piece, over a missing sample too."""
+    u = command()
+    u[1000:1010] = np.nan
+    whole, end = Drive.of(rig).speed(u, RATE, None)
+    state, parts = None, []
+    for part in np.split(u, [1, 700, 1005, 5000]):
+        speed, state = Drive.of(rig).speed(part, RATE, state)
+        parts.append(speed)
+    assert np.allclose(np.concatenate(parts), whole, equal_nan=True, rtol=1e-9, atol=1e-6)
+    assert np.isnan(whole[1000:1010]).all()
+    assert np.isfinite(whole[1010:]).all()
+    assert state == pytest.approx(end, rel=1e-6)
+
+
+def behind_valve(friction: Array, leak: Array) -> dict[str, Array]:
+    """Return the channels of a symmetric cylinder behind a valve without overlap; friction as a pressure [Pa].
+
+    A v = c u_+ sqrt(p_1 - p_A) - c u_- sqrt(p_A - p_2) - G (p_A - p_B), and the same of B by p_A + p_B = p_1 + p_2.
+    """
+    rig = load_rig("servo-valve")
+    t = np.arange(0.0, DURATION, 1.0 / RATE)
+    u = 2.0 * np.sin(3.0 * t) + np.sin(5.3 * t)
+    half = 0.5 * friction * np.tanh(u / 0.05) + 1e4 * u
+    p_1, p_2 = np.full(len(t), 7e6), np.full(len(t), 3e5)
+    p_A, p_B = 0.5 * (p_1 + p_2) + half, 0.5 * (p_1 + p_2) - half
+    gain = rig.valve.Q_N / np.sqrt(rig.valve.dp_N) / rig.valve.u_N
+    v = (gain * u * np.sqrt(np.where(u > 0.0, p_1 - p_A, p_A - p_2)) - leak * (p_A - p_B)) / rig.cylinder.A_A
+    x = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1])) / RATE])
+    noisy = {name: own + NOISE.normal(0.0, 1e3, len(t)) for name, own in (("p_A", p_A), ("p_B", p_B))}
+    return {"u": u, "x": x, "p_1": p_1, "p_2": p_2, **noisy}
+
+
+def test_behind_a_valve_a_leak_is_found_and_friction_is_none() -> None:
+    rig = load_rig("servo-valve")
+    late = np.arange(0.0, DURATION, 1.0 / RATE) >= ONSET
+    leak = step_of(behind_valve(np.full(late.shape, 1.2e5), LEAK * late), rig)
+    assert leak.chance < 1e-4
+    assert leak.fitted[0] == pytest.approx(LEAK, rel=0.1)
+    assert step_of(behind_valve(1.2e5 * (1.0 + 0.2 * late), np.zeros(late.shape)), rig).chance > 0.01
+
+
+def test_port_pressures_that_are_the_chambers_leave_the_leak_whole(rig: Rig, leaking: dict[str, Array]) -> None:
+    """Without lines p_1 - p_2 is p_A - p_B: the flow is the leak's, not shared with the pump's."""
+    read = {name: leaking[name] for name in ("x", "p_A", "p_B", "theta")}
+    with_ports = step_of({**read, "p_1": read["p_A"], "p_2": read["p_B"]}, rig)
+    assert with_ports.fitted[0] == pytest.approx(step_of(read, rig).fitted[0], rel=1e-3)
+
+
+def test_a_stream_is_oriented_and_driven_as_the_recording_is(rig: Rig, leaking: dict[str, Array]) -> None:
+    """Pieces of any size give the same blocks, from a command and with the encoder's sense unknown."""
+    read = {"u": -leaking["u"], "x": leaking["x"], "p_A": leaking["p_A"], "p_B": leaking["p_B"]}
+    balances = equations(rig, frozenset(read))
+    whole = BlockStream(balances, RATE).push(read, last=True)
+    stream, parts = BlockStream(balances, RATE), []
+    for piece in np.array_split(np.arange(len(read["u"])), 7):
+        blocks = stream.push(
+            {name: values[piece] for name, values in read.items()}, last=piece[-1] == len(read["u"]) - 1
+        )
+        parts += [blocks.gram] if blocks is not None else []
+    assert whole is not None
+    assert np.allclose(np.concatenate(parts), whole.gram, rtol=1e-6, atol=1e-9 * np.abs(whole.gram).max())
+
+
+def test_nothing_is_balanced_without_a_source_of_flow(rig: Rig) -> None:
+    assert equations(rig, frozenset({"x", "p_A", "p_B"})) == ()
+    assert equations(load_rig("servo-valve"), frozenset({"x", "p_A", "p_B", "u"})) == ()
