@@ -77,7 +77,7 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     count = max(0, pieces - SPAN + 1)
     cut = np.stack([own[: pieces * stride] for own in increments]).reshape(len(increments) * pieces, stride)
     parts = (cut @ phi.T).reshape(len(increments), pieces, SPAN)
-    missing = ~(np.abs(parts) < LARGEST).all(axis=(0, 2))
+    missing = np.asarray(~(np.abs(parts) < LARGEST).all(axis=(0, 2)))
     if missing.any():
         parts[:, missing] = 0.0
     values, touched = np.zeros((len(increments), count)), np.zeros(count, dtype=bool)
