@@ -144,7 +144,7 @@ class Life:
         self.kind = KINDS[number] if number < len(KINDS) else ""
         self.watch = ss.watch("thesis", false_alarms_per_1000_h=chosen.rate, learn_hours=LEARN_H)
         self.watch.update(recording.between(0.0, 61.0))
-        self.watch.dismiss()
+        self.watch.relearn()
 
     def lpm(self, since: float) -> float:
         """Return the leak at so many seconds since its onset."""

@@ -256,7 +256,7 @@ def solve(matrix: Array, right: Array) -> Array:
     shaped = right / (size if right.ndim == 1 else column)
     _, solved, failed = _cholesky()(scaled, shaped) if shaped.size else (None, shaped, 0)
     if failed:  # rounding made it no longer positive
-        solved = np.linalg.solve(scaled, shaped)
+        solved = np.asarray(np.linalg.solve(scaled, shaped))
     return np.asarray(solved / (size if right.ndim == 1 else column))
 
 
