@@ -1,0 +1,242 @@
+"""The step over all onsets: a brute-force oracle, the law of its score under the null, coverage of onset and bound."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.stats import binom
+
+from sealscope.diagnosis.blocks import Information
+from sealscope.diagnosis.onset import FEWEST, NullLaw, StepTest, course, step_test
+
+SPACING = 3.0
+
+
+def precision_of(random: np.random.Generator, count: int, width: float = 0.5, eliminated: int = 0) -> np.ndarray:
+    """Precision of K blocks, log-normal; `eliminated` other columns took most of what lay along them."""
+    size = np.exp(width * random.standard_normal(count))
+    taken = np.linalg.qr(random.standard_normal((count, eliminated)))[0] if eliminated else np.zeros((count, 0))
+    root = np.sqrt(size)
+    return np.asarray(np.diag(size) - 0.8 * (root[:, None] * taken) @ (taken.T * root))
+
+
+def drawn(
+    random: np.random.Generator, precision: np.ndarray, walk: float = 0.0, coefficient: np.ndarray | float = 0.0
+) -> Information:
+    """Information of a coefficient with level, slope and a random walk whose variance over the noise's averages `walk`
+    in the directions that level and slope leave."""
+    count = len(precision)
+    values, vectors = np.linalg.eigh(precision)
+    design = (vectors * np.sqrt(values)).T
+    index = np.arange(count)
+    trend = np.column_stack([np.ones(count), index - index.mean()])
+    free = np.linalg.qr(design @ trend, mode="complete")[0][:, 2:].T @ design
+    outer = np.minimum.outer(index, index) + 1.0
+    size = walk * len(free) / np.trace(free @ outer @ free.T)
+    wandering = np.sqrt(size) * np.cumsum(random.standard_normal(count))
+    g = coefficient + 3.0 - 0.02 * index + wandering
+    vector = precision @ g + vectors @ (np.sqrt(values) * random.standard_normal(count))
+    return Information(SPACING * (index + 0.5), precision, vector)
+
+
+def judged(information: Information) -> StepTest:
+    test = step_test(information)
+    assert test is not None
+    return test
+
+
+def step(count: int, onset: float) -> np.ndarray:
+    """A step at a time; of the block it falls into a part."""
+    return np.clip(np.arange(count) + 1.0 - onset / SPACING, 0.0, 1.0)
+
+
+def deviation_of(precision: np.ndarray, onset: float, walk: float) -> float:
+    """Standard deviation of a step's size beside level, slope and a walk, by generalised least squares."""
+    count = len(precision)
+    index = np.arange(count)
+    free = np.column_stack([np.ones(count), index - index.mean(), step(count, onset)])
+    inner = np.minimum.outer(index, index) + 1.0
+    covariance = np.linalg.inv(precision) + walk * inner
+    return float(np.sqrt(np.linalg.inv(free.T @ np.linalg.solve(covariance, free))[2, 2]))
+
+
+def restricted(information: Information, onset: float | None, walk: float) -> float:
+    """Restricted log-likelihood over (kappa, step) for a walk, by the textbook formula in the blocks' own coordinates;
+    with an onset the best step > 0 is taken out, its determinant is not."""
+    precision, vector = information.precision, information.vector
+    count = len(precision)
+    index = np.arange(count)
+    trend = np.column_stack([np.ones(count), index - index.mean()])
+    covariance = np.linalg.inv(precision) + walk * (np.minimum.outer(index, index) + 1.0)
+    estimate = np.linalg.solve(precision, vector)
+    inverse = np.linalg.inv(covariance)
+    inner = trend.T @ inverse @ trend
+    projected = inverse - inverse @ trend @ np.linalg.solve(inner, trend.T @ inverse)
+    rest = estimate @ projected @ estimate
+    if onset is not None:
+        s = step(count, onset)
+        rest -= max(s @ projected @ estimate, 0.0) ** 2 / (s @ projected @ s)
+    n = count - 2
+    determinants = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(inner)[1]
+    return float(-0.5 * determinants - 0.5 * n * np.log(rest / n))
+
+
+def largest(information: Information, onset: float | None) -> float:
+    """Largest restricted likelihood over walks of any size, none included."""
+
+    def cost(log_walk: float) -> float:
+        return -restricted(information, onset, float(np.exp(log_walk)))
+
+    starts = np.linspace(-14.0, 4.0, 10)
+    best = starts[int(np.argmin([cost(at) for at in starts]))]
+    fitted = minimize_scalar(cost, bounds=(best - 2.0, best + 2.0), method="bounded")
+    return max(-float(fitted.fun), restricted(information, onset, 0.0))
+
+
+@pytest.mark.parametrize(("count", "walk", "size"), [(5, 0.0, 0.0), (9, 0.5, 0.0), (9, 0.0, 6.0), (14, 3.0, 6.0)])
+def test_score_and_onset_equal_the_brute_force_likelihood(count: int, walk: float, size: float) -> None:
+    random = np.random.default_rng(count)
+    precision = precision_of(random, count, eliminated=2 if count > 9 else 0)
+    made = drawn(random, precision, walk, size * step(count, 0.55 * SPACING * count))
+    test = judged(made)
+    without = largest(made, None)
+    beside = np.array([largest(made, float(onset)) for onset in test.onsets])
+    # the scan tries four walks a decade: it may miss the largest likelihood by a little, and never exceeds it
+    assert test.score == pytest.approx(2.0 * (beside.max() - without), abs=0.06)
+    np.testing.assert_allclose(test.likelihood - test.likelihood.max(), beside - beside.max(), atol=0.06)
+    assert beside[test.best] > beside.max() - 0.05
+
+
+def test_level_slope_and_units_do_not_matter() -> None:
+    random = np.random.default_rng(3)
+    made = drawn(random, precision_of(random, 20), 1.0, 2.0 * step(20, 33.0))
+    test = judged(made)
+    trend = 50.0 - 7.0 * np.arange(20)
+    moved = judged(Information(made.time, made.precision, made.vector + made.precision @ trend))
+    scaled = judged(Information(made.time, 1e24 * made.precision, 1e12 * made.vector))
+    noisier = judged(Information(made.time, made.precision / 100.0, made.vector / 100.0))
+    for other, unit in ((moved, 1.0), (scaled, 1e-12), (noisier, 1.0)):
+        assert other.score == pytest.approx(test.score, rel=1e-6)
+        assert other.chance == pytest.approx(test.chance, rel=1e-5)
+        assert np.array(other.fitted) == pytest.approx(unit * np.array(test.fitted), rel=1e-5)
+        assert other.best == test.best
+
+
+def test_the_score_grows_with_the_step() -> None:
+    random = np.random.default_rng(4)
+    precision = precision_of(random, 30)
+    noise = drawn(random, precision, 0.3)
+    along = precision @ step(30, 40.0)
+    scores = [judged(noise._replace(vector=noise.vector + size * along)).score for size in np.linspace(0.0, 8.0, 15)]
+    assert (np.diff(scores[2:]) > 0.0).all()
+    fallen = judged(noise._replace(vector=noise.vector - 8.0 * along))
+    assert fallen.score < scores[4]
+
+
+def test_threshold_is_the_inverse_of_the_chance() -> None:
+    random = np.random.default_rng(5)
+    for count in (5, 17, 60):
+        test = judged(drawn(random, precision_of(random, count), 1.0))
+        for chance in (0.2, 1e-2, 1e-4):
+            assert test.law.chance(test.threshold(chance)) == pytest.approx(chance, rel=1e-6)
+        assert test.law.chance(test.score) == test.chance
+
+
+def test_a_curve_without_length_leaves_students_t() -> None:
+    """One onset known beforehand: half a beta tail is Student's t of n - 1 degrees of freedom."""
+    from scipy.stats import t
+
+    n, ratio = 9, 2.3
+    score = n * np.log1p(ratio**2 / (n - 1))
+    assert NullLaw(n, 0.0).chance(score) == pytest.approx(float(t.sf(ratio, n - 1)), rel=1e-9)
+
+
+def rejected(random: np.random.Generator, count: int, walk: float, draws: int, level: float, **kind: float) -> int:
+    """Draws of healthy blocks whose chance is below a level; each has precisions of its own."""
+    made = 0
+    for _ in range(draws):
+        precision = precision_of(random, count, **kind)  # type: ignore[arg-type]
+        made += judged(drawn(random, precision, walk)).chance < level
+    return made
+
+
+@pytest.mark.parametrize("count", [5, 12, 40])
+@pytest.mark.parametrize("walk", [0.0, 3.0, 100.0])
+def test_the_chance_is_uniform_or_larger_in_healthy_machines(count: int, walk: float) -> None:
+    draws = 60
+    made = rejected(np.random.default_rng(count), count, walk, draws, 0.05)
+    assert made <= binom.ppf(0.999, draws, 0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [5, 6, 8, 12, 20, 40, 60, 120])
+@pytest.mark.parametrize("walk", [0.0, 0.3, 1.0, 3.0, 10.0, 100.0])
+@pytest.mark.parametrize("kind", [{"width": 0.5}, {"width": 1.5}, {"width": 0.5, "eliminated": 4}], ids=str)
+def test_the_chance_over_machines_of_any_kind(count: int, walk: float, kind: dict[str, float]) -> None:
+    if kind.get("eliminated", 0) > count - 7:
+        pytest.skip("fewer blocks than columns that are eliminated")
+    draws = 2000
+    random = np.random.default_rng(int(100 * walk) + count)
+    chances = []
+    for _ in range(draws):
+        precision = precision_of(random, count, **kind)  # type: ignore[arg-type]
+        chances.append(judged(drawn(random, precision, walk)).chance)
+    for level in (0.01, 0.05, 0.2):
+        assert np.count_nonzero(np.array(chances) < level) <= binom.ppf(0.999, draws, 1.1 * level)
+
+
+def coverage(random: np.random.Generator, count: int, walk: float, size: float, draws: int) -> tuple[int, int]:
+    """Draws whose onset interval holds the onset, and whose bound holds the step, `size` deviations of the step."""
+    held = bounded = 0
+    for _ in range(draws):
+        precision = precision_of(random, count)
+        onset = SPACING * random.uniform(0.15 * count, 0.85 * count)
+        index = np.arange(count)
+        # variance of the walk a block, as `drawn` makes it
+        values, vectors = np.linalg.eigh(precision)
+        design = (vectors * np.sqrt(values)).T
+        trend = np.column_stack([np.ones(count), index])
+        free = np.linalg.qr(design @ trend, mode="complete")[0][:, 2:].T @ design
+        unit = walk * len(free) / np.trace(free @ (np.minimum.outer(index, index) + 1.0) @ free.T)
+        height = size * deviation_of(precision, onset, unit)
+        test = judged(drawn(random, precision, walk, height * step(count, onset)))
+        interval = test.onset()
+        held += interval.low <= onset <= interval.high
+        bounded += test.bound() >= height
+    return held, bounded
+
+
+@pytest.mark.parametrize(("count", "walk"), [(10, 0.0), (25, 0.0), (25, 3.0), (60, 1.0)])
+@pytest.mark.parametrize("size", [1.0, 3.0, 8.0])
+def test_onset_interval_and_bound_hold(count: int, walk: float, size: float) -> None:
+    draws = 60
+    held, bounded = coverage(np.random.default_rng(count), count, walk, size, draws)
+    assert held >= binom.ppf(0.001, draws, 0.95)
+    assert bounded >= binom.ppf(0.001, draws, 0.95)
+
+
+def test_course_is_the_conditional_mean_of_the_blocks() -> None:
+    random = np.random.default_rng(8)
+    made = drawn(random, precision_of(random, 15), 20.0)
+    walk, noise = 0.3, 1.4
+    test = replace(judged(made), walk=(walk, 0.0), noise=(noise, 1.0))
+    given = course(made, test, step=False)
+    index = np.arange(15)
+    # level and slope are free: what the walk's precision says of them is projected out
+    wandering = np.linalg.inv(walk * noise * (np.minimum.outer(index, index) + 1.0))
+    trend = np.column_stack([np.ones(15), index - 7.0])
+    across = wandering @ trend
+    prior = wandering - across @ np.linalg.solve(trend.T @ across, across.T)
+    covariance = np.linalg.inv(made.precision / noise + prior)
+    np.testing.assert_allclose(given.mean, covariance @ made.vector / noise, rtol=1e-6)
+    np.testing.assert_allclose(given.covariance, covariance, atol=1e-6 * float(covariance.max()))
+
+
+def test_too_few_blocks_have_no_test() -> None:
+    random = np.random.default_rng(6)
+    assert step_test(drawn(random, precision_of(random, FEWEST - 1))) is None
+    silent = drawn(random, precision_of(random, 10))
+    assert step_test(silent._replace(precision=0.0 * silent.precision, vector=0.0 * silent.vector)) is None
