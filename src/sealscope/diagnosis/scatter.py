@@ -1,7 +1,7 @@
 """Is it more than in the baseline? A recording's leakage against the scatter between healthy recordings.
 
-The sums of the baseline's recordings are added up and give the coefficients of all terms; what a recording's own rows
-leave of them along the leak's column, its own zero of the flow set aside, is its rise. The rise of each healthy
+The sums of the baseline's recordings, the zero of the flow of each set aside, are added up and give the coefficients of
+all terms; what a recording's own rows leave of them along the leak's column is its rise. The rise of each healthy
 recording against the others measures how recordings differ; whatever the model does not describe is in it, once.
 
     t = rise / (s sqrt(1 + 1/n)),    s^2 = (nu_0 s_0^2 + sum_j r_j^2 ((n - 1)/n)^2) / (nu_0 + n - 1),
@@ -57,8 +57,8 @@ class Rise(NamedTuple):
 
 def rise(judged: Blocks, baseline: Sequence[Blocks], columns: Sequence[Columns]) -> Rise:
     """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine."""
-    sums = [total(own, columns) for own in baseline]
-    value = _rise(total(judged, columns), sum(sums), columns)
+    sums = [_about_own(total(own, columns), columns) for own in baseline]
+    value = _rise(_about_own(total(judged, columns), columns), sum(sums), columns)
     beliefs, count = priors()["scatter"], len(sums)
     flow, pressure = (float(np.average(judged.means[:, k], weights=np.maximum(judged.rows, 1e-9))) for k in (2, 0))
     believed = beliefs["leak"].value * flow / pressure if pressure > 0.0 else 0.0
@@ -72,6 +72,17 @@ def rise(judged: Blocks, baseline: Sequence[Blocks], columns: Sequence[Columns])
     return Rise(value, max(float(deviation), np.finfo(float).tiny), freedom)
 
 
+def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
+    """Return a recording's sums (E, m, m) with the coefficients set aside that nothing ties to another recording's."""
+    reduced = sums.copy()
+    for e, column in enumerate(columns):
+        apart = [k for k in column.nuisance if k != column.leak and not np.isfinite(column.between[k])]
+        cross = sums[e][:, apart]
+        reduced[e] -= cross @ solve(sums[e][np.ix_(apart, apart)], cross.T)
+        reduced[e][apart] = reduced[e][:, apart] = 0.0
+    return reduced
+
+
 def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
     """Return the rise of the leak's coefficient in one recording's sums (E, m, m) beyond those of others.
 
@@ -79,7 +90,7 @@ def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
     """
     precision, vector = 0.0, 0.0
     for e, column in enumerate(columns):
-        chosen = list(column.nuisance)
+        chosen = [k for k in column.nuisance if k == column.leak or np.isfinite(column.between[k])]
         coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
         left = own[e][:, column.left] - own[e][:, chosen] @ coefficients
         others = [k for k in chosen if k != column.leak]

@@ -1,0 +1,126 @@
+"""Between recordings: Student's law of the rise under the null, coverage, and what few recordings allow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom, kstest
+
+from sealscope.diagnosis.blocks import Blocks, Columns
+from sealscope.diagnosis.scatter import Rise, rise
+from sealscope.diagnosis.terms import LEAK, Equation, Term, priors
+
+PRESSURE, FLOW = 1e5, 1e-5
+#: What is believed of the scatter of the leak's coefficient [m^3/(s Pa)].
+BELIEVED = priors()["scatter"]["leak"].value * FLOW / PRESSURE
+
+
+def nothing(_: object) -> np.ndarray:
+    raise AssertionError("sums are given, no channel is read")
+
+
+COLUMNS = Columns(
+    Equation(
+        "test",
+        nothing,
+        (
+            Term("oil", "", "", nothing, "air in the oil", "compliance"),
+            Term("bias", "", "", nothing, "sensor fault", "bias"),
+            Term(LEAK, "", "", nothing, "piston or pump leak", "leak"),
+        ),
+    )
+)
+
+
+def recording(random: np.random.Generator, leak: float, noise: float = 1e-5, shift: float = 0.0) -> Blocks:
+    """Eight blocks of a recording with a zero of its own; `noise` and `shift` [m^3/s over FLOW and PRESSURE]."""
+    x = random.standard_normal((8, 30, 3)) * [1.0, 0.0, PRESSURE] + [0.0, 1.0, 0.3 * PRESSURE]
+    y = x @ [0.5 * FLOW, random.normal() * FLOW, leak] + noise * FLOW * random.standard_normal((8, 30))
+    x[..., 2] += shift
+    values = np.concatenate([x, y[..., None]], axis=2)
+    start = 3.0 * np.arange(8)
+    gram = np.einsum("kri,krj->kij", values, values)[:, None]
+    return Blocks(
+        start,
+        start + 2.9,
+        gram,
+        np.full(8, 30.0),
+        np.tile([PRESSURE, PRESSURE**0.5, FLOW], (8, 1)),
+        np.full((8, 9), PRESSURE),
+    )
+
+
+def risen(random: np.random.Generator, count: int, scatter: float, leak: float = 0.0, **kind: float) -> Rise:
+    """The rise of a recording beyond `count` healthy ones, in a fleet whose leakage scatters."""
+    level = 20.0 * BELIEVED
+    healthy = [recording(random, level + scatter * random.normal(), **kind) for _ in range(count)]
+    return rise(recording(random, level + scatter * random.normal() + leak, **kind), healthy, (COLUMNS,))
+
+
+def believed_scatter(random: np.random.Generator) -> float:
+    """A machine's scatter, drawn from what is believed of it: scaled inverse chi square."""
+    freedom = priors()["scatter"]["freedom"].value
+    return float(BELIEVED * np.sqrt(freedom / random.chisquare(freedom)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_the_score_is_students_t_over_machines_as_they_are_believed(count: int) -> None:
+    random = np.random.default_rng(count)
+    made = [risen(random, count, believed_scatter(random)) for _ in range(80)]
+    assert {own.freedom for own in made} == {priors()["scatter"]["freedom"].value + count - 1}
+    assert kstest([own.chance for own in made], "uniform").pvalue > 1e-3
+    held = sum(low <= 0.0 <= high for low, high in (own.interval(0.9) for own in made))
+    assert binom.ppf(0.0005, len(made), 0.9) <= held <= binom.ppf(0.9995, len(made), 0.9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 12])
+@pytest.mark.parametrize("scatter", [0.2, 1.0, 6.0])
+def test_level_at_a_scatter_that_was_not_expected(count: int, scatter: float) -> None:
+    """A machine that scatters six times as much as believed: the belief counts as one degree of freedom, no more, so
+    the level is at most that of Student's t with one degree less at a score sqrt(n / (n - 1)) smaller."""
+    from scipy.stats import t
+
+    draws, level = 400, 0.01
+    random = np.random.default_rng(count)
+    made = sum(risen(random, count, scatter * BELIEVED).chance < level for _ in range(draws))
+    freedom = count - 1.0
+    worst = 0.03 if count == 1 else float(t.sf(t.isf(level, freedom + 1.0) * np.sqrt(freedom / count), freedom))
+    assert made <= binom.ppf(0.999, draws, worst if scatter > 1.0 else level)
+
+
+def test_the_rise_is_the_leak_that_was_added() -> None:
+    random = np.random.default_rng(0)
+    for leak in (0.0, 5.0 * BELIEVED, 100.0 * BELIEVED):
+        made = risen(random, 4, 1e-3 * BELIEVED, leak)
+        assert made.value == pytest.approx(leak, abs=0.05 * BELIEVED)
+
+
+def test_one_healthy_recording_tells_little() -> None:
+    random = np.random.default_rng(1)
+
+    def half_width(count: int) -> float:
+        low, high = risen(random, count, 0.3 * BELIEVED).interval(0.99)
+        return 0.5 * (high - low)
+
+    alone, few, many = (np.median([half_width(count) for _ in range(20)]) for count in (1, 3, 12))
+    assert alone > 5.0 * few > 5.0 * many
+    # never odds of one in ten thousand from two recordings: a leak of ten believed deviations is no proof
+    assert risen(random, 1, 0.3 * BELIEVED, 10.0 * BELIEVED).chance > 1e-2
+    assert risen(random, 12, 0.3 * BELIEVED, 10.0 * BELIEVED).chance < 1e-4
+
+
+def test_a_zero_of_the_flow_or_of_a_sensor_is_no_rise() -> None:
+    """Each recording has a zero of its own; the judged one's pressure difference is off by five times its size."""
+    for shift in (-5.0 * PRESSURE, 2.0 * PRESSURE):
+        random = np.random.default_rng(2)
+        healthy = [recording(random, 20.0 * BELIEVED) for _ in range(4)]
+        made = rise(recording(random, 20.0 * BELIEVED, shift=shift), healthy, (COLUMNS,))
+        assert abs(made.value) < 0.1 * BELIEVED
+
+
+def test_chance_threshold_and_interval_agree() -> None:
+    made = Rise(3.0, 2.0, 4.0)
+    assert Rise(made.threshold(made.chance) * 2.0, 2.0, 4.0).value == pytest.approx(3.0)
+    low, high = made.interval(1.0 - 2.0 * made.chance)
+    assert (low, high) == (pytest.approx(0.0, abs=1e-9), pytest.approx(6.0))
