@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.diagnosis.observer.detector import Observer
 from sealscope.diagnosis.pressure_model.detector import PressureModel
-from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth

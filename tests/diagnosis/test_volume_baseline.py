@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.balance_detector import VolumeBalance
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 

@@ -167,7 +167,6 @@ class BlockStream:
         begins = self._begin + start / self._rate
         signals = Signals(cut, self._rate, self._zeros)
         inner = slice(start - begin, stop - 1 - begin)
-        values: list[list[Array]] = []
         whole = np.ones((end - first) * self._strides, dtype=bool)
         cut_rows = []
         for balance, sign in zip(self._balances, self._signs, strict=True):
@@ -176,8 +175,9 @@ class BlockStream:
             whole &= cut_rows[-1].whole
         cuts = np.arange(self._strides, len(whole), self._strides)
         kept = np.split(whole, cuts)
-        for own in cut_rows:
-            values.append([block[keep] for block, keep in zip(np.split(own.values, cuts), kept, strict=True)])
+        values = [
+            [block[keep] for block, keep in zip(np.split(own.values, cuts), kept, strict=True)] for own in cut_rows
+        ]
         gram, weights = self._weighting.close(values)
         times = cut_rows[0].time.reshape(end - first, self._strides)
         means, pressures = self._means(signals, inner, end - first), self._pressures(signals, inner, end - first)
@@ -212,7 +212,7 @@ def _parts(values: Array) -> Array:
 
 
 def _zero(pressure: Array) -> float:
-    """Return what makes a gauge pressure absolute: the atmosphere, or more where the sensor's zero is surely too low."""
+    """Return what makes a gauge pressure absolute: the atmosphere, or more where its zero is surely too low."""
     finite = pressure[np.isfinite(pressure)]
     lowest = float(np.min(finite)) if finite.size else 0.0
     return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)

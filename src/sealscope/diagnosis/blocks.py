@@ -302,9 +302,10 @@ def _drifts(blocks: Blocks) -> tuple[Array, float]:
 
 
 class _Normal(NamedTuple):
-    """Sums over the blocks, other columns with each of their drifts in turn (size of them, c): `cross` (c, c), `left`
-    (c,), with the tested column in each block `along` (K, c); of that column `energy` (K,) and `lead` (K,), its product
-    with the left side; `square`: of the left side.
+    """Sums over the blocks of the other columns, each with its drifts in turn (c in all).
+
+    `cross` (c, c), `left` (c,) with the left side, `along` (K, c) with the tested column in each block; of that column
+    `energy` (K,) and `lead` (K,), its product with the left side; `square`: of the left side.
     """
 
     cross: Array
@@ -403,13 +404,9 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     if abs(mean) < width:
         return near
     far = _fit_from(gram, blocks, columns, test, others, mean, width * ratio)
-    unlikely = 2.0 * float(np.log(ratio / beliefs["odds"].value))
-    costs = [
-        len(blocks) * np.log(own.fitted.variance)  # what the model leaves is alike within a block
-        + (own.zero / of) ** 2
-        + cost
-        for own, of, cost in ((near, width, 0.0), (far, width * ratio, unlikely))
-    ]
+    # what the model leaves is alike within a block
+    left = [len(blocks) * np.log(own.fitted.variance) for own in (near, far)]
+    costs = left[0] + near.zero**2 / width**2, left[1] + far.zero**2 / (width * ratio) ** 2 + _unlikely()
     return far if costs[1] < costs[0] else near
 
 
@@ -423,11 +420,12 @@ def _fit_from(
     level = solve(total[np.ix_(others, others)], total[others, columns.left])
     believed = _Belief(np.append(np.abs(level) * columns.drift[others] * minutes, 0.0), width)
     chosen, of_block, slope = [*others, gram.shape[1]], np.zeros((len(blocks), gram.shape[1])), np.zeros(len(blocks))
-    for turn in range(_TURNS + 1):
+    turns = _TURNS if width > 0.0 else 1
+    for turn in range(turns + 1):
         about = _about(gram, columns, test, slope, zero)
         normal = _normal(about, powers, chosen, test, columns.left)
         fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
-        if turn == _TURNS:
+        if turn == turns:
             break
         of_zero = fitted.coefficients[-degrees]
         of_block[:, others] = powers @ fitted.coefficients[:-degrees].reshape(len(others), degrees).T
@@ -436,7 +434,7 @@ def _fit_from(
         if width > 0.0:
             slope, zero = of_test, zero + float(of_zero)
             of_block[:, columns.bias] -= slope * zero
-        if turn == _TURNS - 1:
+        if turn == turns - 1:
             scale = _scale(gram, of_block, fitted.variance, columns)
             gram = _downdated(gram, scale, of_block, fitted.variance, columns)
     return _Fit(gram, normal, fitted, zero)
@@ -466,6 +464,18 @@ def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others
     return 0.5 * (precision + precision.T), vector
 
 
+def _unlikely() -> float:
+    """Return minus twice the logarithm of what is believed of a zero that is far off, over that of a usual one."""
+    beliefs = priors()["zero"]
+    return 2.0 * float(np.log(beliefs["far"].value / beliefs["pressure"].value / beliefs["odds"].value))
+
+
+def cost_of_zero(zero: float) -> float:
+    """Return minus twice the logarithm of what is believed of a zero of the pressures [Pa], over that of none."""
+    beliefs = priors()["zero"]
+    return min((zero / beliefs["pressure"].value) ** 2, (zero / beliefs["far"].value) ** 2 + _unlikely())
+
+
 def zero_of(blocks: Blocks, columns: Sequence[Columns]) -> float:
     """Return the zero of p_A - p_B [Pa] that a change of the leak shows, the equations' mean; near 0 without one."""
     fits = [
@@ -486,8 +496,9 @@ def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
 
 
 def _scale(gram: Array, coefficients: Array, variance: float, columns: Columns) -> float:
-    """Return the standard deviation of the scale of motion between blocks, of the largest likelihood, beside what the
-    tested coefficient takes of each block.
+    """Return the standard deviation of the scale of motion between blocks, of the largest likelihood.
+
+    It is what is left beside what the tested coefficient takes of each block.
     """
     motion, square = _motion(gram, coefficients, columns)
     left = motion[:, columns.left] - np.einsum("km,km->k", motion, coefficients)

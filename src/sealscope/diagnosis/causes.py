@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Blocks, Columns, information, solve, total
+from sealscope.diagnosis.blocks import Blocks, Columns, cost_of_zero, information, solve, total, zero_of
 from sealscope.diagnosis.onset import StepTest, step_test
-from sealscope.diagnosis.terms import ORIFICE, Equation, priors
+from sealscope.diagnosis.terms import LEAK, ORIFICE, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: Blocks that causes are weighed with: a step is dated by the leak's own test.
@@ -25,11 +25,12 @@ SCALE = "scale"
 
 
 class Hypothesis(NamedTuple):
-    """The coefficient of a term stepped: its `name`, the `cause`, the test, and the sign of the step."""
+    """The coefficient of a term stepped: its `name`, the `cause`, the test, and its score less what it needs beside."""
 
     name: str
     cause: Cause
     test: StepTest
+    score: float
 
 
 def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns]) -> tuple[Hypothesis, ...]:
@@ -37,22 +38,26 @@ def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[C
     coarse = blocks.merged(COARSE)
     tested = []
     for index, term in enumerate(balances[0].terms):
+        if term.drift == "motion" and index in columns[0].motion and term.name.startswith("motion"):
+            continue  # area and displacement change together, as a scale
         replaced = columns[0].leak if term.name == ORIFICE else None
         tested.append((term.name, term.cause, information(coarse, columns, index, replaced)))
     orifice = columns[0].names.index(ORIFICE)
     tested.append((SCALE, "sensor fault", information(_with_scale(coarse, columns, orifice), columns, orifice)))
     stepped = []
+    cost = cost_of_zero(zero_of(blocks, columns))
     for name, cause, own in tested:
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
         tests = [step_test(own._replace(vector=sign * own.vector)) for sign in signs]
         best = max((test for test in tests if test is not None), key=lambda test: test.score, default=None)
         if best is not None:
-            stepped.append(Hypothesis(name, cause, best))
-    return tuple(sorted(stepped, key=lambda own: -own.test.score))
+            score = best.score - (cost if name in (LEAK, ORIFICE) else 0.0)  # the zero that it needs
+            stepped.append(Hypothesis(name, cause, best, score))
+    return tuple(sorted(stepped, key=lambda own: -own.score))
 
 
 def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Blocks:
-    """Return the blocks with the fitted motion in place of one column: a step of its coefficient is one of its scale."""
+    """Return the blocks with the fitted motion in place of one column: its coefficient is the motion's scale."""
     gram = blocks.gram.copy()
     for e, (column, sums) in enumerate(zip(columns, total(blocks, columns), strict=True)):
         chosen, motion = list(column.nuisance), list(column.motion)
@@ -73,12 +78,12 @@ def probabilities(tested: Sequence[Hypothesis]) -> dict[Cause, float]:
     if not tested:
         return {}
     beliefs = priors()["causes"]
-    most = max(own.test.score for own in tested)
+    most = max(own.score for own in tested)
     temper = 2.0 * (1.0 + beliefs["model"].value * max(most, 0.0))
     weights: dict[Cause, float] = {}
     for own in tested:
         odds = beliefs["leak" if own.cause in (*LEAKS, "pump leak") else own.cause].value
-        weights[own.cause] = max(weights.get(own.cause, 0.0), odds * float(np.exp((own.test.score - most) / temper)))
+        weights[own.cause] = max(weights.get(own.cause, 0.0), odds * float(np.exp((own.score - most) / temper)))
     total = sum(weights.values())
     return {cause: weight / total for cause, weight in sorted(weights.items(), key=lambda item: -item[1])}
 

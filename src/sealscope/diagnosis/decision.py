@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 #: Share of the false-alarm probability that a question has beside another: the change within the recording where there
 #: is a baseline, the level against the rig's file where there is none.
 SECOND = 0.25
-_95 = 1.96
+_95, _SURE = 1.96, 0.95
 
 
 class Size(NamedTuple):
@@ -208,15 +208,16 @@ def judge(balance: Balance, probability: float, baseline: Sequence[Blocks] = ())
         return Evidence("cannot tell", "p_A and p_B hardly differ, or too few samples are whole: no leak would show")
     questions = _questions(balance, against, probability)
     answered = next((own for own in questions if own.chance < own.probability), None)
+    causes: dict[Cause, float] = {}
     if answered is not None and answered.name == WITHIN:
         causes = probabilities(balance.hypotheses)
-        if not _is_leak(causes):
-            answered = None
+        answered = answered if _is_leak(causes) else None
     if answered is None:
         judging = questions[0]
         bound = bound_of(balance, against)
         enough = balance.mean(2) > 0.0 and bound <= priors()["worth"]["share"].value * balance.mean(2)
-        cause = stepped_cause(balance.hypotheses, probability)
+        enough &= sum(causes.get(own, 0.0) for own in LEAKS) < 1.0 - _SURE  # a change that may as well be a leak
+        cause = stepped_cause(balance.hypotheses, RAREST)
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     else:
         judging = answered

@@ -56,8 +56,8 @@ class Examination:
     none where one was asked for: then a leak within the recording is all that can be stated; `rig`: what detectors may
     assume of the machine; `distrust`: why the pressures cannot be judged, None where they can: then no detector is run;
     `share` of what was to be judged that the recording is: `no leak` needs `WHOLE` of it; `machine`: leak-free
-    recordings of the machine at any operating point, and `doubt`: why the pressures alone cannot be judged: a balance of
-    volumes takes the former and needs no heed of the latter.
+    recordings of the machine at any operating point, and `doubt`: why the pressures alone cannot be judged: a
+    balance of volumes takes the former and needs no heed of the latter.
     A recording that is to be its own baseline needs pressures that move throughout (`recordings.motion`).
     """
 

@@ -112,11 +112,16 @@ class StepTest:
         return np.asarray(weights / weights.sum())
 
     def onset(self, probability: float = 0.95) -> Interval:
-        """Return the most likely onset [s] and the interval that holds it with a probability."""
+        """Return the most likely onset [s] and the interval that holds it with a probability.
+
+        Rows of the block in which the leak begins are weighed as if it leaked throughout or not at all, so that an
+        onset is known to half a block at best.
+        """
         ends = np.interp([0.5 - 0.5 * probability, 0.5 + 0.5 * probability], np.cumsum(self.weights), self.onsets)
         best = float(self.onsets[self.best])
         step = float(self.onsets[1] - self.onsets[0]) if len(self.onsets) > 1 else 0.0
-        return Interval(best, min(float(ends[0]), best) - 0.5 * step, max(float(ends[1]), best) + 0.5 * step)
+        half = 0.5 * PARTS * step
+        return Interval(best, min(float(ends[0]), best) - half, max(float(ends[1]), best) + half)
 
     def bound(self, probability: float = 0.95) -> float:
         """Return the step that is exceeded with probability 1 - `probability`, given that there is a step > 0."""
@@ -150,7 +155,7 @@ class StepTest:
 
 
 class Course(NamedTuple):
-    """A coefficient over the blocks: `mean` (K,) and `covariance` (K, K), given the blocks and the model of the test."""
+    """A coefficient over the blocks, given the blocks and the model of the test: `mean` (K,), `covariance` (K, K)."""
 
     mean: Array
     covariance: Array
@@ -158,7 +163,7 @@ class Course(NamedTuple):
     def over(self, weights: Array) -> Interval:
         """Return the weighted mean of the coefficient with its 95 % interval, weights (K,) of sum 1."""
         value = float(weights @ self.mean)
-        half = 1.96 * float(np.sqrt(max(weights @ self.covariance @ weights, 0.0)))
+        half = 1.96 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half, value + half)
 
 
@@ -205,7 +210,7 @@ class NullLaw(NamedTuple):
 
         n = self.dimensions
         away = float(np.exp(-max(score, 0.0) / n))  # 1 - cos^2
-        tube = self.length / (2.0 * np.pi) * away ** (0.5 * (n - 2))
+        tube = self.length / (2.0 * np.pi) * float(away ** (0.5 * (n - 2)))
         return min(1.0, 0.5 * float(betainc(0.5 * (n - 1), 0.5, away)) + tube)
 
 
@@ -247,7 +252,7 @@ def _onset_times(time: Array, at: Array) -> Array:
     edges = np.concatenate(
         [[1.5 * time[0] - 0.5 * time[1]], 0.5 * (time[1:] + time[:-1]), [1.5 * time[-1] - 0.5 * time[-2]]]
     )
-    return np.interp(at, np.arange(len(edges)), edges)
+    return np.asarray(np.interp(at, np.arange(len(edges)), edges))
 
 
 def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float) -> StepTest:

@@ -127,11 +127,13 @@ class Signals:
     def moved(self, outward: bool, by_A: bool) -> Array:
         """Return the increments of x of one direction while one side carries the pressure [m]."""
         out_A, out, by = self._ways
-        if outward:
-            share = out_A if by_A else out - out_A
-        else:
-            share = by - out_A if by_A else 1.0 - out - by + out_A
-        return share * self.step("x")
+        shares = {
+            (True, True): out_A,
+            (True, False): out - out_A,
+            (False, True): by - out_A,
+            (False, False): 1.0 - out - by + out_A,
+        }
+        return shares[outward, by_A] * self.step("x")
 
     @cached_property
     def _ways(self) -> tuple[Array, Array, Array]:
@@ -154,8 +156,10 @@ def _steps(values: Array) -> Array:
 
 
 class Drive(NamedTuple):
-    """The speed loop of the pump's motor without a load: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d -
-    omega, omega_d = `per_volt` u (eqs. 4.2-4.5); what the load adds is a droop with p_A - p_B, in the leak's level.
+    """The speed loop of the pump's motor without a load.
+
+    (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega, omega_d = `per_volt` u (eqs. 4.2-4.5); what the
+    load adds is a droop with p_A - p_B, in the leak's level.
 
     `gain`: k_p / (k_p + C_e); `pace`: K_i / (k_p + C_e) [1/s].
     """
@@ -212,7 +216,8 @@ class Term(NamedTuple):
 
 
 class Equation(NamedTuple):
-    """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last;
+    """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last.
+
     `healthy`: what is believed of a healthy machine's leak (a row of `terms.toml`), where that says more than nothing;
     `drive`: what makes a speed of the command, and `START`, where none is recorded; `takes`: 1 where a flow into A is
     positive on the left, -1 where it is negative.

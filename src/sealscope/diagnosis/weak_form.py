@@ -31,8 +31,10 @@ LARGEST = 1e100
 
 
 class Rows(NamedTuple):
-    """Rows of a regression: `time` (r,) of each test function's middle [s], `values` (r, c), one a column, over the
-    test function's integral, so that a row is a mean rate; `whole` (r,): no sample it rests on is missing.
+    """Rows of a regression.
+
+    `time` (r,) of each test function's middle [s]; `values` (r, c), one a column, over the test function's integral, so
+    that a row is a mean rate; `whole` (r,): no sample it rests on is missing.
     """
 
     time: Array

@@ -119,10 +119,10 @@ def _stated(part: Recording, rig: Rig) -> _Stated:
     if unusable(balance, part) is None:
         own = balance.balance(part)
         if own is not None and len(own.columns) == 1:
-            size, level = own.size, own.level
-            total = Level(level.value * size.scale, (level.high - level.low) * size.scale / 3.92)
+            size, total = own.size, own.level
+            of_all = Level(total.value * size.scale, (total.high - total.low) * size.scale / 3.92)
             ratio = None if size.ratio is None else size.ratio.value
-            return _Stated("volume balance", total, size.stated, ("x", "m") in own.units, ratio)
+            return _Stated("volume balance", of_all, size.stated, ("x", "m") in own.units, ratio)
     model = PressureModel(rig)
     if unusable(model, part) is None:
         followed = model.follow(part)
@@ -132,9 +132,9 @@ def _stated(part: Recording, rig: Rig) -> _Stated:
     if unusable(observer, part) is None:
         series = observer.follow(part)
         if series.G.size > 1 and misfit(series.estimates, series.formulation, rig) is None:
-            own = observer_level(series)
+            level = observer_level(series)
             flows = observer_states_flow(series.formulation, rig)
-            return _Stated("observer", Level(own.value * G_UNIT, own.error * G_UNIT), flows)
+            return _Stated("observer", Level(level.value * G_UNIT, level.error * G_UNIT), flows)
     log_rms = whole_log_rms(part).reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
     return _Stated("ringing", Level(ringing, _RINGING_ERROR)) if np.isfinite(ringing) else _NOTHING
