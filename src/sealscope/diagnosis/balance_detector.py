@@ -68,11 +68,6 @@ class VolumeBalance:
             frozenset(recording.units.items()),
         )
 
-    def coherent(self, recording: Recording) -> bool:
-        """Return whether both pressures show in the balance: then they are this machine's, whatever they look like."""
-        own = self.balance(recording)
-        return own is not None and own.coherent
-
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a step of the leakage, and of its rise against the baseline."""
         own = self.balance(recording)

@@ -128,31 +128,9 @@ class Balance:
         both = information(self.blocks, self.columns, column.leak, apart)
         return course(both, step_test(both), step=False)
 
-    @cached_property
-    def coherent(self) -> bool:
-        """Whether both pressures show in the balance, by what they compress: then they are this machine's."""
-        from scipy.special import chdtrc
-
-        for column, sums in zip(self.columns, total(self.blocks, self.columns), strict=True):
-            for side in "AB":
-                of_side = [
-                    k for k in column.nuisance if column.names[k].endswith((f" {side}", f" {side} over the stroke"))
-                ]
-                of_side = [k for k in of_side if k not in column.motion]
-                rest = [k for k in column.nuisance if k not in of_side]
-                explained = [_explained(sums, chosen, column.left) for chosen in (rest, list(column.nuisance))]
-                if of_side and chdtrc(len(of_side), explained[1] - explained[0]) > RAREST:
-                    return False
-        return True
-
     def course(self, step: bool) -> Course:
         """Return the leak's coefficient over the blocks."""
         return course(self.leak, self.test, step)
-
-
-def _explained(sums: Array, chosen: list[int], left: int) -> float:
-    """Return how much of the left side's square some columns explain, over a row's variance."""
-    return float(sums[chosen, left] @ solve(sums[np.ix_(chosen, chosen)], sums[chosen, left]))
 
 
 def _size(balance: Balance) -> Size:

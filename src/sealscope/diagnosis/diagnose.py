@@ -73,8 +73,9 @@ class Examination:
         share: float = 1.0,
         machine: Sequence[Recording] | None = None,
         doubt: str | None = None,
+        unreadable: str | None = None,
     ) -> None:
-        self.share, self.doubt = share, doubt
+        self.share, self.doubt, self.unreadable = share, doubt, unreadable
         self.machine = tuple(baseline if machine is None else machine)
         self.recording, self.baseline, self.rig = recording, tuple(baseline), rig
         self.false_alarm_probability = false_alarm_probability
@@ -97,6 +98,7 @@ class Examination:
             share=self.share,
             machine=[own.only(name for name in own.channels if name in wanted) for own in self.machine],
             doubt=self.doubt,
+            unreadable=self.unreadable,
         )
         view._detectors, view._evidence = self._detectors, self._evidence
         return view
@@ -135,8 +137,8 @@ class Examination:
         if detector.name != name:
             raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
         reason = unusable(detector, self.recording) or self.distrust
-        if name == ORDER[0] and reason is None and self.doubt is not None and not _coherent(detector, self.recording):
-            reason = self.doubt
+        if name == ORDER[0]:
+            reason = reason or self.unreadable
         if name == ORDER[0] and reason is None:
             evidence = detector.examine(self.recording, self.machine, self.false_alarm_probability)
             return self._with_share(replace(checked(evidence), detector=name))
@@ -244,12 +246,6 @@ class Examination:
         return [seen for own in self.baseline if (seen := _signatures(own, self._behind_valve)) is not None]
 
 
-def _coherent(detector: Detector, recording: Recording) -> bool:
-    """Return whether a detector's own balance shows that the pressures are the machine's."""
-    asked = getattr(detector, "coherent", None)
-    return asked is not None and bool(asked(recording))
-
-
 def _signatures(recording: Recording, behind_valve: bool) -> Signatures | None:
     try:
         with np.errstate(all="ignore"):
@@ -337,6 +333,7 @@ def diagnose(
         share=judged.share,
         machine=compared.machine,
         doubt=judged.doubt,
+        unreadable=judged.unreadable,
     ).fused(quick)
     return Diagnosis.of(
         fused,

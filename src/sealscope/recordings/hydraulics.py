@@ -8,7 +8,7 @@ channel, a wrong unit or a wrong time unit lack one of these.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -25,6 +25,7 @@ LEAST_SWING = 100.0
 MOST_NOISE = 0.5
 #: A copy differs by less than this share of the swing.
 _COPY = 1e-6
+_COPIED = "p_B is a copy of p_A, but chambers on either side of a piston move against each other"
 #: Correlation at some delay from which a slow signal follows another one; and what independent noise reaches, over the
 #: root of the number of slow samples.
 LEAST_CORRELATION, _BY_CHANCE = 0.1, 5.0
@@ -38,17 +39,43 @@ _PAST = 4
 _MISFIT, _BELONGS = 5.0, 0.5
 
 
+def no_readings(recording: Recording) -> str | None:
+    """Return why a balance of volumes cannot take the pressures of a recording, None where it can.
+
+    It needs no heed of their unit, zero and range, nor of how they follow one another: noise, a copy in the other's
+    channel, or a wrong unit of the time are in its way.
+    """
+    names = [name for name in chambers_of(recording) if len(recording) > 3 and not constant(recording[name])]
+    signals = _signals(recording, names)
+    if _copied(signals):
+        return _COPIED
+    with np.errstate(all="ignore"):
+        return _time(recording) or _noise(signals)
+
+
+def _signals(recording: Recording, names: Sequence[str]) -> dict[str, Array]:
+    signals = {name: recording[name] for name in names}
+    if len(names) == 2:
+        signals["p_A - p_B"] = signals["p_A"] - signals["p_B"]
+    return signals
+
+
+def _copied(signals: Mapping[str, Array]) -> bool:
+    difference = signals.get("p_A - p_B")
+    return difference is not None and bool(
+        np.std(difference) <= _COPY * max(np.std(signals[name]) for name in CHAMBERS)
+    )
+
+
 def no_machine(recording: Recording) -> str | None:
     """Return why a recording without missing pressures is not one of a hydraulic machine, None where it may be.
 
     A channel that is constant or absent is no reason: others report it.
     """
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not constant(recording[name])]
-    signals = {name: recording[name] for name in names}
-    if len(names) == 2:
-        signals["p_A - p_B"] = signals["p_A"] - signals["p_B"]
-        if np.std(signals["p_A - p_B"]) <= _COPY * max(np.std(signals[name]) for name in CHAMBERS):
-            return "p_B is a copy of p_A, but chambers on either side of a piston move against each other"
+    signals = _signals(recording, names)
+    if _copied(signals):
+        return _COPIED
     with np.errstate(all="ignore"):
         return _out_of_range(recording, signals) or _time(recording) or _noise(signals) or _aside(recording, names)
 

@@ -18,7 +18,7 @@ from sealscope.diagnosis.baseline.operating_point import OperatingPoint, differe
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.gaps import MOST_BRIDGED, bridge
-from sealscope.recordings.hydraulics import lack_of_chambers, no_machine
+from sealscope.recordings.hydraulics import lack_of_chambers, no_machine, no_readings
 from sealscope.recordings.motion import does_not_move, runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
 from sealscope.recordings.recording import Recording, remembered
@@ -39,7 +39,8 @@ class Inspection:
     `part`: its longest uniformly sampled stretch with no chamber pressure and no command missing, gaps bridged where
     they can be (`recordings.gaps`); `findings` on the whole; `distrust`: why the chamber pressures cannot be trusted,
     None where they can; `share` of the whole that the stretch is; `doubt`: why the pressures alone, without a balance
-    of volumes, do not look like those of a hydraulic machine, None where they do.
+    of volumes, do not look like those of a hydraulic machine, None where they do; `unreadable`: why not even a balance
+    can take them.
     """
 
     part: Recording
@@ -47,6 +48,7 @@ class Inspection:
     distrust: str | None
     share: float
     doubt: str | None = None
+    unreadable: str | None = None
 
     @property
     def defect(self) -> str | None:
@@ -108,7 +110,10 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     doubt = None
     if distrust is None and len(part) >= SHORTEST and does_not_move(part) is None and (reason := no_machine(part)):
         doubt = f"this is no recording of a hydraulic machine: {reason}"
-    return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1), doubt)
+    unreadable = no_readings(part) if distrust is None and len(part) >= SHORTEST else None
+    if unreadable is not None:
+        unreadable = f"this is no recording of a hydraulic machine: {unreadable}"
+    return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1), doubt, unreadable)
 
 
 def _spoils(finding: Finding, samples: int) -> bool:
@@ -166,7 +171,11 @@ def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
 
 def _distinct(judged: Inspection, baseline: Sequence[Recording]) -> list[Inspection]:
     """Return the inspections of the baselines that hold other samples than the judged recording and one another."""
-    distinct = {own.digest: own for own in map(inspected, baseline) if own.distrust is None and len(own.part)}
+    distinct = {
+        own.digest: own
+        for own in map(inspected, baseline)
+        if own.distrust is None and own.unreadable is None and len(own.part)
+    }
     return [own for digest, own in distinct.items() if digest != judged.digest]
 
 
