@@ -47,6 +47,7 @@ def recording(random: np.random.Generator, leak: float, noise: float = 1e-5, shi
         np.full(8, 30.0),
         np.tile([PRESSURE, PRESSURE**0.5, FLOW], (8, 1)),
         np.full((8, 9), PRESSURE),
+        np.zeros(8),
     )
 
 

@@ -11,6 +11,7 @@ from sealscope.diagnosis.blocks import PRESSURE_PARTS, SMOOTHED, SUPPORT, Blocks
 from sealscope.diagnosis.onset import FEWEST
 from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE, START, Equation, Signals, equations
 from sealscope.diagnosis.weak_form import SPAN, STRIDE, rows, stride_samples
+from sealscope.diagnosis.zero import about_zero
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import array_of, part_of, plain_array
@@ -181,7 +182,7 @@ class BlockStream:
         gram, weights = self._weighting.close(values)
         times = cut_rows[0].time.reshape(end - first, self._strides)
         means, pressures = self._means(signals, inner, end - first), self._pressures(signals, inner, end - first)
-        return Blocks(times[:, 0], times[:, -1], gram, weights, means, pressures)
+        return Blocks(times[:, 0], times[:, -1], gram, weights, means, pressures, np.zeros(end - first))
 
     def _means(self, signals: Signals, inner: slice, count: int) -> Array:
         """Return the means of abs(p_A - p_B), of its root and of the left side's rate over each block."""
@@ -245,7 +246,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
     seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
     stream = BlockStream(balances, recording.rate, seconds, support=None, start=float(recording.t[0]))
     blocks = stream.push(samples, last=True)
-    return None if blocks is None else (blocks.merged(), stream.columns)
+    return None if blocks is None else (about_zero(blocks, stream.columns).merged(), stream.columns)
 
 
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")

@@ -46,6 +46,7 @@ SCALES = np.concatenate([[0.0], 10.0 ** np.linspace(-5.0, 0.0, 41)])
 PRESSURE_PARTS, SMOOTHED = 9, 0.025
 _RIDGE = 1e-10  # of a matrix whose diagonal is 1
 _TURNS = 3
+_MOST, _TOLERANCE = 50, 1e-2  # turns to a fixed point at most, and the relative change that ends them
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,8 @@ class Blocks:
         Means of abs(p_A - p_B) [Pa], of its root, and of the size of the left side's rate [m^3/s].
     pressures : array of float, shape (K, PRESSURE_PARTS)
         Distribution of p_A - p_B [Pa], averaged over `SMOOTHED` seconds: means of its equal parts, in rising order.
+    zero : array of float, shape (K,)
+        What the sums have taken off p_A - p_B [Pa] (`zero.about_zero`); `means` and `pressures` are as recorded.
     """
 
     start: Array
@@ -73,6 +76,7 @@ class Blocks:
     rows: Array
     means: Array
     pressures: Array
+    zero: Array
 
     def __len__(self) -> int:
         return len(self.start)
@@ -96,15 +100,17 @@ class Blocks:
             self.end[last],
             np.add.reduceat(self.gram, first, axis=0),
             rows,
-            *(np.add.reduceat(of * shares, first, axis=0) for of in (self.means, self.pressures)),
+            np.add.reduceat(self.means * shares, first, axis=0),
+            np.add.reduceat(self.pressures * shares, first, axis=0),
+            self.zero[first],
         )
 
-    def driving(self, zero: float = 0.0, root: bool = False) -> Array:
+    def driving(self, zero: float | None = None, root: bool = False) -> Array:
         """Return the mean of abs(p_A - p_B - zero) [Pa], or of its root, over each block, shape (K,).
 
-        A leak's coefficient times it is the leak's mean flow.
+        A leak's coefficient times it is the leak's mean flow. The zero is by default that of the sums.
         """
-        size = np.abs(self.pressures - zero)
+        size = np.abs(self.pressures - (self.zero[:, None] if zero is None else zero))
         return np.asarray((np.sqrt(size) if root else size).mean(axis=1))
 
     @classmethod
@@ -231,7 +237,8 @@ def _weights(blocks: Sequence[Array], columns: Columns, known: Array | None) -> 
     reduced = np.empty_like(own)
     prior = 0.0 if known is None else known[np.ix_(slow, slow)]
     lead = 0.0 if known is None else known[slow, columns.left]
-    for _ in range(_TURNS if len(values) else 0):
+    for _ in range(_MOST if len(values) else 0):
+        before = weights
         for at in places:
             weighted = (fast[at] * weights[at, None]).T
             reduced[at] = own[at] - fast[at] @ solve(weighted @ fast[at], weighted @ own[at])
@@ -243,6 +250,8 @@ def _weights(blocks: Sequence[Array], columns: Columns, known: Array | None) -> 
         if not scale > 0.0:
             return np.ones(len(values))
         weights = np.minimum(1.0, HUBER * scale / np.maximum(residual, np.finfo(float).tiny))
+        if np.abs(weights / before - 1.0).mean() < _TOLERANCE:
+            break
     return weights
 
 
@@ -360,7 +369,7 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
     square = normal.square - float((normal.lead**2 / energy).sum())
     least = 1e-14 * normal.square / rows
     variance = max(square / rows, least)
-    for _ in range(_TURNS):
+    for _ in range(_MOST):
         belief, mean = np.zeros((2, len(believed.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
             belief[:, 1:] = (overlap() * variance / believed.drift**2)[:, None]
@@ -370,7 +379,9 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
         precision = np.minimum(belief.ravel(), 1e9 * np.diag(normal.cross))
         lead = precision * mean.ravel()
         coefficients = solve(cross + np.diag(precision), left + lead)
-        variance = max(square - float(left @ coefficients), least) / rows
+        before, variance = variance, max(square - float(left @ coefficients), least) / rows
+        if abs(variance - before) <= _TOLERANCE * before:
+            break
     return _Fitted(coefficients, precision, lead, max(overlap() * variance, np.finfo(float).tiny))
 
 
@@ -390,30 +401,10 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     """Return the fit of one equation, the tested column's coefficient free in each block.
 
     A leak g (p_A - p_B - z) has a zero z of the pressures' difference, one number: beside a change of g there is one of
-    the bias, by -g z. It is believed to be small, or with some odds far off (`terms.toml`), and found by Gauss's and
-    Newton's steps: from 0, or, far off, from the mean of p_A - p_B.
+    the bias, by -g z. About the zero of the sums (`zero.about_zero`) it is small, and found by Gauss's and Newton's
+    steps.
     """
-    width, beliefs = columns.zero(test, blocks), priors()["zero"]
-    near = _fit_from(gram, blocks, columns, test, others, 0.0, width)
-    if not width > 0.0:
-        return near
-    mean = float(
-        gram[:, columns.bias, test].sum() / max(gram[:, columns.bias, columns.bias].sum(), np.finfo(float).tiny)
-    )
-    ratio = beliefs["far"].value / beliefs["pressure"].value
-    if abs(mean) < width:
-        return near
-    far = _fit_from(gram, blocks, columns, test, others, mean, width * ratio)
-    # what the model leaves is alike within a block
-    left = [len(blocks) * np.log(own.fitted.variance) for own in (near, far)]
-    costs = left[0] + near.zero**2 / width**2, left[1] + far.zero**2 / (width * ratio) ** 2 + _unlikely()
-    return far if costs[1] < costs[0] else near
-
-
-def _fit_from(
-    gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int], zero: float, width: float
-) -> _Fit:
-    """Return the fit of one equation by Gauss's and Newton's steps from a zero of the pressures."""
+    zero, width = 0.0, columns.zero(test, blocks)
     powers, minutes = _drifts(blocks)
     rows, degrees = max(float(blocks.rows.sum()), 1.0), powers.shape[1]
     total = gram.sum(axis=0)
@@ -482,7 +473,31 @@ def zero_of(blocks: Blocks, columns: Sequence[Columns]) -> float:
         _fit(blocks.gram[:, e], blocks, own, own.leak, [k for k in own.nuisance if k != own.leak])
         for e, own in enumerate(columns)
     ]
-    return float(np.mean([fit.zero for fit in fits]))
+    return float(np.mean(blocks.zero)) + float(np.mean([fit.zero for fit in fits]))
+
+
+def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
+    """Return precision (2 K, 2 K) and vector (2 K,) of leak and offset of the flow, and where offsets are taken (K,).
+
+    They are two numbers a block, uncorrelated within it: the offset is that at the block's mean pressure difference.
+    """
+    leak, bias = columns.leak, columns.bias
+    assert bias is not None
+    gram = blocks.gram[:, 0].copy()
+    middle = gram[:, leak, bias] / np.maximum(gram[:, bias, bias], np.finfo(float).tiny)
+    fit = _fit(gram, blocks, columns, leak, [k for k in columns.nuisance if k != leak])
+    gram[:, leak] -= middle[:, None] * gram[:, bias]
+    gram[:, :, leak] -= middle[:, None] * gram[:, :, bias]
+    others = [k for k in columns.nuisance if k not in (leak, bias)]
+    at = [k for k in columns.nuisance if k != leak].index(bias)
+    powers, _ = _drifts(blocks)
+    belief = np.delete(fit.fitted.precision.reshape(-1, powers.shape[1])[:-1], at, axis=0).ravel()
+    of_leak, of_bias = (_normal(gram, powers, others, k, columns.left) for k in (leak, bias))
+    along = np.vstack([of_leak.along, of_bias.along])
+    solved = solve(of_leak.cross + np.diag(belief), np.column_stack([along.T, of_leak.left]))
+    precision = np.diag(np.concatenate([of_leak.energy, of_bias.energy])) - along @ solved[:, :-1]
+    vector = np.concatenate([of_leak.lead, of_bias.lead]) - along @ solved[:, -1]
+    return 0.5 * (precision + precision.T) / fit.fitted.variance, vector / fit.fitted.variance, middle
 
 
 def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:

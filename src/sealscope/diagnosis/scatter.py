@@ -58,14 +58,15 @@ class Rise(NamedTuple):
 def rise(judged: Blocks, baseline: Sequence[Blocks], columns: Sequence[Columns]) -> Rise:
     """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine."""
     sums = [_about_own(total(own, columns), columns) for own in baseline]
-    value = _rise(_about_own(total(judged, columns), columns), np.sum(sums, axis=0), columns)
+    everything = np.sum(sums, axis=0)
+    value = _rise(_about_own(total(judged, columns), columns), everything, columns)
     beliefs, count = priors()["scatter"], len(sums)
-    flow, pressure = (float(np.average(judged.means[:, k], weights=np.maximum(judged.rows, 1e-9))) for k in (2, 0))
+    weights = np.maximum(judged.rows, 1e-9)
+    flow, pressure = (float(np.average(of, weights=weights)) for of in (judged.means[:, 2], judged.driving()))
     believed = beliefs["leak"].value * flow / pressure if pressure > 0.0 else 0.0
     squares = beliefs["freedom"].value * believed**2
     freedom = beliefs["freedom"].value + count - 1
     if count > 1:
-        everything = np.sum(sums, axis=0)
         apart = np.array([_rise(own, everything - own, columns) for own in sums])
         squares += float(np.sum(apart**2)) * ((count - 1) / count) ** 2
     deviation = np.sqrt(squares / freedom * (1.0 + 1.0 / count))

@@ -1,0 +1,108 @@
+"""The zero of the pressure difference: what is taken off p_A - p_B so that leakage is proportional to it.
+
+Sensors that read wrong by a constant z turn a leak g (p_A - p_B) into g (d - z), d what is recorded: a change of g is a
+change of the flow's zero, too, by -g z. Near z = 0 it is a term of every fit (`blocks`); a zero that is wrong by more
+than the pressure difference itself is looked for here. In block k the Gram matrix tells two numbers apart: g_k, by how
+flow follows d within the block, and the flow's offset o_k at the block's mean difference d_k. With a step of the leak's
+coefficient, a random walk w of unknown size q, and a drift of the flow's zero,
+
+    g = F a + w + delta s,    o = (d_k - z) g + B b,    cov w = kappa q min(k, l);
+
+F (level and slope) and B (level, slope and curvature) are projected out. z maximises the restricted likelihood, over
+onsets and (q, kappa), times what is believed: a normal density of good sensors, and at small odds one of those far off.
+Where the leak does not change nothing is known of z, it stays near zero, and nothing depends on it.
+
+Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sealscope.diagnosis.blocks import Blocks, Columns, pair
+from sealscope.diagnosis.onset import FEWEST, WALKS
+from sealscope.diagnosis.terms import priors
+from sealscope.recordings.recording import Array
+
+#: Blocks that the zero is estimated from; neighbours are added up beyond.
+ENOUGH = 60
+#: Zeros that are tried at first: the inverse hyperbolic sine of them in widths of the belief.
+POSITIONS = np.linspace(-4.0, 4.0, 17)
+_RANK = 1e-9  # directions that carry less of the largest precision carry nothing
+
+
+def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
+    """Return the blocks with their sums taken about the zero of p_A - p_B that a change of the leak shows.
+
+    They are returned as they are where the balance has no offset of the flow, or too few blocks.
+    """
+    from scipy.optimize import minimize_scalar
+
+    if len(blocks) < FEWEST or len(columns) != 1 or columns[0].bias is None:
+        return blocks
+    effects = _effects(blocks.merged(ENOUGH), columns[0])
+    if effects is None:
+        return blocks
+    within, offset, z = effects
+    width, beliefs = columns[0].zero(columns[0].leak, blocks), priors()["zero"]
+    far, odds = beliefs["far"].value / beliefs["pressure"].value, beliefs["odds"].value
+
+    def cost(position: float) -> float:
+        zero = float(np.sinh(position))
+        density = np.exp(-0.5 * zero**2) + odds / far * np.exp(-0.5 * (zero / far) ** 2)
+        return -float(np.log(density)) - _likelihood(within - width * zero * offset, z)
+
+    best = int(np.argmin([cost(position) for position in POSITIONS]))
+    ends = POSITIONS[max(best - 1, 0)], POSITIONS[min(best + 1, len(POSITIONS) - 1)]
+    position = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-3}).x
+    zero, own = width * float(np.sinh(position)), columns[0]
+    gram = blocks.gram.copy()
+    gram[:, 0, own.leak] -= zero * gram[:, 0, own.bias]
+    gram[:, 0, :, own.leak] -= zero * gram[:, 0, :, own.bias]
+    return replace(blocks, gram=gram, zero=blocks.zero + zero)
+
+
+def _effects(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array] | None:
+    """Return whitened effects (n, K) of a step of leak and of offset, and residuals z (n,); None: too little is known.
+
+    Column k is a step from block k on; that of the leak goes with the recorded mean pressure difference.
+    """
+    count = len(blocks)
+    precision, vector, middle = pair(blocks, columns)
+    scale = np.sqrt(np.maximum(np.diag(precision), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(precision / np.outer(scale, scale))
+    kept = values > _RANK * max(float(values[-1]), 0.0)
+    index = np.linspace(-1.0, 1.0, count)
+    trend, drift = (np.polynomial.legendre.legvander(index, degree) for degree in (1, 2))
+    fixed = np.block([[trend, np.zeros_like(drift)], [middle[:, None] * trend, drift]])
+    if np.count_nonzero(kept) < fixed.shape[1] + FEWEST - 2:
+        return None
+    root = np.sqrt(values[kept])
+    design = (vectors[:, kept] * root).T * scale
+    fixed = design @ fixed
+    fixed /= np.maximum(np.linalg.norm(fixed, axis=0), np.finfo(float).tiny)
+    free = np.linalg.qr(fixed, mode="complete")[0][:, fixed.shape[1] :].T
+    z = free @ ((vectors[:, kept].T @ (vector / scale)) / root)
+    steps = np.tril(np.ones((count, count)))
+    offset = free @ design[:, count:]
+    return (free @ design[:, :count] + offset * middle) @ steps, offset @ steps, z
+
+
+def _likelihood(steps: Array, z: Array) -> float:
+    """Return the largest log-likelihood of z (n,) over walks and steps; a walk takes each step of `steps` (n, K)."""
+    eigen, basis = np.linalg.eigh(steps.T @ steps)
+    kept = eigen > _RANK * max(float(eigen[-1]), np.finfo(float).tiny)
+    eigen, basis, n = eigen[kept], basis[:, kept], len(z)
+    walks = WALKS * n / max(float(eigen.sum()), np.finfo(float).tiny)
+    spread = 1.0 + walks[:, None] * eigen
+    directions = steps @ (basis / np.sqrt(eigen))
+    inside = directions.T @ z
+    outside = z - directions @ inside
+    total = float(outside @ outside) + (inside**2 / spread).sum(axis=1)
+    along = (np.sqrt(eigen) * inside / spread) @ basis.T
+    size = np.maximum((eigen / spread) @ (basis**2).T, np.finfo(float).tiny)
+    rest = np.maximum(total - (np.maximum(along, 0.0) ** 2 / size).max(axis=1), 1e-9 * total)
+    return float((-0.5 * np.log(spread).sum(axis=1) - 0.5 * n * np.log(rest)).max())
