@@ -38,10 +38,6 @@ SUPPORT = 5
 MOST_BLOCKS = 240
 #: Degree of the drifts.
 DRIFT_DEGREE = 2
-#: Ratios of the variance that goes with the flow to that which does not, which are tried.
-RATIOS = (0.0, *(10.0 ** np.arange(-1.0, 5.1, 0.5)))
-#: Standard deviations of the scale of motion between blocks that are tried, and none.
-SCALES = np.concatenate([[0.0], 10.0 ** np.linspace(-5.0, 0.0, 41)])
 #: Parts of a block's distribution of pressure, and the time over which the pressure is averaged for it [s].
 PRESSURE_PARTS, SMOOTHED = 9, 0.025
 _RIDGE = 1e-10  # of a matrix whose diagonal is 1
@@ -386,12 +382,8 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
 
 
 class _Fit(NamedTuple):
-    """Sums (K, m, m) with the scale of motion of each block set aside, and the fit to them.
+    """The sums that a fit is to, the fit, its last coefficient that of the zero's error, and the zero [Pa]."""
 
-    The coefficient of the zero's error is the last one; `zero` of the pressures [Pa].
-    """
-
-    gram: Array
     normal: _Normal
     fitted: _Fitted
     zero: float
@@ -410,25 +402,15 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     total = gram.sum(axis=0)
     level = solve(total[np.ix_(others, others)], total[others, columns.left])
     believed = _Belief(np.append(np.abs(level) * columns.drift[others] * minutes, 0.0), width)
-    chosen, of_block, slope = [*others, gram.shape[1]], np.zeros((len(blocks), gram.shape[1])), np.zeros(len(blocks))
-    turns = _TURNS if width > 0.0 else 1
-    for turn in range(turns + 1):
-        about = _about(gram, columns, test, slope, zero)
-        normal = _normal(about, powers, chosen, test, columns.left)
+    chosen, slope = [*others, gram.shape[1]], np.zeros(len(blocks))
+    for turn in range(_TURNS + 1):
+        normal = _normal(_about(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
         fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
-        if turn == turns:
+        if turn == _TURNS or not width > 0.0:
             break
-        of_zero = fitted.coefficients[-degrees]
-        of_block[:, others] = powers @ fitted.coefficients[:-degrees].reshape(len(others), degrees).T
-        of_test = (normal.lead - normal.along @ fitted.coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)
-        of_block[:, test] = of_test
-        if width > 0.0:
-            slope, zero = of_test, zero + float(of_zero)
-            of_block[:, columns.bias] -= slope * zero
-        if turn == turns - 1:
-            scale = _scale(gram, of_block, fitted.variance, columns)
-            gram = _downdated(gram, scale, of_block, fitted.variance, columns)
-    return _Fit(gram, normal, fitted, zero)
+        zero += float(fitted.coefficients[-degrees])
+        slope = (normal.lead - normal.along @ fitted.coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)
+    return _Fit(normal, fitted, zero)
 
 
 def _about(gram: Array, columns: Columns, test: int, slope: Array, zero: float) -> Array:
@@ -447,7 +429,7 @@ def _about(gram: Array, columns: Columns, test: int, slope: Array, zero: float) 
 
 def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int]) -> tuple[Array, Array]:
     """Return precision (K, K) and vector (K,) of one equation."""
-    _, normal, fitted, _ = _fit(gram, blocks, columns, test, others)
+    normal, fitted, _ = _fit(gram, blocks, columns, test, others)
     right = np.column_stack([normal.along.T, normal.left + fitted.lead])
     solved = solve(normal.cross + np.diag(fitted.precision), right)
     precision = (np.diag(normal.energy) - normal.along @ solved[:, :-1]) / fitted.variance
@@ -501,41 +483,10 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
 
 
 def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
-    """Return a recording's sums (E, m, m), over the rows' variance, the scale of motion of each block set aside."""
+    """Return a recording's sums (E, m, m), over the rows' variance."""
     sums = []
     for e, own in enumerate(columns):
         others = [k for k in own.nuisance if k != own.leak]
         fit = _fit(blocks.gram[:, e], blocks, own, own.leak, others)
-        sums.append(fit.gram.sum(axis=0) / fit.fitted.variance)
+        sums.append(blocks.gram[:, e].sum(axis=0) / fit.fitted.variance)
     return np.array(sums)
-
-
-def _scale(gram: Array, coefficients: Array, variance: float, columns: Columns) -> float:
-    """Return the standard deviation of the scale of motion between blocks, of the largest likelihood.
-
-    It is what is left beside what the tested coefficient takes of each block.
-    """
-    motion, square = _motion(gram, coefficients, columns)
-    left = motion[:, columns.left] - np.einsum("km,km->k", motion, coefficients)
-    moving = square > 0.0
-    if np.count_nonzero(moving) < 2:
-        return 0.0
-    error, own = variance / square[moving], left[moving] / square[moving]
-    spread = error + SCALES[:, None] ** 2
-    likelihood = -0.5 * (np.log(spread) + own**2 / spread).sum(axis=1)
-    return float(SCALES[int(likelihood.argmax())])
-
-
-def _motion(gram: Array, coefficients: Array, columns: Columns) -> tuple[Array, Array]:
-    """Return the sums of the fitted motion with each column (K, m), and with itself (K,)."""
-    chosen = list(columns.motion)
-    sums = np.einsum("kmi,ki->km", gram[:, :, chosen], coefficients[:, chosen])
-    return sums, np.einsum("ki,ki->k", sums[:, chosen], coefficients[:, chosen])
-
-
-def _downdated(gram: Array, scale: float, coefficients: Array, variance: float, columns: Columns) -> Array:
-    """Return the sums with the scale of motion of each block, known to `scale`, set aside."""
-    if not scale > 0.0:
-        return gram
-    sums, square = _motion(gram, coefficients, columns)
-    return np.asarray(gram - sums[:, :, None] * sums[:, None, :] / (square + variance / scale**2)[:, None, None])
