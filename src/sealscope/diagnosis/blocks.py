@@ -437,16 +437,10 @@ def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others
     return 0.5 * (precision + precision.T), vector
 
 
-def _unlikely() -> float:
-    """Return minus twice the logarithm of what is believed of a zero that is far off, over that of a usual one."""
-    beliefs = priors()["zero"]
-    return 2.0 * float(np.log(beliefs["far"].value / beliefs["pressure"].value / beliefs["odds"].value))
-
-
 def cost_of_zero(zero: float) -> float:
     """Return minus twice the logarithm of what is believed of a zero of the pressures [Pa], over that of none."""
-    beliefs = priors()["zero"]
-    return min((zero / beliefs["pressure"].value) ** 2, (zero / beliefs["far"].value) ** 2 + _unlikely())
+    usual, far, odds = (priors()["zero"][name].value for name in ("pressure", "far", "odds"))
+    return min((zero / usual) ** 2, (zero / far) ** 2 + 2.0 * float(np.log(far / usual / odds)))
 
 
 def zero_of(blocks: Blocks, columns: Sequence[Columns]) -> float:

@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Blocks, Columns, pair
+from sealscope.diagnosis.blocks import Blocks, Columns, cost_of_zero, pair
 from sealscope.diagnosis.onset import FEWEST, WALKS
 from sealscope.diagnosis.terms import priors
 from sealscope.recordings.recording import Array
@@ -47,13 +47,12 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
     if effects is None:
         return blocks
     within, offset, z = effects
-    width, beliefs = columns[0].zero(columns[0].leak, blocks), priors()["zero"]
-    far, odds = beliefs["far"].value / beliefs["pressure"].value, beliefs["odds"].value
+    usual = priors()["zero"]["pressure"].value
+    width = columns[0].zero(columns[0].leak, blocks)
 
     def cost(position: float) -> float:
         zero = float(np.sinh(position))
-        density = np.exp(-0.5 * zero**2) + odds / far * np.exp(-0.5 * (zero / far) ** 2)
-        return -float(np.log(density)) - _likelihood(within - width * zero * offset, z)
+        return 0.5 * cost_of_zero(usual * zero) - _likelihood(within - width * zero * offset, z)
 
     best = int(np.argmin([cost(position) for position in POSITIONS]))
     ends = POSITIONS[max(best - 1, 0)], POSITIONS[min(best + 1, len(POSITIONS) - 1)]
