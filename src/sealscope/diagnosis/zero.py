@@ -10,7 +10,8 @@ coefficient, a random walk w of unknown size q, and a drift of the flow's zero,
 
 F (level and slope) and B (level, slope and curvature) are projected out. z maximises the restricted likelihood, over
 onsets and (q, kappa), times what is believed: a normal density of good sensors, and at small odds one of those far off.
-Where the leak does not change nothing is known of z, it stays near zero, and nothing depends on it.
+The walk is no larger than without z, or z and a walk that is free in every block explain what no leak does. Where the
+leak does not change nothing is known of z, it stays near zero, and nothing depends on it.
 
 Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
 """
@@ -29,8 +30,8 @@ from sealscope.recordings.recording import Array
 
 #: Blocks that the zero is estimated from; neighbours are added up beyond.
 ENOUGH = 60
-#: Zeros that are tried at first: the inverse hyperbolic sine of them in widths of the belief.
-POSITIONS = np.linspace(-4.0, 4.0, 17)
+#: Zeros that are tried at first, within three times what is believed of one that is far off.
+TRIED = 21
 _RANK = 1e-9  # directions that carry less of the largest precision carry nothing
 
 
@@ -47,16 +48,22 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
     if effects is None:
         return blocks
     within, offset, z = effects
-    usual = priors()["zero"]["pressure"].value
+    usual, far = (priors()["zero"][name].value for name in ("pressure", "far"))
     width = columns[0].zero(columns[0].leak, blocks)
+    walks = WALKS[: int(_likelihoods(within, z, WALKS).argmax()) + 1]
+
+    def likelihood(position: float) -> float:
+        return float(_likelihoods(within - width * np.sinh(position) * offset, z, walks).max())
 
     def cost(position: float) -> float:
-        zero = float(np.sinh(position))
-        return 0.5 * cost_of_zero(usual * zero) - _likelihood(within - width * zero * offset, z)
+        return 0.5 * cost_of_zero(usual * float(np.sinh(position))) - likelihood(position)
 
-    best = int(np.argmin([cost(position) for position in POSITIONS]))
-    ends = POSITIONS[max(best - 1, 0)], POSITIONS[min(best + 1, len(POSITIONS) - 1)]
-    position = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-3}).x
+    positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, TRIED)
+    # the likelihood rises towards a zero from far away, beside which what is believed would hide it
+    starts = {TRIED // 2, int(np.argmax([likelihood(position) for position in positions]))}
+    ends = [(positions[max(at - 1, 0)], positions[min(at + 1, TRIED - 1)]) for at in starts]
+    fits = [minimize_scalar(cost, bounds=end, method="bounded", options={"xatol": 1e-3}) for end in ends]
+    position = min(fits, key=lambda fit: fit.fun).x
     zero, own = width * float(np.sinh(position)), columns[0]
     gram = blocks.gram.copy()
     gram[:, 0, own.leak] -= zero * gram[:, 0, own.bias]
@@ -90,12 +97,12 @@ def _effects(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array] | N
     return (free @ design[:, :count] + offset * middle) @ steps, offset @ steps, z
 
 
-def _likelihood(steps: Array, z: Array) -> float:
-    """Return the largest log-likelihood of z (n,) over walks and steps; a walk takes each step of `steps` (n, K)."""
+def _likelihoods(steps: Array, z: Array, walks: Array) -> Array:
+    """Return the log-likelihood of z (n,) for each walk, beside its best step; a walk takes each of `steps` (n, K)."""
     eigen, basis = np.linalg.eigh(steps.T @ steps)
     kept = eigen > _RANK * max(float(eigen[-1]), np.finfo(float).tiny)
     eigen, basis, n = eigen[kept], basis[:, kept], len(z)
-    walks = WALKS * n / max(float(eigen.sum()), np.finfo(float).tiny)
+    walks = walks * n / max(float(eigen.sum()), np.finfo(float).tiny)
     spread = 1.0 + walks[:, None] * eigen
     directions = steps @ (basis / np.sqrt(eigen))
     inside = directions.T @ z
@@ -104,4 +111,4 @@ def _likelihood(steps: Array, z: Array) -> float:
     along = (np.sqrt(eigen) * inside / spread) @ basis.T
     size = np.maximum((eigen / spread) @ (basis**2).T, np.finfo(float).tiny)
     rest = np.maximum(total - (np.maximum(along, 0.0) ** 2 / size).max(axis=1), 1e-9 * total)
-    return float((-0.5 * np.log(spread).sum(axis=1) - 0.5 * n * np.log(rest)).max())
+    return np.asarray(-0.5 * np.log(spread).sum(axis=1) - 0.5 * n * np.log(rest))
