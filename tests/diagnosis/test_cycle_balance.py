@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.diagnosis.cycle_balance.detector import CycleBalance
 from sealscope.diagnosis.cycle_balance.holds import hold_flows
 from sealscope.diagnosis.cycle_balance.series import CycleFlows, cycle_flows
@@ -314,7 +313,6 @@ def test_a_single_rod_under_a_load_that_swings(leak: str, verdict: str) -> None:
     evidence = CycleBalance(rig).examine(recording, [], P)
     assert evidence.verdict == verdict
     assert "while one side carries the load" in evidence.reason
-    assert VolumeBalance(rig).examine(recording, [], P).verdict == "cannot tell"
     assert diagnose(recording, rig=SINGLE).verdict == verdict
     if leak:
         assert evidence.onset_s == pytest.approx(60.0, abs=4.0)

@@ -110,8 +110,8 @@ def test_a_pressure_that_rests_cannot_be_its_own_baseline() -> None:
     assert found(p_A=np.rint(2.0 * noise["p_A"])) is None  # whole numbers of a converter
     with_rest = Recording(t, {**noise, "p_B": holding(1000)}, {"p_A": "Pa", "p_B": "Pa"}, 500.0)
     plain = Recording(t, noise, {"p_A": "Pa", "p_B": "Pa"}, 500.0)
-    assert Examination(with_rest, false_alarm_probability=0.05).distrust is not None
-    assert Examination(with_rest, [plain], false_alarm_probability=0.05).distrust is None
+    assert Examination(with_rest, false_alarm_probability=0.05).doubt is not None
+    assert Examination(with_rest, [plain], false_alarm_probability=0.05).doubt is None
 
 
 def test_it_is_made_for_the_rig_given_or_the_thesis_s(recording: Recording) -> None:

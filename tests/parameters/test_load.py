@@ -101,7 +101,7 @@ def test_a_missing_parameter_is_named(tmp_path: Path) -> None:
     line = next(line for line in THESIS.splitlines(keepends=True) if line.startswith("C_d"))
     path = write(tmp_path, THESIS.replace(line, ""))
     assert refused(path) == f"line.C_d is missing ({path})"
-    assert refused(write(tmp_path, "")) == f"motor.R_c is missing ({path})"
+    assert refused(write(tmp_path, "")) == f"a rig file must hold data, got an empty file ({path})"
 
 
 def test_a_rule_across_values_names_the_file_that_was_asked_for(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def refused(path: Path, **options: object) -> str:
         (GOOD.replace("[s]", "[m]"), "time must have a unit of time, such as s, got m (FILE)"),
         (
             GOOD.replace("p_A", "Druck"),
-            "a recording must have a channel (u, omega, theta, x, p_1, p_2, p_A, p_B, q_leak, q_comp, T_oil) or be "
+            "a recording must have a channel (u, omega, theta, x, p_1, p_2, p_A, p_B, q_leak, q_comp, q_pump, T_oil) or be "
             "given a map such as p_A=COLUMN, got columns t [s], Druck [bar], note (FILE)",
         ),
         (

@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.diagnosis.balance import blocks_of, shortest
 from sealscope.diagnosis.blocks import Blocks
-from sealscope.diagnosis.decision import Balance, judge
+from sealscope.diagnosis.decision import RecordedBalance, judge
 from sealscope.diagnosis.terms import equations
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.weak_form import STRIDE, stride_samples
@@ -54,13 +54,13 @@ class VolumeBalance:
                 return f"{name} is constant or missing"
         return None
 
-    def balance(self, recording: Recording) -> Balance | None:
+    def balance(self, recording: Recording) -> RecordedBalance | None:
         """Return the recording's balance; None where it is too short for any block."""
         made = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
         if made is None:
             return None
         blocks, columns = made
-        return Balance(
+        return RecordedBalance(
             blocks,
             equations(self.rig, frozenset(recording.channels)),
             columns,

@@ -24,7 +24,7 @@ COARSE = 40
 SCALE = "scale"
 
 
-class Hypothesis(NamedTuple):
+class StepHypothesis(NamedTuple):
     """The coefficient of a term stepped: its `name`, the `cause`, the test, and its score less what it needs beside."""
 
     name: str
@@ -33,7 +33,7 @@ class Hypothesis(NamedTuple):
     score: float
 
 
-def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns]) -> tuple[Hypothesis, ...]:
+def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns]) -> tuple[StepHypothesis, ...]:
     """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak."""
     coarse = blocks.merged(COARSE)
     tested = []
@@ -52,7 +52,7 @@ def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[C
         best = max((test for test in tests if test is not None), key=lambda test: test.score, default=None)
         if best is not None:
             score = best.score - (cost if name in (LEAK, ORIFICE) else 0.0)  # the zero that it needs
-            stepped.append(Hypothesis(name, cause, best, score))
+            stepped.append(StepHypothesis(name, cause, best, score))
     return tuple(sorted(stepped, key=lambda own: -own.score))
 
 
@@ -70,7 +70,7 @@ def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Block
     return replace(blocks, gram=gram)
 
 
-def probabilities(tested: Sequence[Hypothesis]) -> dict[Cause, float]:
+def probabilities(tested: Sequence[StepHypothesis]) -> dict[Cause, float]:
     """Return the probability of each cause, given that one of them is present, the most probable first.
 
     A cause is as likely as its best term; logarithms of likelihoods are believed to within a share of the largest.
@@ -88,7 +88,7 @@ def probabilities(tested: Sequence[Hypothesis]) -> dict[Cause, float]:
     return {cause: weight / total for cause, weight in sorted(weights.items(), key=lambda item: -item[1])}
 
 
-def stepped(tested: Sequence[Hypothesis], chance: float) -> Cause | None:
+def stepped(tested: Sequence[StepHypothesis], chance: float) -> Cause | None:
     """Return the most probable cause where a step of its term is as rare as `chance` among so many; else None."""
     named = next(iter(probabilities(tested)), None)
     best = max((own.test for own in tested if own.cause == named), key=lambda test: test.score, default=None)

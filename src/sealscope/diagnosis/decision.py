@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.blocks import Blocks, Columns, Information, information, solve, total, zero_of
-from sealscope.diagnosis.causes import Hypothesis, hypotheses, probabilities
+from sealscope.diagnosis.causes import StepHypothesis, hypotheses, probabilities
 from sealscope.diagnosis.causes import stepped as stepped_cause
 from sealscope.diagnosis.onset import Course, Interval, StepTest, course, step_test
 from sealscope.diagnosis.scatter import Rise, rise
@@ -63,7 +63,7 @@ class Size(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Balance:
+class RecordedBalance:
     """A recording's blocks with all that is asked of them."""
 
     blocks: Blocks
@@ -89,7 +89,7 @@ class Balance:
         return step_test(information(self.blocks, self.columns, column.names.index(ORIFICE), column.leak))
 
     @cached_property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
+    def hypotheses(self) -> tuple[StepHypothesis, ...]:
         """Tests of all terms' coefficients, the most likely first."""
         return hypotheses(self.blocks, self.equations, self.columns)
 
@@ -133,7 +133,7 @@ class Balance:
         return course(self.leak, self.test, step)
 
 
-def _size(balance: Balance) -> Size:
+def _size(balance: RecordedBalance) -> Size:
     """Weigh what is stated of displacement and area against each other.
 
     The balance measures their ratio. A stated displacement sizes every flow directly, a stated area by that ratio;
@@ -163,7 +163,7 @@ def _size(balance: Balance) -> Size:
     return Size(1.0, known, False, ratio, area.value)
 
 
-def _area(balance: Balance, motion: list[int]) -> Interval:
+def _area(balance: RecordedBalance, motion: list[int]) -> Interval:
     """Return the piston's area by the assumed displacement [m^2], the mean of both ways and sides that occur."""
     column = balance.columns[0]
     sums = total(balance.blocks, balance.columns)[0]
@@ -178,7 +178,7 @@ def _area(balance: Balance, motion: list[int]) -> Interval:
     return Interval(abs(value), abs(value) - half, abs(value) + half)
 
 
-def judge(balance: Balance, probability: float, baseline: Sequence[Blocks] = ()) -> Evidence:
+def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Blocks] = ()) -> Evidence:
     """Return the evidence of a balance at a false-alarm probability, against healthy recordings where there are any."""
     test = balance.test
     against = rise(balance.blocks, baseline, balance.columns) if baseline else None
@@ -224,7 +224,7 @@ class _Question(NamedTuple):
     probability: float
 
 
-def _questions(balance: Balance, against: Rise | None, probability: float) -> list[_Question]:
+def _questions(balance: RecordedBalance, against: Rise | None, probability: float) -> list[_Question]:
     """Return the questions that can be asked, each with its share of the false-alarm probability."""
     from scipy.special import ndtr, ndtri
 
@@ -254,11 +254,11 @@ def _is_leak(causes: dict[Cause, float]) -> bool:
     return max(leak, pump) > others and leak > RAREST * pump
 
 
-def _together(balance: Balance) -> Cause:
+def _together(balance: RecordedBalance) -> Cause:
     return "piston or pump leak" if len(balance.columns) == 1 else "piston leak"
 
 
-def _step(balance: Balance, causes: dict[Cause, float]) -> Evidence:
+def _step(balance: RecordedBalance, causes: dict[Cause, float]) -> Evidence:
     """Return the evidence of a leak that began within the recording; its law is weighed, laminar against an orifice."""
     test, orifice = balance.test, balance.through_orifice
     assert test is not None
@@ -282,14 +282,14 @@ def _step(balance: Balance, causes: dict[Cause, float]) -> Evidence:
     return _flow(balance, evidence, value, spread)
 
 
-def _of_rise(balance: Balance, against: Rise) -> tuple[float, float]:
+def _of_rise(balance: RecordedBalance, against: Rise) -> tuple[float, float]:
     """Return a rise against the baseline and its deviation as flows [m^3/s]."""
     pressure = balance.mean(0)
     half = 0.5 * (against.interval()[1] - against.interval()[0]) / _95
     return against.value * pressure, half * pressure
 
 
-def _flow(balance: Balance, evidence: Evidence, value: float, deviation: float) -> Evidence:
+def _flow(balance: RecordedBalance, evidence: Evidence, value: float, deviation: float) -> Evidence:
     """Return the evidence with the flow [m^3/s] of a leak and its deviation, as far as the machine's size is known."""
     size = balance.size
     pump = balance.mean(2)
@@ -312,7 +312,7 @@ def _over(interval: tuple[float, float], unit: float | None) -> tuple[float, flo
     return None if unit is None or not unit > 0.0 else (max(interval[0], 0.0) / unit, interval[1] / unit)
 
 
-def bound_of(balance: Balance, against: Rise | None) -> float:
+def bound_of(balance: RecordedBalance, against: Rise | None) -> float:
     """Return the 95 % upper bound of a leak that began within the recording or came since the baseline [m^3/s]."""
     bounds = []
     if against is not None:
@@ -323,7 +323,11 @@ def bound_of(balance: Balance, against: Rise | None) -> float:
 
 
 def _with_figures(
-    balance: Balance, evidence: Evidence, against: Rise | None, questions: Sequence[_Question], judging: _Question
+    balance: RecordedBalance,
+    evidence: Evidence,
+    against: Rise | None,
+    questions: Sequence[_Question],
+    judging: _Question,
 ) -> Evidence:
     """Return the evidence with scores, thresholds, course, total, bound and the reason in words."""
     size = balance.size
@@ -355,7 +359,7 @@ def _with_figures(
     return replace(evidence, reason=_reason(balance, evidence, bound, judging.name))
 
 
-def _findable(balance: Balance, questions: Sequence[_Question]) -> float | None:
+def _findable(balance: RecordedBalance, questions: Sequence[_Question]) -> float | None:
     """Return the smallest step within the recording that would have been found [m^3/s]."""
     share = next((own.probability for own in questions if own.name == WITHIN), None)
     if balance.test is None or share is None:
@@ -363,7 +367,7 @@ def _findable(balance: Balance, questions: Sequence[_Question]) -> float | None:
     return balance.test.findable(share) * balance.mean(0)
 
 
-def _passage(balance: Balance, level: Interval, findable: float | None) -> Passage:
+def _passage(balance: RecordedBalance, level: Interval, findable: float | None) -> Passage:
     size, pressure, pump = balance.size, balance.mean(0), balance.mean(2)
     healthy = balance.rig.pump.G_healthy
     flow = pressure * size.scale / LITRE_PER_MINUTE
@@ -384,7 +388,7 @@ def _passage(balance: Balance, level: Interval, findable: float | None) -> Passa
     )
 
 
-def _leak_course(balance: Balance, evidence: Evidence) -> LeakCourse:
+def _leak_course(balance: RecordedBalance, evidence: Evidence) -> LeakCourse:
     """Return the leak over the recording: what came with it, or what passes in all where none began."""
     own = balance.whole if evidence.onset_s is None else balance.course(step=True)
     time, value = balance.blocks.time, own.mean
@@ -410,7 +414,7 @@ def _level_text(passage: Passage | None) -> str:
     )
 
 
-def _reason(balance: Balance, evidence: Evidence, bound: float, question: str) -> str:
+def _reason(balance: RecordedBalance, evidence: Evidence, bound: float, question: str) -> str:
     """Return why, in one line."""
     share = f"{100.0 * bound / balance.mean(2):.2g} % of the pump's flow" if balance.mean(2) > 0.0 else "any size"
     limit = f"{evidence.bound_lpm:.2g} L/min" if evidence.bound_lpm is not None else share

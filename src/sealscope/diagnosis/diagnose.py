@@ -141,7 +141,8 @@ class Examination:
             reason = reason or self.unreadable
         if name == ORDER[0] and reason is None:
             evidence = detector.examine(self.recording, self.machine, self.false_alarm_probability)
-            return self._with_share(replace(checked(evidence), detector=name))
+            evidence = self._with_share(replace(checked(evidence), detector=name))
+            return evidence if self.machine else self._without_baseline(evidence)
         baseline, reason = self.baseline, reason or self.doubt
         if reason is None and self.baseline:
             reasons = [unusable(detector, own) for own in self.baseline]
@@ -152,11 +153,7 @@ class Examination:
             return Evidence("cannot tell", reason, detector=name, usable=False)
         evidence = checked(detector.examine(self.recording, baseline, self.false_alarm_probability))
         evidence = self._with_share(replace(evidence, detector=name))
-        if self.no_baseline is not None:
-            if evidence.verdict == "leak" or evidence.cause is not None or evidence.alarmed:
-                evidence = replace(evidence, reason=f"{evidence.reason}; {self.no_baseline}")
-            else:
-                evidence = replace(evidence, verdict="cannot tell", reason=self.no_baseline)
+        evidence = self._without_baseline(evidence)
         if self._behind_valve and name == ORDER[-1] and evidence.verdict != "cannot tell":
             reason = f"{evidence.reason}; {_DAMPED}"
             evidence = replace(
@@ -165,6 +162,14 @@ class Examination:
         if self._single_rod and name == ORDER[-1] and evidence.verdict == "no leak":
             evidence = replace(evidence, verdict="cannot tell", reason=f"{evidence.reason}; {_UNSEEN}")
         return self._isolated(evidence) if name in _ISOLATED else evidence
+
+    def _without_baseline(self, evidence: Evidence) -> Evidence:
+        """Return the evidence where a baseline was asked for and none can be compared: no change is no health."""
+        if self.no_baseline is None:
+            return evidence
+        if evidence.verdict == "leak" or evidence.cause is not None or evidence.alarmed:
+            return replace(evidence, reason=f"{evidence.reason}; {self.no_baseline}")
+        return replace(evidence, verdict="cannot tell", reason=self.no_baseline)
 
     def _with_share(self, evidence: Evidence) -> Evidence:
         """Return the evidence with the share of all that was recorded it rests on; `no leak` needs nearly all."""

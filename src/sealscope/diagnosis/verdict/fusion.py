@@ -68,6 +68,7 @@ def _beside_the_balance(judge: Evidence, ranked: Sequence[Evidence], others: Seq
     cause = naming.cause if judge.cause is None and judge.verdict != "leak" and naming is not None else judge.cause
     reasons = [judge.reason, *(text for own in others if (text := _difference(judge, own)) is not None)]
     parts = (judge, *(own for own in ranked if own is not judge))
+    judge = judge if judge.verdict == "leak" else replace(judge, onset_s=None, onset_interval_s=None)
     return replace(judge, cause=cause, reason="; ".join(reasons), parts=parts)
 
 
