@@ -89,6 +89,9 @@ def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, heal
     assert verdicts(found) == verdicts(diagnose(recording, [leak_free]))
     assert found.quality[-1].text.startswith("1 of 2 baseline recordings is left out: ")
     alone = diagnose(recording, faulty)
+    if fault == "other rate":  # a balance of volumes needs no other rate than its own
+        assert alone.verdict != "leak"
+        return
     assert alone.verdict == "cannot tell"
     assert alone.reason.startswith("no baseline recording can be used: ")
 

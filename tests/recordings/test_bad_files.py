@@ -56,8 +56,8 @@ def refused(path: Path, **options: object) -> str:
         (GOOD.replace("[s]", "[m]"), "time must have a unit of time, such as s, got m (FILE)"),
         (
             GOOD.replace("p_A", "Druck"),
-            "a recording must have a channel (u, omega, theta, x, p_1, p_2, p_A, p_B, q_leak, q_comp, q_pump, T_oil) or be "
-            "given a map such as p_A=COLUMN, got columns t [s], Druck [bar], note (FILE)",
+            "a recording must have a channel (u, omega, theta, x, p_1, p_2, p_A, p_B, q_leak, q_comp, q_pump, T_oil) "
+            "or be given a map such as p_A=COLUMN, got columns t [s], Druck [bar], note (FILE)",
         ),
         (
             "t [s],p_A [Pa],p_A [Pa]\n0,1,2\n1,2,3\n",

@@ -174,7 +174,7 @@ def _distinct(judged: Inspection, baseline: Sequence[Recording]) -> list[Inspect
     distinct = {
         own.digest: own
         for own in map(inspected, baseline)
-        if own.distrust is None and own.unreadable is None and len(own.part)
+        if own.distrust is None and own.unreadable is None and len(own.part) >= SHORTEST
     }
     return [own for digest, own in distinct.items() if digest != judged.digest]
 
