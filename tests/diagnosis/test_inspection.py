@@ -86,10 +86,14 @@ def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, heal
     elif fault == "other rate":
         faulty = replace(faulty, t=2.0 * faulty.t, rate=0.5 * faulty.rate)
     found = diagnose(recording, [faulty, leak_free])
-    assert verdicts(found) == verdicts(diagnose(recording, [leak_free]))
+    plain = diagnose(recording, [leak_free])
+    if fault == "other rate":  # a balance of volumes needs no other rate than its own
+        assert found.verdict == plain.verdict
+    else:
+        assert verdicts(found) == verdicts(plain)
     assert found.quality[-1].text.startswith("1 of 2 baseline recordings is left out: ")
     alone = diagnose(recording, faulty)
-    if fault == "other rate":  # a balance of volumes needs no other rate than its own
+    if fault == "other rate":
         assert alone.verdict != "leak"
         return
     assert alone.verdict == "cannot tell"
