@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.stream import SequentialBalance
+from sealscope.diagnosis.inference.live.stream import SequentialBalance
 from sealscope.recordings import Recording, write
 from sealscope.simulation.simulate import simulate
 

@@ -17,9 +17,9 @@ import numpy as np
 from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleaved
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.diagnosis.balance import blocks_of
-from sealscope.diagnosis.blocks import information, zero_of
-from sealscope.diagnosis.onset import step_test
+from sealscope.diagnosis.inference.balance import blocks_of
+from sealscope.diagnosis.inference.blocks import information, zero_of
+from sealscope.diagnosis.inference.onset import step_test
 from sealscope.errors import SealscopeError
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.simulate import simulate_with_truth

@@ -13,10 +13,10 @@ import matplotlib
 import numpy as np
 
 import sealscope as ss
-from sealscope.diagnosis.balance import blocks_of
-from sealscope.diagnosis.blocks import Information, information
-from sealscope.diagnosis.onset import course, step_test
-from sealscope.diagnosis.weak_form import test_function
+from sealscope.diagnosis.inference.balance import blocks_of
+from sealscope.diagnosis.inference.blocks import Information, information
+from sealscope.diagnosis.inference.onset import course, step_test
+from sealscope.diagnosis.inference.weak_form import test_function
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE

@@ -40,8 +40,8 @@ from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
 import sealscope as ss
-from sealscope.diagnosis.live import BlockConductance, LiveBalance, NotJudged, size_error
-from sealscope.diagnosis.terms import priors
+from sealscope.diagnosis.inference.live.balance import BlockConductance, LiveBalance, NotJudged, size_error
+from sealscope.diagnosis.inference.terms import priors
 
 RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.balance_detector import VolumeBalance
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import Rig, load_rig

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sealscope import datasets
     from sealscope.diagnosis.diagnose import diagnose
     from sealscope.diagnosis.fleet.fleet import Fleet
-    from sealscope.diagnosis.stream import SequentialBalance
+    from sealscope.diagnosis.inference.live.stream import SequentialBalance
     from sealscope.diagnosis.trend.trend import Trend, trend
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.fmu.build import write_fmu, write_sensor_fmu

@@ -7,7 +7,7 @@ import itertools
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.diagnosis.balance_detector import VolumeBalance
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.simulation.simulate import simulate_with_truth
 

@@ -21,8 +21,8 @@ from sealscope.campaigns.prediction.predict import DetectionTarget, closing_text
 from sealscope.campaigns.prediction.report import PredictionReport
 from sealscope.campaigns.prediction.responses import instrument_noise, noise_responses
 from sealscope.cli import prediction
-from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.diagnosis.calibration.scorers import Look
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig

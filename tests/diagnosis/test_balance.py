@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.balance import BlockStream, blocks_of
-from sealscope.diagnosis.blocks import Blocks, Columns, information, zero_of
-from sealscope.diagnosis.onset import StepTest, step_test
-from sealscope.diagnosis.terms import equations
+from sealscope.diagnosis.inference.balance import BlockStream, blocks_of
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, zero_of
+from sealscope.diagnosis.inference.onset import StepTest, step_test
+from sealscope.diagnosis.inference.terms import equations
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.cycle_balance.detector import CycleBalance
-from sealscope.diagnosis.cycle_balance.holds import hold_flows
-from sealscope.diagnosis.cycle_balance.series import CycleFlows, cycle_flows
-from sealscope.diagnosis.cycle_balance.stretches import stretch_flows
 from sealscope.diagnosis.diagnose import Examination, diagnose
+from sealscope.diagnosis.inference.cycle_balance.detector import CycleBalance
+from sealscope.diagnosis.inference.cycle_balance.holds import hold_flows
+from sealscope.diagnosis.inference.cycle_balance.series import CycleFlows, cycle_flows
+from sealscope.diagnosis.inference.cycle_balance.stretches import stretch_flows
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.blocks import Blocks, Columns, Weighting, information, overlap, solve
-from sealscope.diagnosis.terms import LEAK, Equation, Term, priors
-from sealscope.diagnosis.weak_form import rows
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, information, overlap, solve
+from sealscope.diagnosis.inference.terms import LEAK, Equation, Term, priors
+from sealscope.diagnosis.inference.weak_form import rows
 
 FIELDS = tuple(Blocks.__dataclass_fields__)
 STROKE, OIL, ZERO, TESTED, OTHER, LEFT = range(6)

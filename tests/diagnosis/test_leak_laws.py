@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sealscope.diagnosis.balance_detector import VolumeBalance
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.observer.detector import Observer
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.parameters import load_rig

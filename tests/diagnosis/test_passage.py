@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import diagnosis_text, passes

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest
 
-from sealscope.diagnosis.blocks import Blocks, Columns
-from sealscope.diagnosis.scatter import Rise, rise
-from sealscope.diagnosis.terms import LEAK, Equation, Term, priors
+from sealscope.diagnosis.inference.blocks import Blocks, Columns
+from sealscope.diagnosis.inference.scatter import Rise, rise
+from sealscope.diagnosis.inference.terms import LEAK, Equation, Term, priors
 
 PRESSURE, FLOW = 1e5, 1e-5
 #: What is believed of the scatter of the leak's coefficient [m^3/(s Pa)].

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis.live import BLOCK_SECONDS, BlockConductance, LiveBalance
-from sealscope.diagnosis.sequential import StepDetector
-from sealscope.diagnosis.stream import BalanceState, SequentialBalance
+from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, BlockConductance, LiveBalance
+from sealscope.diagnosis.inference.live.sequential import StepDetector
+from sealscope.diagnosis.inference.live.stream import BalanceState, SequentialBalance
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.balance import BlockStream, blocks_of
-from sealscope.diagnosis.blocks import information, zero_of
-from sealscope.diagnosis.onset import StepTest, step_test
-from sealscope.diagnosis.terms import Drive, equations, priors
+from sealscope.diagnosis.inference.balance import BlockStream, blocks_of
+from sealscope.diagnosis.inference.blocks import information, zero_of
+from sealscope.diagnosis.inference.onset import StepTest, step_test
+from sealscope.diagnosis.inference.terms import Drive, equations, priors
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording

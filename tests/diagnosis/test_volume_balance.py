@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.balance_detector import VolumeBalance
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import draw

@@ -24,7 +24,7 @@ def online(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm:
     `false_alarm` at most. An alarm that was raised stays, whatever came later. A record without its channels is
     `cannot tell`.
     """
-    from sealscope.diagnosis.stream import SequentialBalance
+    from sealscope.diagnosis.inference.live.stream import SequentialBalance
 
     stream = SequentialBalance(rig, alarms_per_hour=false_alarm * 3600.0 / recording.duration)
     begin = float(recording.t[0])

@@ -10,8 +10,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.diagnosis.baseline.inspection import inspected
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.pressure_model.detector import PressureModel
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording

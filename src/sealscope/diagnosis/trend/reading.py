@@ -8,12 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from sealscope.diagnosis.balance_detector import VolumeBalance
 from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.baseline.level import DayToDay, Level
 from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.baseline.sessions import start_seconds
 from sealscope.diagnosis.detector import unusable
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.observer.against_baseline import level as observer_level
 from sealscope.diagnosis.observer.detector import Observer
 from sealscope.diagnosis.observer.evidence import misfit

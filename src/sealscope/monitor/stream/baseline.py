@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
-from sealscope.diagnosis.terms import priors
+from sealscope.diagnosis.inference.terms import priors
 from sealscope.errors import InputError
 from sealscope.storage.plain_state import plain_fields
 from sealscope.storage.plain_values import as_type

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.live import BlockConductance, NotJudged, Shown
+from sealscope.diagnosis.inference.live.balance import BlockConductance, NotJudged, Shown
 from sealscope.diagnosis.observer.detector import SLOWEST, block_length
 from sealscope.diagnosis.observer.estimates import Estimates
 from sealscope.diagnosis.observer.evidence import SIZE_ERROR, described, states_flow

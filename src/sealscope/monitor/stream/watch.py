@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.live import (
+from sealscope.diagnosis.inference.live.balance import (
     BLOCK_SECONDS,
     LEARNED,
     BlockConductance,
@@ -23,8 +23,8 @@ from sealscope.diagnosis.live import (
     size_error,
     states_flow,
 )
-from sealscope.diagnosis.sequential import RECENT, StepDetector
-from sealscope.diagnosis.terms import priors
+from sealscope.diagnosis.inference.live.sequential import RECENT, StepDetector
+from sealscope.diagnosis.inference.terms import priors
 from sealscope.errors import InputError
 from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, plain_dataclass, within
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak

@@ -45,7 +45,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Information
+from sealscope.diagnosis.inference.blocks import Information
 from sealscope.recordings.recording import Array
 
 #: Fewest blocks: a level, a slope, a step and its deviation leave nothing below.

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, MOST_BLOCKS
-from sealscope.diagnosis.cycle_balance.shaft import Shaft, shows
+from sealscope.diagnosis.inference.cycle_balance.shaft import Shaft, shows
 from sealscope.physics.leakage import orifice_over_laminar
 from sealscope.recordings.cycle import find_cycle, fundamental
 from sealscope.recordings.gaps import touched

@@ -7,11 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import PRESSURE_PARTS, SMOOTHED, SUPPORT, Blocks, Columns, Weighting
-from sealscope.diagnosis.onset import FEWEST
-from sealscope.diagnosis.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE, START, Equation, Signals, equations
-from sealscope.diagnosis.weak_form import SPAN, STRIDE, rows, stride_samples
-from sealscope.diagnosis.zero import about_zero
+from sealscope.diagnosis.inference.blocks import PRESSURE_PARTS, SMOOTHED, SUPPORT, Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.onset import FEWEST
+from sealscope.diagnosis.inference.terms import (
+    ATMOSPHERE,
+    HALF_DIFFERENCE,
+    LEAST_ABSOLUTE,
+    START,
+    Equation,
+    Signals,
+    equations,
+)
+from sealscope.diagnosis.inference.weak_form import SPAN, STRIDE, rows, stride_samples
+from sealscope.diagnosis.inference.zero import about_zero
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import array_of, part_of, plain_array

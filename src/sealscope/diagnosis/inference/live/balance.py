@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.balance import BlockStream
-from sealscope.diagnosis.blocks import Blocks, Columns, overlap, solve
-from sealscope.diagnosis.terms import Term, equations, priors
-from sealscope.diagnosis.weak_form import stride_samples
+from sealscope.diagnosis.inference.balance import BlockStream
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, overlap, solve
+from sealscope.diagnosis.inference.terms import Term, equations, priors
+from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import array_of, part_of, plain_array

@@ -23,9 +23,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Blocks, Columns, cost_of_zero, pair
-from sealscope.diagnosis.onset import FEWEST, WALKS
-from sealscope.diagnosis.terms import priors
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, cost_of_zero, pair
+from sealscope.diagnosis.inference.onset import FEWEST, WALKS
+from sealscope.diagnosis.inference.terms import priors
 from sealscope.recordings.recording import Array
 
 #: Blocks that the zero is estimated from; neighbours are added up beyond.

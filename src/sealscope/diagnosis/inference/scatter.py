@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Blocks, Columns, solve, total
-from sealscope.diagnosis.terms import priors
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
+from sealscope.diagnosis.inference.terms import priors
 from sealscope.recordings.recording import Array
 
 

@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Blocks, Columns, Information, information, solve, total, zero_of
-from sealscope.diagnosis.causes import StepHypothesis, hypotheses, probabilities
-from sealscope.diagnosis.causes import stepped as stepped_cause
-from sealscope.diagnosis.onset import Course, Interval, StepTest, course, step_test
-from sealscope.diagnosis.scatter import Rise, rise
-from sealscope.diagnosis.terms import ORIFICE, PUMP, Equation, priors
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, Information, information, solve, total, zero_of
+from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, probabilities
+from sealscope.diagnosis.inference.causes import stepped as stepped_cause
+from sealscope.diagnosis.inference.onset import Course, Interval, StepTest, course, step_test
+from sealscope.diagnosis.inference.scatter import Rise, rise
+from sealscope.diagnosis.inference.terms import ORIFICE, PUMP, Equation, priors
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
     NO_RIG,

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.balance import blocks_of, shortest
-from sealscope.diagnosis.blocks import Blocks
-from sealscope.diagnosis.decision import RecordedBalance, judge
-from sealscope.diagnosis.terms import equations
+from sealscope.diagnosis.inference.balance import blocks_of, shortest
+from sealscope.diagnosis.inference.blocks import Blocks
+from sealscope.diagnosis.inference.decision import RecordedBalance, judge
+from sealscope.diagnosis.inference.terms import equations
+from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.weak_form import STRIDE, stride_samples
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
 

@@ -49,7 +49,7 @@ class Prior(NamedTuple):
 @cache
 def priors() -> Mapping[str, Mapping[str, Prior]]:
     """Return what is believed of the terms, and between recordings, by table and name."""
-    tree = tomllib.loads((files("sealscope.diagnosis") / "terms.toml").read_text("utf-8"))
+    tree = tomllib.loads((files("sealscope.diagnosis.inference") / "terms.toml").read_text("utf-8"))
     return {table: {name: Prior(**row) for name, row in rows.items()} for table, rows in tree.items()}
 
 
@@ -155,7 +155,7 @@ def _steps(values: Array) -> Array:
     return values[1:] - values[:-1]
 
 
-class Drive(NamedTuple):
+class SpeedLoop(NamedTuple):
     """The speed loop of the pump's motor without a load.
 
     (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega, omega_d = `per_volt` u (eqs. 4.2-4.5); what the
@@ -169,7 +169,7 @@ class Drive(NamedTuple):
     pace: float
 
     @classmethod
-    def of(cls, rig: Rig) -> Drive:
+    def of(cls, rig: Rig) -> SpeedLoop:
         """Return the drive that a rig's file describes."""
         motor = rig.motor
         total = motor.k_p + motor.C_e
@@ -227,7 +227,7 @@ class Equation(NamedTuple):
     left: Callable[[Signals], Array]
     terms: tuple[Term, ...]
     healthy: str = ""
-    drive: Drive | None = None
+    drive: SpeedLoop | None = None
     takes: float = 1.0
 
 
@@ -460,7 +460,7 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
         term._replace(cause="external leak") if term.name == BIAS and "theta" in channels else term
         for term in ((_START, *_CYLINDER) if by_command else _CYLINDER)
     ]
-    balance = Equation("cylinder", left, tuple(terms), drive=Drive.of(rig) if by_command else None)
+    balance = Equation("cylinder", left, tuple(terms), drive=SpeedLoop.of(rig) if by_command else None)
     return (_with_channels(balance, channels | {START}),)
 
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, MOST_BLOCKS
-from sealscope.diagnosis.cycle_balance.series import ZERO, CycleFlows
-from sealscope.diagnosis.cycle_balance.shaft import Shaft, shows
+from sealscope.diagnosis.inference.cycle_balance.series import ZERO, CycleFlows
+from sealscope.diagnosis.inference.cycle_balance.shaft import Shaft, shows
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording
 

@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.terms import BIAS, LEAK, Equation, Prior, priors
-from sealscope.diagnosis.weak_form import SPAN, test_function
+from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation, Prior, priors
+from sealscope.diagnosis.inference.weak_form import SPAN, test_function
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import array_of, part_of, plain_array

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.blocks import Blocks, Columns, cost_of_zero, information, solve, total, zero_of
-from sealscope.diagnosis.onset import StepTest, step_test
-from sealscope.diagnosis.terms import LEAK, ORIFICE, Equation, priors
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, cost_of_zero, information, solve, total, zero_of
+from sealscope.diagnosis.inference.onset import StepTest, step_test
+from sealscope.diagnosis.inference.terms import LEAK, ORIFICE, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: Blocks that causes are weighed with: a step is dated by the leak's own test.

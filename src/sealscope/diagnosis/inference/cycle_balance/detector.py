@@ -18,10 +18,10 @@ import numpy as np
 
 from sealscope.diagnosis.changepoint.even_drift import step_near
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST, DriftStep, find_step, findable_step
-from sealscope.diagnosis.cycle_balance.holds import hold_flows
-from sealscope.diagnosis.cycle_balance.series import BLOCK, CycleFlows, cycle_flows
-from sealscope.diagnosis.cycle_balance.shaft import shaft_shown
-from sealscope.diagnosis.cycle_balance.stretches import stretch_flows
+from sealscope.diagnosis.inference.cycle_balance.holds import hold_flows
+from sealscope.diagnosis.inference.cycle_balance.series import BLOCK, CycleFlows, cycle_flows
+from sealscope.diagnosis.inference.cycle_balance.shaft import shaft_shown
+from sealscope.diagnosis.inference.cycle_balance.stretches import stretch_flows
 from sealscope.diagnosis.verdict.evidence import (
     LEAK_WORTH_FINDING,
     NO_RIG,

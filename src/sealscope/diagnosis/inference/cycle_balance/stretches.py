@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.changepoint.smooth_drift import FEWEST
-from sealscope.diagnosis.cycle_balance.series import (
+from sealscope.diagnosis.inference.cycle_balance.series import (
     COMES_BACK,
     KNOTS,
     ZERO,
     CycleFlows,
     integral,
 )
-from sealscope.diagnosis.cycle_balance.shaft import shaft_shown, shows
+from sealscope.diagnosis.inference.cycle_balance.shaft import shaft_shown, shows
 from sealscope.physics.leakage import orifice_over_laminar
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.recording import Array, Recording

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.live import (
+from sealscope.diagnosis.inference.live.balance import (
     BLOCK_SECONDS,
     BlockConductance,
     LiveBalance,
@@ -25,8 +25,8 @@ from sealscope.diagnosis.live import (
     size_error,
     states_flow,
 )
-from sealscope.diagnosis.sequential import Rise, StepDetector
-from sealscope.diagnosis.terms import priors
+from sealscope.diagnosis.inference.live.sequential import Rise, StepDetector
+from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.verdict.evidence import NO_RIG, Cause, Evidence, without_flow
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
