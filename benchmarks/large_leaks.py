@@ -5,7 +5,7 @@
 Each size is made under three commands with throttles open and half closed, by both laws of a leak: 12 records of 120 s,
 `--times` as many, each with noise and onset of its own, the leak open from an instant between 55 and 65 s on. A size
 that a command's pump cannot feed is left out there and counted. The detector was developed on this rig, which it also
-assumes; it knows neither onset nor law. Prints the table of docs/decisions/0023-volume-balance.md: of so many records
+assumes; it knows neither onset nor law. Prints the table of docs/decisions/0063-one-inference.md: of so many records
 found, of so many intervals that hold the flow, how far the stated onset is off. `--healthy` leak-free records a setting
 of the throttles and command come first.
 """

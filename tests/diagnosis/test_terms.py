@@ -10,7 +10,7 @@ import pytest
 from sealscope.diagnosis.inference.balance import BlockStream, blocks_of
 from sealscope.diagnosis.inference.blocks import information, zero_of
 from sealscope.diagnosis.inference.onset import StepTest, step_test
-from sealscope.diagnosis.inference.terms import Drive, equations, priors
+from sealscope.diagnosis.inference.terms import SpeedLoop, equations, priors
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording
@@ -41,7 +41,7 @@ def cylinder(rig: Rig, u: Array, leak: float = LEAK) -> dict[str, Array]:
 
     A dx = D omega dt - (V/K) dp_A/2 + (V/K) dp_B/2 - G (p_A - p_B) dt, with the speed that the drive makes of u.
     """
-    omega, _ = Drive.of(rig).speed(u, RATE, None)
+    omega, _ = SpeedLoop.of(rig).speed(u, RATE, None)
     true = [3e6 + sign * (5e4 * np.tanh(omega / 5.0) + 300.0 * omega) for sign in (1.0, -1.0)]
     conductance = leak * (np.arange(len(u)) / RATE >= ONSET)
     flow = rig.pump.q_b / (2.0 * np.pi) * omega
@@ -115,10 +115,10 @@ def test_the_command_s_speed_is_the_same_in_pieces(rig: Rig) -> None:
     """The drive's state goes on from piece to piece, over a missing sample too."""
     u = command()
     u[1000:1010] = np.nan
-    whole, end = Drive.of(rig).speed(u, RATE, None)
+    whole, end = SpeedLoop.of(rig).speed(u, RATE, None)
     state, parts = None, []
     for part in np.split(u, [1, 700, 1005, 5000]):
-        speed, state = Drive.of(rig).speed(part, RATE, state)
+        speed, state = SpeedLoop.of(rig).speed(part, RATE, state)
         parts.append(speed)
     assert np.allclose(np.concatenate(parts), whole, equal_nan=True, rtol=1e-9, atol=1e-6)
     assert np.isnan(whole[1000:1010]).all()
