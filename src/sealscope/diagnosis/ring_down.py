@@ -1,0 +1,409 @@
+"""Pressures and command alone: the ringing after each reversal decays the faster, the more oil passes the piston.
+
+At a reversal the piston sticks, breaks away, and p_A - p_B rings about its slow course. With two chambers of compliance
+C = V/K and a piston of mass M and area A, chamber balance ``C p' = q - A v - G p`` (half of p each) and force balance
+``M v' = A p - F(v)``, linear about the stroke's own speed v, give
+
+    ring(tau) = exp(-int sigma) (a cos(omega tau) + b sin(omega tau)),
+    sigma = dF/dv / (2 M) + G / C,    omega^2 = 2 A^2 / (C M):
+
+a leak adds G/C, whatever the friction, and C follows from the ring's own frequency. Of the friction
+``dF/dv = F_v - F_C (K_brk - 1) C_c exp(-C_c v)``, eq. (4.21), the part that falls with speed is known by shape from the
+command, by size as a prior (`pressures.toml`); the rest is constant within a stroke, as G/C is, and its slow change is
+what a test of onsets allows for. So each block has one damping g, and the ring's frequency, amplitude and phase wander
+from block to block as random walks. Reversals of like command share amplitude and phase, each direction by itself. A
+polynomial takes the slow course out of each window, and lines of the mains, whose frequency the sum p_A + p_B shows,
+where nothing rings, are fitted beside the ring.
+
+Factorisation: this is p(pressures | command). A provider that reads position and angle states p(position | pressures,
+angle) and takes p_A and p_B as given, so that both may be added.
+
+Source of the ring: Merritt, Hydraulic Control Systems, 1967, section 6.6 (valve-piston combination, hydraulic natural
+frequency and damping by leakage).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.information import Information
+from sealscope.diagnosis.priors import priors
+from sealscope.recordings.recording import Array, Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Blocks of a recording, and their least length [s]; a wander is stated for so long [s].
+BLOCKS, SHORTEST_BLOCK, WANDER_TIME = 30, 2.0, 90.0
+#: Bends of the slow course are sought over so many periods of the ring; it has one degree for so many.
+_BEND, _DEGREE = 3.0, 12.0
+#: Commands of a class are alike within this logarithm of length and size.
+_ALIKE = 0.1
+#: The first look: dampings [1/s], relative drifts of the frequency, length of the transforms.
+_DAMPINGS, _DRIFTS, _LENGTH = (-6.0, -3.0, 0.0, 4.0, 10.0, 20.0), np.linspace(-0.05, 0.05, 21), 4096
+#: Steps of the fit, gain in log likelihood that ends it, largest change of a phase in a step [rad], ridge [1], largest
+#: damping of a step [1], largest logarithm of a ring [Pa].
+_STEPS, _ENOUGH, _TURN, _RIDGE, _MOST_DAMPED, _LOUDEST = 15, 0.02, 1.5, 1e-9, 1e6, 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """What the rig's file says of the ring: `omega` [rad/s], slopes of the friction over 2 M [1/s], speed per volt."""
+
+    omega: float
+    viscous: float
+    falling: float
+    transition: float
+    speed: float
+    inertance: float
+
+    @staticmethod
+    def of(rig: Rig, pressures: float) -> Machine:
+        """Return it at a mean of p_A + p_B [Pa]."""
+        cylinder, friction = rig.cylinder, rig.friction
+        area = 0.5 * (cylinder.A_A + cylinder.A_B)
+        coulomb = friction.F_pr + friction.F_cfr * pressures
+        falling = coulomb * (friction.K_brk - 1.0) * friction.C_c
+        return Machine(
+            area * math.sqrt(2.0 * rig.fluid.K_oil / (cylinder.V * cylinder.M_eq)),
+            friction.F_v / (2.0 * cylinder.M_eq),
+            -falling / (2.0 * cylinder.M_eq),
+            friction.C_c,
+            rig.motor.omega_per_volt * rig.pump.q_b / (2.0 * math.pi) / area,
+            cylinder.M_eq / (2.0 * area**2),
+        )
+
+    @property
+    def period(self) -> float:
+        """Period of the ring [s]."""
+        return 2.0 * math.pi / self.omega
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows (r, n) of p_A - p_B [Pa] after r reversals of like command, as deviations from a slow polynomial.
+
+    `values` in the sense of the motion; `tau` [s] from the window's place after the reversal; `slow`: time integral of
+    exp(-C_c v) [s] over tau; `block` (r,); `basis` (n, d) of the polynomial; `lines` (2 m, r, n) of the mains.
+    """
+
+    values: Array
+    tau: Array
+    slow: Array
+    block: NDArray[np.int64]
+    basis: Array
+    lines: Array
+
+    def less_slow(self, rows: Array) -> Array:
+        """Return rows (..., r, n) without their slow polynomial."""
+        return np.asarray(rows - (rows @ self.basis) @ self.basis.T)
+
+    @cached_property
+    def occupied(self) -> NDArray[np.int64]:
+        """Blocks that hold a window."""
+        return np.unique(self.block)
+
+    @cached_property
+    def own(self) -> NDArray[np.int64]:
+        """Place (r,) of each window's block among the occupied ones."""
+        return np.searchsorted(self.occupied, self.block)
+
+
+def reversals(u: Array) -> tuple[Array, Array]:
+    """Return where a command (n,) changes its sign [samples] and the sign afterwards, both (r,).
+
+    A change counts between excursions beyond half of the command's rms, so that noise about zero is none.
+    """
+    level = 0.5 * float(np.sqrt(np.mean(u**2)))
+    beyond = np.flatnonzero(np.abs(u) > level)
+    turns = np.flatnonzero(np.diff(np.sign(u[beyond])))
+    places = []
+    for first, last in zip(beyond[turns], beyond[turns + 1], strict=True):
+        part = u[first : last + 1]
+        k = int(np.flatnonzero(part[:-1] * part[-1] <= 0.0)[-1])
+        places.append(first + k + part[k] / (part[k] - part[k + 1]))
+    return np.array(places), np.sign(u[beyond[turns + 1]])
+
+
+def _plateau(course: Array, width: int) -> tuple[int, int] | None:
+    """Return where the plateau of a half cycle's course (n,) begins and ends: its sharpest bends in either half."""
+    line = np.arange(width) - 0.5 * (width - 1)
+    slope = np.correlate(course, line / (line @ line), "valid")
+    if slope.size < 2 * width + 2:
+        return None
+    bend, middle = slope[:-width] - slope[width:], course.size // 2 - width
+    return int(np.argmax(bend[:middle])) + width, int(np.argmax(bend[middle:])) + middle + width
+
+
+def _mains(total: Array, rate: float) -> Array:
+    """Return the frequencies [Hz] of the mains' lines, from p_A + p_B (n,), where the ring cancels."""
+    spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), 4 * total.size))
+    frequency = np.fft.rfftfreq(4 * total.size, 1.0 / rate)
+    known = priors("pressures.toml", "mains")
+    lines = []
+    for mains in (known["mains_50"], known["mains_60"]):
+        near = np.abs(frequency - mains.value) <= 2.0 * mains.width
+        if np.any(near):
+            line = frequency[near][int(np.argmax(spectrum[near]))]
+            lines += [line * k for k in range(1, int(known["harmonics"].value) + 1)]
+    return np.array([line for line in lines if line < 0.5 * rate])
+
+
+def windows_of(recording: Recording, machine: Machine, edges: NDArray[np.int64]) -> list[Windows]:
+    """Return the windows of a recording in classes of like reversals; `edges` (K + 1,) of the blocks [samples]."""
+    rate, u = recording.rate, recording["u"]
+    dp, total = recording["p_A"] - recording["p_B"], recording["p_A"] + recording["p_B"]
+    place, sense = reversals(u)
+    if place.size < 2:
+        return []
+    sense = sense * np.sign(np.mean(u * (dp - dp.mean())))
+    span = np.diff(place)
+    squares = np.concatenate([[0.0], np.cumsum(u**2)])
+    cut = place.astype(np.int64)
+    size = np.sqrt(np.diff(squares[cut]) / span)
+    keys = np.column_stack([sense[:-1], np.round(np.log(span) / _ALIKE), np.round(np.log(size) / _ALIKE)])
+    _, kind = np.unique(keys, axis=0, return_inverse=True)
+    missing = np.concatenate([[0], np.cumsum(recording.bridged if recording.bridged is not None else 0 * u)])
+    lines, guard = 2.0 * np.pi * _mains(total, rate) / rate, round(0.7 * machine.period * rate)
+    classes = []
+    for k in range(int(kind.max()) + 1):
+        chosen = np.flatnonzero((kind.ravel() == k) & (place[:-1] > place[0]))
+        if chosen.size == 0:
+            continue
+        length, first = int(span[chosen].min()) - 1, np.ceil(place[chosen]).astype(np.int64)
+        course = np.mean(dp[first[:, None] + np.arange(length)] * sense[chosen, None], axis=0)
+        plateau = _plateau(course, round(_BEND * machine.period * rate))
+        if plateau is None or plateau[1] - plateau[0] - 2 * guard < 2.0 * _BEND * machine.period * rate:
+            continue
+        begin, n = plateau[0] + guard, plateau[1] - plateau[0] - 2 * guard
+        whole = missing[first + begin + n] == missing[first + begin]
+        chosen, first = chosen[whole], first[whole]
+        if chosen.size == 0:
+            continue
+        rows = first[:, None] + begin + np.arange(n)
+        degree = max(3, round(n / rate / (_DEGREE * machine.period)))
+        basis, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), degree))
+        slowness = np.exp(-machine.transition * machine.speed * np.abs(u[rows]))
+        empty = Windows(
+            dp[rows] * sense[chosen, None],
+            (first - place[chosen])[:, None] / rate + np.arange(n) / rate,
+            np.cumsum(slowness, axis=1) / rate,
+            np.clip(np.searchsorted(edges, first + begin + n // 2, "right") - 1, 0, edges.size - 2),
+            basis,
+            np.empty((0, *rows.shape)),
+        )
+        waves = np.exp(1j * lines[:, None, None] * rows) * sense[chosen, None]
+        classes.append(
+            Windows(
+                empty.less_slow(empty.values),
+                empty.tau,
+                empty.slow,
+                empty.block,
+                basis,
+                empty.less_slow(np.concatenate([waves.real, waves.imag])),
+            )
+        )
+    return classes
+
+
+class _Ring:
+    """The fit of the ring to the windows: Gauss-Newton steps over all parameters together.
+
+    Parameters: g (K,), omega (K,), then for each class logarithm of the amplitude and phase in the blocks that it is
+    in, then the size of the friction's falling slope [1/s] and the amplitudes of the mains' lines.
+    """
+
+    def __init__(self, classes: list[Windows], machine: Machine, blocks: int, seconds: float, rate: float) -> None:
+        self.classes, self.machine, self.blocks, self.rate = classes, machine, blocks, rate
+        self.beliefs = priors("pressures.toml", "ring_down")
+        starts = np.cumsum([2 * blocks, *(2 * each.occupied.size for each in classes)])
+        self.begins, self.falling = [int(start) for start in starts[:-1]], int(starts[-1])
+        self.size = self.falling + 1 + len(classes[0].lines)
+        self.middle = (np.arange(blocks) + 0.5) / blocks - 0.5
+        self.centre = np.zeros(self.size)
+        self.centre[self.falling] = machine.falling
+        self.strain = self._strain(seconds)
+        self.freedom = sum(each.values.size - each.block.size * each.basis.shape[1] for each in classes)
+
+    def _strain(self, seconds: float) -> Array:
+        """Return the precision (p, p) of the random walks and of the prior on the friction's slope."""
+        strain = np.zeros((self.size, self.size))
+        wide, K = self.beliefs, self.blocks
+        walks = [(np.arange(K, 2 * K), np.arange(K), wide["frequency_wander"].width * self.machine.omega)]
+        for each, begin in zip(self.classes, self.begins, strict=True):
+            m = each.occupied.size
+            walks.append((np.arange(begin, begin + m), each.occupied, wide["amplitude_wander"].width))
+            walks.append((np.arange(begin + m, begin + 2 * m), each.occupied, wide["phase_wander"].width))
+        for places, block, width in walks:
+            steps = np.diff(np.eye(places.size), axis=0)
+            variance = width**2 * np.diff(block) * seconds / WANDER_TIME
+            strain[np.ix_(places, places)] = steps.T @ (steps / variance[:, None])
+        width = wide["friction_slope"].width * abs(self.machine.falling)
+        strain[self.falling, self.falling] = 1.0 / max(width, np.finfo(float).tiny) ** 2
+        return strain
+
+    def start(self) -> Array:
+        """Return parameters (p,) from the first look: the frequency, its drift and the damping that gather most power.
+
+        Windows are summed over blocks of a steady amplitude, with phases that turn evenly over the recording.
+        """
+        machine, K = self.machine, self.blocks
+        frequency = self.beliefs["frequency"]
+        x, lines = np.zeros(self.size), self._lines()
+        free = [each.values - np.tensordot(lines, each.lines, 1) for each in self.classes]
+        bins = np.arange(_LENGTH // 2)
+        around = machine.omega / (2.0 * np.pi) * (frequency.value + 2.0 * frequency.width * np.linspace(-1, 1, 200))
+        around = around[around < 0.42 * self.rate]
+        turns = np.fft.fftfreq(4 * K, 1.0 / K) ** 2 <= 36.0
+        best, chosen = -1.0, (machine.omega, 0.0, 0.0)
+        for damping in _DAMPINGS:
+            sums = []
+            for values, each in zip(free, self.classes, strict=True):
+                decay = np.exp(-damping * np.arange(each.tau.shape[1]) / self.rate)
+                shift = np.exp(-2j * np.pi * self.rate / _LENGTH * bins * each.tau[:, :1])
+                spectra = np.fft.rfft(values * (decay / np.linalg.norm(decay)), _LENGTH)[:, : bins.size] * shift
+                total = np.zeros((K, bins.size), dtype=np.complex128)
+                np.add.at(total, each.block, spectra)
+                sums.append(total / math.sqrt(each.block.size))
+            for drift in _DRIFTS:
+                at = np.rint(around * (1.0 + drift * self.middle[:, None]) * (_LENGTH / self.rate)).astype(np.int64)
+                rows = np.arange(K)[:, None]
+                power = sum(np.max(np.abs(np.fft.fft(s[rows, at], 4 * K, axis=0)[turns]) ** 2, axis=0) for s in sums)
+                k = int(np.argmax(power))
+                if power[k] > best:
+                    best, chosen = float(power[k]), (2.0 * np.pi * around[k], drift, damping)
+        omega, drift, damping = chosen
+        slowness = np.mean([np.mean(each.slow[:, -1] / each.tau[:, -1]) for each in self.classes])
+        x[:K] = damping - machine.falling * slowness
+        x[K : 2 * K] = omega * (1.0 + drift * self.middle)
+        x[self.falling], x[self.falling + 1 :] = machine.falling, lines
+        for values, each, begin in zip(free, self.classes, self.begins, strict=True):
+            wave, when = self._wave(x, each, begin), self.middle[each.block][:, None]
+            rows = each.less_slow(np.array([wave.real, -wave.imag, wave.real * when, -wave.imag * when]))
+            a = np.linalg.lstsq(rows.reshape(4, -1).T, values.ravel(), rcond=None)[0]
+            course = (a[0] + 1j * a[1]) + (a[2] + 1j * a[3]) * self.middle[each.occupied]
+            m = each.occupied.size
+            x[begin : begin + m] = np.log(np.maximum(np.abs(course), np.finfo(float).tiny))
+            x[begin + m : begin + 2 * m] = np.unwrap(np.angle(course))
+        return x
+
+    def _lines(self) -> Array:
+        """Return the amplitudes (2 m,) of the mains' lines by themselves."""
+        m = self.size - self.falling - 1
+        rows = np.concatenate([each.lines.reshape(m, -1) for each in self.classes], axis=1)
+        values = np.concatenate([each.values.ravel() for each in self.classes])
+        return np.asarray(np.linalg.lstsq(rows @ rows.T, rows @ values, rcond=_RIDGE)[0])
+
+    def _wave(self, x: Array, each: Windows, begin: int) -> NDArray[np.complex128]:
+        """Return the ring (r, n) of a class as a complex wave, whose real part is seen."""
+        m, K = each.occupied.size, self.blocks
+        decay = x[:K][each.block, None] * each.tau + x[self.falling] * each.slow
+        start = x[begin : begin + m][each.own] + 1j * x[begin + m : begin + 2 * m][each.own]
+        turn = 1j * x[K : 2 * K][each.block, None] * each.tau
+        return np.asarray(np.exp(np.clip(start.real[:, None] - decay, None, _LOUDEST) + 1j * start.imag[:, None] + turn))
+
+    def _residual(self, x: Array, each: Windows, wave: NDArray[np.complex128]) -> Array:
+        return np.asarray(each.values - each.less_slow(wave.real) - np.tensordot(x[self.falling + 1 :], each.lines, 1))
+
+    def squares(self, x: Array) -> float:
+        """Return the sum of squares [Pa^2] that parameters (p,) leave."""
+        left = [self._residual(x, each, self._wave(x, each, at)) for each, at in zip(self.classes, self.begins, strict=True)]
+        return float(sum(np.vdot(each, each) for each in left))
+
+    def normal(self, x: Array) -> tuple[Array, Array, float, float]:
+        """Return the normal matrix (p, p), right side (p,), squares left [Pa^2], and long-run over plain variance.
+
+        The last is the mean square of the score of g in a window over what white residuals would give.
+        """
+        N, b, squares = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
+        scores = expected = 0.0
+        K, lines = self.blocks, np.arange(self.falling, self.size)
+        for each, begin in zip(self.classes, self.begins, strict=True):
+            wave, m = self._wave(x, each, begin), each.occupied.size
+            seen, turned = wave.real, -wave.imag
+            columns = np.array([-each.tau * seen, each.tau * turned, seen, turned, -each.slow * seen])
+            columns = np.concatenate([each.less_slow(columns), each.lines])
+            left = self._residual(x, each, wave)
+            squares += float(np.vdot(left, left))
+            scores += float(np.sum(np.einsum("rn,rn->r", columns[0], left) ** 2))
+            expected += float(np.vdot(columns[0], columns[0]))
+            for own, block in enumerate(each.occupied):
+                here = each.block == block
+                rows = columns[:, here].reshape(len(columns), -1)
+                at = np.concatenate([[block, K + block, begin + own, begin + m + own], lines])
+                N[np.ix_(at, at)] += rows @ rows.T
+                b[at] += rows @ left[here].ravel()
+        variance = squares / self.freedom
+        return N, b, squares, scores / max(expected * variance, np.finfo(float).tiny)
+
+    def fit(self) -> tuple[Array, Array, Array]:
+        """Return the likeliest g (K,) [1/s], and precision (K, K) and vector (K,) of g, all else eliminated."""
+        x, damping = self.start(), 1e-2
+        for _ in range(_STEPS):
+            N, b, squares, inflation = self.normal(x)
+            variance = squares / self.freedom
+            off = x - self.centre
+            H, slope = N / variance + self.strain, b / variance - self.strain @ off
+            cost = squares / variance + float(off @ self.strain @ off)
+            gained = 0.0
+            while damping < _MOST_DAMPED:
+                step = np.linalg.solve(H + np.diag(damping * np.diag(H) + _RIDGE), slope)
+                step *= min(1.0, _TURN / max(float(np.max(np.abs(step[2 * self.blocks : self.falling]))), 1e-300))
+                fresh = x + step
+                off = fresh - self.centre
+                gained = cost - self.squares(fresh) / variance - float(off @ self.strain @ off)
+                if gained > 0.0:
+                    break
+                damping = 8.0 * max(damping, 1e-3)
+            if gained <= 0.0:
+                break
+            x, damping = fresh, damping / 8.0
+            if gained < _ENOUGH:
+                break
+        N, b, squares, inflation = self.normal(x)
+        scale = self.freedom / (squares * max(1.0, inflation))
+        H, slope = N * scale + self.strain, b * scale - self.strain @ (x - self.centre)
+        K = self.blocks
+        rest = H[K:, K:] + _RIDGE * np.diag(np.diag(H[K:, K:]))
+        shared = np.linalg.solve(rest, np.column_stack([H[K:, :K], slope[K:]]))
+        precision = H[:K, :K] - H[:K, K:] @ shared[:, :K]
+        return x, precision, slope[:K] - H[:K, K:] @ shared[:, K] + precision @ x[:K]
+
+
+def evidence(recording: Recording, rig: Rig) -> Information | None:
+    """Return the information of the ringing on the conductance past the piston, block by block.
+
+    `recording`: p_A, p_B [Pa] and the command u [V] at a uniform rate. None where the rig's piston has no two like
+    areas or a valve drives it, where the command never reverses, or no reversal leaves a plateau to ring on.
+    """
+    if rig.cylinder.single_rod or rig.valve.spool == "present":
+        return None
+    n, rate = len(recording), recording.rate
+    blocks = max(1, min(BLOCKS, int(n / rate / SHORTEST_BLOCK)))
+    edges = np.round(np.linspace(0, n, blocks + 1)).astype(np.int64)
+    dp = recording["p_A"] - recording["p_B"]
+    machine = Machine.of(rig, float(np.mean(recording["p_A"] + recording["p_B"])))
+    classes = windows_of(recording, machine, edges)
+    if not classes:
+        return None
+    ring = _Ring(classes, machine, blocks, n / rate / blocks, rate)
+    x, precision, vector = ring.fit()
+    weight = np.diag(precision)
+    omega = float(weight @ x[blocks : 2 * blocks] / weight.sum())
+    compliance = 1.0 / (machine.inertance * omega**2)
+    pressure = np.add.reduceat(np.abs(dp), edges[:-1]) / np.diff(edges)
+    beliefs = ring.beliefs
+    return Information(
+        recording.t[0] + 0.5 * (edges[1:] + edges[:-1]) / rate,
+        precision / compliance**2,
+        vector / compliance,
+        pressure,
+        math.hypot(beliefs["mass"].width, 2.0 * beliefs["area"].width),
+        (1.0, beliefs["orifice"].value),
+    )
