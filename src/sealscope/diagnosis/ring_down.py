@@ -235,7 +235,8 @@ class _Ring:
         """Return the precision (p, p) of the random walks and of the prior on the friction's slope."""
         strain = np.zeros((self.size, self.size))
         wide, K = self.beliefs, self.blocks
-        walks = [(np.arange(K, 2 * K), np.arange(K), wide["frequency_wander"].width * self.machine.omega)]
+        walks = [(np.arange(K), np.arange(K), wide["damping_wander"].width)]
+        walks.append((np.arange(K, 2 * K), np.arange(K), wide["frequency_wander"].width * self.machine.omega))
         for each, begin in zip(self.classes, self.begins, strict=True):
             m = each.occupied.size
             walks.append((np.arange(begin, begin + m), each.occupied, wide["amplitude_wander"].width))
@@ -368,8 +369,10 @@ class _Ring:
                 break
         N, b, squares, inflation = self.normal(x)
         scale = self.freedom / (squares * max(1.0, inflation))
-        H, slope = N * scale + self.strain, b * scale - self.strain @ (x - self.centre)
         K = self.blocks
+        strain = self.strain.copy()
+        strain[:K, :K] = 0.0
+        H, slope = N * scale + strain, b * scale - strain @ (x - self.centre)
         rest = H[K:, K:] + _RIDGE * np.diag(np.diag(H[K:, K:]))
         shared = np.linalg.solve(rest, np.column_stack([H[K:, :K], slope[K:]]))
         precision = H[:K, :K] - H[:K, K:] @ shared[:, :K]
