@@ -1,19 +1,12 @@
-"""What is believed of machines before a recording is seen: values with widths, units and sources, in data files."""
+"""What is believed of machines before a recording is seen: values with widths, units and sources, in a data file."""
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Mapping
 from functools import cache
-from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
-
-from sealscope.errors import InputError
-from sealscope.storage.toml_file import read_toml
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-_FIELDS = {"value", "width", "unit", "source"}
+from importlib.resources import files
+from typing import NamedTuple
 
 
 class Prior(NamedTuple):
@@ -26,14 +19,7 @@ class Prior(NamedTuple):
 
 
 @cache
-def priors(file: str, table: str) -> Mapping[str, Prior]:
-    """Return the priors of a table of a packaged file of this room, by name.
-
-    Raises InputError where an entry is not value, width >= 0, unit and source.
-    """
-    place = f"diagnosis/{file}"
-    entries = read_toml(Path(__file__).with_name(file), "a file of priors", place)[table]
-    for name, entry in entries.items():
-        if set(entry) != _FIELDS or entry["width"] < 0:
-            raise InputError(f"a prior must have {', '.join(sorted(_FIELDS))} and width >= 0: {table}.{name} ({place})")
-    return MappingProxyType({name: Prior(**entry) for name, entry in entries.items()})
+def priors(table: str) -> Mapping[str, Prior]:
+    """Return the priors of a table of `pressures.toml`, by name."""
+    tree = tomllib.loads((files("sealscope.diagnosis") / "pressures.toml").read_text("utf-8"))
+    return {name: Prior(**row) for name, row in tree[table].items()}

@@ -19,15 +19,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from sealscope.compiled import contracted, kernel
-from sealscope.diagnosis.information import Information
+from sealscope.diagnosis.pressures import (
+    WANDER_TIME,
+    PressureEvidence,
+    eliminated,
+    mains_lines,
+    pressure_evidence,
+    usable,
+)
 from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.ring_down import ring_down
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
@@ -35,24 +43,30 @@ from sealscope.physics.leakage import laminar_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
 from sealscope.physics.rig import RigNumbers, rig_numbers
-from sealscope.diagnosis.ring_down import WANDER_TIME
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: What a block has of its own: speed per volt [rad/(s V)], lead of the command [s], speed beside it [rad/s], stiffness
-#: of the oil [Pa], Coulomb friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay [s/m],
-#: share by which friction is larger on the way out [1], conductance past the piston [m^3/(s Pa)].
+#: of the oil [Pa], Coulomb friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay
+#: [s/m], share by which friction is larger on the way out [1], conductance past the piston [m^3/(s Pa)], lag of the
+#: transducers [s].
 PARAMETERS = ("gain", "lead", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "lag")
 GAIN, LEAD, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, LAG = range(len(PARAMETERS))
-_SIZE, _STATES = len(PARAMETERS), 5
+_SIZE = len(PARAMETERS)
 State = tuple[float, float, float, float, float]
 Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float]
 #: Longest step of the solver [s]: RK4 is within 100 Pa there, far under the noise of transducers.
 _STEP = 1.01e-3
-#: Steps of differences as a share of what is believed, gain of log likelihood that ends a descent.
-_NUDGE, _ENOUGH = 0.05, 0.1
+#: Steps of differences as a share of what is believed; gain of log likelihood that ends a descent, steps of one.
+_NUDGE, _ENOUGH, _STEPS = 0.05, 0.1, 12
+#: Least share of a step that is tried; damping [1] of steps that did not gain, at first, at least and at most.
+_LEAST_SHARE, _DAMPED, _LEAST_DAMPED, _MOST_DAMPED = 0.02, 0.1, 1e-3, 100.0
+#: The first fit: length of its window [s], width of the Gaussian that takes the ring out [periods], steps of the slow
+#: fit, and stiffnesses from which the whole is fitted.
+_WINDOW, _SLOW, _FIRST_STEPS, _STARTS = 40.0, 0.6, 6, 3
+_POSITIVE = [GAIN, K_OIL, F_C, K_BRK, C_C]
 
 
 @contracted
@@ -120,8 +134,6 @@ def simulate_response(
             read = read + (y[0] - read) * (h / (h + now[LAG]))
 
 
-import os
-NS=int(os.environ.get('NS','3'))
 @dataclass(frozen=True, eq=False)
 class Simulator:
     """The reduced rig under a recorded command; `command` (2 every n + 1, 2) as `simulate_response` takes it."""
@@ -134,207 +146,225 @@ class Simulator:
     @staticmethod
     def of(u: Array, rate: float, rig: Rig) -> Simulator:
         """Return it for a command (n,) [V] that ramps from sample to sample."""
-        every = math.ceil(1.0 / rate / _STEP)
-        numbers = rig_numbers(rig)
-        area = 0.5 * (numbers.A_A + numbers.A_B)
+        every, numbers = math.ceil(1.0 / rate / _STEP), rig_numbers(rig)
+        area, h = 0.5 * (numbers.A_A + numbers.A_B), 1.0 / rate / every
         fine = np.interp(np.arange(2 * every * u.size + 1) / (2 * every), np.arange(u.size), u)
-        h = 1.0 / rate / every
-        return Simulator(
-            np.column_stack([fine, np.gradient(fine, 0.5 * h)]), h, every, numbers._replace(A_A=area, A_B=area)
-        )
+        command = np.column_stack([fine, np.gradient(fine, 0.5 * h)])
+        return Simulator(command, h, every, numbers._replace(A_A=area, A_B=area))
 
-    def run(self, sets: Array, block: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return p_A - p_B (n, lanes) [Pa] of up to 16 parameter sets (lanes, K, p); `block` (n,) of each sample."""
+    def run(self, sets: Array, block: NDArray[np.int64]) -> Array:
+        """Return p_A - p_B (n, lanes) [Pa] of up to 16 paths (lanes, K, p); `block` (n,): that of each sample."""
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)
         theta = np.ascontiguousarray(sets[lanes].reshape(SINGLE_WIDTH, -1).T, dtype=np.float32)
         out = np.empty((block.size, SINGLE_WIDTH), dtype=np.float32)
-        command = self.command[: 2 * self.every * block.size + 1]
-        simulate_response(command, self.h, self.every, theta, block, self.numbers, out)
-        return out[:, : len(sets)]
+        simulate_response(self.command, self.h, self.every, theta, block, self.numbers, out)
+        return out[:, : len(sets)].astype(np.float64)
 
 
-class Path:
-    """Likeliest parameters of K blocks, by Gauss-Newton steps over all blocks together.
+class Beliefs(NamedTuple):
+    """What is believed of the parameters (p,): centre of their mean, its `width`, and how far they `wander` in 90 s."""
 
-    `dp` (n,) [Pa], `edges` (K + 1,) [samples] of blocks of `seconds`; `centre`, `widths`, `walks` (p,): what is
-    believed of the parameters' mean, and how far they wander. `units` (p,): a step of a difference.
-    """
-
-    def __init__(
-        self, simulator: Simulator, dp: Array, edges: NDArray[np.int64], seconds: float, beliefs: tuple[Array, ...], width: float = 0.0
-    ) -> None:
-        self.centre, widths, walks = beliefs
-        self.simulator, self.dp, self.edges, self.K = simulator, dp, edges, edges.size - 1
-        self.block = np.repeat(np.arange(self.K), np.diff(edges))
-        self.units = _NUDGE * np.minimum(widths, walks)
-        steps, mean = np.diff(np.eye(self.K), axis=0), np.full((self.K, self.K), 1.0 / self.K**2)
-        self.strains = [
-            mean * (unit / width) ** 2 + steps.T @ steps * ((unit / walk) ** 2 * WANDER_TIME / seconds)
-            for width, walk, unit in zip(widths, walks, self.units, strict=True)
-        ]
-        self.variance, self.width = math.nan, width
-
-    def strain(self, without: int = -1) -> Array:
-        """Return the precision (K p, K p) of the path in units, `without` what is believed of one parameter."""
-        p = self.units.size
-        strain = np.zeros((self.K, p, self.K, p))
-        for j, each in enumerate(self.strains):
-            strain[:, j, :, j] = each * (j != without)
-        return strain.reshape(self.K * p, self.K * p)
-
-    def centred(self, rows: Array) -> Array:
-        """Return rows (n, ...) without their means over the blocks, and without what is quicker than `width`."""
-        if self.width > 0.0:
-            rows = gaussian_filter1d(rows, self.width, axis=0)
-        means = np.add.reduceat(rows, self.edges[:-1]) / np.diff(self.edges)[:, None]
-        return np.asarray(rows - means[self.block])
-
-    def look(self, theta: Array, move: Array, shares: Array) -> tuple[Array, Array, Array]:
-        """Return residual (n,), Jacobian (n, p) [Pa per unit] at a path moved wholly, and squares left at `shares`."""
-        p = self.units.size
-        sets = np.concatenate([np.tile(theta + move, (p + 1, 1, 1)), theta + shares[:, None, None] * move])
-        sets[range(1, p + 1), :, range(p)] += self.units[:, None]
-        shown = self.simulator.run(sets, self.block).astype(np.float64)
-        left = self.centred(np.column_stack([self.dp - shown[:, 0], self.dp[:, None] - shown[:, p + 1 :]]))
-        return left[:, 0], self.centred(shown[:, 1 : p + 1] - shown[:, :1]), np.einsum("nm,nm->m", left, left)
-
-    def normal(self, left: Array, slopes: Array) -> tuple[Array, Array]:
-        """Return the information (K p, K p) and vector (K, p) of linear blocks, in units, at the present variance."""
-        p = self.units.size
-        N, b = np.zeros((self.K, p, self.K, p)), np.empty((self.K, p))
-        for k, (first, end) in enumerate(zip(self.edges[:-1], self.edges[1:], strict=True)):
-            here = slopes[first:end]
-            N[k, :, k], b[k] = here.T @ here, here.T @ left[first:end]
-        return N.reshape(self.K * p, self.K * p) / self.variance, b / self.variance
-
-    def descend(self, theta: Array, steps: int, verbose=False) -> tuple[Array, Array, Array]:
-        """Return a likelier path (K, p) and residual and Jacobian about it."""
-        p, strain = self.units.size, self.strain()
-        shares = np.geomspace(0.5, 0.02, SINGLE_WIDTH - p - 1)
-        off = lambda path: ((path - self.centre) / self.units).ravel()  # noqa: E731
-        left, slopes, squares = self.look(theta, np.zeros_like(theta), shares)
-        damping = 0.0
-        for _ in range(steps):
-            self.variance = self.spread(left)
-            N, b = self.normal(left, slopes)
-            H, slope = N + strain, b.ravel() - strain @ off(theta)
-            cost = float(left @ left) / self.variance + off(theta) @ strain @ off(theta)
-            move = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope).reshape(self.K, p) * self.units
-            move = self.held(theta, move)
-            fresh, slopes_there, squares = self.look(theta, move, shares)
-            costs = squares / self.variance
-            costs = np.array([c + off(theta + s * move) @ strain @ off(theta + s * move) for c, s in zip(costs, [1.0, *shares])])
-            best = int(np.nanargmin(costs)) if np.any(np.isfinite(costs)) else 0
-            gained = cost - costs[best]
-            if verbose: print("   gained", gained, "best", best, "rms", np.sqrt(self.variance), "damp", damping, theta.mean(0))
-            if not gained > 0.0:
-                if damping > 10.0: break
-                damping = max(10.0 * damping, 0.1)
-                continue
-            if best == 0:
-                theta, left, slopes = theta + move, fresh, slopes_there
-                damping = damping / 10 if damping > 1e-3 else 0.0
-            else:
-                theta = theta + shares[best - 1] * move
-                left, slopes, _ = self.look(theta, np.zeros_like(theta), shares)
-            if gained < _ENOUGH:
-                break
-        self.variance = self.spread(left)
-        return theta, left, slopes
-
-    def spread(self, left: Array) -> float:
-        """Return the variance [Pa^2] of a residual (n,), for as many samples as are independent."""
-        return float(left @ left) / (left.size - self.K) * max(1.0, 2.0 * math.sqrt(math.pi) * self.width)
-
-    def held(self, theta: Array, move: Array) -> Array:
-        """Return a move that keeps what must be positive above half of itself."""
-        positive = [GAIN, K_OIL, F_C, K_BRK, C_C]
-        move = move.copy()
-        move[:, LAG] = np.maximum(move[:, LAG], -theta[:, LAG])
-        move[:, positive] = np.clip(move[:, positive], -0.5 * theta[:, positive], theta[:, positive])
-        return move
+    centre: Array
+    width: Array
+    wander: Array
 
 
-def beliefs_of(rig: Rig, pressures: float) -> tuple[Array, Array, Array]:
-    """Return centre, width and wander (p,) of the parameters of a rig's machines at a mean p_A + p_B [Pa]."""
-    friction = rig.friction
-    coulomb = friction.F_pr + friction.F_cfr * pressures
-    own = {"gain": rig.motor.omega_per_volt, "bias": rig.motor.omega_per_volt, "K": rig.fluid.K_oil, "F_C": coulomb, "F_v": friction.F_v, "K_brk": friction.K_brk, "C_c": friction.C_c}
-    mean, wander = priors("pressures.toml", "response"), priors("pressures.toml", "response_wander")
+def beliefs_of(rig: Rig, pressures: float) -> Beliefs:
+    """Return the beliefs on machines of a rig at a mean p_A + p_B [Pa]."""
+    friction, gain = rig.friction, rig.motor.omega_per_volt
+    of_difference = friction.coulomb_pressure == "difference"
+    coulomb = coulomb_friction(0.5 * pressures, 0.5 * pressures, friction.F_pr, friction.F_cfr, of_difference)
+    own = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
+    own |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
     scale = np.array([own.get(name, 1.0) for name in PARAMETERS])
-    return (
+    mean, wander = priors("response"), priors("response_wander")
+    return Beliefs(
         scale * [mean[name].value for name in PARAMETERS],
         scale * [mean[name].width for name in PARAMETERS],
         scale * [wander[name].width for name in PARAMETERS],
     )
 
 
-def evidence(recording: Recording, rig: Rig, verbose=False) -> Information | None:
-    from sealscope.diagnosis import ring_down
-    import time
-    t0=time.time()
-    n, rate = len(recording), recording.rate
-    u, dp = recording["u"], recording["p_A"] - recording["p_B"]
-    pressures = float(np.mean(recording["p_A"] + recording["p_B"]))
-    dp = dp * np.sign(np.mean(u * (dp - dp.mean())))
-    simulator = Simulator.of(u, rate, rig)
-    centre, widths, walks = beliefs_of(rig, pressures)
-    # where the ring is
-    machine = ring_down.Machine.of(rig, pressures)
-    K = max(1, min(ring_down.BLOCKS, int(n / rate / ring_down.SHORTEST_BLOCK)))
-    edges = np.round(np.linspace(0, n, K + 1)).astype(np.int64)
-    classes = ring_down.windows_of(recording, machine, edges)
-    theta = centre.copy()
-    stiff=np.ones(K); 
-    first = int(min(n, 40 * rate)); kw=max(1,int(round(K*first/n)))
-    if classes:
-        ring = ring_down._Ring(classes, machine, K, n / rate / K, rate)
-        x,_,_ = ring.fit()
-        om=x[K:2*K]; o0=om[:kw].mean()
-        theta[K_OIL] *= (o0 / machine.omega) ** 2
-        stiff=(om/o0)**2
-    t1=time.time()
-    sets = np.tile(theta, (SINGLE_WIDTH, 1, 1))
-    sets[:, 0, GAIN] *= np.geomspace(0.4, 2.5, SINGLE_WIDTH)
-    wn=widths.copy(); wn[K_OIL]=0.05*theta[K_OIL]
-    bel=(theta, wn, walks)
-    w=Path(simulator, dp[:first], np.array([0, first]), n/rate/K, bel, 0.6*machine.period*rate)
-    shown=simulator.run(sets, w.block[:first])
-    k=int(np.argmin(np.einsum("nm,nm->m",*(2*[w.centred(dp[:first,None]-shown)]))))
-    theta=sets[k]
-    theta,_,_=w.descend(theta, 6, verbose)
-    w.width=0.0
-    sets=np.tile(theta,(SINGLE_WIDTH,1,1)); sets[:,0,K_OIL]=bel[0][K_OIL]*np.linspace(0.93,1.07,SINGLE_WIDTH)
-    cost=np.einsum("nm,nm->m",*(2*[w.centred(dp[:first,None]-simulator.run(sets, w.block[:first]))]))
-    low=np.flatnonzero((cost<=np.append(cost[1:],np.inf))&(cost<=np.append(np.inf,cost[:-1])))
-    low=low[np.argsort(cost[low])][:NS]
-    if theta[0,K_OIL]<0.93*bel[0][K_OIL] or theta[0,K_OIL]>1.07*bel[0][K_OIL] or True: starts=[theta,*sets[low]]
-    tried=[w.descend(x0, 12, verbose) for x0 in starts]
-    sq=[float(l@l) for _,l,_ in tried]
-    if verbose: print("tried",np.sqrt(np.array(sq)/first).round(0))
-    theta=tried[int(np.argmin(sq))][0]
-    t2=time.time()
-    path=Path(simulator, dp, edges, n/rate/K, bel)
-    theta=np.tile(theta,(K,1)); theta[:,K_OIL]*=stiff
-    theta, left, slopes = path.descend(theta, 15, verbose)
-    t3=time.time()
-    if verbose: print("times",t1-t0,t2-t1,t3-t2)
-    lines=2*np.pi*ring_down._mains(recording["p_A"]+recording["p_B"],rate)/rate
-    waves=np.exp(1j*np.arange(n)[:,None]*lines); W=np.column_stack([waves.real,waves.imag])
-    left=left-W@np.linalg.lstsq(W.T@W,W.T@left,rcond=None)[0]
-    path.variance=float(left@left)/n
-    N,b=path.normal(left,slopes)
-    # long run variance
-    sc=slopes[:,G]*left; L=int(rate); m=n//L
-    infl=np.mean(sc[:m*L].reshape(m,L).sum(1)**2)/(np.mean(np.sum(slopes[:m*L,G].reshape(m,L)**2,1))*path.variance)
-    N/=max(1,infl); b=b/max(1,infl)
-    strain=path.strain(G); off=((theta-path.centre)/path.units).ravel()
-    H=N+strain; slope=b.ravel()-strain@off
-    g=np.arange(G,H.shape[0],len(PARAMETERS)); rest=np.setdiff1d(np.arange(H.shape[0]),g)
-    sol=np.linalg.solve(H[np.ix_(rest,rest)],np.column_stack([H[np.ix_(rest,g)],slope[rest]]))
-    precision=H[np.ix_(g,g)]-H[np.ix_(g,rest)]@sol[:,:-1]
-    vector=slope[g]-H[np.ix_(g,rest)]@sol[:,-1]+precision@(theta[:,G]/path.units[G])
-    pressure=np.add.reduceat(np.abs(dp),edges[:-1])/np.diff(edges)
-    out=Information(recording.t[0]+0.5*(edges[1:]+edges[:-1])/rate, precision/path.units[G]**2, vector/path.units[G], pressure, 0.17,(1.0,2.0))
-    if verbose: print("rms",np.sqrt(path.variance),"infl",infl, theta.mean(0), theta[:,G])
-    return out
+class Path:
+    """Likeliest parameters of K blocks, by Gauss-Newton steps over all blocks together.
+
+    `dp` (n,) [Pa], `edges` (K + 1,) of the blocks [samples], each `seconds` long. With `smooth` [samples] > 0 only what
+    a Gaussian of that width leaves of the pressure is fitted. `unit` (p,): a step of the parameters for a difference.
+    """
+
+    def __init__(
+        self, simulator: Simulator, dp: Array, edges: NDArray[np.int64], seconds: float, beliefs: Beliefs
+    ) -> None:
+        self.simulator, self.dp, self.edges, self.beliefs = simulator, dp, edges, beliefs
+        self.blocks, self.smooth, self.variance = edges.size - 1, 0.0, math.nan
+        self.block = np.repeat(np.arange(self.blocks), np.diff(edges))
+        self.unit = _NUDGE * np.minimum(beliefs.width, beliefs.wander)
+        steps, level = np.diff(np.eye(self.blocks), axis=0), np.full((self.blocks, self.blocks), self.blocks**-2.0)
+        walk = WANDER_TIME / seconds * steps.T @ steps
+        self.strain = np.zeros((self.blocks, _SIZE, self.blocks, _SIZE))
+        for j, unit in enumerate(self.unit):
+            self.strain[:, j, :, j] = (unit / beliefs.wander[j]) ** 2 * walk + (unit / beliefs.width[j]) ** 2 * level
+
+    def seen(self, rows: Array) -> Array:
+        """Return rows (n, ...) without their means over the blocks, and without what is not fitted."""
+        rows = gaussian_filter1d(rows, self.smooth, axis=0) if self.smooth > 0.0 else rows
+        means = np.add.reduceat(rows, self.edges[:-1]) / np.diff(self.edges)[:, None]
+        return np.asarray(rows - means[self.block])
+
+    def squares(self, sets: Array) -> Array:
+        """Return the squares [Pa^2] that up to 16 paths (m, K, p) leave."""
+        left = self.seen(self.dp[:, None] - self.simulator.run(sets, self.block))
+        return np.einsum("nm,nm->m", left, left)
+
+    def look(self, theta: Array, others: Array) -> tuple[Array, Array, Array]:
+        """Return residual (n,) and Jacobian (n, p) [Pa per unit] at a path, and the squares that `others` leave."""
+        sets = np.concatenate([np.tile(theta, (_SIZE + 1, 1, 1)), others])
+        sets[range(1, _SIZE + 1), :, range(_SIZE)] += self.unit[:, None]
+        shown = self.simulator.run(sets, self.block)
+        left = self.seen(self.dp[:, None] - shown[:, [0, *range(_SIZE + 1, len(sets))]])
+        slopes = self.seen(shown[:, 1 : _SIZE + 1] - shown[:, :1])
+        return left[:, 0], slopes, np.einsum("nm,nm->m", left[:, 1:], left[:, 1:])
+
+    def spread(self, left: Array) -> float:
+        """Return the variance [Pa^2] of a residual (n,), for as many samples as are independent of each other."""
+        return float(left @ left) / (left.size - self.blocks) * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
+
+    def normal(self, left: Array, slopes: Array) -> tuple[Array, Array]:
+        """Return information (K p, K p) and vector (K p,) of the blocks, in units, at the present variance."""
+        N, b = np.zeros_like(self.strain), np.empty((self.blocks, _SIZE))
+        for k, (first, end) in enumerate(zip(self.edges[:-1], self.edges[1:], strict=True)):
+            here = slopes[first:end]
+            N[k, :, k], b[k] = here.T @ here, here.T @ left[first:end]
+        return N.reshape(b.size, b.size) / self.variance, b.ravel() / self.variance
+
+    def off(self, theta: Array) -> Array:
+        """Return a path (K, p) as deviations (K p,) from what is believed, in units."""
+        return np.asarray((theta - self.beliefs.centre) / self.unit).ravel()
+
+    def descend(self, theta: Array, steps: int) -> tuple[Array, Array, Array]:
+        """Return a likelier path (K, p) with residual (n,) and Jacobian (n, p) about it.
+
+        A whole step is run with its Jacobian, beside shares of it; where none of them gains, it is damped.
+        """
+        strain = self.strain.reshape(theta.size, theta.size)
+        shares = np.concatenate([[1.0], np.geomspace(0.5, _LEAST_SHARE, SINGLE_WIDTH - _SIZE - 1)])
+        left, slopes, _ = self.look(theta, theta[None])
+        damping = 0.0
+        for _ in range(steps):
+            self.variance = self.spread(left)
+            N, b = self.normal(left, slopes)
+            off = self.off(theta)
+            H = N + strain
+            move = np.linalg.solve(H + damping * np.diag(np.diag(H)), b - strain @ off)
+            paths = theta + shares[:, None, None] * move.reshape(theta.shape) * self.unit
+            paths = self._held(theta, paths)
+            there, slopes_there, squares = self.look(paths[0], paths[1:])
+            offs = np.array([self.off(path) for path in paths])
+            costs = np.append(there @ there, squares) / self.variance + np.einsum("mi,mi->m", offs @ strain, offs)
+            gains = np.nan_to_num(left @ left / self.variance + off @ strain @ off - costs, nan=-np.inf)
+            best = int(np.argmax(gains))
+            if not gains[best] > 0.0:
+                damping = max(10.0 * damping, _DAMPED)
+                if damping > _MOST_DAMPED:
+                    break
+                continue
+            theta, damping = paths[best], 0.1 * damping if damping > _LEAST_DAMPED else 0.0
+            left, slopes = (there, slopes_there) if best == 0 else self.look(theta, theta[None])[:2]
+            if gains[best] < _ENOUGH:
+                break
+        self.variance = self.spread(left)
+        return theta, left, slopes
+
+    @staticmethod
+    def _held(theta: Array, paths: Array) -> Array:
+        """Return paths (m, K, p) whose positive parameters are between half and twice those of `theta` (K, p)."""
+        paths[:, :, _POSITIVE] = np.clip(paths[:, :, _POSITIVE], 0.5 * theta[:, _POSITIVE], 2.0 * theta[:, _POSITIVE])
+        paths[:, :, LAG] = np.maximum(paths[:, :, LAG], 0.0)
+        return paths
+
+
+def first_fit(path: Path, period: float) -> Array:
+    """Return parameters (1, p) that hold over a window, a path of one block; the ring has a `period` [samples].
+
+    The ringing makes many local minima. So the slow part of the pressure is fitted first, from the best of several
+    gains; then the whole, from what was reached and from the best stiffnesses about the one believed.
+    """
+    spread, beliefs = np.linspace(-2.0, 2.0, SINGLE_WIDTH), path.beliefs
+
+    def tried(theta: Array, parameter: int) -> tuple[Array, Array]:
+        sets = np.tile(theta, (SINGLE_WIDTH, 1, 1))
+        centre = beliefs.centre[parameter]
+        sets[:, 0, parameter] = centre * np.exp(beliefs.width[parameter] / centre * spread)
+        return sets, np.nan_to_num(path.squares(sets), nan=np.inf)
+
+    path.smooth = _SLOW * period
+    sets, squares = tried(beliefs.centre, GAIN)
+    theta, _, _ = path.descend(sets[int(np.argmin(squares))], _FIRST_STEPS)
+    path.smooth = 0.0
+    sets, squares = tried(theta, K_OIL)
+    beside = np.pad(squares, 1, constant_values=np.inf)
+    minima = np.flatnonzero((squares <= beside[2:]) & (squares <= beside[:-2]))
+    starts = [theta, *sets[minima[np.argsort(squares[minima])][:_STARTS]]]
+    fits = [path.descend(start, _STEPS) for start in starts]
+    return min(fits, key=lambda fit: float(np.nan_to_num(fit[1] @ fit[1], nan=np.inf)))[0]
+
+
+def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
+    """Return what the whole response says of the conductance past the piston, block by block.
+
+    Parameters
+    ----------
+    recording : Recording
+        p_A, p_B [Pa] and the command u [V] at a uniform rate.
+    rig : Rig
+        What is believed of the machine.
+
+    Returns
+    -------
+    PressureEvidence or None
+        None where the rig's piston has no two like areas or a valve drives it, nothing rings after a reversal, or no
+        parameters simulate the recording.
+    """
+    ring = ring_down(recording, rig) if usable(recording, rig) else None
+    if ring is None:
+        return None
+    rate, edges, seconds = recording.rate, ring.edges, recording.duration / len(ring.omega)
+    dp, total = recording["p_A"] - recording["p_B"], recording["p_A"] + recording["p_B"]
+    dp = dp * np.sign(np.mean(recording["u"] * (dp - dp.mean())))
+    beliefs, simulator = beliefs_of(rig, float(np.mean(total))), Simulator.of(recording["u"], rate, rig)
+    early = min(len(ring.omega), max(1, round(_WINDOW / seconds)))
+    softened = float(np.mean(ring.stiffness[:early]))
+    beliefs.centre[K_OIL] *= softened
+    beliefs.width[K_OIL] = priors("response")["K_of_ring"].width * beliefs.centre[K_OIL]
+    window = Path(simulator, dp[: edges[early]], edges[[0, early]], seconds, beliefs)
+    with np.errstate(over="ignore", invalid="ignore"):
+        first = first_fit(window, 2.0 * np.pi * rate / float(np.mean(ring.omega)))
+        theta = np.tile(first, (len(ring.omega), 1))
+        theta[:, K_OIL] *= ring.stiffness / softened
+        path = Path(simulator, dp, edges, seconds, beliefs)
+        theta, left, slopes = path.descend(theta, _STEPS)
+    if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(left))):
+        return None
+    waves = np.exp(2j * np.pi / rate * np.arange(dp.size)[:, None] * mains_lines(total, rate))
+    rows = np.column_stack([waves.real, waves.imag])
+    left = left - rows @ np.linalg.lstsq(rows.T @ rows, rows.T @ left, rcond=None)[0]
+    precision, vector = _of_conductance(path, theta, left, slopes, round(rate))
+    return pressure_evidence(recording, edges, precision, vector, (1.0, priors("response")["orifice"].value))
+
+
+def _of_conductance(path: Path, theta: Array, left: Array, slopes: Array, second: int) -> tuple[Array, Array]:
+    """Return precision (K, K) and vector (K,) of G, noise scaled by its long-run variance in G's score over a `second`.
+
+    What is believed of G itself, which guided the descent, is taken out.
+    """
+    score = np.add.reduceat(slopes[:, G] * left, np.arange(0, left.size, second))
+    path.variance = path.spread(left)
+    expected = path.variance * float(slopes[:, G] @ slopes[:, G])
+    path.variance *= max(1.0, float(score @ score) / max(expected, np.finfo(float).tiny))
+    N, b = path.normal(left, slopes)
+    strain = path.strain.copy()
+    strain[:, G, :, G] = 0.0
+    strain = strain.reshape(N.shape)
+    precision, vector = eliminated(N + strain, b - strain @ path.off(theta), np.arange(G, len(N), _SIZE))
+    unit = path.unit[G]
+    return precision / unit**2, (vector + precision @ (theta[:, G] / unit)) / unit

@@ -32,17 +32,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.information import Information
+from sealscope.diagnosis.pressures import (
+    WANDER_TIME,
+    PressureEvidence,
+    block_edges,
+    eliminated,
+    mains_lines,
+    pressure_evidence,
+    usable,
+)
 from sealscope.diagnosis.priors import priors
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Array, Recording, remembered
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Blocks of a recording, and their least length [s]; a wander is stated for so long [s].
-BLOCKS, SHORTEST_BLOCK, WANDER_TIME = 30, 2.0, 90.0
-#: Bends of the slow course are sought over so many periods of the ring; it has one degree for so many.
-_BEND, _DEGREE = 3.0, 12.0
+#: Bends of the slow course are sought over so many periods of the ring; it has one degree for so many, and
+#: a window keeps so many off the bends.
+_BEND, _DEGREE, _GUARD = 3.0, 12.0, 0.7
 #: Commands of a class are alike within this logarithm of length and size.
 _ALIKE = 0.1
 #: The first look: dampings [1/s], relative drifts of the frequency, length of the transforms.
@@ -102,7 +109,7 @@ class Windows:
 
     def less_slow(self, rows: Array) -> Array:
         """Return rows (..., r, n) without their slow polynomial."""
-        return np.asarray(rows - (rows @ self.basis) @ self.basis.T)
+        return _less(rows, self.basis)
 
     @cached_property
     def occupied(self) -> NDArray[np.int64]:
@@ -141,75 +148,73 @@ def _plateau(course: Array, width: int) -> tuple[int, int] | None:
     return int(np.argmax(bend[:middle])) + width, int(np.argmax(bend[middle:])) + middle + width
 
 
-def _mains(total: Array, rate: float) -> Array:
-    """Return the frequencies [Hz] of the mains' lines, from p_A + p_B (n,), where the ring cancels."""
-    spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), 4 * total.size))
-    frequency = np.fft.rfftfreq(4 * total.size, 1.0 / rate)
-    known = priors("pressures.toml", "mains")
-    lines = []
-    for mains in (known["mains_50"], known["mains_60"]):
-        near = np.abs(frequency - mains.value) <= 2.0 * mains.width
-        if np.any(near):
-            line = frequency[near][int(np.argmax(spectrum[near]))]
-            lines += [line * k for k in range(1, int(known["harmonics"].value) + 1)]
-    return np.array([line for line in lines if line < 0.5 * rate])
-
-
 def windows_of(recording: Recording, machine: Machine, edges: NDArray[np.int64]) -> list[Windows]:
     """Return the windows of a recording in classes of like reversals; `edges` (K + 1,) of the blocks [samples]."""
-    rate, u = recording.rate, recording["u"]
-    dp, total = recording["p_A"] - recording["p_B"], recording["p_A"] + recording["p_B"]
+    u, dp = recording["u"], recording["p_A"] - recording["p_B"]
     place, sense = reversals(u)
     if place.size < 2:
         return []
-    sense = sense * np.sign(np.mean(u * (dp - dp.mean())))
-    span = np.diff(place)
-    squares = np.concatenate([[0.0], np.cumsum(u**2)])
-    cut = place.astype(np.int64)
-    size = np.sqrt(np.diff(squares[cut]) / span)
-    keys = np.column_stack([sense[:-1], np.round(np.log(span) / _ALIKE), np.round(np.log(size) / _ALIKE)])
+    sense = sense[:-1] * np.sign(np.mean(u * (dp - dp.mean())))
+    span, cut = np.diff(place), place.astype(np.int64)
+    size = np.sqrt(np.diff(np.concatenate([[0.0], np.cumsum(u**2)])[cut]) / span)
+    keys = np.column_stack([sense, np.round(np.log(span) / _ALIKE), np.round(np.log(size) / _ALIKE)])
     _, kind = np.unique(keys, axis=0, return_inverse=True)
-    missing = np.concatenate([[0], np.cumsum(recording.bridged if recording.bridged is not None else 0 * u)])
-    lines, guard = 2.0 * np.pi * _mains(total, rate) / rate, round(0.7 * machine.period * rate)
+    cutting = _Cutting(
+        recording, machine, edges, dp, 2.0 * np.pi * mains_lines(recording["p_A"] + recording["p_B"], recording.rate)
+    )
     classes = []
     for k in range(int(kind.max()) + 1):
         chosen = np.flatnonzero((kind.ravel() == k) & (place[:-1] > place[0]))
-        if chosen.size == 0:
-            continue
-        length, first = int(span[chosen].min()) - 1, np.ceil(place[chosen]).astype(np.int64)
-        course = np.mean(dp[first[:, None] + np.arange(length)] * sense[chosen, None], axis=0)
-        plateau = _plateau(course, round(_BEND * machine.period * rate))
-        if plateau is None or plateau[1] - plateau[0] - 2 * guard < 2.0 * _BEND * machine.period * rate:
-            continue
+        if chosen.size > 0:
+            windows = cutting.windows(place[chosen], int(span[chosen].min()) - 1, sense[chosen])
+            classes += [] if windows is None else [windows]
+    return classes
+
+
+@dataclass(frozen=True, eq=False)
+class _Cutting:
+    """Cuts windows out of a recording's p_A - p_B (n,) [Pa]; `lines` [rad/s] of the mains."""
+
+    recording: Recording
+    machine: Machine
+    edges: NDArray[np.int64]
+    dp: Array
+    lines: Array
+
+    def windows(self, place: Array, length: int, sense: Array) -> Windows | None:
+        """Return the windows after the reversals at `place` (r,), within `length` samples; None without a plateau."""
+        rate, machine, u = self.recording.rate, self.machine, self.recording["u"]
+        first, ring = np.ceil(place).astype(np.int64), machine.period * rate
+        course = np.mean(self.dp[first[:, None] + np.arange(length)] * sense[:, None], axis=0)
+        plateau = _plateau(course, round(_BEND * ring))
+        guard = round(_GUARD * ring)
+        if plateau is None or plateau[1] - plateau[0] - 2 * guard < 2.0 * _BEND * ring:
+            return None
         begin, n = plateau[0] + guard, plateau[1] - plateau[0] - 2 * guard
-        whole = missing[first + begin + n] == missing[first + begin]
-        chosen, first = chosen[whole], first[whole]
-        if chosen.size == 0:
-            continue
+        if self.recording.bridged is not None:
+            missing = np.concatenate([[0], np.cumsum(self.recording.bridged)])
+            whole = missing[first + begin + n] == missing[first + begin]
+            first, place, sense = first[whole], place[whole], sense[whole]
+        if first.size == 0:
+            return None
         rows = first[:, None] + begin + np.arange(n)
-        degree = max(3, round(n / rate / (_DEGREE * machine.period)))
+        degree = max(3, round(n / (_DEGREE * ring)))
         basis, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), degree))
         slowness = np.exp(-machine.transition * machine.speed * np.abs(u[rows]))
-        empty = Windows(
-            dp[rows] * sense[chosen, None],
-            (first - place[chosen])[:, None] / rate + np.arange(n) / rate,
-            np.cumsum(slowness, axis=1) / rate,
-            np.clip(np.searchsorted(edges, first + begin + n // 2, "right") - 1, 0, edges.size - 2),
-            basis,
-            np.empty((0, *rows.shape)),
+        waves = np.exp(1j * self.lines[:, None, None] / rate * rows) * sense[:, None]
+        return Windows(
+            values=_less(self.dp[rows] * sense[:, None], basis),
+            tau=((first - place)[:, None] + np.arange(n)) / rate,
+            slow=np.cumsum(slowness, axis=1) / rate,
+            block=np.clip(np.searchsorted(self.edges, first + begin + n // 2, "right") - 1, 0, self.edges.size - 2),
+            basis=basis,
+            lines=_less(np.concatenate([waves.real, waves.imag]), basis),
         )
-        waves = np.exp(1j * lines[:, None, None] * rows) * sense[chosen, None]
-        classes.append(
-            Windows(
-                empty.less_slow(empty.values),
-                empty.tau,
-                empty.slow,
-                empty.block,
-                basis,
-                empty.less_slow(np.concatenate([waves.real, waves.imag])),
-            )
-        )
-    return classes
+
+
+def _less(rows: Array, basis: Array) -> Array:
+    """Return rows (..., n) without their parts along the orthonormal columns of `basis` (n, d)."""
+    return np.asarray(rows - (rows @ basis) @ basis.T)
 
 
 class _Ring:
@@ -221,7 +226,7 @@ class _Ring:
 
     def __init__(self, classes: list[Windows], machine: Machine, blocks: int, seconds: float, rate: float) -> None:
         self.classes, self.machine, self.blocks, self.rate = classes, machine, blocks, rate
-        self.beliefs = priors("pressures.toml", "ring_down")
+        self.beliefs = priors("ring_down")
         starts = np.cumsum([2 * blocks, *(2 * each.occupied.size for each in classes)])
         self.begins, self.falling = [int(start) for start in starts[:-1]], int(starts[-1])
         self.size = self.falling + 1 + len(classes[0].lines)
@@ -307,14 +312,17 @@ class _Ring:
         decay = x[:K][each.block, None] * each.tau + x[self.falling] * each.slow
         start = x[begin : begin + m][each.own] + 1j * x[begin + m : begin + 2 * m][each.own]
         turn = 1j * x[K : 2 * K][each.block, None] * each.tau
-        return np.asarray(np.exp(np.clip(start.real[:, None] - decay, None, _LOUDEST) + 1j * start.imag[:, None] + turn))
+        return np.asarray(
+            np.exp(np.clip(start.real[:, None] - decay, None, _LOUDEST) + 1j * start.imag[:, None] + turn)
+        )
 
     def _residual(self, x: Array, each: Windows, wave: NDArray[np.complex128]) -> Array:
         return np.asarray(each.values - each.less_slow(wave.real) - np.tensordot(x[self.falling + 1 :], each.lines, 1))
 
     def squares(self, x: Array) -> float:
         """Return the sum of squares [Pa^2] that parameters (p,) leave."""
-        left = [self._residual(x, each, self._wave(x, each, at)) for each, at in zip(self.classes, self.begins, strict=True)]
+        pairs = zip(self.classes, self.begins, strict=True)
+        left = [self._residual(x, each, self._wave(x, each, begin)) for each, begin in pairs]
         return float(sum(np.vdot(each, each) for each in left))
 
     def normal(self, x: Array) -> tuple[Array, Array, float, float]:
@@ -368,45 +376,70 @@ class _Ring:
             if gained < _ENOUGH:
                 break
         N, b, squares, inflation = self.normal(x)
-        scale = self.freedom / (squares * max(1.0, inflation))
-        K = self.blocks
-        strain = self.strain.copy()
-        strain[:K, :K] = 0.0
-        H, slope = N * scale + strain, b * scale - strain @ (x - self.centre)
-        rest = H[K:, K:] + _RIDGE * np.diag(np.diag(H[K:, K:]))
-        shared = np.linalg.solve(rest, np.column_stack([H[K:, :K], slope[K:]]))
-        precision = H[:K, :K] - H[:K, K:] @ shared[:, :K]
-        return x, precision, slope[:K] - H[:K, K:] @ shared[:, K] + precision @ x[:K]
+        scale, strain = self.freedom / (squares * max(1.0, inflation)), self.strain.copy()
+        strain[: self.blocks, : self.blocks] = 0.0
+        own = np.arange(self.blocks)
+        precision, vector = eliminated(N * scale + strain, b * scale - strain @ (x - self.centre), own)
+        return x, precision, vector + precision @ x[: self.blocks]
 
 
-def evidence(recording: Recording, rig: Rig) -> Information | None:
-    """Return the information of the ringing on the conductance past the piston, block by block.
+@dataclass(frozen=True, eq=False)
+class RingDown:
+    """The ring of a recording, block by block between `edges` (K + 1,) [samples].
 
-    `recording`: p_A, p_B [Pa] and the command u [V] at a uniform rate. None where the rig's piston has no two like
-    areas or a valve drives it, where the command never reverses, or no reversal leaves a plateau to ring on.
+    `omega` (K,) [rad/s]; `stiffness` (K,): its square over that of the rig's own [1]; `precision` (K, K) and `vector`
+    (K,) of the damping g [1/s]; `inertance` M/(2 A^2) [kg/m^4].
     """
-    if rig.cylinder.single_rod or rig.valve.spool == "present":
+
+    edges: NDArray[np.int64]
+    omega: Array
+    stiffness: Array
+    precision: Array
+    vector: Array
+    inertance: float
+
+    @property
+    def compliance(self) -> float:
+        """Compliance of a chamber and what is connected to it [m^3/Pa], from the ring: C = 2 A^2/(M omega^2)."""
+        weight = np.maximum(np.diag(self.precision), np.finfo(float).tiny)
+        return float(1.0 / (self.inertance * (weight @ self.omega / weight.sum()) ** 2))
+
+
+def ring_down(recording: Recording, rig: Rig) -> RingDown | None:
+    """Return the ring of a recording that is `usable`, computed once; None where no reversal leaves a plateau."""
+
+    def compute(recording: Recording) -> RingDown | None:
+        edges, rate = block_edges(recording), recording.rate
+        machine = Machine.of(rig, float(np.mean(recording["p_A"] + recording["p_B"])))
+        classes = windows_of(recording, machine, edges)
+        if not classes:
+            return None
+        blocks = edges.size - 1
+        x, precision, vector = _Ring(classes, machine, blocks, recording.duration / blocks, rate).fit()
+        omega = x[blocks : 2 * blocks]
+        return RingDown(edges, omega, (omega / machine.omega) ** 2, precision, vector, machine.inertance)
+
+    return remembered(recording, ("ring down", rig), compute, ("u", "p_A", "p_B"))
+
+
+def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
+    """Return what the ringing says of the conductance past the piston, block by block.
+
+    Parameters
+    ----------
+    recording : Recording
+        p_A, p_B [Pa] and the command u [V] at a uniform rate; windows with bridged samples are left out.
+    rig : Rig
+        What is believed of the machine: friction's falling slope, mass over area squared, where the ring may be.
+
+    Returns
+    -------
+    PressureEvidence or None
+        None where the rig's piston has no two like areas, a valve drives it, or nothing rings after a reversal.
+    """
+    ring = ring_down(recording, rig) if usable(recording, rig) else None
+    if ring is None:
         return None
-    n, rate = len(recording), recording.rate
-    blocks = max(1, min(BLOCKS, int(n / rate / SHORTEST_BLOCK)))
-    edges = np.round(np.linspace(0, n, blocks + 1)).astype(np.int64)
-    dp = recording["p_A"] - recording["p_B"]
-    machine = Machine.of(rig, float(np.mean(recording["p_A"] + recording["p_B"])))
-    classes = windows_of(recording, machine, edges)
-    if not classes:
-        return None
-    ring = _Ring(classes, machine, blocks, n / rate / blocks, rate)
-    x, precision, vector = ring.fit()
-    weight = np.diag(precision)
-    omega = float(weight @ x[blocks : 2 * blocks] / weight.sum())
-    compliance = 1.0 / (machine.inertance * omega**2)
-    pressure = np.add.reduceat(np.abs(dp), edges[:-1]) / np.diff(edges)
-    beliefs = ring.beliefs
-    return Information(
-        recording.t[0] + 0.5 * (edges[1:] + edges[:-1]) / rate,
-        precision / compliance**2,
-        vector / compliance,
-        pressure,
-        math.hypot(beliefs["mass"].width, 2.0 * beliefs["area"].width),
-        (1.0, beliefs["orifice"].value),
-    )
+    laws = (1.0, priors("ring_down")["orifice"].value)
+    C = ring.compliance
+    return pressure_evidence(recording, ring.edges, ring.precision / C**2, ring.vector / C, laws)
