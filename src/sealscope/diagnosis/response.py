@@ -305,8 +305,9 @@ def first_fit(path: Path, period: float) -> Array:
     beside = np.pad(squares, 1, constant_values=np.inf)
     minima = np.flatnonzero((squares <= beside[2:]) & (squares <= beside[:-2]))
     starts = [theta, *sets[minima[np.argsort(squares[minima])][:_STARTS]]]
-    fits = [path.descend(start, _STEPS) for start in starts]
-    return min(fits, key=lambda fit: float(np.nan_to_num(fit[1] @ fit[1], nan=np.inf)))[0]
+    fits = [path.descend(start, _FIRST_STEPS) for start in starts]
+    best = min(fits, key=lambda fit: float(np.nan_to_num(fit[1] @ fit[1], nan=np.inf)))[0]
+    return path.descend(best, _STEPS)[0]
 
 
 def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:

@@ -56,7 +56,9 @@ _ALIKE = 0.1
 _DAMPINGS, _DRIFTS, _LENGTH = (-6.0, -3.0, 0.0, 4.0, 10.0, 20.0), np.linspace(-0.05, 0.05, 21), 4096
 #: Steps of the fit, gain in log likelihood that ends it, largest change of a phase in a step [rad], ridge [1], largest
 #: damping of a step [1], largest logarithm of a ring [Pa].
-_STEPS, _ENOUGH, _TURN, _RIDGE, _MOST_DAMPED, _LOUDEST = 15, 0.02, 1.5, 1e-9, 1e6, 25.0
+_STEPS, _ENOUGH, _TURN, _RIDGE, _DAMPED, _MOST_DAMPED, _LOUDEST = 15, 0.02, 1.5, 1e-9, 0.01, 1e6, 25.0
+#: Shares of the windows that are fitted in turn.
+_HEADS = (0.25, 0.5, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,13 @@ class Windows:
     def less_slow(self, rows: Array) -> Array:
         """Return rows (..., r, n) without their slow polynomial."""
         return _less(rows, self.basis)
+
+    def head(self, n: int) -> Windows:
+        """Return the first n samples of each window."""
+        basis, _ = np.linalg.qr(self.basis[:n])
+        rows = (_less(rows[..., :n], basis) for rows in (self.values, self.lines))
+        values, lines = rows
+        return Windows(values, self.tau[:, :n], self.slow[:, :n], self.block, basis, lines)
 
     @cached_property
     def occupied(self) -> NDArray[np.int64]:
@@ -185,18 +194,17 @@ class _Cutting:
         """Return the windows after the reversals at `place` (r,), within `length` samples; None without a plateau."""
         rate, machine, u = self.recording.rate, self.machine, self.recording["u"]
         first, ring = np.ceil(place).astype(np.int64), machine.period * rate
-        course = np.mean(self.dp[first[:, None] + np.arange(length)] * sense[:, None], axis=0)
-        plateau = _plateau(course, round(_BEND * ring))
-        guard = round(_GUARD * ring)
-        if plateau is None or plateau[1] - plateau[0] - 2 * guard < 2.0 * _BEND * ring:
-            return None
-        begin, n = plateau[0] + guard, plateau[1] - plateau[0] - 2 * guard
         if self.recording.bridged is not None:
             missing = np.concatenate([[0], np.cumsum(self.recording.bridged)])
-            whole = missing[first + begin + n] == missing[first + begin]
+            whole = missing[first + length] == missing[first]
             first, place, sense = first[whole], place[whole], sense[whole]
         if first.size == 0:
             return None
+        course = np.mean(self.dp[first[:, None] + np.arange(length)] * sense[:, None], axis=0)
+        plateau, guard = _plateau(course, round(_BEND * ring)), round(_GUARD * ring)
+        if plateau is None or plateau[1] - plateau[0] - 2 * guard < 2.0 * _BEND * ring:
+            return None
+        begin, n = plateau[0] + guard, plateau[1] - plateau[0] - 2 * guard
         rows = first[:, None] + begin + np.arange(n)
         degree = max(3, round(n / (_DEGREE * ring)))
         basis, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), degree))
@@ -351,36 +359,38 @@ class _Ring:
         variance = squares / self.freedom
         return N, b, squares, scores / max(expected * variance, np.finfo(float).tiny)
 
-    def fit(self) -> tuple[Array, Array, Array]:
-        """Return the likeliest g (K,) [1/s], and precision (K, K) and vector (K,) of g, all else eliminated."""
-        x, damping = self.start(), 1e-2
+    def descend(self, x: Array) -> Array:
+        """Return likelier parameters (p,), by damped Gauss-Newton steps."""
+        damping = _DAMPED
         for _ in range(_STEPS):
-            N, b, squares, inflation = self.normal(x)
-            variance = squares / self.freedom
-            off = x - self.centre
+            N, b, squares, _ = self.normal(x)
+            variance, off = squares / self.freedom, x - self.centre
             H, slope = N / variance + self.strain, b / variance - self.strain @ off
-            cost = squares / variance + float(off @ self.strain @ off)
-            gained = 0.0
-            while damping < _MOST_DAMPED:
+            cost, gained = squares / variance + float(off @ self.strain @ off), 0.0
+            while damping < _MOST_DAMPED and gained <= 0.0:
                 step = np.linalg.solve(H + np.diag(damping * np.diag(H) + _RIDGE), slope)
-                step *= min(1.0, _TURN / max(float(np.max(np.abs(step[2 * self.blocks : self.falling]))), 1e-300))
-                fresh = x + step
+                largest = float(np.max(np.abs(step[2 * self.blocks : self.falling])))
+                fresh = x + min(1.0, _TURN / max(largest, _RIDGE)) * step
                 off = fresh - self.centre
                 gained = cost - self.squares(fresh) / variance - float(off @ self.strain @ off)
-                if gained > 0.0:
-                    break
-                damping = 8.0 * max(damping, 1e-3)
-            if gained <= 0.0:
-                break
-            x, damping = fresh, damping / 8.0
+                damping = damping / 8.0 if gained > 0.0 else 8.0 * damping
+            if gained > 0.0:
+                x = fresh
             if gained < _ENOUGH:
                 break
+        return x
+
+    def information(self, x: Array) -> tuple[Array, Array]:
+        """Return precision (K, K) and vector (K,) of g about parameters (p,), all others eliminated.
+
+        What is believed of g itself, which guided the descent, is taken out.
+        """
         N, b, squares, inflation = self.normal(x)
         scale, strain = self.freedom / (squares * max(1.0, inflation)), self.strain.copy()
         strain[: self.blocks, : self.blocks] = 0.0
         own = np.arange(self.blocks)
         precision, vector = eliminated(N * scale + strain, b * scale - strain @ (x - self.centre), own)
-        return x, precision, vector + precision @ x[: self.blocks]
+        return precision, vector + precision @ x[: self.blocks]
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,7 +425,12 @@ def ring_down(recording: Recording, rig: Rig) -> RingDown | None:
         if not classes:
             return None
         blocks = edges.size - 1
-        x, precision, vector = _Ring(classes, machine, blocks, recording.duration / blocks, rate).fit()
+        size = blocks, recording.duration / blocks, rate
+        x = _Ring(classes, machine, *size).start()
+        for share in _HEADS:  # a phase that is lost late in a window is kept early in it
+            rings = _Ring([each.head(math.ceil(share * each.tau.shape[1])) for each in classes], machine, *size)
+            x = rings.descend(x)
+        precision, vector = rings.information(x)
         omega = x[blocks : 2 * blocks]
         return RingDown(edges, omega, (omega / machine.omega) ** 2, precision, vector, machine.inertance)
 
