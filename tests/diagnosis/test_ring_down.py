@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from tests.diagnosis.ringing import Ring, recording_of, step_of
 
 from sealscope.diagnosis.ring_down import evidence, reversals, ring_down
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
+
+from .ringing import Ring, recording_of, step_of
 
 THESIS = load_rig("thesis")
 KNOWN = Ring(frequency=65.0, damping=12.0, step=4.0)

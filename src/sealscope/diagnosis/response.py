@@ -214,7 +214,7 @@ class Path:
     def squares(self, sets: Array) -> Array:
         """Return the squares [Pa^2] that up to 16 paths (m, K, p) leave."""
         left = self.seen(self.dp[:, None] - self.simulator.run(sets, self.block))
-        return np.einsum("nm,nm->m", left, left)
+        return np.asarray(np.einsum("nm,nm->m", left, left))
 
     def look(self, theta: Array, others: Array) -> tuple[Array, Array, Array]:
         """Return residual (n,) and Jacobian (n, p) [Pa per unit] at a path, and the squares that `others` leave."""
@@ -365,7 +365,7 @@ def _of_conductance(path: Path, theta: Array, left: Array, slopes: Array, second
     N, b = path.normal(left, slopes)
     strain = path.strain.copy()
     strain[:, G, :, G] = 0.0
-    strain = strain.reshape(N.shape)
-    precision, vector = eliminated(N + strain, b - strain @ path.off(theta), np.arange(G, len(N), _SIZE))
+    beliefs = strain.reshape(N.shape)
+    precision, vector = eliminated(N + beliefs, b - beliefs @ path.off(theta), np.arange(G, len(N), _SIZE))
     unit = path.unit[G]
     return precision / unit**2, (vector + precision @ (theta[:, G] / unit)) / unit

@@ -52,8 +52,10 @@ if TYPE_CHECKING:
 _BEND, _DEGREE, _GUARD = 3.0, 12.0, 0.7
 #: Commands of a class are alike within this logarithm of length and size.
 _ALIKE = 0.1
-#: The first look: dampings [1/s], relative drifts of the frequency, length of the transforms.
+#: The first look: dampings [1/s], relative drifts of the frequency, length of the transforms, frequencies, the highest
+#: as a share of the rate, and turns of the phase over the recording.
 _DAMPINGS, _DRIFTS, _LENGTH = (-6.0, -3.0, 0.0, 4.0, 10.0, 20.0), np.linspace(-0.05, 0.05, 21), 4096
+_FREQUENCIES, _HIGHEST, _TURNS = 200, 0.42, 6.0
 #: Steps of the fit, gain in log likelihood that ends it, largest change of a phase in a step [rad], ridge [1], largest
 #: damping of a step [1], largest logarithm of a ring [Pa].
 _STEPS, _ENOUGH, _TURN, _RIDGE, _DAMPED, _MOST_DAMPED, _LOUDEST = 15, 0.02, 1.5, 1e-9, 0.01, 1e6, 25.0
@@ -263,37 +265,12 @@ class _Ring:
         return strain
 
     def start(self) -> Array:
-        """Return parameters (p,) from the first look: the frequency, its drift and the damping that gather most power.
-
-        Windows are summed over blocks of a steady amplitude, with phases that turn evenly over the recording.
-        """
-        machine, K = self.machine, self.blocks
-        frequency = self.beliefs["frequency"]
-        x, lines = np.zeros(self.size), self._lines()
+        """Return parameters (p,) from the first look, with amplitudes and phases that change evenly."""
+        machine, K, lines = self.machine, self.blocks, self._lines()
         free = [each.values - np.tensordot(lines, each.lines, 1) for each in self.classes]
-        bins = np.arange(_LENGTH // 2)
-        around = machine.omega / (2.0 * np.pi) * (frequency.value + 2.0 * frequency.width * np.linspace(-1, 1, 200))
-        around = around[around < 0.42 * self.rate]
-        turns = np.fft.fftfreq(4 * K, 1.0 / K) ** 2 <= 36.0
-        best, chosen = -1.0, (machine.omega, 0.0, 0.0)
-        for damping in _DAMPINGS:
-            sums = []
-            for values, each in zip(free, self.classes, strict=True):
-                decay = np.exp(-damping * np.arange(each.tau.shape[1]) / self.rate)
-                shift = np.exp(-2j * np.pi * self.rate / _LENGTH * bins * each.tau[:, :1])
-                spectra = np.fft.rfft(values * (decay / np.linalg.norm(decay)), _LENGTH)[:, : bins.size] * shift
-                total = np.zeros((K, bins.size), dtype=np.complex128)
-                np.add.at(total, each.block, spectra)
-                sums.append(total / math.sqrt(each.block.size))
-            for drift in _DRIFTS:
-                at = np.rint(around * (1.0 + drift * self.middle[:, None]) * (_LENGTH / self.rate)).astype(np.int64)
-                rows = np.arange(K)[:, None]
-                power = sum(np.max(np.abs(np.fft.fft(s[rows, at], 4 * K, axis=0)[turns]) ** 2, axis=0) for s in sums)
-                k = int(np.argmax(power))
-                if power[k] > best:
-                    best, chosen = float(power[k]), (2.0 * np.pi * around[k], drift, damping)
-        omega, drift, damping = chosen
+        omega, drift, damping = self._strongest(free)
         slowness = np.mean([np.mean(each.slow[:, -1] / each.tau[:, -1]) for each in self.classes])
+        x = np.zeros(self.size)
         x[:K] = damping - machine.falling * slowness
         x[K : 2 * K] = omega * (1.0 + drift * self.middle)
         x[self.falling], x[self.falling + 1 :] = machine.falling, lines
@@ -306,6 +283,37 @@ class _Ring:
             x[begin : begin + m] = np.log(np.maximum(np.abs(course), np.finfo(float).tiny))
             x[begin + m : begin + 2 * m] = np.unwrap(np.angle(course))
         return x
+
+    def _strongest(self, free: list[Array]) -> tuple[float, float, float]:
+        """Return frequency [rad/s], its drift [1] and the damping [1/s] that gather most power of the windows `free`.
+
+        Windows are summed over blocks of a steady amplitude, with phases that turn evenly over the recording.
+        """
+        K, bin_width, known = self.blocks, self.rate / _LENGTH, self.beliefs["frequency"]
+        around = known.value + 2.0 * known.width * np.linspace(-1.0, 1.0, _FREQUENCIES)
+        around = around * self.machine.omega / (2.0 * np.pi)
+        around = around[around < _HIGHEST * self.rate]
+        reach = 1.0 + 0.5 * float(np.max(np.abs(_DRIFTS)))
+        first, last = math.floor(around[0] / reach / bin_width), math.ceil(around[-1] * reach / bin_width)
+        bins, rows = np.arange(first, min(last + 2, _LENGTH // 2)), np.arange(K)[:, None]
+        turns = np.abs(np.fft.fftfreq(4 * K, 1.0 / K)) <= _TURNS
+        best, chosen = -1.0, (self.machine.omega, 0.0, 0.0)
+        for damping in _DAMPINGS:
+            sums = []
+            for values, each in zip(free, self.classes, strict=True):
+                decay = np.exp(-damping * np.arange(each.tau.shape[1]) / self.rate)
+                shift = np.exp(-2j * np.pi * bin_width * bins * each.tau[:, :1])
+                spectra = np.fft.rfft(values * (decay / np.linalg.norm(decay)), _LENGTH)[:, bins] * shift
+                sums.append((each.block == rows) @ spectra / math.sqrt(each.block.size))
+            for drift in _DRIFTS:
+                at = np.rint(around * (1.0 + drift * self.middle[:, None]) / bin_width).astype(np.int64) - first
+                power = np.zeros(around.size)
+                for total in sums:
+                    power += np.max(np.abs(np.fft.fft(total[rows, at], 4 * K, axis=0)[turns]) ** 2, axis=0)
+                k = int(np.argmax(power))
+                if power[k] > best:
+                    best, chosen = float(power[k]), (2.0 * np.pi * float(around[k]), float(drift), damping)
+        return chosen
 
     def _lines(self) -> Array:
         """Return the amplitudes (2 m,) of the mains' lines by themselves."""
