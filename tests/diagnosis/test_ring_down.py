@@ -123,3 +123,9 @@ def test_a_command_that_never_reverses_leaves_nothing_to_tell() -> None:
     recording = recording_of(KNOWN, THESIS, seconds=20.0)
     held = {"u": 1.0 + 0.1 * np.array(recording["u"]) / KNOWN.volts}
     assert evidence(replace(recording, channels={**recording.channels, **held}), THESIS) is None
+
+
+def test_a_rate_below_the_ring_s_leaves_nothing_to_tell() -> None:
+    recording = recording_of(KNOWN, THESIS, seconds=20.0)
+    slow = {name: recording[name][::8] for name in recording.channels}
+    assert evidence(Recording(recording.t[::8], slow, recording.units, recording.rate / 8), THESIS) is None

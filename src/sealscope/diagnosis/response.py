@@ -29,6 +29,7 @@ from sealscope.compiled import contracted, kernel
 from sealscope.diagnosis.pressures import (
     WANDER_TIME,
     PressureEvidence,
+    block_edges,
     eliminated,
     mains_lines,
     pressure_evidence,
@@ -323,25 +324,26 @@ def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
     Returns
     -------
     PressureEvidence or None
-        None where the rig's piston has no two like areas or a valve drives it, nothing rings after a reversal, or no
-        parameters simulate the recording.
+        None where the rig's piston has no two like areas or a valve drives it, or no parameters simulate the recording.
     """
-    ring = ring_down(recording, rig) if usable(recording, rig) else None
-    if ring is None:
+    if not usable(recording, rig):
         return None
-    rate, edges, seconds = recording.rate, ring.edges, recording.duration / len(ring.omega)
+    ring, edges, rate = ring_down(recording, rig), block_edges(recording), recording.rate
     dp, total = recording["p_A"] - recording["p_B"], recording["p_A"] + recording["p_B"]
     dp = dp * np.sign(np.mean(recording["u"] * (dp - dp.mean())))
     beliefs, simulator = beliefs_of(rig, float(np.mean(total))), Simulator.of(recording["u"], rate, rig)
-    early = min(len(ring.omega), max(1, round(_WINDOW / seconds)))
-    softened = float(np.mean(ring.stiffness[:early]))
-    beliefs.centre[K_OIL] *= softened
-    beliefs.width[K_OIL] = priors("response")["K_of_ring"].width * beliefs.centre[K_OIL]
-    window = Path(simulator, dp[: edges[early]], edges[[0, early]], seconds, beliefs)
+    blocks = edges.size - 1
+    seconds, stiffness = recording.duration / blocks, np.ones(blocks)
+    early = min(blocks, max(1, round(_WINDOW / seconds)))
+    if ring is not None:
+        stiffness = ring.stiffness / float(np.mean(ring.stiffness[:early]))
+        beliefs.centre[K_OIL] *= float(np.mean(ring.stiffness[:early]))
+        beliefs.width[K_OIL] = priors("response")["K_of_ring"].width * beliefs.centre[K_OIL]
+    m, window = simulator.numbers, Path(simulator, dp[: edges[early]], edges[[0, early]], seconds, beliefs)
+    period = 2.0 * math.pi * rate * math.sqrt(m.V * m.M_eq / (2.0 * beliefs.centre[K_OIL])) / m.A_A
     with np.errstate(over="ignore", invalid="ignore"):
-        first = first_fit(window, 2.0 * np.pi * rate / float(np.mean(ring.omega)))
-        theta = np.tile(first, (len(ring.omega), 1))
-        theta[:, K_OIL] *= ring.stiffness / softened
+        theta = np.tile(first_fit(window, period), (blocks, 1))
+        theta[:, K_OIL] *= stiffness
         path = Path(simulator, dp, edges, seconds, beliefs)
         theta, left, slopes = path.descend(theta, _STEPS)
     if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(left))):

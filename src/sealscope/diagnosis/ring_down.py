@@ -429,7 +429,9 @@ def ring_down(recording: Recording, rig: Rig) -> RingDown | None:
     def compute(recording: Recording) -> RingDown | None:
         edges, rate = block_edges(recording), recording.rate
         machine = Machine.of(rig, float(np.mean(recording["p_A"] + recording["p_B"])))
-        classes = windows_of(recording, machine, edges)
+        lowest = 1.0 - 2.0 * priors("ring_down")["frequency"].width
+        slow = machine.omega * lowest > 2.0 * math.pi * _HIGHEST * rate
+        classes = [] if slow else windows_of(recording, machine, edges)
         if not classes:
             return None
         blocks = edges.size - 1
