@@ -1,16 +1,19 @@
-"""What a provider says from pressures and command: information on the leak, block by block, and how it is a flow."""
+"""What the providers of evidence from pressures and command share: beliefs, blocks, elimination, and their result."""
 
 from __future__ import annotations
 
 import math
+import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.blocks import Information
-from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -19,6 +22,22 @@ if TYPE_CHECKING:
 
 #: Most blocks of a recording, and their least length [s]; a wander is stated for so long [s].
 BLOCKS, SHORTEST_BLOCK, WANDER_TIME = 30, 2.0, 90.0
+
+
+class Prior(NamedTuple):
+    """A normal prior: its centre `value` and standard deviation `width`, both in `unit`, and the `source` of them."""
+
+    value: float
+    width: float
+    unit: str
+    source: str
+
+
+@cache
+def priors(table: str) -> Mapping[str, Prior]:
+    """Return the priors of a table of `pressures.toml`, by name."""
+    tree = tomllib.loads((files("sealscope.diagnosis") / "pressures.toml").read_text("utf-8"))
+    return {name: Prior(**row) for name, row in tree[table].items()}
 
 
 @dataclass(frozen=True, eq=False)

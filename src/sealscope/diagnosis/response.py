@@ -33,9 +33,9 @@ from sealscope.diagnosis.pressures import (
     eliminated,
     mains_lines,
     pressure_evidence,
+    priors,
     usable,
 )
-from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.ring_down import ring_down
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction

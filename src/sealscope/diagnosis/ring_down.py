@@ -39,9 +39,9 @@ from sealscope.diagnosis.pressures import (
     eliminated,
     mains_lines,
     pressure_evidence,
+    priors,
     usable,
 )
-from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array, Recording, remembered
 
 if TYPE_CHECKING:
@@ -242,12 +242,12 @@ class _Ring:
         self.size = self.falling + 1 + len(classes[0].lines)
         self.middle = (np.arange(blocks) + 0.5) / blocks - 0.5
         self.centre = np.zeros(self.size)
-        self.centre[self.falling] = machine.falling
+        self.centre[self.falling], self.centre[blocks : 2 * blocks] = machine.falling, machine.omega
         self.strain = self._strain(seconds)
         self.freedom = sum(each.values.size - each.block.size * each.basis.shape[1] for each in classes)
 
     def _strain(self, seconds: float) -> Array:
-        """Return the precision (p, p) of the random walks and of the prior on the friction's slope."""
+        """Return the precision (p, p) of the random walks, of the mean frequency and of the friction's slope."""
         strain = np.zeros((self.size, self.size))
         wide, K = self.beliefs, self.blocks
         walks = [(np.arange(K), np.arange(K), wide["damping_wander"].width)]
@@ -260,6 +260,8 @@ class _Ring:
             steps = np.diff(np.eye(places.size), axis=0)
             variance = width**2 * np.diff(block) * seconds / WANDER_TIME
             strain[np.ix_(places, places)] = steps.T @ (steps / variance[:, None])
+        own = slice(K, 2 * K)
+        strain[own, own] += 1.0 / (K * wide["frequency"].width * self.machine.omega) ** 2
         width = wide["friction_slope"].width * abs(self.machine.falling)
         strain[self.falling, self.falling] = 1.0 / max(width, np.finfo(float).tiny) ** 2
         return strain
