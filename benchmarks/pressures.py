@@ -57,7 +57,7 @@ def main() -> None:
             if evidence is None:
                 silent += 1
                 continue
-            moment, precision, vector = evidence.information
+            moment, precision, vector = evidence.information[:3]
             test = step_test(Information(moment, UNIT**2 * precision, UNIT * vector))
             if test is None or test.chance >= given.false_alarm:
                 continue
