@@ -129,3 +129,8 @@ def test_a_rate_below_the_ring_s_leaves_nothing_to_tell() -> None:
     recording = recording_of(KNOWN, THESIS, seconds=20.0)
     slow = {name: recording[name][::8] for name in recording.channels}
     assert evidence(Recording(recording.t[::8], slow, recording.units, recording.rate / 8), THESIS) is None
+
+
+def test_what_moves_slowly_and_does_not_ring_is_no_ring() -> None:
+    found = ring_down(recording_of(KNOWN._replace(frequency=4.0, damping=20.0, amplitude=3e4), THESIS), THESIS)
+    assert np.all(found.stiffness > 0.3)

@@ -243,6 +243,10 @@ class _Ring:
         self.middle = (np.arange(blocks) + 0.5) / blocks - 0.5
         self.centre = np.zeros(self.size)
         self.centre[self.falling], self.centre[blocks : 2 * blocks] = machine.falling, machine.omega
+        known = self.beliefs["frequency"]
+        self.band = machine.omega * (
+            known.value + 2.0 * known.width * np.array([-1.0, 1.0])
+        )  # what else moves is no ring
         self.strain = self._strain(seconds)
         self.freedom = sum(each.values.size - each.block.size * each.basis.shape[1] for each in classes)
 
@@ -291,9 +295,8 @@ class _Ring:
 
         Windows are summed over blocks of a steady amplitude, with phases that turn evenly over the recording.
         """
-        K, bin_width, known = self.blocks, self.rate / _LENGTH, self.beliefs["frequency"]
-        around = known.value + 2.0 * known.width * np.linspace(-1.0, 1.0, _FREQUENCIES)
-        around = around * self.machine.omega / (2.0 * np.pi)
+        K, bin_width = self.blocks, self.rate / _LENGTH
+        around = np.linspace(*self.band, _FREQUENCIES) / (2.0 * np.pi)
         around = around[around < _HIGHEST * self.rate]
         reach = 1.0 + 0.5 * float(np.max(np.abs(_DRIFTS)))
         first, last = math.floor(around[0] / reach / bin_width), math.ceil(around[-1] * reach / bin_width)
@@ -381,6 +384,7 @@ class _Ring:
                 step = np.linalg.solve(H + np.diag(damping * np.diag(H) + _RIDGE), slope)
                 largest = float(np.max(np.abs(step[2 * self.blocks : self.falling])))
                 fresh = x + min(1.0, _TURN / max(largest, _RIDGE)) * step
+                fresh[self.blocks : 2 * self.blocks] = np.clip(fresh[self.blocks : 2 * self.blocks], *self.band)
                 off = fresh - self.centre
                 gained = cost - self.squares(fresh) / variance - float(off @ self.strain @ off)
                 damping = damping / 8.0 if gained > 0.0 else 8.0 * damping
