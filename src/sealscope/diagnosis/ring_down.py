@@ -296,7 +296,7 @@ class _Ring:
         Windows are summed over blocks of a steady amplitude, with phases that turn evenly over the recording.
         """
         K, bin_width = self.blocks, self.rate / _LENGTH
-        around = np.linspace(*self.band, _FREQUENCIES) / (2.0 * np.pi)
+        around = np.linspace(self.band[0], self.band[1], _FREQUENCIES) / (2.0 * np.pi)
         around = around[around < _HIGHEST * self.rate]
         reach = 1.0 + 0.5 * float(np.max(np.abs(_DRIFTS)))
         first, last = math.floor(around[0] / reach / bin_width), math.ceil(around[-1] * reach / bin_width)
