@@ -6,7 +6,7 @@
 
 Machines of the profile `bench`, 180 s at 500 Hz, the leak by either law in turn from 90 s on; `--families`: of the
 development families of `strangers` in turn. A machine counts as found where the step of the conductance has a chance
-below `--false-alarm` (`sealscope.diagnosis.onset`). The time is that of a core, the step's test left out.
+below `--false-alarm` (`sealscope.diagnosis.inference.onset`). The time is that of a core, the step's test left out.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.campaigns.cases.machines import sized_once
-from sealscope.diagnosis.blocks import Information
-from sealscope.diagnosis.onset import step_test
+from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import step_test
 from sealscope.parameters import load_rig
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.simulate import simulate_with_truth

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.blocks import Information
-from sealscope.diagnosis.onset import step_test
-from sealscope.diagnosis.pressures import eliminated
-from sealscope.diagnosis.response import (
+from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import step_test
+from sealscope.diagnosis.inference.pressures.evidence import eliminated
+from sealscope.diagnosis.inference.pressures.response import (
     C_C,
     F_C,
     F_V,

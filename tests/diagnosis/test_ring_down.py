@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sealscope.diagnosis.ring_down import evidence, reversals, ring_down
+from sealscope.diagnosis.inference.pressures.ring_down import evidence, reversals, ring_down
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.pressures import (
+from sealscope.diagnosis.inference.pressures.evidence import (
     WANDER_TIME,
     PressureEvidence,
     block_edges,

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from sealscope.compiled import contracted, kernel
-from sealscope.diagnosis.pressures import (
+from sealscope.diagnosis.inference.pressures.evidence import (
     WANDER_TIME,
     PressureEvidence,
     block_edges,
@@ -36,7 +36,7 @@ from sealscope.diagnosis.pressures import (
     priors,
     usable,
 )
-from sealscope.diagnosis.ring_down import ring_down
+from sealscope.diagnosis.inference.pressures.ring_down import ring_down
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store

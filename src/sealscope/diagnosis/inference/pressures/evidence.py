@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.blocks import Information
+from sealscope.diagnosis.inference.blocks import Information
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -36,7 +36,7 @@ class Prior(NamedTuple):
 @cache
 def priors(table: str) -> Mapping[str, Prior]:
     """Return the priors of a table of `pressures.toml`, by name."""
-    tree = tomllib.loads((files("sealscope.diagnosis") / "pressures.toml").read_text("utf-8"))
+    tree = tomllib.loads((files("sealscope.diagnosis.inference.pressures") / "pressures.toml").read_text("utf-8"))
     return {name: Prior(**row) for name, row in tree[table].items()}
 
 
