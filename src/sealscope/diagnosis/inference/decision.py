@@ -293,7 +293,7 @@ def _flow(balance: RecordedBalance, evidence: Evidence, value: float, deviation:
     """Return the evidence with the flow [m^3/s] of a leak and its deviation, as far as the machine's size is known."""
     size = balance.size
     pump = balance.mean(2)
-    half = _95 * float(np.hypot(deviation, value * size.deviation))
+    half = _95 * float(np.linalg.norm([deviation, value * size.deviation, value * priors()["size"]["law"].value]))
     low, high = max(value - half, 0.0), value + half
     relative = RelativeLeak(
         pump_share=value / pump if pump > 0.0 else None,
