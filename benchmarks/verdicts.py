@@ -1,78 +1,98 @@
-"""What `diagnose` says of the machines of packaged plans from all channels: a part of each kind of record.
+"""Verdicts on fixed bench records, and how they differ from those of another state of the source.
 
-    python benchmarks/verdicts.py [--records 200] [--false-alarm 0.01] [PLAN ...]
+    python benchmarks/verdicts.py INTO.jsonl [--against BEFORE.jsonl] [--records FOLDER]
 
-The records are the plan's own, each kind in its proportion. The verdict knows the channels and the rig as designed, not
-the drawn machine, no onset, no size, no baseline. "Interval", "onset": how many of the stated 95 % intervals hold the
-true mean flow, and the true onset; "bound": median of what is stated with `no leak`; seconds of one core a record.
+Takes the first cases of the plan `bench-detectors`: 64 leak-free records, 16 of each size, 10 of each fault (198 in
+all), and diagnoses each with all channels and with pressures and command alone. One JSON line a diagnosis: that of the
+public contract without the findings, and `tag`. With --against, prints every verdict, cause and L/min that differs, and
+how far scores and thresholds moved. --records keeps the simulated records, so that both states judge the same bytes.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
-from collections import defaultdict
-from dataclasses import dataclass, field
+import json
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.cases.case import cases_of, interleaved
+import sealscope as ss
+from sealscope.campaigns.cases.case import CampaignCase, cases_of
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.diagnosis.diagnose import diagnose
-from sealscope.simulation.simulate import simulate_with_truth
 
-PLANS = ("bench-detectors", "bench-strangers-development", "bench-closed-loop-development", "bench-load-development")
-
-
-@dataclass
-class Kind:
-    """What was said of the records of one kind."""
-
-    verdicts: list[str] = field(default_factory=list)
-    intervals: list[bool] = field(default_factory=list)
-    onsets: list[bool] = field(default_factory=list)
-    bounds: list[float] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
+HEALTHY, SIZE, FAULT = 64, 16, 10
+VIEWS = {"all": None, "pressures": {"u", "p_A", "p_B"}}
 
 
-def judged(plan_name: str, records: int, false_alarm: float) -> dict[tuple[float, str], Kind]:
-    """Return what is said of the first records of a plan, by leak [L/min] and fault."""
-    plan = load_plan(plan_name)
-    kinds: dict[tuple[float, str], Kind] = defaultdict(Kind)
-    for case in interleaved(cases_of(plan))[:records]:
-        simulated = simulate_with_truth(experiment_of(plan, case))
-        kind, started = kinds[case.leak_lpm, case.fault], time.process_time()
-        verdict = diagnose(simulated.recording, rig=plan.rig, false_alarm_probability=false_alarm, quick=True)
-        kind.seconds.append(time.process_time() - started)
-        kind.verdicts.append(verdict.verdict)
-        if verdict.bound_lpm is not None:
-            kind.bounds.append(verdict.bound_lpm)
-        if verdict.verdict == "leak" and case.leak_lpm and verdict.leak_interval_lpm and verdict.onset_interval_s:
-            low, high = verdict.leak_interval_lpm
-            kind.intervals.append(low <= simulated.truth.mean_leak_lpm <= high)
-            first, last = verdict.onset_interval_s
-            kind.onsets.append(first <= plan.onset_s <= last)
-    return kinds
+def chosen_cases() -> Iterator[CampaignCase]:
+    """Yield the first cases of each kind of record."""
+    taken: Counter[tuple[float, str]] = Counter()
+    for case in cases_of(load_plan("bench-detectors")):
+        kind = (case.leak_lpm, case.fault)
+        most = FAULT if case.fault else SIZE if case.leak_lpm else HEALTHY
+        if taken[kind] < most:
+            taken[kind] += 1
+            yield case
+
+
+def recording_of(case: CampaignCase, folder: Path | None) -> ss.Recording:
+    """Return the record of a case, from the folder where it was kept."""
+    file = None if folder is None else folder / f"{case.id}.nc"
+    if file is not None and file.is_file():
+        return ss.read(file)
+    recording = ss.simulate_with_truth(experiment_of(load_plan("bench-detectors"), case)).recording
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        ss.write(recording, file)
+    return recording
+
+
+def diagnoses(folder: Path | None) -> Iterator[dict[str, Any]]:
+    """Yield every diagnosis as plain values."""
+    for case in chosen_cases():
+        recording = recording_of(case, folder)
+        for view, channels in VIEWS.items():
+            seen = recording if channels is None else recording.only(channels & set(recording.channels))
+            tree = ss.diagnose(seen, rig="thesis").as_dict()  # stated, so that L/min is compared
+            del tree["quality"], tree["file"]
+            yield {"tag": f"{case.id} {case.leak_lpm} L/min {case.fault} {view}", **tree}
+
+
+def compare(before: dict[str, dict[str, Any]], after: dict[str, dict[str, Any]]) -> None:
+    """Print what differs between two sets of diagnoses, by tag."""
+    both = sorted(before.keys() & after.keys())
+    print(f"{len(both)} diagnoses in both, {len(before.keys() ^ after.keys())} in one of them only")
+    for key in ("verdict", "cause"):
+        pairs = [(tag, before[tag][key], after[tag][key]) for tag in both if before[tag][key] != after[tag][key]]
+        print(f"{key}: {len(pairs)} differ", *(f"  {tag}: {old} -> {new}" for tag, old, new in pairs), sep="\n")
+    for key in ("score", "threshold", "leak_lpm", "onset_s"):
+        pairs = [(before[tag][key], after[tag][key]) for tag in both]
+        change = [abs(new / old - 1.0) for old, new in pairs if old and new]
+        lost = sum((old is None) != (new is None) for old, new in pairs)
+        print(f"{key}: relative change at most {max(change, default=0):.2g}, median {np.median(change or [0]):.2g}")
+        if lost:
+            print(f"  stated in one of the two only: {lost}")
 
 
 def main() -> None:
+    """Diagnose, write, compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("plans", nargs="*", default=PLANS)
-    parser.add_argument("--records", type=int, default=200)
-    parser.add_argument("--false-alarm", type=float, default=0.01)
-    options = parser.parse_args()
-    print("| plan | leak [L/min] or fault | `leak` | `cannot tell` | interval | onset | bound [L/min] | s |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name in options.plans:
-        for (leak, fault), kind in sorted(judged(name, options.records, options.false_alarm).items()):
-            count, unsure = (kind.verdicts.count(own) for own in ("leak", "cannot tell"))
-            number = len(kind.verdicts)
-            hold = (f"{sum(own)} of {len(own)}" if own else "" for own in (kind.intervals, kind.onsets))
-            bound = f"{np.median(kind.bounds):.2g}" if kind.bounds else ""
-            what = fault or f"{leak:g}"
-            cells = (name, what, f"{count} of {number}", unsure, *hold, bound, f"{np.median(kind.seconds):.2f}")
-            print("| " + " | ".join(str(cell) for cell in cells) + " |", flush=True)
+    parser.add_argument("into", type=Path)
+    parser.add_argument("--against", type=Path, help="File of an earlier run.")
+    parser.add_argument("--records", type=Path, help="Folder of the simulated records.")
+    arguments = parser.parse_args()
+    after = {}
+    with arguments.into.open("w", encoding="utf-8") as file:
+        for tree in diagnoses(arguments.records):
+            after[tree["tag"]] = tree
+            print(json.dumps(tree), file=file, flush=True)
+    if arguments.against:
+        lines = arguments.against.read_text(encoding="utf-8").splitlines()
+        compare({tree["tag"]: tree for tree in map(json.loads, lines)}, after)
 
 
 if __name__ == "__main__":

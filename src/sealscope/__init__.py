@@ -37,7 +37,7 @@ _HOMES = {
     "Recording": "recordings.recording",
     "Rig": "parameters",
     "RmsStream": "signals.windows",
-    "SequentialBalance": "diagnosis.stream",
+    "SequentialBalance": "diagnosis.inference.live.stream",
     "Trend": "diagnosis.trend.trend",
     "Watch": "monitor.stream.watch",
     "diagnose": "diagnosis.diagnose",
