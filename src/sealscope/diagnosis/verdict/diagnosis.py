@@ -113,13 +113,13 @@ class Diagnosis(Evidence):
     >>> import sealscope as ss
     >>> diagnosis = ss.diagnose(ss.simulate(leak="0.05 L/min from 30 s", duration="60 s", seed=1))
     >>> diagnosis
-    Diagnosis('leak', file='recording', onset_s=30, leak_lpm=0.05, score=250.1, threshold=6.695)
+    Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.05196, score=169.7, threshold=15.47)
     >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
-    ('piston or pump leak', '79 mm/min')
+    ('piston or pump leak', '86 mm/min')
     >>> [evidence.detector for evidence in diagnosis.parts if evidence.verdict == "cannot tell"]
     ['cycle balance', 'pressure model', 'observer']
     >>> [round(end, 1) for end in diagnosis.as_dict()["onset_interval_s"]]
-    [29.9, 30.1]
+    [27.9, 31.4]
     """
 
     file: str = "recording"
