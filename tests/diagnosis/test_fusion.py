@@ -128,8 +128,8 @@ def test_nothing_changes_the_verdict_of_a_balance() -> None:
 
 
 @pytest.mark.slow
-def test_no_flow_is_stated_of_a_machine_with_another_geometry() -> None:
-    """0.03 L/min past a pump of 3.9 instead of 4.9 cm^3/rev: the pressure model lent 0.0086 (0.0061 to 0.0111)."""
+def test_flow_of_a_machine_with_another_geometry_is_stated_with_its_width() -> None:
+    """0.03 L/min past a pump of 3.9 instead of 4.9 cm^3/rev."""
     recording = simulate(
         command="3 sin(4t)",
         leak="0.03 L/min from 60 s",
@@ -139,9 +139,10 @@ def test_no_flow_is_stated_of_a_machine_with_another_geometry() -> None:
     )
     found = diagnose(recording, rig="thesis")
     assert (found.verdict, found.detector) == ("leak", BALANCE)
-    assert "the geometry is another" in found.reason
-    assert any(own.leak_lpm is not None for own in found.parts)
-    assert found.leak_lpm is found.leak_interval_lpm is None
+    assert "displacement over area is 0.82" in found.reason
+    assert found.leak_interval_lpm is not None
+    low, high = found.leak_interval_lpm
+    assert low < 0.03 < high < 0.06
 
 
 def test_no_leak_keeps_its_own_bound_and_dates_nothing() -> None:

@@ -80,6 +80,13 @@ def test_no_fault_is_seen_in_signals_without(values: np.ndarray, name: str) -> N
     assert inspect(recording({name: values})) == ()
 
 
+def test_counts_of_an_empty_recording_have_no_moment() -> None:
+    empty = Recording(np.empty(0), {"p_A": np.empty(0)}, {"p_A": "count"}, 0.5)
+    assert [(finding.code, finding.first_t) for finding in inspect(empty) if finding.code == "raw_counts"] == [
+        ("raw_counts", None)
+    ]
+
+
 def test_speed() -> None:
     long = recording(healthy(90_000))
     start = time.perf_counter()

@@ -107,7 +107,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 
 
 def _moment(recording: Recording, index: int) -> float | None:
-    t = float(recording.t[index])
+    t = float(recording.t[index]) if index < recording.t.size else np.nan
     return t if np.isfinite(t) else None
 
 
