@@ -6,7 +6,6 @@ import logging
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,15 +13,14 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.baseline.inspection import comparable, inspected
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
-from sealscope.diagnosis.isolation import Signatures, elsewhere, isolated, signatures, unasked
+from sealscope.diagnosis.inference.other import other_step
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.verdict.fusion import ORDER, fuse, judges, rank
+from sealscope.diagnosis.verdict.judgement import judged, judging, rank
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
-from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -32,14 +30,6 @@ _log = logging.getLogger(__name__)
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
 FALSE_ALARM_PROBABILITY = 0.01
 _PROBABILITIES = (1e-4, 0.2)
-#: Least share of a recording that `no leak` rests on.
-WHOLE = 0.95
-#: Detectors that name a cause by the pressures: they do so of nothing that another cause explains, alone either.
-_ISOLATED = ("cycle balance", "pressure model", "observer")
-#: Why the change of RMS alone judges no valve-controlled machine.
-_DAMPED = "behind a servo valve, whose edges damp the ringing as well, that tells no leak from a sound machine"
-#: Why it calls no single rod sound: of 24 leaks of 0.05 L/min and 24 of 0.5 on development machines it saw none.
-_UNSEEN = "on a single rod leaks of 0.5 L/min may change nothing in them"
 
 
 def check_probability(probability: float) -> None:
@@ -52,13 +42,9 @@ def check_probability(probability: float) -> None:
 class Examination:
     """One recording, its gaps bridged, without missing samples, and what detectors are given beside it.
 
-    `baseline`: leak-free recordings that can be compared with it (`baseline.inspection`); `no_baseline`: why there is
-    none where one was asked for: then a leak within the recording is all that can be stated; `rig`: what detectors may
-    assume of the machine; `distrust`: why the pressures cannot be judged, None where they can: then no detector is run;
-    `share` of what was to be judged that the recording is: `no leak` needs `WHOLE` of it; `machine`: leak-free
-    recordings of the machine at any operating point, and `doubt`: why the pressures alone cannot be judged: a
-    balance of volumes takes the former and needs no heed of the latter.
-    A recording that is to be its own baseline needs pressures that move throughout (`recordings.motion`).
+    `baseline`: leak-free recordings of the machine; `rig`: what detectors may assume of it; `distrust`: why the
+    pressures cannot be judged, None where they can: then no detector is run; `refusal`: why none of the baselines that
+    were given can be compared; `share` of what was to be judged that the recording is.
     """
 
     def __init__(
@@ -69,19 +55,12 @@ class Examination:
         false_alarm_probability: float,
         rig: Rig | str | os.PathLike[str] = "thesis",
         distrust: str | None = None,
-        no_baseline: str | None = None,
+        refusal: str | None = None,
         share: float = 1.0,
-        machine: Sequence[Recording] | None = None,
-        doubt: str | None = None,
-        unreadable: str | None = None,
     ) -> None:
-        self.share, self.doubt, self.unreadable = share, doubt, unreadable
-        self.machine = tuple(baseline if machine is None else machine)
         self.recording, self.baseline, self.rig = recording, tuple(baseline), rig
         self.false_alarm_probability = false_alarm_probability
-        self.distrust, self.no_baseline = distrust, no_baseline
-        if doubt is None and not self.baseline and (still := does_not_move(recording)) is not None:
-            self.doubt = f"the pressures cannot be trusted: {still}"
+        self.distrust, self.refusal, self.share = distrust, refusal, share
         self._detectors: dict[str, Detector] = {}
         self._evidence: dict[tuple[str, frozenset[str]], Evidence] = {}
 
@@ -94,11 +73,8 @@ class Examination:
             false_alarm_probability=self.false_alarm_probability,
             rig=self.rig,
             distrust=self.distrust,
-            no_baseline=self.no_baseline,
+            refusal=self.refusal,
             share=self.share,
-            machine=[own.only(name for name in own.channels if name in wanted) for own in self.machine],
-            doubt=self.doubt,
-            unreadable=self.unreadable,
         )
         view._detectors, view._evidence = self._detectors, self._evidence
         return view
@@ -137,127 +113,36 @@ class Examination:
         if detector.name != name:
             raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
         reason = unusable(detector, self.recording) or self.distrust
-        if name == ORDER[0]:
-            reason = reason or self.unreadable
-        if name == ORDER[0] and reason is None:
-            evidence = detector.examine(self.recording, self.machine, self.false_alarm_probability)
-            evidence = self._with_share(replace(checked(evidence), detector=name))
-            return evidence if self.machine else self._without_baseline(evidence)
-        baseline, reason = self.baseline, reason or self.doubt
-        if reason is None and self.baseline:
-            reasons = [unusable(detector, own) for own in self.baseline]
-            baseline = tuple(own for own, why in zip(self.baseline, reasons, strict=True) if why is None)
+        baseline = self.baseline
+        if reason is None and baseline:
+            reasons = [unusable(detector, own) for own in baseline]
+            baseline = tuple(own for own, why in zip(baseline, reasons, strict=True) if why is None)
             if not baseline:
                 reason = f"no baseline recording can be used: {reasons[0]}"
         if reason is not None:
             return Evidence("cannot tell", reason, detector=name, usable=False)
         evidence = checked(detector.examine(self.recording, baseline, self.false_alarm_probability))
-        evidence = self._with_share(replace(evidence, detector=name))
-        evidence = self._without_baseline(evidence)
-        if self._behind_valve and name == ORDER[-1] and evidence.verdict != "cannot tell":
-            reason = f"{evidence.reason}; {_DAMPED}"
-            evidence = replace(
-                evidence, verdict="cannot tell", reason=reason, cause=None, onset_s=None, onset_interval_s=None
-            )
-        if self._single_rod and name == ORDER[-1] and evidence.verdict == "no leak":
-            evidence = replace(evidence, verdict="cannot tell", reason=f"{evidence.reason}; {_UNSEEN}")
-        return self._isolated(evidence) if name in _ISOLATED else evidence
-
-    def _without_baseline(self, evidence: Evidence) -> Evidence:
-        """Return the evidence where a baseline was asked for and none can be compared: no change is no health."""
-        if self.no_baseline is None:
-            return evidence
-        if evidence.verdict == "leak" or evidence.cause is not None or evidence.alarmed:
-            return replace(evidence, reason=f"{evidence.reason}; {self.no_baseline}")
-        return replace(evidence, verdict="cannot tell", reason=self.no_baseline)
-
-    def _with_share(self, evidence: Evidence) -> Evidence:
-        """Return the evidence with the share of all that was recorded it rests on; `no leak` needs nearly all."""
-        share = self.share * evidence.share
-        evidence = replace(evidence, share=share)
-        if evidence.verdict == "cannot tell" or share >= 1.0:
-            return evidence
-        reason = f"{evidence.reason}; this rests on {100.0 * share:.3g} % of the recording"
-        if evidence.verdict == "no leak" and share < WHOLE:
-            reason += f", and the rest may hide a leak ({WHOLE:.0%} are needed)"
-            return replace(evidence, verdict="cannot tell", reason=reason)
-        return replace(evidence, reason=reason)
+        return replace(evidence, detector=name, share=self.share * evidence.share)
 
     def fused(self, quick: bool = False) -> Evidence:
         """Return one verdict from all registered detectors; `quick`: from those down to the one that judges.
 
         Two run at a time: compiled code runs beside the interpreter, and a detector's evidence does not depend on the
-        others. A detector that sees a change in the pressures and cannot name its cause is believed where nothing else
-        stepped with it, and a verdict other than `leak` that names no cause gets that of a plain step (`isolation`).
+        others.
         """
         from concurrent.futures import ThreadPoolExecutor
 
         from threadpoolctl import threadpool_limits
 
+        names = sorted(detectors(), key=rank)
         # the limit is the process's: set here, it does not change while detectors come and go
         with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
-            evidences = [] if quick else [self._isolated(own) for own in pool.map(self.evidence, detectors())]
-            for name in sorted(detectors(), key=rank) if quick else ():
-                evidences.append(self._isolated(self.evidence(name)))
-                if judges(evidences[-1]):
+            evidences = [] if quick else list(pool.map(self.evidence, names))
+            for name in names if quick else ():
+                evidences.append(self.evidence(name))
+                if judging(evidences) is not None:
                     break
-        fused = fuse(evidences)
-        if (
-            fused.detector == ORDER[0]
-            or fused.verdict == "leak"
-            or self.distrust is not None
-            or self._signatures is None
-        ):
-            return fused
-        other = elsewhere(self._signatures)
-        if other is not None:  # of two recordings in one, or of swapped channels, nothing is said
-            reason = f"{fused.reason}; but {other.text}"
-            return replace(fused, verdict="cannot tell", cause=other.cause, reason=reason)
-        if fused.cause is not None:
-            return fused
-        with np.errstate(all="ignore"):
-            stepped = unasked(self._signatures)
-        if stepped is None:
-            return fused
-        onset, other = stepped
-        reason = f"{fused.reason}; near {onset:.0f} s {other.text}"
-        return replace(fused, cause=other.cause, reason=reason)
-
-    def _isolated(self, evidence: Evidence) -> Evidence:
-        if evidence.verdict != "leak" or evidence.detector == ORDER[0] or self._signatures is None:
-            return evidence
-        with np.errstate(all="ignore"):
-            return isolated(evidence, self._signatures, self._known if evidence.onset_s is None else ())
-
-    @cached_property
-    def _behind_valve(self) -> bool:
-        from sealscope.parameters import load_rig
-
-        return load_rig(self.rig).valve.spool == "present"
-
-    @cached_property
-    def _single_rod(self) -> bool:
-        from sealscope.parameters import load_rig
-
-        return load_rig(self.rig).cylinder.single_rod
-
-    @cached_property
-    def _signatures(self) -> Signatures | None:
-        return _signatures(self.recording, self._behind_valve)
-
-    @cached_property
-    def _known(self) -> list[Signatures]:
-        """Signatures of the baseline."""
-        return [seen for own in self.baseline if (seen := _signatures(own, self._behind_valve)) is not None]
-
-
-def _signatures(recording: Recording, behind_valve: bool) -> Signatures | None:
-    try:
-        with np.errstate(all="ignore"):
-            return signatures(recording, behind_valve=behind_valve)
-    except (ArithmeticError, np.linalg.LinAlgError):
-        _log.debug("what else stepped cannot be computed", exc_info=True)
-        return None
+        return judged(evidences, None if self.distrust else other_step(self.recording), self.refusal)
 
 
 @checked_call
@@ -274,8 +159,8 @@ def diagnose(
 ) -> Diagnosis:
     """Say whether oil bypasses the piston in a recording.
 
-    Every detector that the channels allow is run. The most specific of those with a verdict judges (volume balance,
-    cycle balance, pressure model, observer, rms change, then plug-ins); the others are stated beside it.
+    Every detector that the channels allow is run. The first with a verdict judges: by volumes, by the response of the
+    pressures, then plug-ins, last by the change of RMS; the others are stated beside it.
 
     Parameters
     ----------
@@ -326,28 +211,25 @@ def diagnose(
     _check_recording("recording", recording)
     known, machine = assumed_rig(rig, recording)
     baselines = [baseline] if isinstance(baseline, Recording) else _sequence(baseline)
-    judged = inspected(recording)
-    compared = comparable(judged, baselines)
-    fused = Examination(
-        judged.part,
-        compared.parts,
+    inspection = inspected(recording)
+    compared = comparable(inspection, baselines)
+    evidence = Examination(
+        inspection.part,
+        compared.machine,
         false_alarm_probability=false_alarm_probability,
         rig=known,
-        distrust=judged.distrust,
-        no_baseline=compared.refusal,
-        share=judged.share,
-        machine=compared.machine,
-        doubt=judged.doubt,
-        unreadable=judged.unreadable,
+        distrust=inspection.distrust,
+        refusal=None if compared.machine else compared.refusal,
+        share=inspection.share,
     ).fused(quick)
     return Diagnosis.of(
-        fused,
+        evidence,
         recording,
         machine,
         file=os.fspath(file) if file else None,
         false_alarm_probability=false_alarm_probability,
-        quality=(*judged.findings, *compared.findings),
-        baselines=len(compared.machine if fused.detector == ORDER[0] else compared.parts),
+        quality=(*inspection.findings, *compared.findings),
+        baselines=len(compared.machine),
         limit=repair,
     )
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, cost_of_zero, information, solve, total, zero_of
 from sealscope.diagnosis.inference.onset import StepTest, step_test
+from sealscope.diagnosis.inference.other import OtherStep
 from sealscope.diagnosis.inference.terms import LEAK, ORIFICE, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
@@ -70,26 +71,41 @@ def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Block
     return replace(blocks, gram=gram)
 
 
-def probabilities(tested: Sequence[StepHypothesis]) -> dict[Cause, float]:
+def probabilities(tested: Sequence[StepHypothesis], other: OtherStep | None = None) -> dict[Cause, float]:
     """Return the probability of each cause, given that one of them is present, the most probable first.
 
-    A cause is as likely as its best term; logarithms of likelihoods are believed to within a share of the largest.
+    A cause is as likely as its best term; what stepped at the same time in what a leak does not move (`other`) speaks
+    for its cause, and another duty may change any coefficient with it. Logarithms of likelihoods are believed to within
+    a share of the largest.
     """
     if not tested:
         return {}
-    beliefs = priors()["causes"]
-    most = max(own.score for own in tested)
+    beliefs, scores = priors()["causes"], dict[Cause, float]()
+    for each in tested:
+        scores[each.cause] = max(scores.get(each.cause, -np.inf), each.score)
+    if other is not None and abs(tested[0].test.onset().value - other.onset) <= other.doubt + _doubt(tested[0].test):
+        own = max(scores.values()) if other.cause == "changed duty" else max(scores.get(other.cause, 0.0), 0.0)
+        scores[other.cause] = own + other.score
+    most = max(scores.values())
     temper = 2.0 * (1.0 + beliefs["model"].value * max(most, 0.0))
-    weights: dict[Cause, float] = {}
-    for own in tested:
-        odds = beliefs["leak" if own.cause in (*LEAKS, "pump leak") else own.cause].value
-        weights[own.cause] = max(weights.get(own.cause, 0.0), odds * float(np.exp((own.score - most) / temper)))
+    weights = {
+        cause: beliefs["leak" if cause in (*LEAKS, "pump leak") else cause].value
+        * float(np.exp((score - most) / temper))
+        for cause, score in scores.items()
+    }
     total = sum(weights.values())
     return {cause: weight / total for cause, weight in sorted(weights.items(), key=lambda item: -item[1])}
 
 
-def stepped(tested: Sequence[StepHypothesis], chance: float) -> Cause | None:
+def _doubt(test: StepTest) -> float:
+    onset = test.onset()
+    return onset.high - onset.low
+
+
+def stepped(tested: Sequence[StepHypothesis], chance: float, other: OtherStep | None = None) -> Cause | None:
     """Return the most probable cause where a step of its term is as rare as `chance` among so many; else None."""
-    named = next(iter(probabilities(tested)), None)
+    named = next(iter(probabilities(tested, other)), None)
+    if other is not None and named == other.cause:
+        return named
     best = max((own.test for own in tested if own.cause == named), key=lambda test: test.score, default=None)
     return named if best is not None and best.chance * len(tested) < chance else None

@@ -22,6 +22,7 @@ from sealscope.diagnosis.inference.blocks import Blocks, Columns, Information, i
 from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, probabilities
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Interval, StepTest, course, step_test
+from sealscope.diagnosis.inference.other import OtherStep, other_step
 from sealscope.diagnosis.inference.scatter import Rise, rise
 from sealscope.diagnosis.inference.terms import ORIFICE, PUMP, Equation, priors
 from sealscope.diagnosis.verdict.evidence import (
@@ -34,7 +35,7 @@ from sealscope.diagnosis.verdict.evidence import (
     Passage,
     RelativeLeak,
 )
-from sealscope.recordings.recording import Array
+from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class RecordedBalance:
     columns: tuple[Columns, ...]
     rig: Rig
     units: frozenset[tuple[str, str]]
+    recording: Recording | None = None
 
     @cached_property
     def leak(self) -> Information:
@@ -92,6 +94,11 @@ class RecordedBalance:
     def hypotheses(self) -> tuple[StepHypothesis, ...]:
         """Tests of all terms' coefficients, the most likely first."""
         return hypotheses(self.blocks, self.equations, self.columns)
+
+    @cached_property
+    def other(self) -> OtherStep | None:
+        """What stepped in what a leak does not move."""
+        return None if self.recording is None else other_step(self.recording)
 
     @cached_property
     def zero(self) -> float:
@@ -188,14 +195,14 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Block
     answered = next((own for own in questions if own.chance < own.probability), None)
     causes: dict[Cause, float] = {}
     if answered is not None and answered.name == WITHIN:
-        causes = probabilities(balance.hypotheses)
+        causes = probabilities(balance.hypotheses, balance.other)
         answered = answered if _is_leak(causes) else None
     if answered is None:
         judging = questions[0]
         bound = bound_of(balance, against)
         enough = balance.mean(2) > 0.0 and bound <= priors()["worth"]["share"].value * balance.mean(2)
         enough &= sum(causes.get(own, 0.0) for own in LEAKS) < 1.0 - _SURE  # a change that may as well be a leak
-        cause = stepped_cause(balance.hypotheses, RAREST)
+        cause = stepped_cause(balance.hypotheses, RAREST, balance.other)
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     else:
         judging = answered

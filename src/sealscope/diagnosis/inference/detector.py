@@ -66,6 +66,7 @@ class VolumeBalance:
             columns,
             self.rig,
             frozenset(recording.units.items()),
+            recording,
         )
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:

@@ -333,6 +333,29 @@ def _lost_outside(side: str) -> Term:
     )
 
 
+def _made_up(side: str) -> Term:
+    """Return what is lost to the outside on one side and made up by a check valve on the side of lower pressure.
+
+    While that is the same side, the balance shows nothing.
+    """
+    name = f"p_{side}"
+
+    def lost(s: Signals) -> Array:
+        carries = _middle(s.carried_by_A)
+        return np.asarray((carries if side == "A" else 1.0 - carries) * s.mean(name) * s.dt)
+
+    return Term(
+        f"external leak {side}, made up",
+        f"[{name} the larger] {name} dt",
+        "m^3/(s Pa)",
+        lost,
+        "external leak",
+        nuisance=False,
+        needs=("p_A", "p_B"),
+        driven="pressure",
+    )
+
+
 _LAG = Term("lag", "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
 _BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
 _PUMP = Term(
@@ -378,6 +401,8 @@ _CYLINDER = (
     _PUMP,
     _lost_outside("A"),
     _lost_outside("B"),
+    _made_up("A"),
+    _made_up("B"),
     *_LEAKS,
 )
 

@@ -1,0 +1,159 @@
+"""What else the chamber pressures show: friction, load and sensors, by their levels in either direction of motion.
+
+Of each block four numbers are taken, the mean of each chamber's pressure over both directions and half of what it
+differs by between them,
+
+    p_i = level_i + half_i sign(v),    i = A, B.
+
+A leak between the chambers moves none of them: the force that the piston needs sets their difference, the oil that is
+enclosed their mean. Another cause moves some of them together, at one instant and in a known pattern: each pattern, a
+subspace of the four, is a hypothesis. With S the covariance of neighbouring blocks' differences, which drifts and walks
+hardly enter, coordinates S^(-1/2) (..) are alike in noise: the steps in the orthonormal directions of a pattern add up,
+F the share by which each makes the residual smaller,
+
+    rank = max over onsets of n sum_j F_j - (m - 1) log K,    F_j = exp(score_j / n) - 1,
+
+a coefficient more costs log K (G. Schwarz, Ann. Statist. 6 (1978) 461).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import two_sided
+from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.recordings.recording import Array, Recording
+
+#: Blocks of a recording, the first number of which each moves both ways; what part of a block a way needs.
+BLOCKS, LEAST = (40, 20, 10), 0.1
+_RANK = 1e-9  # directions that carry less than this share of the largest carry nothing
+#: Oil that is lost lowers both levels; what raises them has many causes.
+CHARGE = "a loss of oil"
+#: What gives the direction of motion, in the order of preference.
+_POSITIONS, _SPEEDS = ("x", "theta"), ("omega", "u")
+
+
+class Pattern(NamedTuple):
+    """A hypothesis: which of (level A, level B, half A, half B) step together, and what that means.
+
+    `bases`: rows (m, 4) that span them; where a simpler pattern lies within, once with it first for each.
+    """
+
+    name: str
+    cause: Cause | None
+    bases: tuple[Array, ...]
+
+
+class Level(NamedTuple):
+    """A pattern's test.
+
+    `rank` among the patterns; twice the logarithm of the likelihood ratio, n log(1 + sum_j F_j), and its chance; the
+    onset and the length of a block [s].
+    """
+
+    name: str
+    cause: Cause | None
+    rank: float
+    score: float
+    chance: float
+    onset: float
+    block: float
+
+
+def directions(recording: Recording) -> Array | None:
+    """Return the direction of motion at each sample, 1, -1 or 0; None where no channel shows it."""
+    for name in _POSITIONS:
+        if name in recording:
+            half = max(1, round(0.025 * recording.rate))
+            padded = np.pad(recording[name], half, mode="edge")
+            return np.asarray(np.sign(padded[2 * half :] - padded[: -2 * half]))
+    return next((np.sign(recording[name]) for name in _SPEEDS if name in recording), None)
+
+
+def levels(recording: Recording) -> tuple[Array, Array] | None:
+    """Return times (K,) and the four numbers (K, 4) of each block; None where the pressures or the motion are missing.
+
+    Without a direction the halves are zero.
+    """
+    if not {"p_A", "p_B"} <= set(recording.channels):
+        return None
+    way = directions(recording)
+    for count in BLOCKS:
+        length = len(recording) // count
+        if length < 2:
+            continue
+        p = np.stack([recording[name][: count * length].reshape(count, length) for name in ("p_A", "p_B")])
+        time = recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate
+        if way is None:
+            level = p.mean(axis=2).T
+            return time, np.column_stack([level, np.zeros_like(level)])
+        own = way[: count * length].reshape(count, length)
+        shares = np.stack([(own > 0.0).mean(axis=1), (own < 0.0).mean(axis=1)])
+        if shares.min() < LEAST:
+            continue
+        out, back = ((p * (own == sign)).mean(axis=2) / share for sign, share in zip((1.0, -1.0), shares, strict=True))
+        return time, np.vstack([0.5 * (out + back), 0.5 * (out - back)]).T
+    return None
+
+
+def _patterns(mean: Array) -> Iterator[Pattern]:
+    """Yield the hypotheses about the four numbers, by their means (4,)."""
+    A, B, half_A, half_B = np.eye(4)
+    yield Pattern(CHARGE, "external leak", (np.array([A + B]),))
+    yield Pattern("friction", "friction change", (np.array([A + B, half_A, half_B]),))
+    yield Pattern("load", "changed duty", tuple(np.array(own) for own in ([A, B], [B, A], [A + B, A])))
+    yield Pattern("zero of p_A", "sensor fault", (A[None],))
+    yield Pattern("zero of p_B", "sensor fault", (B[None],))
+    yield Pattern("scale of p_A", "sensor fault", ((mean[0] * A + mean[2] * half_A)[None],))
+    yield Pattern("scale of p_B", "sensor fault", ((mean[1] * B + mean[3] * half_B)[None],))
+
+
+def level_tests(recording: Recording) -> tuple[Level, ...]:
+    """Return the tests of all patterns, the most likely first."""
+    made = levels(recording)
+    if made is None:
+        return ()
+    time, values = made
+    kept = np.flatnonzero(np.ptp(values, axis=0) > 0.0)
+    change = np.diff(values[:, kept], axis=0)
+    covariance = change.T @ change / len(change)
+    size = np.sqrt(np.diag(covariance))
+    eigen, basis = np.linalg.eigh(covariance / np.outer(size, size))
+    root = np.zeros((len(kept), 4))
+    root[:, kept] = (basis / np.sqrt(np.maximum(eigen, _RANK))) @ basis.T / size
+    tested = []
+    for pattern in _patterns(values.mean(axis=0)):
+        tests = [_test(pattern, own @ root.T, values @ root.T, time) for own in pattern.bases]
+        least = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
+        if least is not None:
+            rises = pattern.name == CHARGE and _rises(values[:, :2].sum(axis=1), time > least.onset)
+            tested.append(least._replace(cause=None) if rises else least)
+    return tuple(sorted(tested, key=lambda test: -test.rank))
+
+
+def _rises(values: Array, after: NDArray[np.bool_]) -> bool:
+    return bool(after.all() or not after.any() or values[after].mean() > values[~after].mean())
+
+
+def _test(pattern: Pattern, rows: Array, whitened: Array, time: Array) -> Level | None:
+    """Return the test of whitened blocks (K, c) by the steps of `rows` (m, c), the first of them as it is."""
+    basis, size = np.linalg.qr(rows.T)
+    basis = basis[:, np.abs(np.diag(size)) > _RANK * np.abs(size).max()]
+    blocks = [Information(time, np.eye(len(time)), whitened @ own) for own in basis.T]
+    tests = [test for own in blocks if (test := two_sided(own)) is not None]
+    if not tests:
+        return None
+    half, count = 0.5 * len(time), len(tests)
+    gains = np.array([test.likelihood - test.likelihood.max() + 0.5 * test.score for test in tests])
+    shares = np.expm1(np.maximum(gains, 0.0) / half).sum(axis=0)
+    best = int(np.argmax(shares))
+    score = 2.0 * half * float(np.log1p(shares[best]))
+    chance = 2.0 * count * min(test.law.chance(score) for test in tests)
+    rank = 2.0 * half * float(shares[best]) - (count - 1) * float(np.log(len(time)))
+    onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
+    return Level(pattern.name, pattern.cause, rank, score, min(1.0, chance), onset, block)

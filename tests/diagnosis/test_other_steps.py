@@ -1,0 +1,124 @@
+"""What else than a leak stepped: each pattern by closed forms, each fault of the simulator by its cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.inference.levels import level_tests, levels
+from sealscope.diagnosis.inference.other import other_step
+from sealscope.recordings.recording import Recording
+from sealscope.simulation.simulate import simulate
+
+RATE, SECONDS = 200.0, 120.0
+T = np.arange(round(RATE * SECONDS)) / RATE
+LATE = T >= 60.0
+
+
+def machine(**changed: np.ndarray) -> Recording:
+    """A piston that moves to and fro: p_A is 5 bar +- 1 bar, p_B 5 bar -+ 1 bar, 1 kPa of noise, a slow drift."""
+    noise = np.random.default_rng(3).standard_normal((2, T.size)) * 1e3
+    way, drift = np.sign(np.cos(4.0 * T)), 20.0 * T
+    channels = {
+        "u": 3.0 * np.cos(4.0 * T),
+        "x": 0.01 * np.sin(4.0 * T),
+        "p_A": 5e5 + 1e5 * way + drift + noise[0],
+        "p_B": 5e5 - 1e5 * way + drift + noise[1],
+    }
+    channels |= {name: channels[name] + step for name, step in changed.items()}
+    return Recording(T, channels, {"u": "V", "x": "m", "p_A": "Pa", "p_B": "Pa"}, RATE)
+
+
+def test_the_levels_of_both_directions() -> None:
+    made = levels(machine())
+    assert made is not None
+    assert made[1].mean(axis=0) == pytest.approx([5.012e5, 5.012e5, 1e5, -1e5], rel=0.02)
+
+
+WAY = np.sign(np.cos(4.0 * T))
+STEPS: dict[str, tuple[dict[str, np.ndarray], str | None]] = {
+    "nothing": ({}, None),
+    "friction": ({"p_A": 5e3 * WAY * LATE, "p_B": -5e3 * WAY * LATE}, "friction change"),
+    "zero of p_A": ({"p_A": 5e3 * LATE}, "sensor fault"),
+    "scale of p_B": ({"p_B": 0.03 * (5e5 - 1e5 * WAY) * LATE}, "sensor fault"),
+    "load": ({"p_A": 6e3 * LATE, "p_B": -6e3 * LATE}, "changed duty"),
+    "oil is lost": ({"p_A": -6e3 * LATE, "p_B": -6e3 * LATE}, "external leak"),
+    "charge rises": ({"p_A": 6e3 * LATE, "p_B": 6e3 * LATE}, None),
+    "duty": ({"u": 0.3 * np.cos(4.0 * T) * LATE, "x": 1e-3 * np.sin(4.0 * T) * LATE}, "changed duty"),
+    "command alone": ({"u": 0.3 * np.cos(4.0 * T) * LATE}, None),
+    "hum": ({"p_A": 1e3 * np.sin(2.0 * np.pi * 50.0 * T) * LATE}, "sensor fault"),
+}
+
+
+@pytest.mark.parametrize("kind", STEPS)
+def test_each_step_has_its_cause_and_its_time(kind: str) -> None:
+    changed, cause = STEPS[kind]
+    step = other_step(machine(**changed))
+    assert (None if step is None else step.cause) == cause
+    assert step is None or abs(step.onset - 60.0) < 6.0
+
+
+def test_units_and_sides_do_not_matter() -> None:
+    recording = machine(p_A=5e3 * WAY * LATE, p_B=-5e3 * WAY * LATE)
+    scores = [test.score for test in level_tests(recording)]
+    counts = replace(
+        recording, channels={n: v * (1e-3 if n.startswith("p_") else 1.0) for n, v in recording.channels.items()}
+    )
+    swapped = replace(recording, channels={**recording.channels, "p_A": recording["p_B"], "p_B": recording["p_A"]})
+    for other in (counts, swapped):
+        assert sorted(test.score for test in level_tests(other)) == pytest.approx(sorted(scores), rel=0.02)
+
+
+CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "filter": lambda p: np.convolve(np.pad(p, 1, mode="edge"), [0.25, 0.5, 0.25], "valid"),
+    "noise": lambda p: p + 3e3 * np.random.default_rng(5).standard_normal(p.size),
+}
+
+
+@pytest.mark.parametrize("kind", CHANGES)
+@pytest.mark.parametrize("names", [("p_A",), ("p_A", "p_B")])
+def test_another_reading_is_a_sensor_fault(kind: str, names: tuple[str, ...]) -> None:
+    recording = machine()
+    changed = {name: np.where(LATE, CHANGES[kind](recording[name]), recording[name]) for name in names}
+    step = other_step(replace(recording, channels={**recording.channels, **changed}))
+    assert step is not None
+    assert step.cause == "sensor fault"
+
+
+def test_swapped_sensors_are_a_sensor_fault() -> None:
+    recording = machine()
+    p_A, p_B = recording["p_A"], recording["p_B"]
+    changed = {"p_A": np.where(LATE, p_B, p_A), "p_B": np.where(LATE, p_A, p_B)}
+    step = other_step(replace(recording, channels={**recording.channels, **changed}))
+    assert step is not None
+    assert (step.cause, round(step.onset / 10.0)) == ("sensor fault", 6)
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        ("friction +20 % from 60 s", "friction change"),
+        ("sensor p_A offset 5 psi from 60 s", "sensor fault"),
+        ("sensor p_A gain 2 % from 60 s", "sensor fault"),
+        ("duty amplitude x1.1 from 60 s", "changed duty"),
+    ],
+)
+def test_faults_of_the_simulated_rig(fault: str, cause: str) -> None:
+    step = other_step(simulate(command="3 sin(4t)", fault=fault, duration="120 s", seed=1))
+    assert step is not None
+    assert (step.cause, round(step.onset / 10.0)) == (cause, 6)
+
+
+@pytest.mark.parametrize("leak", [(), "0.0042 L/min from 60 s", "0.1 L/min from 60 s"])
+def test_a_leak_moves_none_of_them(leak: str) -> None:
+    assert other_step(simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)) is None
+
+
+def test_a_large_leak_slows_the_piston_and_is_a_leak() -> None:
+    recording = simulate(command="3 sin(4t)", leak="0.5 L/min from 60 s", duration="120 s", seed=1)
+    assert other_step(recording) is not None
+    assert diagnose(recording, quick=True).verdict == "leak"
