@@ -21,7 +21,7 @@ NONE = Evidence("no leak", "it does not", 1.0, 3.0)
 UNFIT = Evidence("cannot tell", "the model does not fit")
 DRIFT = Evidence("cannot tell", "a drift and a leak look alike", 9.0, 3.0)
 COURSE = LeakCourse(np.arange(3.0), np.ones(3), np.zeros(3), np.full(3, 2.0))
-BALANCE, CYCLES, MODEL, OBSERVER, RMS = ORDER
+BALANCE, CYCLES, RESPONSE, RMS = ORDER
 
 
 def fused(**evidences: Evidence) -> Evidence:
@@ -34,12 +34,12 @@ def unusable(name: str, reason: str) -> Evidence:
 
 
 def test_the_most_specific_with_a_verdict_judges_whatever_the_order() -> None:
-    evidences = [replace(LEAK, detector=name) for name in (RMS, "my own", OBSERVER, MODEL)]
+    evidences = [replace(LEAK, detector=name) for name in (RMS, "my own", RESPONSE, CYCLES)]
     evidences.insert(3, replace(NONE, detector=BALANCE))
     for turn in (evidences, evidences[::-1]):
         found = fuse(turn)
         assert (found.detector, found.verdict, found.score) == (BALANCE, "no leak", 1.0)
-        assert [own.detector for own in found.parts][:4] == [BALANCE, MODEL, OBSERVER, RMS]
+        assert [own.detector for own in found.parts][:4] == [BALANCE, CYCLES, RESPONSE, RMS]
     assert fused(my_own=LEAK, rms_change=UNFIT).detector == "my own"
 
 
@@ -58,27 +58,27 @@ def test_a_detector_abstains_where_nothing_was_seen_and_judges_where_something_w
 def test_the_least_specific_calls_nothing_sound_in_which_another_saw_a_change_without_a_name() -> None:
     change = replace(DRIFT, detector="large change")
     seen = replace(UNFIT, parts=(change,))
-    kept = fused(rms_change=NONE, pressure_model=seen)
+    kept = fused(rms_change=NONE, cycle_balance=seen)
     assert (kept.detector, kept.verdict) == (RMS, "cannot tell")
     assert "the model does not fit" in kept.reason
-    assert fused(rms_change=LEAK, pressure_model=seen).verdict == "leak"
-    assert fused(observer=NONE, pressure_model=seen).verdict == "no leak"
+    assert fused(rms_change=LEAK, cycle_balance=seen).verdict == "leak"
+    assert fused(pressure_response=NONE, cycle_balance=seen).verdict == "no leak"
     unclear = replace(seen, parts=(replace(change, score=2.0),))
-    assert fused(rms_change=NONE, pressure_model=unclear).verdict == "no leak"
+    assert fused(rms_change=NONE, cycle_balance=unclear).verdict == "no leak"
 
 
 def test_a_small_change_of_a_machine_that_wanders_is_no_leak_by_itself() -> None:
     unruly = replace(UNFIT, reason="the parameters wander", unruly=True)
     within = replace(LEAK, score=5.9, onset_s=30.0, onset_interval_s=(29.0, 31.0))
-    kept = fused(rms_change=within, pressure_model=unruly, my_own=replace(LEAK, leak_lpm=0.1))
+    kept = fused(rms_change=within, cycle_balance=unruly, my_own=replace(LEAK, leak_lpm=0.1))
     assert (kept.detector, kept.verdict, kept.onset_s, kept.leak_lpm) == (RMS, "cannot tell", None, None)
     assert kept.parts[0].verdict == "leak"
     assert "the parameters wander" in kept.reason
-    assert fused(rms_change=replace(within, score=6.1), pressure_model=unruly).verdict == "leak"
-    assert fused(rms_change=within, pressure_model=UNFIT).verdict == "leak"
-    assert fused(observer=within, pressure_model=unruly).verdict == "leak"
+    assert fused(rms_change=replace(within, score=6.1), cycle_balance=unruly).verdict == "leak"
+    assert fused(rms_change=within, cycle_balance=UNFIT).verdict == "leak"
+    assert fused(pressure_response=within, cycle_balance=unruly).verdict == "leak"
     against_baseline = replace(within, onset_s=None, onset_interval_s=None)
-    assert fused(rms_change=against_baseline, pressure_model=unruly).verdict == "leak"
+    assert fused(rms_change=against_baseline, cycle_balance=unruly).verdict == "leak"
 
 
 def test_a_detector_that_could_not_look_is_told_and_never_judges() -> None:
@@ -100,30 +100,30 @@ def test_nobody_judges() -> None:
 def test_a_leak_gets_from_others_what_the_judge_lacks() -> None:
     timed = replace(LEAK, onset_s=90.0, onset_interval_s=(88.0, 92.0))
     sized = replace(LEAK, leak_lpm=0.004, leak_interval_lpm=(0.003, 0.005), course=COURSE)
-    found = fused(pressure_model=LEAK, observer=sized, rms_change=timed)
+    found = fused(cycle_balance=LEAK, pressure_response=sized, rms_change=timed)
     assert (found.onset_s, found.onset_interval_s) == (90.0, (88.0, 92.0))
     assert (found.leak_lpm, found.leak_interval_lpm, found.course) == (0.004, (0.003, 0.005), COURSE)
-    assert found.reason == "it leaks; onset from rms change; L/min from observer"
+    assert found.reason == "it leaks; onset from rms change; L/min from pressure response"
     assert (found.score, found.threshold) == (LEAK.score, LEAK.threshold)
     own = replace(timed, onset_s=70.0, onset_interval_s=None)
     assert fused(volume_balance=own, rms_change=timed).onset_interval_s is None  # not another's interval
     disagreeing = replace(NONE, leak_lpm=0.001, onset_s=3.0)
-    assert fused(pressure_model=LEAK, rms_change=disagreeing).leak_lpm is None
+    assert fused(cycle_balance=LEAK, rms_change=disagreeing).leak_lpm is None
 
 
 def test_a_figure_that_is_refused_is_not_lent() -> None:
     lent = replace(LEAK, onset_s=90.0, leak_lpm=0.031, leak_interval_lpm=(0.03, 0.032), course=COURSE)
     for figure, other in (("leak_lpm", "onset_s"), ("onset_s", "leak_lpm")):
-        found = fused(pressure_model=replace(LEAK, refuses=frozenset({figure})), observer=lent)
+        found = fused(cycle_balance=replace(LEAK, refuses=frozenset({figure})), pressure_response=lent)
         assert getattr(found, figure) is None
         assert getattr(found, other) is not None
-    assert fused(pressure_model=replace(LEAK, refuses=frozenset({"leak_lpm"})), observer=lent).course is None
+    assert fused(cycle_balance=replace(LEAK, refuses=frozenset({"leak_lpm"})), pressure_response=lent).course is None
 
 
 def test_nothing_changes_the_verdict_of_a_balance() -> None:
     lent = replace(LEAK, onset_s=90.0, leak_lpm=0.031, course=COURSE)
     for own in (LEAK, NONE):
-        judged = fused(volume_balance=own, observer=lent, rms_change=lent)
+        judged = fused(volume_balance=own, pressure_response=lent, rms_change=lent)
         assert replace(judged, parts=(), reason=own.reason) == replace(own, detector=BALANCE)
 
 
@@ -147,7 +147,7 @@ def test_flow_of_a_machine_with_another_geometry_is_stated_with_its_width() -> N
 
 def test_no_leak_keeps_its_own_bound_and_dates_nothing() -> None:
     bound = replace(NONE, leak_lpm=1e-5, leak_interval_lpm=(-1e-4, 1e-4), onset_s=5.0, onset_interval_s=(4.0, 6.0))
-    found = fused(pressure_model=bound, rms_change=replace(LEAK, onset_s=90.0, leak_lpm=0.1))
+    found = fused(cycle_balance=bound, rms_change=replace(LEAK, onset_s=90.0, leak_lpm=0.1))
     assert (found.leak_lpm, found.onset_s, found.onset_interval_s) == (1e-5, None, None)
 
 
@@ -161,7 +161,7 @@ def test_no_leak_of_the_least_specific_needs_that_a_leak_would_have_shown(
     assert (found.verdict, found.detector) == (verdict, RMS)
     assert ("volume balance: a leak of 2 % would not have shown" in found.reason) == (verdict == "cannot tell")
     assert fused(rms_change=LEAK, volume_balance=blind).verdict == "leak"
-    assert fused(pressure_model=NONE, volume_balance=blind).verdict == "no leak"  # which has its own eyes
+    assert fused(cycle_balance=NONE, volume_balance=blind).verdict == "no leak"  # which has its own eyes
 
 
 def test_disagreement_is_said() -> None:
@@ -170,10 +170,10 @@ def test_disagreement_is_said() -> None:
     )
     assert "rms change sees a change like a leak's" in fused(volume_balance=NONE, rms_change=LEAK).reason
     rubbing = replace(NONE, cause="friction change", score=5.0)
-    found = fused(volume_balance=NONE, pressure_model=rubbing, rms_change=LEAK)
+    found = fused(volume_balance=NONE, cycle_balance=rubbing, rms_change=LEAK)
     assert (found.verdict, found.cause) == ("no leak", "friction change")
-    assert "pressure model takes the change for friction change" in found.reason
-    leaking = fused(volume_balance=LEAK, pressure_model=rubbing)
+    assert "cycle balance takes the change for friction change" in found.reason
+    leaking = fused(volume_balance=LEAK, cycle_balance=rubbing)
     assert (leaking.verdict, leaking.cause) == ("leak", None)  # the judge's word stands
     assert fused(volume_balance=LEAK, rms_change=LEAK).reason == "it leaks"
 

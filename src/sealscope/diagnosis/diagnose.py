@@ -35,7 +35,9 @@ _PROBABILITIES = (1e-4, 0.2)
 #: Least share of a recording that `no leak` rests on.
 WHOLE = 0.95
 #: Detectors that name a cause by the pressures: they do so of nothing that another cause explains, alone either.
-_ISOLATED = ("cycle balance", "pressure model", "observer")
+_ISOLATED = ("cycle balance",)
+#: Detectors that weigh a leak against other causes themselves: nothing changes their verdict.
+_WEIGHED = (ORDER[0], "pressure response")
 #: Why the change of RMS alone judges no valve-controlled machine.
 _DAMPED = "behind a servo valve, whose edges damp the ringing as well, that tells no leak from a sound machine"
 #: Why it calls no single rod sound: of 24 leaks of 0.05 L/min and 24 of 0.5 on development machines it saw none.
@@ -203,7 +205,7 @@ class Examination:
                     break
         fused = fuse(evidences)
         if (
-            fused.detector == ORDER[0]
+            fused.detector in _WEIGHED
             or fused.verdict == "leak"
             or self.distrust is not None
             or self._signatures is None
@@ -224,7 +226,7 @@ class Examination:
         return replace(fused, cause=other.cause, reason=reason)
 
     def _isolated(self, evidence: Evidence) -> Evidence:
-        if evidence.verdict != "leak" or evidence.detector == ORDER[0] or self._signatures is None:
+        if evidence.verdict != "leak" or evidence.detector in _WEIGHED or self._signatures is None:
             return evidence
         with np.errstate(all="ignore"):
             return isolated(evidence, self._signatures, self._known if evidence.onset_s is None else ())
@@ -275,7 +277,7 @@ def diagnose(
     """Say whether oil bypasses the piston in a recording.
 
     Every detector that the channels allow is run. The most specific of those with a verdict judges (volume balance,
-    cycle balance, pressure model, observer, rms change, then plug-ins); the others are stated beside it.
+    cycle balance, pressure response, rms change, then plug-ins); the others are stated beside it.
 
     Parameters
     ----------
