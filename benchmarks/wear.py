@@ -9,7 +9,7 @@ temperature of its oil wanders (deviation 2 K, of which 0.7 lasts to the next da
 (4.5 % a kelvin), friction and stiffness, the seals' friction scatters by 2 % and the sensors' zeros by 0.1 psi; within
 a day it drifts as the bench does. The first 20 days are healthy, then the piston's seal wears by 0.002 L/min a month
 (laminar, at the machine's own mean pressure difference). Recordings of 120 s at 500 Hz. Level of `all channels`: volume
-balance; of `pressures and command`: pressure model.
+balance; of `pressures and command`: pressure response.
 
 `table` runs the trend on them, told that the last 1, 2, 5 or 20 healthy days were healthy (and shown no earlier one);
 the detector knows neither the machine, nor its temperature, nor when the wear begins. `--false-alarms N`: as many
@@ -45,7 +45,7 @@ from sealscope.units import LITRE_PER_MINUTE
 HEALTHY_DAYS, WORN_DAYS, SECONDS = 20, 84, 120.0
 WEAR = 0.002
 TOLD = (1, 2, 5, 20)
-VIEWS = {"all channels": "volume balance", "pressures and command": "pressure model"}
+VIEWS = {"all channels": "volume balance", "pressures and command": "pressure response"}
 #: Temperature of the oil from day to day [K], what of it lasts, and what a kelvin changes.
 _KELVIN, _LASTS = 2.0, 0.7
 _PER_KELVIN = {"pump.G_pump": 0.045, "fluid.K_oil": -0.005, "friction.F_v": -0.045}

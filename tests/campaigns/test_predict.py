@@ -23,7 +23,7 @@ from sealscope.campaigns.prediction.responses import instrument_noise, noise_res
 from sealscope.cli import prediction
 from sealscope.diagnosis.calibration.scorers import Look
 from sealscope.diagnosis.inference.detector import VolumeBalance
-from sealscope.diagnosis.pressure_model.detector import PressureModel
+from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.faults import From, Leak
@@ -158,7 +158,7 @@ def test_the_judging_detectors_say_what_they_would_find(made: PredictionReport, 
 
 
 @pytest.mark.slow
-def test_the_pressure_model_finds_what_is_predicted() -> None:
+def test_the_pressure_response_finds_what_is_predicted() -> None:
     thesis = load_rig("thesis")
     experiment = experiment_for(thesis, "3 sin(4t)", 80.0)
     _, model = judge_predictions(experiment, 0.01, 0.9, 0)
@@ -169,7 +169,7 @@ def test_the_pressure_model_finds_what_is_predicted() -> None:
     for seed in range(70, 76):
         leak = Leak("laminar", coefficient=1.3 * model.smallest * LITRE_PER_MINUTE / dp, opening=From(40.0))
         recording = simulate_with_truth(replace(experiment, leaks=(leak,), seed=seed)).recording
-        found.append(PressureModel(thesis).examine(recording, [], 0.01).verdict == "leak")
+        found.append(PressureResponse(thesis).examine(recording, [], 0.01).verdict == "leak")
     assert sum(found) >= 5
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.pressure_model.detector import PressureModel
+from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.machine import assumed_rig, unstated
 from sealscope.diagnosis.verdict.severity import RepairLimit, severity
@@ -86,13 +86,14 @@ def test_pressures_alone_state_no_flow_without_a_rig() -> None:
     own = simulate(command="3 sin(4t)", leak="0.02 L/min from 40 s", duration="80 s", seed=1)
     pressures = own.only(["u", "p_A", "p_B"])
     foreign = diagnose(replace(pressures, provenance={}))
-    known = PressureModel(assumed_rig(None, pressures)[0]).examine(pressures, [], 0.01)
+    known = PressureResponse(assumed_rig(None, pressures)[0]).examine(pressures, [], 0.01)
     assert known.leak_lpm == pytest.approx(0.02, rel=0.5)
     assert (known.verdict, known.score) == (foreign.verdict, foreign.score)
     assert foreign.leak_lpm is None and foreign.severity is None
     assert "no rig was stated" in foreign.reason and "L/min," not in foreign.reason
     assert all(own.leak_lpm is None and own.course is None for own in foreign.parts)
-    assert not PressureModel(stated(area=f"{AREA} m^2")).states_flow  # the ringing needs the moving mass, too
+    area_alone = PressureResponse(stated(area=f"{AREA} m^2")).examine(pressures, [], 0.01)
+    assert area_alone.leak_lpm is None  # the ringing needs the moving mass, too
 
 
 def test_who_states_the_machine() -> None:

@@ -270,7 +270,7 @@ def test_the_channels_decide_which_detectors_are_calibrated(records):
     whole = records(1, duration=20.0, throttled=True)
     assert default_detectors([whole])[:2] == ("volume balance, calibrated", "rms change")
     no_angle = whole.only([name for name in whole.channels if name not in ("theta", "omega", "u")])
-    assert default_detectors([whole, no_angle])[0] == "rms change"  # the pressure model needs 40 s
+    assert default_detectors([whole, no_angle])[0] == "rms change"  # the pressure response needs 40 s
     assert default_detectors([whole.only(["p_A"])]) == ("rms change", "d3 of p_A changed", "d4 of p_A changed")
 
 

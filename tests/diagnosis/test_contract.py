@@ -96,7 +96,7 @@ EVERY = {**detectors(), "ringing energy": example}
 #: Detectors that only say whether something changed, and not when.
 UNDATED = ("ringing energy",)
 #: Detectors to which the size of a pressure means something.
-PHYSICAL = ("volume balance", "cycle balance", "pressure model", "observer")
+PHYSICAL = ("volume balance", "cycle balance", "pressure response")
 COURSE = ("t", "lpm", "low", "high")
 
 
@@ -208,7 +208,7 @@ def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
         assert after.score is None
     else:
         # a z of runs in single precision, after as many steps as pay: known to a small part of its deviation
-        rounded = 0.1 if detector.name == "pressure model" else 1e-12
+        rounded = 0.1 if detector.name == "pressure response" else 1e-12
         assert after.score == pytest.approx(
             before.score, rel=1e-6 if detector.name not in PHYSICAL else 1e-2, abs=rounded
         )

@@ -158,18 +158,18 @@ def test_quick_stops_at_the_detector_that_judges(recording: Recording, monkeypat
     """The most specific first; one that abstains does not judge; verdict and figures are those of all together."""
 
     class Abstains(Looker):
-        name = "pressure model"
+        name = "cycle balance"
 
         def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
             return Evidence("cannot tell", "too little")
 
     class Judges(Looker):
-        name = "observer"
+        name = "rms change"
 
-    monkeypatch.setattr(registry, "DETECTORS", {"looker": Looker, "observer": Judges, "pressure model": Abstains})
+    monkeypatch.setattr(registry, "DETECTORS", {"looker": Looker, "rms change": Judges, "cycle balance": Abstains})
     whole = Examination(recording, false_alarm_probability=0.05).fused()
     seen.clear()
     quick = Examination(recording, false_alarm_probability=0.05).fused(quick=True)
-    assert [part.detector for part in quick.parts] == ["observer", "pressure model"]
+    assert [part.detector for part in quick.parts] == ["rms change", "cycle balance"]
     assert len(seen) == 1
     assert (quick.verdict, quick.score, quick.detector) == (whole.verdict, whole.score, whole.detector)

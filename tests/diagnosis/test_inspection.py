@@ -54,7 +54,7 @@ def test_a_leak_within_the_recording_is_stated_whatever_the_baseline(leaky: Reco
 
 @pytest.mark.slow
 def test_copies_count_once_for_every_detector(healthy: list[Recording]) -> None:
-    """Three copies have no scatter of their own: for the observer they were three baselines."""
+    """Three copies have no scatter of their own: they were three baselines."""
     recording, leak_free = healthy[:2]
     found = diagnose(recording, [leak_free, copied(leak_free), leak_free])
     assert verdicts(found) == verdicts(diagnose(recording, [leak_free]))
@@ -112,7 +112,7 @@ def test_of_a_baseline_with_a_long_gap_the_longest_stretch_is_used(healthy: list
 class Failing:
     """Raises `error` where it examines."""
 
-    name = "observer"
+    name = "pressure response"
     error: Exception
 
     def __init__(self, rig: object) -> None:
@@ -128,17 +128,17 @@ class Failing:
 @pytest.mark.parametrize(
     ("error", "reason", "level"),
     [
-        (RuntimeError("no\nway"), "detector 'observer' is left out: RuntimeError: no way", logging.ERROR),
-        (ValueError("wrong shape"), "detector 'observer' is left out: ValueError: wrong shape", logging.ERROR),
+        (RuntimeError("no\nway"), "detector 'pressure response' is left out: RuntimeError: no way", logging.ERROR),
+        (ValueError("wrong shape"), "detector 'pressure response' is left out: ValueError: wrong shape", logging.ERROR),
         # numbers that nothing can be computed with are no defect of the detector
         (
             ZeroDivisionError("division by zero"),
-            "observer cannot be computed on this recording: division by zero",
+            "pressure response cannot be computed on this recording: division by zero",
             None,
         ),
         (
             np.linalg.LinAlgError("Singular matrix"),
-            "observer cannot be computed on this recording: singular matrix",
+            "pressure response cannot be computed on this recording: singular matrix",
             None,
         ),
     ],
@@ -154,13 +154,13 @@ def test_a_built_in_detector_that_fails_costs_its_own_evidence_alone(
     rms_change = registry.DETECTORS["rms change"]
     monkeypatch.setattr(registry, "DETECTORS", {"rms change": rms_change})
     expected = diagnose(healthy[0])
-    monkeypatch.setattr(registry, "DETECTORS", {"observer": Failing, "rms change": rms_change})
+    monkeypatch.setattr(registry, "DETECTORS", {"pressure response": Failing, "rms change": rms_change})
     monkeypatch.setattr(Failing, "error", error, raising=False)
     detector._log_once.cache_clear()
     with caplog.at_level(logging.DEBUG, "sealscope.diagnosis.detector"):
         found = diagnose(healthy[0])
     assert (found.verdict, found.score, found.reason) == (expected.verdict, expected.score, expected.reason)
-    own = next(own for own in found.parts if own.detector == "observer")
+    own = next(own for own in found.parts if own.detector == "pressure response")
     assert own.verdict == "cannot tell"
     assert own.reason == reason
     (record,) = caplog.records

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.observer.detector import Observer
-from sealscope.parameters import load_rig
+from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.inference.pressures.response import Follower
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import cycle
 from sealscope.recordings.cycle import cycle_of
 from sealscope.recordings.recording import Array, Recording, remembered
@@ -86,21 +87,21 @@ def test_nothing_is_kept_of_a_recording_that_is_gone() -> None:
 
 def test_a_baseline_is_followed_once_for_many_files(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = load_rig("thesis")
-    baseline = [simulate(command="7 sin(4t)", duration=120.0, seed=seed) for seed in (1, 2)]
-    files = [simulate(command="7 sin(4t)", duration=120.0, seed=seed) for seed in (3, 4)]
+    baseline = [simulate(command="7 sin(4t)", duration=30.0, seed=seed) for seed in (1, 2)]
+    files = [simulate(command="7 sin(4t)", duration=30.0, seed=seed) for seed in (3, 4)]
     followed: list[Recording] = []
-    plain = Observer.follow
+    plain = Follower.begun
 
-    def follow(self: Observer, recording: Recording) -> object:
+    def begun(recording: Recording, rig: Rig) -> Follower:
         followed.append(recording)
-        return plain(self, recording)
+        return plain(recording, rig)
 
-    fresh = [Observer(rig).examine(one, [replace_of(b) for b in baseline], 0.01) for one in files]
-    monkeypatch.setattr(Observer, "follow", follow)
-    found = [Observer(rig).examine(one, baseline, 0.01) for one in files]
-    assert all(one.score is not None for one in fresh), [one.reason for one in fresh]
-    assert [one.score for one in found] == [one.score for one in fresh]
-    assert sum(one is b for one in followed for b in baseline) == 2
+    fresh = [PressureResponse(rig).examine(own, [replace_of(b) for b in baseline], 0.01) for own in files]
+    monkeypatch.setattr(Follower, "begun", begun)
+    again = [PressureResponse(rig).examine(own, baseline, 0.01) for own in files]
+    assert all(own.score is not None for own in fresh), [own.reason for own in fresh]
+    assert [own.score for own in again] == [own.score for own in fresh]
+    assert sum(own is b for own in followed for b in baseline) == 2
 
 
 def replace_of(recording: Recording) -> Recording:

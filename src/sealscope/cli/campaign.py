@@ -292,7 +292,7 @@ def calibrate(
     """Set thresholds from leak-free recordings of your own machine, for `diagnose --calibration`.
 
     It takes 5 recordings or more of an operating point. By default the channels that are there decide: the volume
-    balance judges, else the pressure model, else rms change, with details of the pressures beside it.
+    balance judges, else the pressure response, else rms change, with details of the pressures beside it.
     """
     from hashlib import sha256
 

@@ -59,8 +59,8 @@ def predict(
 ) -> None:
     """Predict the smallest leak that each detector finds, with the Cramer-Rao bound beside it.
 
-    The thesis's detectors, or those of --detector, are given the onset; volume balance and pressure model, which make
-    the verdict of diagnose, look for it.
+    The thesis's detectors, or those of --detector, are given the onset; volume balance and pressure response, which
+    make the verdict of diagnose, look for it.
     """
     from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, change_detector
     from sealscope.campaigns.prediction.predict import (

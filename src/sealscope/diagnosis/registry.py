@@ -25,8 +25,7 @@ def _built_in(module: str, name: str) -> Factory:
 DETECTORS: dict[str, Factory] = {
     "volume balance": _built_in("inference.detector", "VolumeBalance"),
     "cycle balance": _built_in("inference.cycle_balance.detector", "CycleBalance"),
-    "pressure model": _built_in("pressure_model.detector", "PressureModel"),
-    "observer": _built_in("observer.detector", "Observer"),
+    "pressure response": _built_in("inference.pressures.detector", "PressureResponse"),
     "rms change": _built_in("rms_change.detector", "RmsChange"),
 }
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.inference.detector import VolumeBalance
-from sealscope.diagnosis.pressure_model.detector import PressureModel
+from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
@@ -20,7 +20,7 @@ from sealscope.simulation.experiment import Experiment
 #: Leak-free records that each detector looks at.
 RECORDS = 3
 #: Judge -> channels that it looks at.
-_CHANNELS = {"volume balance": ("theta", "x", "p_A", "p_B", "p_1", "p_2"), "pressure model": ("u", "p_A", "p_B")}
+_CHANNELS = {"volume balance": ("theta", "x", "p_A", "p_B", "p_1", "p_2"), "pressure response": ("u", "p_A", "p_B")}
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,10 @@ def judge_predictions(
     seed: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[JudgePrediction, ...]:
-    """Return what volume balance and pressure model find in a leak-free `experiment` with `RECORDS` seeds from `seed`.
+    """Return what both judges find in a leak-free `experiment` with `RECORDS` seeds from `seed`.
 
-    The volume balance has steps of rising size added to its blocks, at three places of the middle; a step counts where
-    it and every larger one is found at all of them. The pressure model states the deviation s of a step in the middle,
-    and finds ``(threshold + z_detection) s``. The largest of the records is taken.
+    Each states the deviation s of a step at the median onset, and finds ``(sqrt(threshold) + z) s``, z that of 90 %.
+    The largest of the records is taken.
     """
     from sealscope.diagnosis.diagnose import check_probability
     from sealscope.simulation.simulate import simulate_with_truth
@@ -69,22 +68,17 @@ def judge_predictions(
         made = simulate_with_truth(replace(experiment, seed=seed + number)).recording
         records.append(inspected(made).part)
         progress((number + 1) / (2 * RECORDS))
-    balance, model = VolumeBalance(experiment.rig), PressureModel(experiment.rig)
 
-    def by_balance(record: Recording) -> float | str:
-        if (missing := balance.usable(record)) is not None:
+    def findable(detector: VolumeBalance | PressureResponse, record: Recording) -> float | str:
+        if (missing := detector.usable(record)) is not None:
             return missing
-        evidence = balance.examine(record, [], false_alarm)
+        evidence = detector.examine(record, [], false_alarm)
         step = None if evidence.passage is None else evidence.passage.findable_lpm
         return evidence.reason if step is None else step
 
-    def by_model(record: Recording) -> float | str:
-        missing = model.usable(record)
-        return missing if missing is not None else model.findable(record, false_alarm, detection)
-
     predictions = []
-    for name, find in (("volume balance", by_balance), ("pressure model", by_model)):
-        steps = [find(record) for record in records]
+    for detector in (VolumeBalance(experiment.rig), PressureResponse(experiment.rig)):
+        name, steps = detector.name, [findable(detector, record) for record in records]
         refusals = [step for step in steps if isinstance(step, str)]
         sizes = [step for step in steps if not isinstance(step, str)]
         worst = max(sizes, default=math.inf)

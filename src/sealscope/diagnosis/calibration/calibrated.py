@@ -31,7 +31,7 @@ DEFAULT_DETECTORS = ("rms change", "d3 of p_A changed", "d4 of p_A changed", "d3
 
 
 #: Detectors that judge before them, most telling first, where every recording has the channels that they need.
-_RANKED = ("volume balance", "pressure model")
+_RANKED = ("volume balance", "pressure response")
 
 
 def default_detectors(parts: Sequence[Recording], rig: Rig | str = "thesis") -> tuple[str, ...]:

@@ -118,14 +118,17 @@ class Blocks:
 class Information(NamedTuple):
     """What K blocks say of one coefficient, one number g_k a block: likelihood exp(vector g - g precision g / 2).
 
-    `time` (K,) [s], `precision` (K, K), `vector` (K,); `level`: standard deviation of what is believed of the
-    coefficient before the first block, infinite where nothing is.
+    `time` (K,) [s], `precision` (K, K), `vector` (K,). What is believed of the coefficient, infinite where nothing is:
+    `level`, its standard deviation before the first block; `slope`, that of an even change over all blocks; `walk`,
+    the scale of a half-Cauchy distribution of the deviation that a random walk reaches over all blocks.
     """
 
     time: Array
     precision: Array
     vector: Array
     level: float = float("inf")
+    slope: float = float("inf")
+    walk: float = float("inf")
 
 
 class Columns:

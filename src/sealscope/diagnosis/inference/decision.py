@@ -196,7 +196,7 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Block
     causes: dict[Cause, float] = {}
     if answered is not None and answered.name == WITHIN:
         causes = probabilities(balance.hypotheses, balance.other)
-        answered = answered if _is_leak(causes) else None
+        answered = answered if is_leak(causes) else None
     if answered is None:
         judging = questions[0]
         bound = bound_of(balance, against)
@@ -221,7 +221,7 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Block
 WITHIN, AGAINST, LEVEL = "within the recording", "against the baseline", "against the rig's file"
 
 
-class _Question(NamedTuple):
+class Question(NamedTuple):
     """A question asked: its score and threshold, the chance of the score, its share of the false-alarm probability."""
 
     name: str
@@ -231,7 +231,7 @@ class _Question(NamedTuple):
     probability: float
 
 
-def _questions(balance: RecordedBalance, against: Rise | None, probability: float) -> list[_Question]:
+def _questions(balance: RecordedBalance, against: Rise | None, probability: float) -> list[Question]:
     """Return the questions that can be asked, each with its share of the false-alarm probability."""
     from scipy.special import ndtr, ndtri
 
@@ -241,19 +241,19 @@ def _questions(balance: RecordedBalance, against: Rise | None, probability: floa
     second = SECOND * probability if test is not None and (against is not None or level) else 0.0
     if against is not None:
         share = probability - second
-        questions.append(_Question(AGAINST, against.score, against.threshold(share), against.chance, share))
+        questions.append(Question(AGAINST, against.score, against.threshold(share), against.chance, share))
     if test is not None:
         share = second if against is not None else probability - second
-        questions.insert(0, _Question(WITHIN, test.score, test.threshold(share), test.chance, share))
+        questions.insert(0, Question(WITHIN, test.score, test.threshold(share), test.chance, share))
     if level:
         own, share = balance.level, second or probability
         deviation = float(np.hypot((own.high - own.low) / (2 * _95), own.value * balance.size.deviation))
         score = (own.value - healthy) / max(deviation, np.finfo(float).tiny)
-        questions.append(_Question(LEVEL, score, float(-ndtri(share)), float(ndtr(-score)), share))
+        questions.append(Question(LEVEL, score, float(-ndtri(share)), float(ndtr(-score)), share))
     return questions
 
 
-def _is_leak(causes: dict[Cause, float]) -> bool:
+def is_leak(causes: dict[Cause, float]) -> bool:
     """Whether a leak past piston or pump, which lie in parallel, is more probable than every other cause."""
     pump = causes.get("pump leak", 0.0)
     leak = sum(causes.get(cause, 0.0) for cause in LEAKS)
@@ -333,8 +333,8 @@ def _with_figures(
     balance: RecordedBalance,
     evidence: Evidence,
     against: Rise | None,
-    questions: Sequence[_Question],
-    judging: _Question,
+    questions: Sequence[Question],
+    judging: Question,
 ) -> Evidence:
     """Return the evidence with scores, thresholds, course, total, bound and the reason in words."""
     size = balance.size
@@ -366,7 +366,7 @@ def _with_figures(
     return replace(evidence, reason=_reason(balance, evidence, bound, judging.name))
 
 
-def _findable(balance: RecordedBalance, questions: Sequence[_Question]) -> float | None:
+def _findable(balance: RecordedBalance, questions: Sequence[Question]) -> float | None:
     """Return the smallest step within the recording that would have been found [m^3/s]."""
     share = next((own.probability for own in questions if own.name == WITHIN), None)
     if balance.test is None or share is None:

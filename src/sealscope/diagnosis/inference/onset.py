@@ -184,6 +184,8 @@ def course(information: Information, test: StepTest | None, step: bool) -> Cours
     basis = np.column_stack(design)
     precision = basis.T @ information.precision @ basis / noise
     precision[np.arange(fixed, basis.shape[1]), np.arange(fixed, basis.shape[1])] += 1.0 / noise
+    if count >= FEWEST:
+        precision[1, 1] += 1.0 / noise / information.slope**2
     inverse = _inverse(precision)
     mean = basis @ (inverse @ (basis.T @ information.vector / noise))
     return Course(mean, basis @ inverse @ basis.T)
@@ -226,15 +228,19 @@ def step_test(information: Information) -> StepTest | None:
     design = (vectors[:, kept] * root).T
     z = (vectors[:, kept].T @ vector) / root
     index = np.arange(count)
-    trend = np.column_stack([np.ones(count), index - index.mean()])
-    free = np.linalg.qr(design @ trend, mode="complete")[0][:, 2:].T
+    fixed = design @ np.column_stack([np.ones(count), (index - index.mean()) / count])
+    if np.isfinite(information.slope):  # what is believed of the slope is a reading of it
+        fixed = np.vstack([fixed, [0.0, 1.0 / information.slope]])
+        design, z = np.vstack([design, np.zeros(count)]), np.append(z, 0.0)
+    free = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T
     inner, outer = free @ design, np.minimum.outer(index, index) + 1.0
     covariance = inner @ outer @ inner.T
     unit = len(free) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
     at = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
     steps = np.clip(index[:, None] + 1.0 - at, 0.0, 1.0)
-    return _scan(basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0), _onset_times(time, at), unit)
+    parts = basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0)
+    return _scan(*parts, _onset_times(time, at), unit, -np.log1p(WALKS * unit * count / information.walk**2))
 
 
 def two_sided(information: Information) -> StepTest | None:
@@ -248,7 +254,7 @@ def two_sided(information: Information) -> StepTest | None:
 
 def _with_level(information: Information) -> tuple[Array, Array, Array]:
     """Return time, precision and vector with what is believed of the level as a block before the first."""
-    time, precision, vector, level = information
+    time, precision, vector, level = information[:4]
     if not np.isfinite(level) or len(time) < FEWEST:
         return time, precision, vector
     before = np.zeros((len(time) + 1, len(time) + 1))
@@ -264,13 +270,16 @@ def _onset_times(time: Array, at: Array) -> Array:
     return np.asarray(np.interp(at, np.arange(len(edges)), edges))
 
 
-def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float) -> StepTest:
-    """Return the test from z (n,), steps (n, o) and the walk's eigenvalues (n,), times `unit`, in its eigenvectors."""
+def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float, believed: Array) -> StepTest:
+    """Return the test from z (n,), steps (n, o) and the walk's eigenvalues (n,), times `unit`, in its eigenvectors.
+
+    `believed`: logarithm of the density of each of `WALKS`.
+    """
     n = len(z)
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
     along, square = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
-    determinant = np.log(weight).sum(axis=1)
+    determinant = np.log(weight).sum(axis=1) + 2.0 * believed
     without = 0.5 * determinant - 0.5 * n * np.log(total / n)
     rest = np.maximum(total[:, None] - np.maximum(along, 0.0) ** 2 / square, 1e-12 * total[:, None])
     beside = 0.5 * determinant[:, None] - 0.5 * n * np.log(rest / n)

@@ -60,15 +60,23 @@ def rise(judged: Blocks, baseline: Sequence[Blocks], columns: Sequence[Columns])
     sums = [_about_own(total(own, columns), columns) for own in baseline]
     everything = np.sum(sums, axis=0)
     value = _rise(_about_own(total(judged, columns), columns), everything, columns)
-    beliefs, count = priors()["scatter"], len(sums)
     weights = np.maximum(judged.rows, 1e-9)
     flow, pressure = (float(np.average(of, weights=weights)) for of in (judged.means[:, 2], judged.driving()))
-    believed = beliefs["leak"].value * flow / pressure if pressure > 0.0 else 0.0
+    believed = priors()["scatter"]["leak"].value * flow / pressure if pressure > 0.0 else 0.0
+    apart = [_rise(own, everything - own, columns) for own in sums] if len(sums) > 1 else [0.0]
+    return student(value, apart, believed)
+
+
+def student(value: float, apart: Sequence[float], believed: float) -> Rise:
+    """Return a rise against n healthy recordings, each of which is so far `apart` from the others.
+
+    `believed`: what is believed of the scatter beforehand.
+    """
+    beliefs, count = priors()["scatter"], len(apart)
     squares = beliefs["freedom"].value * believed**2
     freedom = beliefs["freedom"].value + count - 1
     if count > 1:
-        apart = np.array([_rise(own, everything - own, columns) for own in sums])
-        squares += float(np.sum(apart**2)) * ((count - 1) / count) ** 2
+        squares += float(np.sum(np.square(apart))) * ((count - 1) / count) ** 2
     deviation = np.sqrt(squares / freedom * (1.0 + 1.0 / count))
     return Rise(value, max(float(deviation), np.finfo(float).tiny), freedom)
 

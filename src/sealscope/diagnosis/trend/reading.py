@@ -14,12 +14,8 @@ from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.baseline.sessions import start_seconds
 from sealscope.diagnosis.detector import unusable
 from sealscope.diagnosis.inference.detector import VolumeBalance
-from sealscope.diagnosis.observer.against_baseline import level as observer_level
-from sealscope.diagnosis.observer.detector import Observer
-from sealscope.diagnosis.observer.evidence import misfit
-from sealscope.diagnosis.observer.evidence import states_flow as observer_states_flow
-from sealscope.diagnosis.observer.model import G_UNIT
-from sealscope.diagnosis.pressure_model.detector import DAY_TO_DAY, PressureModel, is_followed
+from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.inference.pressures.evidence import priors
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole_log_rms
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.parameters import Rig
@@ -29,11 +25,11 @@ from sealscope.recordings.recording import Recording
 
 #: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
 #: details.
-Basis = Literal["volume balance", "pressure model", "observer", "ringing"]
-BASES: tuple[Basis, ...] = ("volume balance", "pressure model", "observer", "ringing")
+Basis = Literal["volume balance", "pressure response", "ringing"]
+BASES: tuple[Basis, ...] = ("volume balance", "pressure response", "ringing")
 #: From day to day a level moves by this share of itself, or by this much; both known as from five recordings. Those of
 #: the conductances are what `diagnose` assumes; that of the ringing is `rms change`'s between sessions.
-_SHARE, _BY_RINGING, _RINGING, _FREEDOM = 0.1, 0.6 * G_UNIT, 0.11, 4.0
+_SHARE, _RINGING, _FREEDOM = 0.1, 0.11, 4.0
 #: Error of a ringing's logarithm that a recording states of itself.
 _RINGING_ERROR = 0.01
 
@@ -123,25 +119,16 @@ def _stated(part: Recording, rig: Rig) -> _Stated:
             of_all = Level(total.value * size.scale, (total.high - total.low) * size.scale / 3.92)
             ratio = None if size.ratio is None else size.ratio.value
             return _Stated("volume balance", of_all, size.stated, ("x", "m") in own.units, ratio)
-    model = PressureModel(rig)
-    if unusable(model, part) is None:
-        followed = model.follow(part)
-        if not isinstance(followed, str) and is_followed(followed):
-            return _Stated("pressure model", followed.level, model.states_flow)
-    observer = Observer(rig)
-    if unusable(observer, part) is None:
-        series = observer.follow(part)
-        if series.G.size > 1 and misfit(series.estimates, series.formulation, rig) is None:
-            level = observer_level(series)
-            flows = observer_states_flow(series.formulation, rig)
-            return _Stated("observer", Level(level.value * G_UNIT, level.error * G_UNIT), flows)
+    response = PressureResponse(rig)
+    if unusable(response, part) is None and (reading := response.reading(part)) is not None:
+        return _Stated("pressure response", Level(*reading.level), reading.stated)
     log_rms = whole_log_rms(part).reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
     return _Stated("ringing", Level(ringing, _RINGING_ERROR)) if np.isfinite(ringing) else _NOTHING
 
 
 def _reasons(part: Recording, rig: Rig) -> str:
-    reasons = (unusable(detector(rig), part) for detector in (VolumeBalance, PressureModel, Observer))
+    reasons = (unusable(detector(rig), part) for detector in (VolumeBalance, PressureResponse))
     return "; ".join(dict.fromkeys(reason for reason in reasons if reason)) or "the pressures do not ring"
 
 
@@ -156,6 +143,4 @@ def scatter_of(basis: Basis, usual: float) -> DayToDay:
     """Return the prior on the scatter of a level from day to day, for a machine of that usual level."""
     if basis == "volume balance":
         return DayToDay(max(_SHARE * abs(usual), float(np.finfo(float).tiny)), _FREEDOM)
-    if basis == "pressure model":
-        return DAY_TO_DAY
-    return DayToDay(_BY_RINGING if basis == "observer" else _RINGING, _FREEDOM)
+    return DayToDay(priors("response")["G_level"].width if basis == "pressure response" else _RINGING, _FREEDOM)

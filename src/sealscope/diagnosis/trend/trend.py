@@ -68,7 +68,7 @@ class Trend:
     reason : str
         Why, in one line.
     basis : str or None
-        What the levels rest on: volume balance, pressure model, observer, or the damping of the pressures' ringing.
+        What the levels rest on: volume balance, pressure response, or the damping of the pressures' ringing.
     unit : str
         Unit of the levels: ``L/min``, or ``%`` of the first recordings where the machine's size is not known.
     pressure : float or None

@@ -19,8 +19,7 @@ _WITHIN_DAYS = 3.0
 _FURTHEST = 120.0
 _BASES = {
     "volume balance": "by the volume balance",
-    "pressure model": "by the pressure model",
-    "observer": "by the observer",
+    "pressure response": "by the pressures' response",
     "ringing": "the damping of the pressures' ringing, relative: no L/min",
 }
 

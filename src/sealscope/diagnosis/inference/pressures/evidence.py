@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import FEWEST
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 #: Most blocks of a recording, and their least length [s]; a wander is stated for so long [s].
 BLOCKS, SHORTEST_BLOCK, WANDER_TIME = 30, 2.0, 90.0
+#: Fewest samples a second: two and a half times the highest ring of the rigs.
+SLOWEST = 200.0
 
 
 class Prior(NamedTuple):
@@ -74,25 +77,46 @@ class PressureEvidence:
 
 
 def pressure_evidence(
-    recording: Recording, edges: NDArray[np.int64], precision: Array, vector: Array, laws: tuple[float, float]
+    recording: Recording, edges: NDArray[np.int64], information: Information, laws: tuple[float, float]
 ) -> PressureEvidence:
-    """Return the evidence of blocks between the samples `edges` (K + 1,), from their precision and vector of g."""
+    """Return the evidence of blocks between the samples `edges` (K + 1,), from what they say of g."""
     known = priors("ring_down")
     dp = np.abs(recording["p_A"] - recording["p_B"])
-    return PressureEvidence(
-        Information(recording.t[0] + 0.5 * (edges[1:] + edges[:-1]) / recording.rate, precision, vector),
-        np.add.reduceat(dp, edges[:-1]) / np.diff(edges),
-        math.hypot(known["mass"].width, 2.0 * known["area"].width),
-        laws,
-    )
+    pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
+    return PressureEvidence(information, pressure, math.hypot(known["mass"].width, 2.0 * known["area"].width), laws)
 
 
-def usable(recording: Recording, rig: Rig) -> bool:
-    """Return whether a recording has command and pressures in their units, of a pump that drives two like areas."""
-    units = {"u": "V", "p_A": "Pa", "p_B": "Pa"}
-    stated = all(name in recording and recording.units[name] == unit for name, unit in units.items())
-    whole = stated and all(np.all(np.isfinite(recording[name])) and np.ptp(recording[name]) > 0.0 for name in units)
-    return whole and not rig.cylinder.single_rod and rig.valve.spool == "absent"
+def middles(recording: Recording, edges: NDArray[np.int64]) -> Array:
+    """Return the times (K,) of the middles of blocks between the samples `edges` (K + 1,) [s]."""
+    return np.asarray(recording.t[0] + 0.5 * (edges[1:] + edges[:-1]) / recording.rate)
+
+
+def wander_of_conductance(seconds: float) -> float:
+    """Return how far a healthy machine's conductance wanders in so many seconds [m^3/(s Pa)]."""
+    return priors("response")["G_wander"].width * math.sqrt(seconds / WANDER_TIME)
+
+
+def unusable(recording: Recording, rig: Rig) -> str | None:
+    """Return None where a recording has command and pressures in their units, of a pump that drives two like areas.
+
+    Else why not, in words.
+    """
+    if rig.valve.spool != "absent":
+        return "behind a servo valve a position is needed"
+    if rig.cylinder.single_rod:
+        return "needs a cylinder of two like areas: on a single rod a position is needed"
+    for name, unit in {"u": "V", "p_A": "Pa", "p_B": "Pa"}.items():
+        if name not in recording:
+            return f"needs {name}"
+        if recording.units[name] != unit:
+            return f"needs {name} in a unit, got counts"
+        if not np.all(np.isfinite(recording[name])) or not np.ptp(recording[name]) > 0.0:
+            return f"{name} is constant or missing"
+    if recording.duration < FEWEST * SHORTEST_BLOCK:
+        return f"needs {FEWEST * SHORTEST_BLOCK:g} s or more, got {recording.duration:.3g} s"
+    if recording.rate < SLOWEST:
+        return f"needs {SLOWEST:g} Hz or more, got {recording.rate:.3g} Hz: the ringing after a reversal is not seen"
+    return None
 
 
 def block_edges(recording: Recording) -> NDArray[np.int64]:

@@ -6,37 +6,43 @@ pressure difference and theta_k the parameters of block k, which wander from blo
 
     y_k(theta) = y_k(theta_k^0) + J_k (theta_k - theta_k^0),
 
-where each block is linear about its own theta_k^0: the likeliest path, found by Gauss-Newton steps. All lanes of one
-call of the kernel are one Jacobian: the path, and the path with each parameter a little more in all blocks. What is
-left is Gaussian in all theta_k; all but the conductance G past the piston are eliminated by a Schur complement.
+where each block is linear about its own theta_k^0: an iterated Kalman filter leads it from block to block (`Follower`),
+live and over a recording alike. All lanes of one call of the kernel are one Jacobian: the path, and the path with each
+parameter a little more in all blocks; their states are carried from block to block. Over a recording what is left is
+Gaussian in all theta_k together (`Response`), so that what the blocks say of one parameter, all others eliminated, is
+a block of its inverse. The block keeps sums only.
 
 The ring of `ring_down` is in this response, and so is what it does not see: the ramp, the breakaway, and how far the
 pressure falls while sliding. Both providers read the same pressures under the same factorisation, p(pressures |
 command): they are two hypotheses of the machine, this one with the laws of the rig, and are never added.
+
+Source: B. M. Bell and F. W. Cathey, IEEE Trans. Autom. Control 38 (1993) 294 (iterated filter as Gauss-Newton steps).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from sealscope.compiled import contracted, kernel
+from sealscope.diagnosis.inference.blocks import Information
 from sealscope.diagnosis.inference.pressures.evidence import (
     WANDER_TIME,
     PressureEvidence,
     block_edges,
-    eliminated,
     mains_lines,
+    middles,
     pressure_evidence,
     priors,
-    usable,
+    unusable,
+    wander_of_conductance,
 )
-from sealscope.diagnosis.inference.pressures.ring_down import ring_down
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
@@ -44,7 +50,7 @@ from sealscope.physics.leakage import laminar_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
 from sealscope.physics.rig import RigNumbers, rig_numbers
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Array, Recording, remembered
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -52,21 +58,28 @@ if TYPE_CHECKING:
 #: What a block has of its own: speed per volt [rad/(s V)], lead of the command [s], speed beside it [rad/s], stiffness
 #: of the oil [Pa], Coulomb friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay
 #: [s/m], share by which friction is larger on the way out [1], conductance past the piston [m^3/(s Pa)], lag of the
-#: transducers [s].
-PARAMETERS = ("gain", "lead", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "lag")
-GAIN, LEAD, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, LAG = range(len(PARAMETERS))
-_SIZE = len(PARAMETERS)
+#: transducers [s]; then what no simulation needs: scale of p_A - p_B [1] and its offset [Pa].
+PARAMETERS = ("gain", "lead", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "lag", "scale", "offset")
+GAIN, LEAD, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, LAG, SCALE, OFFSET = range(len(PARAMETERS))
+_SIZE, _SIMULATED = len(PARAMETERS), LAG + 1
 State = tuple[float, float, float, float, float]
 Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float]
 #: Longest step of the solver [s]: RK4 is within 100 Pa there, far under the noise of transducers.
 _STEP = 1.01e-3
-#: Steps of differences as a share of what is believed; gain of log likelihood that ends a descent, steps of one.
-_NUDGE, _ENOUGH, _STEPS = 0.05, 0.1, 12
+#: Steps of differences as a share of what is believed; gain of twice the log likelihood that is worth a run, most steps
+#: of a fit, turns to the noise's variance.
+_NUDGE, _ENOUGH, _STEPS, _TURNS = 0.05, 5.0, 12, 2
+#: Share of the variance of p_A - p_B that parameters which simulate it leave.
+_EXPLAINED = 0.5
+#: Where a block's chi square is so many deviations more than expected, jumps are tried: conductances [m^3/(s Pa)], and
+#: stiffnesses over the one before.
+_UNEXPLAINED = 3.0
+_CONDUCTANCES, _STIFFNESSES = np.geomspace(1e-12, 2e-10, SINGLE_WIDTH), np.geomspace(0.15, 1.2, SINGLE_WIDTH)
 #: Least share of a step that is tried; damping [1] of steps that did not gain, at first, at least and at most.
 _LEAST_SHARE, _DAMPED, _LEAST_DAMPED, _MOST_DAMPED = 0.02, 0.1, 1e-3, 100.0
 #: The first fit: length of its window [s], width of the Gaussian that takes the ring out [periods], steps of the slow
 #: fit, and stiffnesses from which the whole is fitted.
-_WINDOW, _SLOW, _FIRST_STEPS, _STARTS = 40.0, 0.6, 6, 3
+_WINDOW, _SLOW, _FIRST_STEPS, _STARTS = 12.0, 0.6, 6, 3
 _POSITIVE = [GAIN, K_OIL, F_C, K_BRK, C_C]
 
 
@@ -95,37 +108,36 @@ def _moved(y: State, h: float, k: State) -> State:
 
 @kernel
 def simulate_response(
-    command: np.ndarray, h: float, every: int, theta: np.ndarray, block: np.ndarray, m: RigNumbers, out: np.ndarray
+    command: np.ndarray, rate: float, every: int, theta: np.ndarray, states: np.ndarray, m: RigNumbers, out: np.ndarray
 ) -> None:
-    """Write p_A - p_B [Pa] of all lanes at each sample into `out` (n, lanes), from rest, by RK4 in steps of h [s].
+    """Write p_A - p_B [Pa] of all lanes at each sample into `out` (n, lanes), by RK4, `every` steps a sample.
 
-    `command` (2 every n + 1, 2) at every half step: [V] and [V/s], `every` steps to a sample; `theta` (K p, lanes), a
-    row a parameter, block after block; `block` (n,) which of them holds at a sample.
+    `command` (n + 1,) [V]: at the sample before, then at each, with ramps between; `theta` (p, lanes), a row a
+    parameter; `states` (6, lanes): p, v, omega, i, I and the reading at the sample before, on return at the last.
     """
-    zero = load(theta, LEAD) * 0.0
-    y = (zero, zero, zero, zero, zero)
-    read = zero
-    for sample in range(block.size):
-        store(out, sample, read)
-        row = _SIZE * block[sample]
-        now = (
-            load(theta, row),
-            load(theta, row + 1),
-            load(theta, row + 2),
-            load(theta, row + 3),
-            load(theta, row + 4),
-            load(theta, row + 5),
-            load(theta, row + 6),
-            load(theta, row + 7),
-            load(theta, row + 8),
-            load(theta, row + 9),
-            load(theta, row + 10),
-        )
+    y = (load(states, 0), load(states, 1), load(states, 2), load(states, 3), load(states, 4))
+    read = load(states, 5)
+    now = (
+        load(theta, 0),
+        load(theta, 1),
+        load(theta, 2),
+        load(theta, 3),
+        load(theta, 4),
+        load(theta, 5),
+        load(theta, 6),
+        load(theta, 7),
+        load(theta, 8),
+        load(theta, 9),
+        load(theta, 10),
+    )
+    h = 1.0 / (rate * every)
+    for sample in range(command.size - 1):
+        rise = command[sample + 1] - command[sample]
+        ahead = now[GAIN] * now[LEAD] * (rise * rate) + now[BIAS]
         for step in range(every):
-            at = 2 * (sample * every + step)
-            w_0 = now[GAIN] * (command[at, 0] + now[LEAD] * command[at, 1]) + now[BIAS]
-            w_1 = now[GAIN] * (command[at + 1, 0] + now[LEAD] * command[at + 1, 1]) + now[BIAS]
-            w_2 = now[GAIN] * (command[at + 2, 0] + now[LEAD] * command[at + 2, 1]) + now[BIAS]
+            w_0 = now[GAIN] * (command[sample] + rise * (step / every)) + ahead
+            w_1 = now[GAIN] * (command[sample] + rise * ((step + 0.5) / every)) + ahead
+            w_2 = now[GAIN] * (command[sample] + rise * ((step + 1.0) / every)) + ahead
             k_1 = _rates(y, w_0, now, m)
             k_2 = _rates(_moved(y, 0.5 * h, k_1), w_1, now, m)
             k_3 = _rates(_moved(y, 0.5 * h, k_2), w_1, now, m)
@@ -133,41 +145,26 @@ def simulate_response(
             total = _moved(_moved(_moved(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4)
             y = _moved(y, h / 6.0, total)
             read = read + (y[0] - read) * (h / (h + now[LAG]))
-
-
-@dataclass(frozen=True, eq=False)
-class Simulator:
-    """The reduced rig under a recorded command; `command` (2 every n + 1, 2) as `simulate_response` takes it."""
-
-    command: Array
-    h: float
-    every: int
-    numbers: RigNumbers
-
-    @staticmethod
-    def of(u: Array, rate: float, rig: Rig) -> Simulator:
-        """Return it for a command (n,) [V] that ramps from sample to sample."""
-        every, numbers = math.ceil(1.0 / rate / _STEP), rig_numbers(rig)
-        area, h = 0.5 * (numbers.A_A + numbers.A_B), 1.0 / rate / every
-        fine = np.interp(np.arange(2 * every * u.size + 1) / (2 * every), np.arange(u.size), u)
-        command = np.column_stack([fine, np.gradient(fine, 0.5 * h)])
-        return Simulator(command, h, every, numbers._replace(A_A=area, A_B=area))
-
-    def run(self, sets: Array, block: NDArray[np.int64]) -> Array:
-        """Return p_A - p_B (n, lanes) [Pa] of up to 16 paths (lanes, K, p); `block` (n,): that of each sample."""
-        lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)
-        theta = np.ascontiguousarray(sets[lanes].reshape(SINGLE_WIDTH, -1).T, dtype=np.float32)
-        out = np.empty((block.size, SINGLE_WIDTH), dtype=np.float32)
-        simulate_response(self.command, self.h, self.every, theta, block, self.numbers, out)
-        return out[:, : len(sets)].astype(np.float64)
+        store(out, sample, read)
+    store(states, 0, y[0])
+    store(states, 1, y[1])
+    store(states, 2, y[2])
+    store(states, 3, y[3])
+    store(states, 4, y[4])
+    store(states, 5, read)
 
 
 class Beliefs(NamedTuple):
-    """What is believed of the parameters (p,): centre of their mean, its `width`, and how far they `wander` in 90 s."""
+    """What is believed of the parameters (p,): centre and `width` of their mean, and how far they `wander` in 90 s."""
 
     centre: Array
     width: Array
     wander: Array
+
+    @property
+    def unit(self) -> Array:
+        """Steps of the parameters for a difference, in which all matrices are."""
+        return np.asarray(_NUDGE * np.minimum(self.width, self.wander))
 
 
 def beliefs_of(rig: Rig, pressures: float) -> Beliefs:
@@ -186,129 +183,375 @@ def beliefs_of(rig: Rig, pressures: float) -> Beliefs:
     )
 
 
-class Path:
-    """Likeliest parameters of K blocks, by Gauss-Newton steps over all blocks together.
+class Machine(NamedTuple):
+    """The reduced rig of the simulation, at a rate [Hz] in `every` steps a sample."""
 
-    `dp` (n,) [Pa], `edges` (K + 1,) of the blocks [samples], each `seconds` long. With `smooth` [samples] > 0 only what
-    a Gaussian of that width leaves of the pressure is fitted. `unit` (p,): a step of the parameters for a difference.
+    numbers: RigNumbers
+    rate: float
+    every: int
+
+    @staticmethod
+    def of(rig: Rig, rate: float) -> Machine:
+        """Return that of a rig's kind."""
+        numbers = rig_numbers(rig)
+        area = 0.5 * (numbers.A_A + numbers.A_B)
+        return Machine(numbers._replace(A_A=area, A_B=area), rate, math.ceil(1.0 / rate / _STEP))
+
+    def run(self, command: Array, paths: Array, states: Array) -> tuple[Array, Array]:
+        """Return p_A - p_B (n, m) [Pa] of up to 16 sets (m, p) from their states (6, m), and the states at the end."""
+        lanes = np.minimum(np.arange(SINGLE_WIDTH), len(paths) - 1)
+        theta = np.ascontiguousarray(paths[lanes, :_SIMULATED].T, dtype=np.float32)
+        ends = np.ascontiguousarray(states[:, lanes], dtype=np.float32)
+        out = np.empty((command.size - 1, SINGLE_WIDTH), dtype=np.float32)
+        simulate_response(command, self.rate, self.every, theta, ends, self.numbers, out)
+        return out[:, : len(paths)].astype(np.float64), ends[:, : len(paths)].astype(np.float64)
+
+    def period(self, stiffness: float) -> float:
+        """Return the ring's period [samples] at a stiffness of the oil [Pa]."""
+        m = self.numbers
+        return 2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A
+
+
+class Normal(NamedTuple):
+    """Normal belief on the parameters: mean (p,) and precision (p, p) in units."""
+
+    mean: Array
+    precision: Array
+
+
+class Look(NamedTuple):
+    """A stretch about parameters `theta` (p,): residual (n,), Jacobian (n, p) [Pa per unit], states at the end."""
+
+    theta: Array
+    left: Array
+    slopes: Array
+    ends: Array
+
+    def cost(self, variance: float, belief: Normal, unit: Array) -> float:
+        """Return minus twice the logarithm of the posterior."""
+        off = (self.theta - belief.mean) / unit
+        return float(self.left @ self.left / variance + off @ belief.precision @ off)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Samples that one set of parameters holds for.
+
+    `command` (n + 1,) [V] with that of the sample before; `dp` (n,) [Pa]; `states` (6, 12): of path and perturbed paths
+    before; `unit` (p,); `apart` (n, m): orthonormal rows that are taken out, the mains' lines; `known` (n,): whether a
+    sample is. With `smooth` [samples] > 0 only what a Gaussian of that width leaves is fitted.
     """
 
-    def __init__(
-        self, simulator: Simulator, dp: Array, edges: NDArray[np.int64], seconds: float, beliefs: Beliefs
-    ) -> None:
-        self.simulator, self.dp, self.edges, self.beliefs = simulator, dp, edges, beliefs
-        self.blocks, self.smooth, self.variance = edges.size - 1, 0.0, math.nan
-        self.block = np.repeat(np.arange(self.blocks), np.diff(edges))
-        self.unit = _NUDGE * np.minimum(beliefs.width, beliefs.wander)
-        steps, level = np.diff(np.eye(self.blocks), axis=0), np.full((self.blocks, self.blocks), self.blocks**-2.0)
-        walk = WANDER_TIME / seconds * steps.T @ steps
-        self.strain = np.zeros((self.blocks, _SIZE, self.blocks, _SIZE))
-        for j, unit in enumerate(self.unit):
-            self.strain[:, j, :, j] = (unit / beliefs.wander[j]) ** 2 * walk + (unit / beliefs.width[j]) ** 2 * level
+    machine: Machine
+    command: Array
+    dp: Array
+    states: Array
+    unit: Array
+    apart: Array
+    known: Array
+    smooth: float = 0.0
 
     def seen(self, rows: Array) -> Array:
-        """Return rows (n, ...) without their means over the blocks, and without what is not fitted."""
+        """Return rows (n, m) without what is not fitted."""
         rows = gaussian_filter1d(rows, self.smooth, axis=0) if self.smooth > 0.0 else rows
-        means = np.add.reduceat(rows, self.edges[:-1]) / np.diff(self.edges)[:, None]
-        return np.asarray(rows - means[self.block])
+        rows = rows * self.known[:, None]
+        return np.asarray(rows - self.apart @ (self.apart.T @ rows))
 
-    def squares(self, sets: Array) -> Array:
-        """Return the squares [Pa^2] that up to 16 paths (m, K, p) leave."""
-        left = self.seen(self.dp[:, None] - self.simulator.run(sets, self.block))
-        return np.asarray(np.einsum("nm,nm->m", left, left))
+    def residuals(self, paths: Array) -> Array:
+        """Return what up to 16 sets of parameters (m, p) leave (n, m), their means taken out."""
+        shown, _ = self.machine.run(self.command, paths, self.states[:, np.zeros(len(paths), dtype=int)])
+        left = self.seen(self.dp[:, None] - paths[:, SCALE] * shown)
+        return np.asarray(left - left.mean(axis=0))
 
-    def look(self, theta: Array, others: Array) -> tuple[Array, Array, Array]:
-        """Return residual (n,) and Jacobian (n, p) [Pa per unit] at a path, and the squares that `others` leave."""
-        sets = np.concatenate([np.tile(theta, (_SIZE + 1, 1, 1)), others])
-        sets[range(1, _SIZE + 1), :, range(_SIZE)] += self.unit[:, None]
-        shown = self.simulator.run(sets, self.block)
-        left = self.seen(self.dp[:, None] - shown[:, [0, *range(_SIZE + 1, len(sets))]])
-        slopes = self.seen(shown[:, 1 : _SIZE + 1] - shown[:, :1])
-        return left[:, 0], slopes, np.einsum("nm,nm->m", left[:, 1:], left[:, 1:])
+    def look(self, theta: Array, others: Array) -> tuple[Look, Array]:
+        """Return the look about parameters (p,), and what others (m, p) leave, (n, m)."""
+        sets = np.concatenate([np.tile(theta, (_SIMULATED + 1, 1)), others])
+        sets[range(1, _SIMULATED + 1), range(_SIMULATED)] += self.unit[:_SIMULATED]
+        states = self.states[:, [*range(_SIMULATED + 1), *[0] * len(others)]]
+        shown, ends = self.machine.run(self.command, sets, states)
+        own = [0, *range(_SIMULATED + 1, len(sets))]
+        left = self.dp[:, None] - sets[own, SCALE] * shown[:, own] - sets[own, OFFSET]
+        slopes = theta[SCALE] * (shown[:, 1 : _SIMULATED + 1] - shown[:, :1])
+        rest = np.column_stack([self.unit[SCALE] * shown[:, 0], np.full(len(shown), self.unit[OFFSET])])
+        rows = self.seen(np.concatenate([left, slopes, rest], axis=1))
+        count = len(own)
+        return Look(theta, rows[:, 0], rows[:, count:], ends[:, : _SIMULATED + 1]), rows[:, 1:count]
 
     def spread(self, left: Array) -> float:
         """Return the variance [Pa^2] of a residual (n,), for as many samples as are independent of each other."""
-        return float(left @ left) / (left.size - self.blocks) * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
+        count = max(float(np.count_nonzero(self.known)) - _SIZE, 1.0)
+        return max(float(left @ left), 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
-    def normal(self, left: Array, slopes: Array) -> tuple[Array, Array]:
-        """Return information (K p, K p) and vector (K p,) of the blocks, in units, at the present variance."""
-        N, b = np.zeros_like(self.strain), np.empty((self.blocks, _SIZE))
-        for k, (first, end) in enumerate(zip(self.edges[:-1], self.edges[1:], strict=True)):
-            here = slopes[first:end]
-            N[k, :, k], b[k] = here.T @ here, here.T @ left[first:end]
-        return N.reshape(b.size, b.size) / self.variance, b.ravel() / self.variance
+    def descend(self, theta: Array, belief: Normal, steps: int, variance: float | None = None) -> Look:
+        """Return the look about likelier parameters; their noise's variance [Pa^2] is fitted where it is not given.
 
-    def off(self, theta: Array) -> Array:
-        """Return a path (K, p) as deviations (K p,) from what is believed, in units."""
-        return np.asarray((theta - self.beliefs.centre) / self.unit).ravel()
-
-    def descend(self, theta: Array, steps: int) -> tuple[Array, Array, Array]:
-        """Return a likelier path (K, p) with residual (n,) and Jacobian (n, p) about it.
-
-        A whole step is run with its Jacobian, beside shares of it; where none of them gains, it is damped.
+        A whole step is run with its Jacobian, beside shares of it; where none of them gains, it is damped. A step is
+        not made where it would gain less than is worth a run.
         """
-        strain = self.strain.reshape(theta.size, theta.size)
-        shares = np.concatenate([[1.0], np.geomspace(0.5, _LEAST_SHARE, SINGLE_WIDTH - _SIZE - 1)])
-        left, slopes, _ = self.look(theta, theta[None])
-        damping = 0.0
+        shares = np.concatenate([[1.0], np.geomspace(0.5, _LEAST_SHARE, SINGLE_WIDTH - _SIMULATED - 1)])
+        look, damping = self.look(theta, np.empty((0, _SIZE)))[0], 0.0
         for _ in range(steps):
-            self.variance = self.spread(left)
-            N, b = self.normal(left, slopes)
-            off = self.off(theta)
-            H = N + strain
-            move = np.linalg.solve(H + damping * np.diag(np.diag(H)), b - strain @ off)
-            paths = theta + shares[:, None, None] * move.reshape(theta.shape) * self.unit
-            paths = self._held(theta, paths)
-            there, slopes_there, squares = self.look(paths[0], paths[1:])
-            offs = np.array([self.off(path) for path in paths])
-            costs = np.append(there @ there, squares) / self.variance + np.einsum("mi,mi->m", offs @ strain, offs)
-            gains = np.nan_to_num(left @ left / self.variance + off @ strain @ off - costs, nan=-np.inf)
+            noise = variance or self.spread(look.left)
+            off = (look.theta - belief.mean) / self.unit
+            H = look.slopes.T @ look.slopes / noise + belief.precision
+            rise = look.slopes.T @ look.left / noise - belief.precision @ off
+            move = np.linalg.solve(H + damping * np.diag(np.diag(H)), rise)
+            if float(rise @ move) < _ENOUGH:
+                break
+            paths = held(look.theta, look.theta + shares[:, None] * move * self.unit)
+            whole, lefts = self.look(paths[0], paths[1:])
+            offs = (paths[1:] - belief.mean) / self.unit
+            costs = np.einsum("nm,nm->m", lefts, lefts) / noise + np.einsum("mi,ij,mj->m", offs, belief.precision, offs)
+            costs = np.append(whole.cost(noise, belief, self.unit), costs)
+            gains = np.nan_to_num(look.cost(noise, belief, self.unit) - costs, nan=-np.inf)
             best = int(np.argmax(gains))
             if not gains[best] > 0.0:
                 damping = max(10.0 * damping, _DAMPED)
                 if damping > _MOST_DAMPED:
                     break
                 continue
-            theta, damping = paths[best], 0.1 * damping if damping > _LEAST_DAMPED else 0.0
-            left, slopes = (there, slopes_there) if best == 0 else self.look(theta, theta[None])[:2]
-            if gains[best] < _ENOUGH:
-                break
-        self.variance = self.spread(left)
-        return theta, left, slopes
-
-    @staticmethod
-    def _held(theta: Array, paths: Array) -> Array:
-        """Return paths (m, K, p) whose positive parameters are between half and twice those of `theta` (K, p)."""
-        paths[:, :, _POSITIVE] = np.clip(paths[:, :, _POSITIVE], 0.5 * theta[:, _POSITIVE], 2.0 * theta[:, _POSITIVE])
-        paths[:, :, LAG] = np.maximum(paths[:, :, LAG], 0.0)
-        return paths
+            damping = 0.1 * damping if damping > _LEAST_DAMPED else 0.0
+            look = whole if best == 0 else self.look(paths[best], paths[:0])[0]
+        return look
 
 
-def first_fit(path: Path, period: float) -> Array:
-    """Return parameters (1, p) that hold over a window, a path of one block; the ring has a `period` [samples].
+def held(theta: Array, paths: Array) -> Array:
+    """Return sets (m, p) whose positive parameters are between half and twice those of `theta` (p,)."""
+    paths[:, _POSITIVE] = np.clip(paths[:, _POSITIVE], 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE])
+    paths[:, LAG] = np.maximum(paths[:, LAG], 0.0)
+    return np.asarray(paths)
+
+
+def first_fit(stretch: Stretch, beliefs: Beliefs) -> tuple[Array, float]:
+    """Return parameters (p,) that hold over a stretch, and the variance that they leave [Pa^2].
 
     The ringing makes many local minima. So the slow part of the pressure is fitted first, from the best of several
     gains; then the whole, from what was reached and from the best stiffnesses about the one believed.
     """
-    spread, beliefs = np.linspace(-2.0, 2.0, SINGLE_WIDTH), path.beliefs
+    spread, belief = (
+        np.linspace(-2.0, 2.0, SINGLE_WIDTH),
+        Normal(beliefs.centre, np.diag((beliefs.unit / beliefs.width) ** 2)),
+    )
 
-    def tried(theta: Array, parameter: int) -> tuple[Array, Array]:
-        sets = np.tile(theta, (SINGLE_WIDTH, 1, 1))
+    def tried(of: Stretch, theta: Array, parameter: int) -> tuple[Array, Array]:
+        sets = np.tile(theta, (SINGLE_WIDTH, 1))
         centre = beliefs.centre[parameter]
-        sets[:, 0, parameter] = centre * np.exp(beliefs.width[parameter] / centre * spread)
-        return sets, np.nan_to_num(path.squares(sets), nan=np.inf)
+        sets[:, parameter] = centre * np.exp(beliefs.width[parameter] / centre * spread)
+        left = of.residuals(sets)
+        return sets, np.nan_to_num(np.einsum("nm,nm->m", left, left), nan=np.inf)
 
-    path.smooth = _SLOW * period
-    sets, squares = tried(beliefs.centre, GAIN)
-    theta, _, _ = path.descend(sets[int(np.argmin(squares))], _FIRST_STEPS)
-    path.smooth = 0.0
-    sets, squares = tried(theta, K_OIL)
+    slow = replace(stretch, smooth=_SLOW * stretch.machine.period(beliefs.centre[K_OIL]))
+    sets, squares = tried(slow, beliefs.centre, GAIN)
+    theta = slow.descend(sets[int(np.argmin(squares))], belief, _FIRST_STEPS).theta
+    sets, squares = tried(stretch, theta, K_OIL)
     beside = np.pad(squares, 1, constant_values=np.inf)
     minima = np.flatnonzero((squares <= beside[2:]) & (squares <= beside[:-2]))
     starts = [theta, *sets[minima[np.argsort(squares[minima])][:_STARTS]]]
-    fits = [path.descend(start, _FIRST_STEPS) for start in starts]
-    best = min(fits, key=lambda fit: float(np.nan_to_num(fit[1] @ fit[1], nan=np.inf)))[0]
-    return path.descend(best, _STEPS)[0]
+    fits = [stretch.descend(start, belief, _FIRST_STEPS) for start in starts]
+    best = min(fits, key=lambda fit: float(np.nan_to_num(fit.left @ fit.left, nan=np.inf)))
+    best = stretch.descend(best.theta, belief, _STEPS)
+    return best.theta, stretch.spread(best.left)
+
+
+class Linear(NamedTuple):
+    """A block's sums about its own parameters `theta` (p,), in units of them.
+
+    `N` (p, p) and `b` (p,): of the Jacobian's products with itself and the residual [Pa^2]; `squares` of the residual
+    over `samples`; `score` (s,) and `cross` (s, p): products of the column of G with residual and Jacobian in
+    each of about so many seconds, which show how far the residual is from white.
+    """
+
+    theta: Array
+    N: Array
+    b: Array
+    squares: float
+    samples: float
+    score: Array
+    cross: Array
+
+
+def linear(look: Look, known: Array, second: int) -> Linear:
+    """Return the sums of a look."""
+    first, along = np.arange(0, look.left.size, second), look.slopes[:, G : G + 1]
+    return Linear(
+        look.theta,
+        look.slopes.T @ look.slopes,
+        look.slopes.T @ look.left,
+        float(look.left @ look.left),
+        float(np.count_nonzero(known)),
+        np.add.reduceat(along[:, 0] * look.left, first),
+        np.add.reduceat(along * look.slopes, first, axis=0),
+    )
+
+
+class Follower:
+    """Leads the response along a machine, block by block: an iterated Kalman filter of its parameters.
+
+    `machine`, `beliefs`; `sense`: sign of p_A - p_B that goes with the command; then what changes from block to block:
+    parameters `theta` (p,) and their `covariance` (p, p) in units, `variance` of the noise [Pa^2], `states` (6, 12) and
+    `last`, the command at the last sample [V].
+    """
+
+    def __init__(self, machine: Machine, beliefs: Beliefs, sense: float) -> None:
+        self.machine, self.beliefs, self.sense = machine, beliefs, sense
+        self.theta, self.variance, self.last = beliefs.centre, math.nan, math.nan
+        self.covariance = np.diag((beliefs.width / beliefs.unit) ** 2)
+        self.states = np.zeros((6, _SIMULATED + 1))
+
+    @staticmethod
+    def begun(recording: Recording, rig: Rig) -> Follower:
+        """Return it fitted to the first seconds of a recording, about to take these."""
+        u, dp = recording["u"], recording["p_A"] - recording["p_B"]
+        total = float(np.mean(recording["p_A"] + recording["p_B"]))
+        sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
+        follower = Follower(Machine.of(rig, recording.rate), beliefs_of(rig, total), sense)
+        window = recording.samples(slice(0, math.ceil(_WINDOW * recording.rate)))
+        follower.theta, follower.variance = first_fit(follower.stretch(window), follower.beliefs)
+        return follower
+
+    def stretch(self, block: Recording) -> Stretch:
+        """Return the samples of a block after the last one."""
+        u, n = block["u"], len(block)
+        before = u[0] if math.isnan(self.last) else self.last
+        known = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)
+        lines = mains_lines(block["p_A"] + block["p_B"], block.rate)
+        waves = np.exp(2j * np.pi / block.rate * np.arange(n)[:, None] * lines)
+        apart = np.linalg.qr(np.column_stack([waves.real, waves.imag]) * known[:, None])[0]
+        dp = self.sense * (block["p_A"] - block["p_B"])
+        return Stretch(self.machine, np.append(before, u), dp, self.states, self.beliefs.unit, apart, known)
+
+    def _belief(self, seconds: float, jumped: int | None = None) -> Normal:
+        """Return what is believed of a block so long beforehand; a parameter that `jumped` as widely as at first."""
+        beliefs = self.beliefs
+        wander = (beliefs.wander / beliefs.unit) ** 2 * (seconds / WANDER_TIME)
+        if jumped is not None:
+            wander[jumped] += (beliefs.width[jumped] / beliefs.unit[jumped]) ** 2
+        return Normal(self.theta, np.asarray(np.linalg.inv(self.covariance + np.diag(wander))))
+
+    def _led(self, stretch: Stretch, seconds: float) -> tuple[Look, Normal]:
+        """Return the likeliest look and the belief beside it.
+
+        Where wandering does not explain the block, a jump is looked for: of the conductance, or of the stiffness.
+        """
+        unit, belief = self.beliefs.unit, self._belief(seconds)
+        led = [(stretch.descend(self.theta, belief, _STEPS, self.variance), belief)]
+        samples = float(np.count_nonzero(stretch.known))
+        if led[0][0].cost(self.variance, belief, unit) > samples + _UNEXPLAINED * math.sqrt(2.0 * samples):
+            for parameter, values in ((G, _CONDUCTANCES), (K_OIL, self.theta[K_OIL] * _STIFFNESSES)):
+                sets, belief = np.tile(self.theta, (SINGLE_WIDTH, 1)), self._belief(seconds, parameter)
+                sets[:, parameter] = values
+                squares = np.nan_to_num(np.square(stretch.residuals(sets)).sum(axis=0), nan=np.inf)
+                led.append((stretch.descend(sets[int(squares.argmin())], belief, _STEPS, self.variance), belief))
+        return min(led, key=lambda own: own[0].cost(self.variance, own[1], unit))
+
+    def take(self, block: Recording) -> Linear:
+        """Return the sums of the next block."""
+        stretch = self.stretch(block)
+        look, belief = self._led(stretch, block.duration)
+        own = linear(look, stretch.known, round(block.rate))
+        H = own.N / self.variance + belief.precision
+        off = (look.theta - belief.mean) / self.beliefs.unit
+        self.covariance = np.asarray(np.linalg.inv(H))
+        move = self.covariance @ (own.b / self.variance - belief.precision @ off)
+        self.theta = held(look.theta, (look.theta + move * self.beliefs.unit)[None])[0]
+        self.states, self.last = look.ends, float(block["u"][-1])
+        return own
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """All blocks of a recording together: the parameters' `mean` (K p,) and `covariance` (K p, K p) about `theta`.
+
+    In units of the parameters; `strain` (K, p, K, p): precision of what is believed of them; `time` (K,) of the middles
+    of the blocks [s]; `variance` of the residual [Pa^2].
+    """
+
+    time: Array
+    blocks: tuple[Linear, ...]
+    beliefs: Beliefs
+    mean: Array
+    covariance: Array
+    strain: Array
+    variance: float
+
+    @staticmethod
+    def of(time: Array, blocks: Sequence[Linear], beliefs: Beliefs, seconds: float) -> Response:
+        """Return it for blocks of so many seconds; the noise is scaled by its long-run variance in the score of G."""
+        K, unit = len(blocks), beliefs.unit
+        steps, level = np.diff(np.eye(K), axis=0), np.full((K, K), K**-2.0)
+        walk = WANDER_TIME / seconds * steps.T @ steps
+        strain = np.zeros((K, _SIZE, K, _SIZE))
+        for j in range(_SIZE):
+            strain[:, j, :, j] = (unit[j] / beliefs.wander[j]) ** 2 * walk + (unit[j] / beliefs.width[j]) ** 2 * level
+        off = np.array([(block.theta - beliefs.centre) / unit for block in blocks])
+        pull = np.einsum("kilj,lj->ki", strain, off)
+        count = sum(block.samples for block in blocks)
+        variance = sum(block.squares for block in blocks) / count
+        for _ in range(_TURNS):
+            matrix = strain.copy()
+            for k, block in enumerate(blocks):
+                matrix[k, :, k] += block.N / variance
+            covariance = np.asarray(np.linalg.inv(matrix.reshape(K * _SIZE, K * _SIZE)))
+            mean = covariance @ (np.array([block.b for block in blocks]) / variance - pull).ravel()
+            white, inflation = _noise(blocks, mean.reshape(K, _SIZE), count)
+            variance = white * inflation
+        return Response(time, tuple(blocks), beliefs, mean, covariance, strain, white)
+
+    def parameters(self) -> Array:
+        """Return the likeliest parameters of all blocks (K, p)."""
+        theta = np.array([block.theta for block in self.blocks])
+        return np.asarray(theta + self.mean.reshape(theta.shape) * self.beliefs.unit)
+
+    def information(self, parameter: int) -> Information:
+        """Return what the blocks say of a parameter, all others eliminated.
+
+        What is believed of the parameter itself, which guided the filter, is taken out; that it wanders evenly or as a
+        random walk is stated beside.
+        """
+        own = np.arange(parameter, self.mean.size, _SIZE)
+        inverse = np.linalg.inv(self.covariance[np.ix_(own, own)])
+        believed, unit = self.strain[:, parameter, :, parameter], self.beliefs.unit[parameter]
+        at = np.array([block.theta[parameter] for block in self.blocks]) / unit
+        precision = inverse - believed
+        off = at - self.beliefs.centre[parameter] / unit
+        vector = inverse @ self.mean[own] + believed @ off + precision @ at
+        seconds = float(self.time[-1] - self.time[0]) * len(self.time) / max(len(self.time) - 1, 1)
+        wander = float(self.beliefs.wander[parameter]) * math.sqrt(seconds / WANDER_TIME)
+        reach = wander_of_conductance(seconds) if parameter == G else wander
+        precision = 0.5 * (precision + precision.T) / unit**2
+        return Information(self.time, precision, vector / unit, slope=reach, walk=reach)
+
+
+def _noise(blocks: Sequence[Linear], off: Array, count: float) -> tuple[float, float]:
+    """Return the variance [Pa^2] left at deviations (K, p), and the long-run variance of G's score over it."""
+    squares = sum(
+        block.squares - 2.0 * block.b @ own + own @ block.N @ own for block, own in zip(blocks, off, strict=True)
+    )
+    variance = max(float(squares), 1.0) / count
+    scores = np.concatenate([block.score - block.cross @ own for block, own in zip(blocks, off, strict=True)])
+    expected = variance * sum(block.N[G, G] for block in blocks)
+    return variance, max(1.0, float(scores @ scores) / max(expected, np.finfo(float).tiny))
+
+
+def response(recording: Recording, rig: Rig) -> Response | None:
+    """Return the response of a recording that is `usable`, computed once; None where no parameters simulate it."""
+
+    def compute(recording: Recording) -> Response | None:
+        edges = block_edges(recording)
+        seconds = recording.duration / (len(edges) - 1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                follower = Follower.begun(recording, rig)
+                parts = (recording.samples(slice(int(first), int(end))) for first, end in pairwise(edges))
+                own = Response.of(
+                    middles(recording, edges), [follower.take(part) for part in parts], follower.beliefs, seconds
+                )
+            except np.linalg.LinAlgError:
+                return None
+        whole = np.all(np.isfinite(own.mean)) and np.all(np.isfinite(own.covariance))
+        return own if whole and own.variance < _EXPLAINED * np.var(recording["p_A"] - recording["p_B"]) else None
+
+    return remembered(recording, ("response", rig), compute, ("u", "p_A", "p_B"))
 
 
 def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
@@ -317,7 +560,7 @@ def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
     Parameters
     ----------
     recording : Recording
-        p_A, p_B [Pa] and the command u [V] at a uniform rate.
+        p_A, p_B [Pa] and the command u [V] at a uniform rate; bridged samples weigh nothing.
     rig : Rig
         What is believed of the machine.
 
@@ -326,48 +569,8 @@ def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
     PressureEvidence or None
         None where the rig's piston has no two like areas or a valve drives it, or no parameters simulate the recording.
     """
-    if not usable(recording, rig):
+    own = response(recording, rig) if unusable(recording, rig) is None else None
+    if own is None:
         return None
-    ring, edges, rate = ring_down(recording, rig), block_edges(recording), recording.rate
-    dp, total = recording["p_A"] - recording["p_B"], recording["p_A"] + recording["p_B"]
-    dp = dp * np.sign(np.mean(recording["u"] * (dp - dp.mean())))
-    beliefs, simulator = beliefs_of(rig, float(np.mean(total))), Simulator.of(recording["u"], rate, rig)
-    blocks = edges.size - 1
-    seconds, stiffness = recording.duration / blocks, np.ones(blocks)
-    early = min(blocks, max(1, round(_WINDOW / seconds)))
-    if ring is not None:
-        stiffness = ring.stiffness / float(np.mean(ring.stiffness[:early]))
-        beliefs.centre[K_OIL] *= float(np.mean(ring.stiffness[:early]))
-        beliefs.width[K_OIL] = priors("response")["K_of_ring"].width * beliefs.centre[K_OIL]
-    m, window = simulator.numbers, Path(simulator, dp[: edges[early]], edges[[0, early]], seconds, beliefs)
-    period = 2.0 * math.pi * rate * math.sqrt(m.V * m.M_eq / (2.0 * beliefs.centre[K_OIL])) / m.A_A
-    with np.errstate(over="ignore", invalid="ignore"):
-        theta = np.tile(first_fit(window, period), (blocks, 1))
-        theta[:, K_OIL] *= stiffness
-        path = Path(simulator, dp, edges, seconds, beliefs)
-        theta, left, slopes = path.descend(theta, _STEPS)
-    if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(left))):
-        return None
-    waves = np.exp(2j * np.pi / rate * np.arange(dp.size)[:, None] * mains_lines(total, rate))
-    rows = np.column_stack([waves.real, waves.imag])
-    left = left - rows @ np.linalg.lstsq(rows.T @ rows, rows.T @ left, rcond=None)[0]
-    precision, vector = _of_conductance(path, theta, left, slopes, round(rate))
-    return pressure_evidence(recording, edges, precision, vector, (1.0, priors("response")["orifice"].value))
-
-
-def _of_conductance(path: Path, theta: Array, left: Array, slopes: Array, second: int) -> tuple[Array, Array]:
-    """Return precision (K, K) and vector (K,) of G, noise scaled by its long-run variance in G's score over a `second`.
-
-    What is believed of G itself, which guided the descent, is taken out.
-    """
-    score = np.add.reduceat(slopes[:, G] * left, np.arange(0, left.size, second))
-    path.variance = path.spread(left)
-    expected = path.variance * float(slopes[:, G] @ slopes[:, G])
-    path.variance *= max(1.0, float(score @ score) / max(expected, np.finfo(float).tiny))
-    N, b = path.normal(left, slopes)
-    strain = path.strain.copy()
-    strain[:, G, :, G] = 0.0
-    beliefs = strain.reshape(N.shape)
-    precision, vector = eliminated(N + beliefs, b - beliefs @ path.off(theta), np.arange(G, len(N), _SIZE))
-    unit = path.unit[G]
-    return precision / unit**2, (vector + precision @ (theta[:, G] / unit)) / unit
+    laws = (1.0, priors("response")["orifice"].value)
+    return pressure_evidence(recording, block_edges(recording), own.information(G), laws)

@@ -32,15 +32,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.inference.blocks import Information
 from sealscope.diagnosis.inference.pressures.evidence import (
     WANDER_TIME,
     PressureEvidence,
     block_edges,
     eliminated,
     mains_lines,
+    middles,
     pressure_evidence,
     priors,
-    usable,
+    unusable,
+    wander_of_conductance,
 )
 from sealscope.recordings.recording import Array, Recording, remembered
 
@@ -468,9 +471,11 @@ def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
     PressureEvidence or None
         None where the rig's piston has no two like areas, a valve drives it, or nothing rings after a reversal.
     """
-    ring = ring_down(recording, rig) if usable(recording, rig) else None
+    ring = ring_down(recording, rig) if unusable(recording, rig) is None else None
     if ring is None:
         return None
     laws = (1.0, priors("ring_down")["orifice"].value)
     C = ring.compliance
-    return pressure_evidence(recording, ring.edges, ring.precision / C**2, ring.vector / C, laws)
+    time, reach = middles(recording, ring.edges), wander_of_conductance(recording.duration)
+    information = Information(time, ring.precision / C**2, ring.vector / C, slope=reach, walk=reach)
+    return pressure_evidence(recording, ring.edges, information, laws)

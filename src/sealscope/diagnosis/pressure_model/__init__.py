@@ -1,1 +1,0 @@
-"""A reduced model of the rig, fitted to the pressure difference and followed block by block."""
