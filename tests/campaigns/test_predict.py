@@ -14,9 +14,9 @@ from scipy.special import ndtr, ndtri
 from typer.testing import CliRunner
 
 from sealscope.campaigns.prediction import predict as module
-from sealscope.campaigns.prediction.predict import DetectionTarget, closing_text, experiment_for, predict, with_closing
-from sealscope.campaigns.prediction.report import PredictionReport
-from sealscope.campaigns.prediction.rules import THESIS_RULES, smallest_leaks
+from sealscope.campaigns.prediction.predict import closing_text, experiment_for, predict, with_closing
+from sealscope.campaigns.prediction.report import BoundFigures, PredictionReport
+from sealscope.campaigns.prediction.rules import THESIS_RULES, DetectionTarget, smallest_leaks
 from sealscope.cli import prediction
 from sealscope.diagnosis.registry import detectors
 from sealscope.errors import InputError, SimulationFailed
@@ -63,6 +63,12 @@ def few() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the bound, which takes longer than all else of a short prediction."""
+    monkeypatch.setattr(module, "_bound", lambda *given: BoundFigures(0.0, 0.0, ()))
+
+
 @pytest.fixture(scope="module")
 def made(rig: Rig) -> PredictionReport:
     return predict(
@@ -70,7 +76,7 @@ def made(rig: Rig) -> PredictionReport:
     )  # fmt: skip
 
 
-def test_what_is_predicted_is_found(rig: Rig) -> None:
+def test_what_is_predicted_is_found(rig: Rig, no_bound: None) -> None:
     """1.3 times the size is found in most records made afresh, and a third of it in none."""
     experiment = experiment_for(rig, "7 sin(4t)", 60.0)
     made = predict(experiment, DetectionTarget(rules=()), commands=())
@@ -105,7 +111,7 @@ def test_the_answer_comes_first_and_fits_a_terminal(made: PredictionReport) -> N
     assert "must stay within +-10 V" in bad.note and bad.note in made.text()
 
 
-def test_the_seed_makes_the_records(rig: Rig) -> None:
+def test_the_seed_makes_the_records(rig: Rig, no_bound: None) -> None:
     experiment = experiment_for(rig, "3 sin(4t)", 20.0)
     one, other, third = (
         predict(experiment, DetectionTarget(rules=("d3 of p_A fell",), seed=seed), commands=()).as_dict()
@@ -115,7 +121,7 @@ def test_the_seed_makes_the_records(rig: Rig) -> None:
     assert one["rules"] != third["rules"] and one["smallest_leak_lpm"] != third["smallest_leak_lpm"]
 
 
-def test_a_bench_draws_machines_that_drift(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bench_draws_machines_that_drift(rig: Rig, no_bound: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "BENCH_SIZES", (0.008, 0.1))
     experiment, target = experiment_for(rig, "7 sin(4t)", 20.0), DetectionTarget(rules=("d3 of p_A fell",))
     still = predict(experiment, target, commands=())
@@ -146,7 +152,7 @@ def records(shift: float, scatter: float = 1.0) -> Array:
 def test_a_shift_in_proportion_has_the_closed_form(rule: str, tails: float) -> None:
     """mean = k a: POD = Phi(k a - z), so that the smallest leak is (z + z_detection)/k."""
     sizes, k = np.array([0.01, 0.02, 0.04]), 200.0
-    (found,) = smallest_leaks(sizes, [records(k * a) for a in (0.0, *sizes)], [rule], 0.01, 0.9)
+    (found,) = smallest_leaks(sizes, [records(k * a) for a in (0.0, *sizes)], DetectionTarget(rules=(rule,)))
     z = ndtri(1 - 0.01 / tails)
     assert found.smallest == pytest.approx((z + ndtri(0.9)) / k, rel=0.01)
     assert found.found == pytest.approx(ndtr(0.0042 * k - z), rel=0.02)
@@ -156,7 +162,7 @@ def test_a_shift_in_proportion_has_the_closed_form(rule: str, tails: float) -> N
 def test_what_never_moves_is_not_found_and_what_cannot_be_computed_says_so() -> None:
     sizes = np.array([0.01, 0.1])
     changes = [np.column_stack([records(0.0), records(-5.0 * k), records(math.nan)]) for k in range(3)]
-    still, away, unknown = smallest_leaks(sizes, changes, THESIS_RULES[:3], 0.01, 0.9)
+    still, away, unknown = smallest_leaks(sizes, changes, DetectionTarget(rules=THESIS_RULES[:3]))
     assert still.smallest is None and still.found == pytest.approx(0.01)
     assert away.smallest is None and away.found < 0.01
     assert unknown.smallest is unknown.scatter is unknown.found is None

@@ -56,9 +56,9 @@ def predict(
 
     The rules are given the onset of the leak; the detectors of diagnose look for it.
     """
-    from sealscope.campaigns.prediction.predict import STANDARD_COMMANDS, DetectionTarget, experiment_for
+    from sealscope.campaigns.prediction.predict import STANDARD_COMMANDS, experiment_for
     from sealscope.campaigns.prediction.predict import predict as predict_leaks
-    from sealscope.campaigns.prediction.rules import THESIS_RULES, check_rule
+    from sealscope.campaigns.prediction.rules import THESIS_RULES, DetectionTarget, check_rule
     from sealscope.units import parse_quantity
 
     target = DetectionTarget(

@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -24,8 +24,8 @@ from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.scorers import Sides
 from sealscope.campaigns.prediction.report import BoundFigures, DutyRow, FindableLeak, PredictionReport
-from sealscope.campaigns.prediction.rules import THESIS_RULES, change_of, check_rule, smallest_leaks
-from sealscope.diagnosis.diagnose import Examination, check_probability
+from sealscope.campaigns.prediction.rules import DetectionTarget, change_of, smallest_leaks
+from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.registry import DETECTORS
 from sealscope.errors import InputError, SealscopeError, SimulationFailed
 from sealscope.parameters import Rig
@@ -54,36 +54,15 @@ _FINDABLE = 0.9
 STANDARD_COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)", "8 sin(t)")
 STANDARD_CLOSINGS = (None, 0.5)
 #: Sizes of leaks that the thesis's rules are tried on [L/min], and on machines of a bench.
-SIZES, BENCH_SIZES = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.128), (0.002, 0.008, 0.032, 0.128)
+SIZES, BENCH_SIZES = (0.001, 0.002, 0.004, 0.008, 0.032, 0.128), (0.002, 0.008, 0.032, 0.128)
 #: Leak-free records that the detectors are asked about, and records of each size for the rules.
-RECORDS, RULE_RECORDS = 3, 24
+RECORDS, RULE_RECORDS = 3, 12
 #: Shortest record of a prediction [s]: each half must hold whole cycles of the slowest standard command.
 SHORTEST = 20.0
 #: How much of a command is looked at to centre its sweep [s].
 LONGEST_LOOK = 1000.0
 #: Fewest and most machines drawn from a bench, and the largest share of them that may fail.
 FEWEST, MOST_DRAWS, MOST_FAILED = 8, 100_000, 0.25
-
-
-@dataclass(frozen=True)
-class DetectionTarget:
-    """What a prediction is made for: false-alarm and detection probability, the thesis's rules, the noise's seed.
-
-    Raises InputError for probabilities that no detector can be set for, a name that is no rule or a negative seed.
-    """
-
-    false_alarm: float = 0.01
-    detection: float = 0.9
-    rules: tuple[str, ...] = THESIS_RULES
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        smallest_found(1.0, self.false_alarm, self.detection)
-        check_probability(self.false_alarm)
-        for name in self.rules:
-            check_rule(name)
-        if self.seed < 0:
-            raise InputError(f"seed must be >= 0, got {self.seed}")
 
 
 def with_closing(rig: Rig, closing: float | None) -> Rig:
@@ -120,7 +99,7 @@ def experiment_for(rig: Rig, command: Command | str, duration: float, x_0: float
 
 def predict(
     experiment: Experiment,
-    target: DetectionTarget = DetectionTarget(),
+    target: DetectionTarget | None = None,
     *,
     commands: Iterable[str] = STANDARD_COMMANDS,
     closings: Iterable[float | None] = STANDARD_CLOSINGS,
@@ -135,6 +114,7 @@ def predict(
     stands. Raises InputError for values that break a rule, SimulationFailed where the experiment itself cannot be
     simulated, or more than a quarter of the bench's machines.
     """
+    target = target or DetectionTarget()
     if bench:
         records, sizes, changes = _of_bench(
             experiment, target, bench, draws, partial(progress, "machines of the bench")
@@ -161,7 +141,7 @@ def predict(
         records=len(records),
         largest=float(sizes.max(initial=0.0)),
         leaks=found,
-        rules=smallest_leaks(sizes, changes, target.rules, target.false_alarm, target.detection),
+        rules=smallest_leaks(sizes, changes, target, alike=not bench),
         bound=bound,
         duties=tuple(_in_parallel(jobs, partial(progress, "commands compared"))),
     )
@@ -210,7 +190,6 @@ def _of_rig(
     whole = {f"sensors.{name}.{fault}_rate": 0.0 for name in ("p_A", "p_B") for fault in ("stuck", "drop")}
     rig = experiment.rig.with_overrides(whole, source="varied for a prediction")
     volts, factor = experiment.commanded.volts(experiment.sample_times()), oversampling(experiment)
-    seeds = [int(state) for state in np.random.SeedSequence(target.seed).generate_state(RULE_RECORDS, np.uint32)]
     records: list[Recording] = []
     flows, changes = [], []
     for number, size in enumerate((0.0, *SIZES) if target.rules else (0.0,)):
@@ -219,7 +198,8 @@ def _of_rig(
             G = size * LITRE_PER_MINUTE / _driving(records[0])
             leaks = (Leak("laminar", coefficient=G, opening=From(experiment.duration / 2.0)),)
         path = trajectory(replace(experiment, leaks=leaks), leaks)
-        made = [record(rig, path, volts, factor, seed) for seed in seeds[: RULE_RECORDS if target.rules else RECORDS]]
+        seeds = np.random.SeedSequence((target.seed, number)).generate_state(max(RECORDS, RULE_RECORDS), np.uint32)
+        made = [record(rig, path, volts, factor, int(seed)) for seed in seeds[: None if target.rules else RECORDS]]
         if size:
             later = slice(len(made[0]) // 2, None)
             flows.append(in_lpm(G, float(np.mean(np.abs(made[0]["p_A"] - made[0]["p_B"])[later]))))

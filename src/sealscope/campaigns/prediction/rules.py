@@ -16,7 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sealscope.campaigns.cases.bound import smallest_found
 from sealscope.campaigns.plans.scorers import SCORERS, Sides
+from sealscope.diagnosis.diagnose import check_probability
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -54,6 +56,27 @@ def check_rule(name: str) -> str:
     return rule.name
 
 
+@dataclass(frozen=True)
+class DetectionTarget:
+    """What a prediction is made for: false-alarm and detection probability, the thesis's rules, the noise's seed.
+
+    Raises InputError for probabilities that no detector can be set for, a name that is no rule or a negative seed.
+    """
+
+    false_alarm: float = 0.01
+    detection: float = 0.9
+    rules: tuple[str, ...] = THESIS_RULES
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        smallest_found(1.0, self.false_alarm, self.detection)
+        check_probability(self.false_alarm)
+        for name in self.rules:
+            check_rule(name)
+        if self.seed < 0:
+            raise InputError(f"seed must be >= 0, got {self.seed}")
+
+
 def change_of(rule: str, sides: Sides) -> float:
     """Return the change of the log RMS, positive in the direction of the rule; NaN where it cannot be computed."""
     (quantity, chamber, word), *_ = SCORERS[rule].parts
@@ -71,29 +94,32 @@ def detection_of(shift: Array, scatter: Array, leak_free: float, false_alarm: fl
 
 
 def smallest_leaks(
-    sizes: Array, changes: Sequence[Array], rules: Sequence[str], false_alarm: float, detection: float
+    sizes: Array, changes: Sequence[Array], target: DetectionTarget, *, alike: bool = False
 ) -> tuple[RulePrediction, ...]:
-    """Return the smallest leak that each rule finds with probability `detection`.
+    """Return the smallest leak that each of the target's rules finds.
 
-    `sizes` (m,) rising [L/min]; `changes`: `change_of` each rule in records (n, d), without a leak and with each size.
+    `sizes` (m,) rising [L/min]; `changes`: `change_of` each rule in records (n, d), without a leak and with each size;
+    `alike`: whether the scatter is the same at every size, so that all records tell it.
     """
     from scipy.interpolate import PchipInterpolator
 
-    if not rules:
+    if not target.rules:
         return ()
     knots = np.concatenate([[0.0], sizes])
     mean = np.stack([own.mean(axis=0) for own in changes])
     scatter = np.stack([own.std(axis=0, ddof=1) for own in changes])
+    if alike:
+        scatter = np.tile(np.sqrt(np.mean(scatter**2, axis=0)), (len(changes), 1))
     fine = np.append(np.geomspace(sizes[0] / 100.0, sizes[-1], _FINE), STATED)
     predictions = []
-    for k, rule in enumerate(rules):
+    for k, rule in enumerate(target.rules):
         if not (np.isfinite(mean[:, k]).all() and (scatter[:, k] > 0.0).all()):
             predictions.append(RulePrediction(rule, None, None, None))
             continue
         shift = PchipInterpolator(knots, mean[:, k] - mean[0, k])(fine)
         spread = np.interp(fine, knots, scatter[:, k])
-        pod = detection_of(shift, spread, float(scatter[0, k]), false_alarm, rule.endswith("changed"))
-        enough = np.flatnonzero(pod[:-1] >= detection)
+        pod = detection_of(shift, spread, float(scatter[0, k]), target.false_alarm, rule.endswith("changed"))
+        enough = np.flatnonzero(pod[:-1] >= target.detection)
         smallest = float(fine[enough[0]]) if enough.size else None
         predictions.append(RulePrediction(rule, smallest, float(scatter[0, k]), float(pod[-1])))
     return tuple(predictions)
