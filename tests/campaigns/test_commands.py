@@ -1,8 +1,7 @@
-"""Campaigns and calibrations from the command line, and their page."""
+"""Campaigns from the command line, and their page."""
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 
@@ -11,9 +10,6 @@ import pytest
 from sealscope import cli
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.recordings import write
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
 
 
 @pytest.fixture
@@ -49,7 +45,6 @@ def test_run_status_and_report(call, tiny, tmp_path):
     again = call("campaign", "report", tiny, "-o", folder)
     assert again[0] == 0
     assert (folder / "report.html").read_text(encoding="utf-8") == page
-    assert json.loads((folder / "calibration.json").read_text())["made_from"]["campaign"]["name"] == "tiny"
 
 
 def test_no_more_processes_than_two_a_core(call, tiny, tmp_path, monkeypatch):
@@ -77,8 +72,6 @@ def test_in_batches_it_says_so_and_goes_on(call, tiny, tmp_path):
     assert "Simulated in batches on the cpu: " in out
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "<dt>simulated</dt><dd>in batches on the cpu</dd>" in re.sub(r"\s*\n\s*", "", page)
-    made_from = json.loads((folder / "calibration.json").read_text())["made_from"]["campaign"]
-    assert made_from["mode"] == "in batches on the cpu"
     rows = (folder / "rows.jsonl").read_bytes()
     assert call("campaign", "run", tiny, "-o", folder, "--device", "cpu", "--batch")[0] == 0
     assert (folder / "rows.jsonl").read_bytes() == rows
@@ -129,8 +122,6 @@ def test_an_incomplete_campaign_says_so(call, tiny, tmp_path):
         (("campaign", "run", "TINY", "-o", "nowhere", "--device", "tpu"), "--device must be cpu or gpu, got tpu"),
         (("campaign", "run", "bench-volume", "--batch"), "got 'volume balance', which needs whole recordings"),
         (("campaign", "run", "appendix-c", "--batch"), "must simulate its records; run it without --batch"),
-        (("calibrate", "--baseline", "none.csv", "-o", "c.json"), "none.csv"),
-        (("calibrate", "--baseline", "-o", "c.json"), "--baseline must be followed by one file or more"),
     ],
 )
 def test_wrong_calls_are_one_line(call, tiny, tmp_path, monkeypatch, words, told):
@@ -139,65 +130,3 @@ def test_wrong_calls_are_one_line(call, tiny, tmp_path, monkeypatch, words, told
     assert status in (1, 2)
     assert told in err
     assert len(err.splitlines()) == 1
-    assert not (tmp_path / "c.json").exists()
-
-
-@pytest.fixture
-def logs(tmp_path):
-    """Leak-free and leaky recordings of one machine, as files."""
-    files = {}
-    for seed in range(10):
-        path = tmp_path / f"sound-{seed}.csv"
-        write(simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording, path)
-        files[path.stem] = path
-    leaky = tmp_path / "leaky.csv"
-    write(
-        simulate_with_truth(
-            Experiment.of(command="3 sin(4t)", duration=8.0, seed=77, leak="0.3 L/min from 4 s")
-        ).recording,
-        leaky,
-    )
-    other = tmp_path / "other.csv"
-    write(simulate_with_truth(Experiment.of(command="5 sin(2t)", duration=8.0, seed=78)).recording, other)
-    return files, leaky, other
-
-
-def test_calibrate_on_the_own_machine_and_diagnose_by_it(call, logs, tmp_path):
-    sound, leaky, other = logs
-    target = tmp_path / "calibration.json"
-    status, out, err = call(
-        "calibrate", "--baseline", *sound.values(), "-o", target, "--false-alarm", "0.1",
-        "--detector", "d3 of p_A changed", "--detector", "d4 of p_A changed",
-    )  # fmt: skip
-    assert status == 0, err
-    assert "10 recordings at 500 Hz" in out
-    made = json.loads(target.read_text())["made_from"]
-    assert [one["file"] for one in made["recordings"]] == [path.name for path in sound.values()]
-    status, out, err = call("diagnose", leaky, other, "--calibration", target, "--format", "jsonl")
-    assert status == 0, err
-    first, second = (json.loads(line) for line in out.splitlines())
-    assert (first["verdict"], second["verdict"]) == ("leak", "cannot tell")
-    assert first["false_alarm_probability"] == 0.1
-    assert first["score"] > first["threshold"]
-    assert "outside the calibrated operating points: another command" in second["reason"]
-    status, _, err = call("report", leaky, "--calibration", target, "-o", tmp_path / "page.html")
-    assert status == 0, err
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert "leak" in page
-    status, out, _ = call("diagnose", leaky, "--calibration", target)
-    assert (status, "true onset" in out + page) == (0, False)  # nothing is given here, other than in a campaign
-    status, _, err = call("diagnose", leaky, "--calibration", target, "--baseline", sound["sound-1"])
-    assert status == 2
-    assert "--calibration must stand without --baseline" in err
-    (tmp_path / "bad.json").write_text("{}")
-    status, _, err = call("diagnose", leaky, "--calibration", tmp_path / "bad.json")
-    assert status == 1
-    assert "bad.json" in err
-
-
-def test_too_few_recordings_are_refused_and_nothing_is_written(call, logs, tmp_path):
-    sound, _, _ = logs
-    status, _, err = call("calibrate", "--baseline", *list(sound.values())[:4], "-o", tmp_path / "c.json")
-    assert status == 2
-    assert "must be at least 5" in err
-    assert not (tmp_path / "c.json").exists()

@@ -15,13 +15,11 @@ import pytest
 from sealscope.campaigns.cases.row import CaseRow, cause_of, rank_of
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution.store import read_rows
-from sealscope.campaigns.judging.judge import calibration_of, judge
+from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, plan_detector
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.diagnosis import plugins, registry
-from sealscope.diagnosis.calibration.calibrated import diagnose_calibrated
-from sealscope.diagnosis.calibration.thresholds import load
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
@@ -37,8 +35,8 @@ rate = "500 Hz"
 false_alarm = 0.2
 seed = 3
 keep_recordings = true
-detectors = ["watcher", "watcher @ pressures", "watcher, calibrated @ pressures", "diagnose", "diagnose @ pressures",
-             "diagnose, quick", "diagnose, quick @ pressures", "rms change, own threshold", "d3 of p_A changed"]
+detectors = ["watcher", "watcher @ pressures", "diagnose", "diagnose @ pressures",
+             "diagnose, quick", "diagnose, quick @ pressures", "rms change", "d3 of p_A changed"]
 
 [views]
 pressures = ["u", "p_A", "p_B"]
@@ -111,7 +109,7 @@ def done(plan, tmp_path, finished):
 
 
 def test_every_detector_sees_its_channels_and_is_run_once(plan, done):
-    assert len(examined) == 2 * plan.size  # once for each set of channels, although three entries ask for one of them
+    assert len(examined) == 2 * plan.size  # once for each set of channels, although several entries ask for one of them
     assert examined.count(("u", "p_A", "p_B")) == plan.size
     whole = next(one for one in examined if "x" in one)
     assert {"theta", "omega", "p_1", "p_2"} <= set(whole)
@@ -183,7 +181,6 @@ def test_what_it_adds_up_to(plan, done):
     assert recall(named["watcher @ pressures"], "friction change") == 1.0
     assert recall(named["watcher"], "piston leak") == 1.0
     assert recall(named["watcher"], "friction change") == 0.0
-    assert "watcher, calibrated @ pressures" not in named
     files = {path.name: path for path in write_result(result, done)}
     assert {"estimates.csv", "causes.csv", "onsets.csv", "records.csv"} <= set(files)
     with files["records.csv"].open(encoding="utf-8") as file:
@@ -198,28 +195,11 @@ def test_what_it_adds_up_to(plan, done):
     columns = ("true onset given", "channels given", "rig assumed")
     assert [given["watcher @ pressures"][name] for name in columns] == ["no", "u p_A p_B", "thesis"]
     assert [given["d3 of p_A changed"][name] for name in columns] == ["yes", " ".join(ALL_CHANNELS), ""]
-    assert [given["rms change, own threshold"][name] for name in columns[::2]] == ["no", "thesis"]
+    assert [given["rms change"][name] for name in columns[::2]] == ["no", "thesis"]
     assert [given["always fire"][name] for name in columns] == ["", "", ""]
     for words in ("splits the record where the leak opens: d3 of p_A changed.", "u, p_A, p_B to watcher @ pressures"):
         assert words in campaign_text(result)
         assert words in page
-
-
-@pytest.mark.slow
-def test_a_calibration_of_a_view_is_used_through_it(plan, done, tmp_path):
-    """The watcher calls it friction when it sees pressures alone, so it has no score to calibrate; d3 has."""
-    text = PLAN.replace('"watcher, calibrated @ pressures"', '"rms change, calibrated @ pressures"')
-    (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
-    other = load_plan(tmp_path / "seen.toml")
-    campaign.run(other, done, jobs=1)
-    write_result(simulated_result(other, done), done)
-    known = load(done / "calibration.json")
-    assert known.views == {"pressures": ("u", "p_A", "p_B")}
-    recording = read(next(iter((done / "recordings").glob("*.nc"))))
-    found = diagnose_calibrated(recording, known)
-    assert found.methods[0].detector == "rms change, calibrated @ pressures"
-    assert found.score is not None
-    assert found.threshold is not None
 
 
 @pytest.mark.parametrize(
@@ -263,21 +243,14 @@ def test_detectors_may_assume_another_rig(plan, done, tmp_path):
 
 
 def test_what_names_stand_for(plan):
-    assert (
-        plan_detector("watcher, calibrated @ pressures").key
-        == plan_detector("watcher @ pressures").key
-        == "watcher @ pressures"
-    )
-    assert plan_detector("watcher").own
-    assert plan_detector("watcher, own threshold").key == "watcher"
-    assert not plan_detector("rms change").own  # the scorer of that name, as ever
-    assert plan_detector("rms change").needs_calibration
-    assert plan_detector("rms change, own threshold").own
-    assert not plan_detector("sign rule: d3 of p_A fell").needs_calibration
+    seen = plan_detector("watcher @ pressures")
+    assert (seen.of, seen.view, seen.scorer) == ("watcher", "pressures", None)
+    assert plan_detector("rms change").scorer is None
+    assert plan_detector("d3 of p_A fell @ pressures").needs_threshold
+    assert not plan_detector("sign rule: d3 of p_A fell").needs_threshold
     for name, told in (
         ("watchr", "did you mean 'watcher'"),
-        ("watchr, calibrated", "did you mean 'watcher, calibrated'"),
-        ("diagnose, calibrated", "cannot be calibrated"),
+        ("watcher, calibrated", "must be one of"),
         ("watcher, quick", "must be one of"),
         ("watcher @ nowhere", "must be one of"),
     ):
@@ -334,7 +307,7 @@ def test_flows_onsets_and_causes_by_hand():
         row(9, "cannot tell", fault="air 1 %"),
         replace(row(10, "leak", fault="air 1 %"), error="it failed"),
     ]
-    found = judge(rows, ["watcher"], calibration_of(rows, ["watcher"], false_alarm=0.1), onset_s=90.0)
+    found = judge(rows, ["watcher"], onset_s=90.0)
     (onset,) = found.onsets
     assert (onset.errors.n, onset.errors.median.value, onset.errors.median_size.value) == (2, -6.0, 2.0)
     assert (onset.errors.coverage.count, onset.errors.coverage.n) == (1, 2)
@@ -356,7 +329,7 @@ def test_flows_onsets_and_causes_by_hand():
         ("friction change", "friction change"): 1, ("friction change", "piston leak"): 1,
         ("air in the oil", "cannot tell"): 2,
     }  # fmt: skip
-    assert found.calibration is None
+    assert not found.thresholds
 
 
 def test_every_fault_of_the_simulator_has_a_cause():
@@ -378,5 +351,5 @@ def test_the_documented_plan_is_sound_where_the_example_is_installed(monkeypatch
         load_plan(example / "judge.toml")
     monkeypatch.setattr(registry, "DETECTORS", {**registry.DETECTORS, "ringing energy": made})
     plan = load_plan(example / "judge.toml")
-    assert [name for name in plan.detectors if plan_detector(name).needs_calibration] == ["ringing energy, calibrated"]
+    assert not any(plan_detector(name).needs_threshold for name in plan.detectors)
     assert plan.views == {"pressures": ("u", "p_A", "p_B")}

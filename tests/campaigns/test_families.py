@@ -8,8 +8,7 @@ from sealscope.campaigns.cases.bound import UNKNOWN, change_bound, in_lpm, leak_
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import leak_of
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.families import ALL, ANY_LAW, family_findings
-from sealscope.campaigns.judging.judge import judge
+from sealscope.campaigns.judging.judge import ALL, ANY_LAW, judge
 from sealscope.campaigns.judging.tables import tables_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.verdict.evidence import Evidence
@@ -18,11 +17,6 @@ from sealscope.reporting.campaign.tables import family_lines
 from sealscope.simulation.experiment import Experiment
 
 NAME = "diagnose"
-POINT = {
-    "direction": 0, "level": 11.0, "rate": 500.0, "units": ["Pa", "Pa"], "chambers": ["p_A", "p_B"],
-    "command_rms": 2.12, "cycle": 1.57,
-}  # fmt: skip
-PLACE = {"point": POINT, "duration_s": 180.0}
 
 
 def row(number, family, verdict, leak=0.0, law="laminar", bound=None, interval=None, error=None):
@@ -30,7 +24,7 @@ def row(number, family, verdict, leak=0.0, law="laminar", bound=None, interval=N
     return CaseRow(
         id=f"{number:016x}", use="judge", leak_lpm=leak, fault="", levels={"family": family}, replicate=number,
         flow_lpm=leak, statements={} if error else {NAME: evidence}, scores={} if error else {NAME: (1.0, None)},
-        law=law, bound_lpm=bound, error=error, place={} if error else PLACE,
+        law=law, bound_lpm=bound, error=error,
     )  # fmt: skip
 
 
@@ -46,9 +40,7 @@ ROWS = [
 
 
 def findings():
-    verdicts = {(NAME, one.id): "cannot tell" if one.error else one.statements[NAME].verdict for one in ROWS}
-    found = family_findings(ROWS, [NAME], verdicts, false_alarm=0.01)
-    return {(one.family, one.leak_lpm, one.law): one for one in found}
+    return {(one.family, one.leak_lpm, one.law): one for one in judge(ROWS, [NAME], false_alarm=0.01).families}
 
 
 def test_each_family_is_counted_by_hand():
@@ -75,7 +67,7 @@ def test_only_leaks_that_the_bound_allows_count_against_it():
 
 
 def test_the_table_says_which_half_it_is():
-    tables = {table.name: table for table in tables_of(judge(ROWS, [NAME], None), part="held back")}
+    tables = {table.name: table for table in tables_of(judge(ROWS, [NAME]), part="held back")}
     families = tables["families"]
     assert {line[0] for line in families.rows} == {"held back"}
     assert {line[1] for line in families.rows} == {ALL, "hoses", "mass"}
@@ -84,7 +76,7 @@ def test_the_table_says_which_half_it_is():
 
 
 def test_the_page_shows_each_family():
-    lines = family_lines(judge(ROWS, [NAME], None))
+    lines = family_lines(judge(ROWS, [NAME]))
     assert lines[0][:3] == (NAME, ALL, "no leak")
     both = next(line for line in lines if line[1:3] == ("hoses", "0.004 any"))
     assert both[3].startswith("50 %")

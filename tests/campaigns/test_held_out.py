@@ -12,7 +12,6 @@ from sealscope.campaigns.held_out.checks import checks_of, clustered_area, swapp
 from sealscope.campaigns.held_out.classifiers import (
     MeasuredSamples,
     chosen_candidates,
-    fit_logistic,
     fold_log_odds,
     held_out_scores,
 )
@@ -31,17 +30,22 @@ def cloud(seed, n=200, f=3):
 
 
 def test_one_binary_feature_has_the_log_odds_ratio():
-    """Without a ridge the fit is saturated: log odds of each half are those counted."""
+    """With hardly a ridge the fit is saturated: log odds of each half are those counted."""
     x = np.array([0.0] * 10 + [1.0] * 20)[:, None]
     y = np.array([True] * 3 + [False] * 7 + [True] * 15 + [False] * 5)
-    fit = fit_logistic(x, y, 0.0)
-    assert fit.log_odds(np.array([[0.0], [1.0]])) == pytest.approx([np.log(3 / 7), np.log(15 / 5)], abs=1e-9)
+    odds = whole(x, y, 1e-12)
+    assert odds[[0, -1]] == pytest.approx([np.log(3 / 7), np.log(15 / 5)], abs=1e-9)
+
+
+def whole(x, y, ridge):
+    """Log odds of all samples from a fit to all of them."""
+    return fold_log_odds(x, y, np.ones((1, len(x)), dtype=bool), ridge)[0]
 
 
 @pytest.mark.parametrize("ridge", [0.01, 1.0, 30.0])
 def test_it_is_the_minimum_that_a_general_optimiser_finds(ridge):
     x, y = cloud(1)
-    fit = fit_logistic(x, y, ridge)
+    odds = whole(x, y, ridge)
     z = (x - x.mean(axis=0)) / x.std(axis=0)
 
     def loss(w):
@@ -49,26 +53,20 @@ def test_it_is_the_minimum_that_a_general_optimiser_finds(ridge):
         return np.logaddexp(0.0, np.where(y, -eta, eta)).sum() + 0.5 * ridge * (w[1:] ** 2).sum()
 
     best = minimize(loss, np.zeros(4), method="BFGS", options={"gtol": 1e-9})
-    assert loss(np.r_[fit.intercept, fit.weights]) <= best.fun + 1e-9
-    assert np.r_[fit.intercept, fit.weights] == pytest.approx(best.x, abs=1e-5)
+    assert odds == pytest.approx(best.x[0] + z @ best.x[1:], abs=1e-4)
 
 
 def test_units_of_the_features_do_not_matter():
     x, y = cloud(2)
-    plain = fit_logistic(x, y, 1.0).log_odds(x)
-    assert fit_logistic(x * [1e5, 1e-3, 7.0] + [3.0, -2.0, 1e3], y, 1.0).log_odds(
-        x * [1e5, 1e-3, 7.0] + [3.0, -2.0, 1e3]
-    ) == pytest.approx(plain, abs=1e-7)
+    assert whole(x * [1e5, 1e-3, 7.0] + [3.0, -2.0, 1e3], y, 1.0) == pytest.approx(whole(x, y, 1.0), abs=1e-7)
 
 
 def test_what_cannot_be_fitted_is_one_line():
     x, y = cloud(3)
     with pytest.raises(InputError, match="both classes"):
-        fit_logistic(x, np.ones(len(x), dtype=bool), 1.0)
+        whole(x, np.ones(len(x), dtype=bool), 1.0)
     with pytest.raises(InputError, match="must vary"):
-        fit_logistic(np.ones((len(x), 1)), y, 1.0)
-    with pytest.raises(InputError, match="larger ridge"):
-        fit_logistic(np.arange(10.0)[:, None], np.arange(10) > 4, 0.0)
+        whole(np.ones((len(x), 1)), y, 1.0)
 
 
 def test_a_held_out_test_is_not_seen():
@@ -105,14 +103,11 @@ def test_all_folds_at_once_are_the_fits_one_by_one(ridge):
     x, y = cloud(5)
     folds = np.random.default_rng(1).random((6, len(x))) < 0.7
     together = fold_log_odds(x, y, folds, ridge)
-    alone = np.stack([fit_logistic(x[fold], y[fold], ridge).log_odds(x) for fold in folds])
-    assert together == pytest.approx(alone, abs=1e-7)
+    alone = np.concatenate([fold_log_odds(x, y, fold[None], ridge) for fold in folds])
+    assert together == pytest.approx(alone, abs=1e-9)
     apart = x[:, :1] * 1e3 + 1e4 * y[:, None]  # separable: whole steps alone may not reach it
-    assert fold_log_odds(apart, y, folds, ridge) == pytest.approx(
-        np.stack([fit_logistic(apart[fold], y[fold], ridge).log_odds(apart) for fold in folds]), abs=1e-6
-    )
-    with pytest.raises(InputError, match="larger ridge"):
-        fold_log_odds(apart, y, folds, 0.0)
+    odds = fold_log_odds(apart, y, folds, ridge)
+    assert np.all((odds > 0) == y) and np.all(np.isfinite(odds))
     with pytest.raises(InputError, match="both classes"):
         fold_log_odds(x, y, np.stack([y, ~y]), ridge)
 
@@ -245,7 +240,7 @@ def test_without_the_sheet_it_says_what_it_needs(tmp_path, monkeypatch):
     [
         ('data = "other"', "data must be one of appendix-c"),
         ('leave_out = "half"', "leave_out must be one of test, condition"),
-        ("ridge = -1.0", "ridge must be >= 0, got -1"),
+        ("ridge = -1.0", "ridge must be > 0, got -1"),
         ('features = "d3"', "features must be a list of names"),
         ("permutations = -1", "permutations must be"),
         ("permutations = 1000000000000", "permutations must be at most 100000, got 1000000000000"),

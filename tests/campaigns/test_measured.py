@@ -62,12 +62,12 @@ def plan_of(folder, text=PLAN):
 
 def test_recordings_are_calibrated_and_judged(folder):
     result = recorded_result(plan_of(folder), folder)
-    assert (result.judgement.calibrated_on, result.judgement.judged, len(result.rows)) == (10, 4, 14)
+    assert (result.judgement.leak_free, result.judgement.judged, len(result.rows)) == (10, 4, 14)
     table = {row.detector: row for row in result.judgement.table}
     assert table["d3 of p_A changed"].detection.count == 2
     assert table["d3 of p_A changed"].false_alarm.n == 2
     files = write_result(result, folder / "out")
-    assert {path.name for path in files} >= {"table.csv", "records.csv", "calibration.json"}
+    assert {path.name for path in files} >= {"table.csv", "records.csv", "thresholds.csv"}
     before = {path.name: path.read_bytes() for path in files}
     again = write_result(recorded_result(plan_of(folder), folder), folder / "out")
     assert {path.name: path.read_bytes() for path in again} == before
@@ -128,8 +128,8 @@ def test_data_that_are_not_there_are_named(tmp_path):
 def test_rotary_strokes(real_folder):
     """Levels of d3 lie high where the seal is defective; ten sound strokes raise one alarm at 10 %."""
     result = recorded_result(load_plan("rotary-seal"), real_folder / "vtnsi_actuator")
-    assert (result.judgement.calibrated_on, result.judgement.judged, len(result.judgement.failed)) == (20, 40, 0)
-    assert len(result.judgement.calibration.groups) == 2  # the two directions
+    assert (result.judgement.leak_free, result.judgement.judged, len(result.judgement.failed)) == (20, 40, 0)
+    assert {duty for _, duty in result.judgement.thresholds} == {"in", "out"}  # the two directions
     table = {row.detector: row for row in result.judgement.table}
     assert table["d3 of p_B high"].detection.value > 0.5
     assert table["d3 of p_B high"].false_alarm.count <= 4

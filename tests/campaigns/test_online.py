@@ -35,7 +35,7 @@ def test_a_stream_without_its_channels_cannot_tell(recording):
 
 def test_only_detectors_with_a_stream_are_online():
     parsed = plan_detector("volume balance, online @ some")
-    assert (parsed.of, parsed.online, parsed.key) == ("volume balance", True, "volume balance, online @ some")
+    assert (parsed.of, parsed.online, parsed.view) == ("volume balance", True, "some")
     check_detector("volume balance, online", {})
     with pytest.raises(InputError, match="online must be one of volume balance, got 'observer, online'"):
         check_detector("observer, online", {})

@@ -43,7 +43,7 @@ def once(tiny, tmp_path):
 
 def test_processes_make_the_same_bytes(once, tmp_path):
     plan, expected = once
-    assert {"records.csv", "table.csv", "pod.csv", "cells.csv", "calibration.json"} <= set(expected)
+    assert {"records.csv", "table.csv", "pod.csv", "cells.csv", "thresholds.csv"} <= set(expected)
     assert campaign.run(plan, tmp_path / "two", jobs=2).complete
     assert files_of(plan, tmp_path / "two") == expected
 

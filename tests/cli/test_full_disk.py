@@ -89,7 +89,7 @@ def result_of(plan: SimulatedPlan, folder: Path) -> dict[str, bytes]:
 def test_a_campaign_goes_on_when_there_is_room_again(plan: SimulatedPlan, tmp_path: Path) -> None:
     assert run(plan, tmp_path / "whole", jobs=1).complete
     expected, refusals = result_of(plan, tmp_path / "whole"), 0
-    for size in range(0, 20_000, 700):
+    for size in range(0, 20_000, 400):
         try:
             with room(size):
                 assert run(plan, tmp_path / "full", jobs=1).complete

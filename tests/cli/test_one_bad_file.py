@@ -76,15 +76,6 @@ def test_report_goes_on_after_a_page_that_cannot_be_written(batch, call):
     ]
 
 
-def test_calibrate_names_every_bad_file(batch, call):
-    (batch / "worse.csv").write_text("nothing")
-    files = [batch / name for name in ("bad.nc", "good.nc", "worse.csv")]
-    done = call("calibrate", "-o", batch / "c.json", "--baseline", *files)
-    assert done.status == 1
-    assert len(done.err.splitlines()) == 2
-    assert not (batch / "c.json").exists()
-
-
 def test_a_campaign_over_recordings_goes_on(batch, call, monkeypatch, tmp_path):
     from sealscope.campaigns.cases import recordings as module
     from sealscope.campaigns.plans.reader import load_plan

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis import registry
-from sealscope.diagnosis.calibration.scorers import Look, scorer
 from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 
@@ -93,14 +91,6 @@ def test_it_is_made_for_the_rig_given_or_the_thesis_s(recording: Recording) -> N
         examination = Examination(recording, false_alarm_probability=0.05, rig=rig)
         examination.evidence("looker")
         assert rigs.pop() is expected
-
-
-def test_a_detector_s_score_may_be_calibrated(recording: Recording) -> None:
-    look = Look(recording, false_alarm_probability=0.05)
-    assert scorer("looker, calibrated").score(look).value == 0.05
-    assert len(seen) == 1
-    with pytest.raises(InputError, match="did you mean 'looker, calibrated'"):
-        scorer("looker, calibratd")
 
 
 def test_two_at_a_time_and_as_each_by_itself(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,10 +17,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.baseline.inspection import inspected
 from sealscope.diagnosis.baseline.operating_point import operating_point
-from sealscope.diagnosis.calibration.calibrated import calibrate_on, diagnose_calibrated
-from sealscope.diagnosis.calibration.thresholds import load, save, with_judge
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.recordings import read
 from sealscope.recordings.recording import Recording
@@ -185,25 +182,3 @@ def test_a_single_stroke_is_too_short_to_be_its_own_baseline(defective: list[Rec
         found = diagnose(stroke)
         assert found.verdict == "cannot tell"
         assert "--baseline" in found.reason
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["session_act_1_healthy", pytest.param("session_act_2_healthy", marks=pytest.mark.long)]
-)
-@pytest.mark.parametrize("count", [pytest.param(12, marks=pytest.mark.long), 20])
-def test_few_strokes_calibrate_every_detector(name: str, count: int, tmp_path: Path) -> None:
-    """Five strokes a direction were too few, and 107 left every stroke `cannot tell`."""
-    strokes = [read(path, map=MAP, rate=1000) for path in files(name)]
-    strokes = [stroke for stroke in strokes if inspected(stroke).defect is None]
-    known = {str(k): stroke for k, stroke in enumerate(strokes[:count])}
-    made = calibrate_on(known, false_alarm_probability=0.01)
-    for group in made.groups:
-        assert all(group.judges(detector) for detector in made.detectors)
-    save(made, tmp_path / "strokes.json")
-    made = load(tmp_path / "strokes.json")
-    later = strokes[count::3]
-    for detector in ("rms change", "d3 of p_A changed"):
-        verdicts = Counter(diagnose_calibrated(stroke, with_judge(made, detector)).verdict for stroke in later)
-        assert verdicts["leak"] <= 0.03 * len(later), detector
-        assert verdicts["no leak"] > 0, detector

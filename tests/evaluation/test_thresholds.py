@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from scipy.special import ndtr
 
 from sealscope.errors import InputError
-from sealscope.evaluation.thresholds import LevelWander, predictive_threshold, quantile_threshold, records_needed
+from sealscope.evaluation.thresholds import quantile_threshold, records_needed
 
 distinct = st.lists(st.integers(-10_000, 10_000), min_size=25, max_size=120, unique=True)
 
@@ -124,49 +123,3 @@ def test_too_few_records_and_impossible_probabilities(call, line):
     with pytest.raises(InputError) as error:
         call()
     assert str(error.value) == line
-
-
-def test_an_extrapolated_tail_is_students_and_holds_on_average():
-    from scipy.special import stdtrit
-
-    scores = np.array([0.3, -1.0, 0.8, 0.1, 2.0, -0.4])
-    found = predictive_threshold(scores, 0.01)
-    n = scores.size
-    expected = scores.mean() + scores.std(ddof=1) * math.sqrt(1 + 1 / n) * stdtrit(n - 1, 0.99)
-    assert found.value == pytest.approx(expected, rel=0.01)
-    assert (found.rank, found.n) == (0, n)
-    assert found.expected == pytest.approx(0.01, rel=1e-6)
-    assert found.low < 0.01 < found.high
-    rng = np.random.default_rng(2)
-    true = [1.0 - ndtr(predictive_threshold(rng.standard_normal(5), 0.05).value) for _ in range(2000)]
-    assert np.mean(true) == pytest.approx(0.05, rel=0.1)
-    sure = [1.0 - ndtr(predictive_threshold(rng.standard_normal(5), 0.05, promise="bound").value) for _ in range(2000)]
-    assert np.mean(np.array(sure) <= 0.05) == pytest.approx(0.95, abs=0.015)
-
-
-def test_a_power_of_the_score_keeps_the_rate_of_sizes_and_squares():
-    """Sizes of normal deviates and largest sums of squares, by the powers that make them nearly normal."""
-    rng = np.random.default_rng(3)
-    sizes, squares = np.abs(rng.standard_normal((3000, 6))), rng.chisquare(6, (3000, 40, 6)).max(axis=1)
-    for scores, power in ((sizes, 2 / 3), (squares, 1 / 3)):
-        alarms = [row[5] > predictive_threshold(row[:5], 0.05, power=power).value for row in scores]
-        assert np.mean(alarms) == pytest.approx(0.05, abs=0.015)
-
-
-def test_a_mean_that_wanders_raises_the_threshold_and_keeps_the_rate():
-    rng = np.random.default_rng(4)
-    wander = LevelWander(3.0, 4.0)
-    alarms = []
-    for _ in range(3000):
-        row = rng.standard_normal(11)
-        shift = 3.0 * math.sqrt(4.0 / rng.chisquare(4.0)) * rng.standard_normal()
-        alarms.append(row[10] + shift > predictive_threshold(row[:10], 0.05, wander=wander).value)
-    assert np.mean(alarms) == pytest.approx(0.05, abs=0.015)
-    assert predictive_threshold(row, 0.01, wander=wander).value > predictive_threshold(row, 0.01).value
-
-
-def test_too_few_or_equal_scores_have_no_tail():
-    with pytest.raises(InputError, match="must be at least 5 to extrapolate the tail of a score, got 4"):
-        predictive_threshold(range(4), 0.01)
-    with pytest.raises(InputError, match=r"must scatter, got 6 equal to 2"):
-        predictive_threshold([2.0] * 6, 0.01)

@@ -221,7 +221,7 @@ duration = "6 s"
 onset = "3 s"
 false_alarm = 0.2
 seed = 3
-detectors = ["d3 of p_A changed", "rms change, own threshold"]
+detectors = ["d3 of p_A changed", "rms change"]
 
 [[records]]
 use = "calibrate"

@@ -140,7 +140,6 @@ def campaign_result(tmp_path_factory):
             levels={},
             replicate=number,
             flow_lpm=leak,
-            place={},
             scores={"volume balance": (score, None)},
             statements={"volume balance": said},
         )
@@ -150,7 +149,7 @@ def campaign_result(tmp_path_factory):
     rows += [row(100 + k, 9.0, leak=0.0042, cause=either) for k in range(10)]
     rows += [row(200 + k, 1.0 if k == 5 else 8.0, fault="pump leak x3", cause=either if k else "piston leak")
              for k in range(6)]  # fmt: skip
-    judgement = judge(rows, plan.detectors, None, onset_s=plan.onset_s, hours=plan.duration_s / 3600)
+    judgement = judge(rows, plan.detectors, onset_s=plan.onset_s, hours=plan.duration_s / 3600)
     return CampaignResult(plan, tuple(rows), 0, judgement, known=prior_knowledge(plan))
 
 

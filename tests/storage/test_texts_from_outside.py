@@ -48,7 +48,7 @@ def test_settings_of_a_plan(entry: str, rule: str, tmp_path: Path) -> None:
     path, key = tmp_path / "plan.toml", entry.partition(" ")[0]
     lines = [line for line in PLAN.splitlines() if not line.startswith(f"{key} =")]
     calibrated = '[[records]]\nuse = "calibrate"\ncount = 9\n' if key == "false_alarm" else ""
-    detectors = "d3 of p_A fell" if calibrated else "rms change, own threshold"
+    detectors = "d3 of p_A fell" if calibrated else "rms change"
     text = "\n".join([lines[0], entry, *lines[1:], calibrated]).replace("rms change", detectors)
     path.write_text(text)
     with pytest.raises(InputError, match=rule):
@@ -58,8 +58,7 @@ def test_settings_of_a_plan(entry: str, rule: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("files", ["**x/*.csv", "**/**/*.csv", "a\\u0000b"])
 def test_patterns_of_a_plan(files: str, tmp_path: Path) -> None:
     (tmp_path / "plan.toml").write_text(
-        '[campaign]\nname = "a"\ndetectors = ["rms change, own threshold"]\n[recordings]\n[[recordings.sets]]\n'
-        f'files = "{files}"\n'
+        f'[campaign]\nname = "a"\ndetectors = ["rms change"]\n[recordings]\n[[recordings.sets]]\nfiles = "{files}"\n'
     )
     with pytest.raises(InputError, match="files must"):
         load_plan(tmp_path / "plan.toml")

@@ -1,27 +1,22 @@
-"""A campaign's result, from its folder or from measured data: rows judged, calibration and tables written."""
+"""A campaign's result, from its folder or from measured data: rows judged, tables written."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from sealscope.campaigns.cases.recordings import ProgressCallback, recorded_rows
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.execution import store
 from sealscope.campaigns.held_out.checks import HeldOutCheck, checks_of
 from sealscope.campaigns.held_out.classifiers import MeasuredSamples, held_out_rows
-from sealscope.campaigns.judging.judge import Judgement, calibration_of, judge
+from sealscope.campaigns.judging.judge import Judgement, judge
 from sealscope.campaigns.judging.tables import PriorKnowledge, ResultTable, rows_table, tables_of, write_tables
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, plan_detector
 from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, SimulatedPlan
-from sealscope.diagnosis.calibration.scorers import scorer
-from sealscope.diagnosis.calibration.thresholds import Calibration, save
 from sealscope.errors import InputError
 from sealscope.storage.folders import make_folder
-
-CALIBRATION = "calibration.json"
 
 
 @dataclass(frozen=True)
@@ -53,25 +48,22 @@ def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowle
     for name in plan.detectors:
         detector = plan_detector(name)
         known[name] = PriorKnowledge(
-            onset=simulated and not detector.detector and scorer(detector.of).timing == "split",
+            onset=simulated and detector.scorer is not None and detector.scorer.split,
             channels=tuple(plan.views.get(detector.view, ALL_CHANNELS)),
-            rig=(rig.name if rig is not None else "thesis") if detector.detector else "",
+            rig=(rig.name if rig is not None else "thesis") if detector.scorer is None else "",
         )
     return known
 
 
-def _calibration(
-    plan: SimulatedPlan | RecordedPlan, rows: Sequence[CaseRow], made_from: Mapping[str, Any], split_share: float
-) -> Calibration | None:
-    return calibration_of(
+def _judged(plan: SimulatedPlan | RecordedPlan, rows: Sequence[CaseRow], **known: float) -> Judgement:
+    return judge(
         rows,
         plan.detectors,
         false_alarm=plan.false_alarm,
         promise=plan.promise,
         confidence=plan.confidence,
-        split_share=split_share,
-        made_from={"campaign": made_from},
-        views=plan.views,
+        onset_s=known.get("onset_s"),
+        hours=known.get("hours"),
     )
 
 
@@ -81,15 +73,7 @@ def simulated_result(plan: SimulatedPlan, folder: Path) -> CampaignResult:
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
     head = store.head(folder) or store.made_from(plan)
-    judgement = judge(
-        rows,
-        plan.detectors,
-        _calibration(plan, rows, head, plan.onset_s / plan.duration_s),
-        onset_s=plan.onset_s,
-        hours=plan.duration_s / 3600.0,
-        confidence=plan.confidence,
-        false_alarm=plan.false_alarm,
-    )
+    judgement = _judged(plan, rows, onset_s=plan.onset_s, hours=plan.duration_s / 3600.0)
     mode = str(head.get("mode", store.RUN_BY_RUN))
     return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
 
@@ -98,16 +82,14 @@ def held_out_result(plan: HeldOutPlan, samples: MeasuredSamples) -> CampaignResu
     """Return the result of a campaign over measured data; an alarm is log odds over 0."""
     rows = held_out_rows(plan, samples)
     names = detectors_of(plan)
-    judgement = judge(rows, names, None, thresholds=dict.fromkeys(names, 0.0), confidence=plan.confidence)
+    judgement = judge(rows, names, own=dict.fromkeys(names, 0.0), confidence=plan.confidence)
     return CampaignResult(plan, tuple(rows), 0, judgement, tuple(checks_of(plan, samples)))
 
 
 def recorded_result(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> CampaignResult:
     """Return the result of a campaign over the recordings in a folder."""
     rows = recorded_rows(plan, folder, progress)
-    made_from = {"name": plan.name, "title": plan.title, "recordings": len(rows)}
-    judgement = judge(rows, plan.detectors, _calibration(plan, rows, made_from, 0.5), confidence=plan.confidence)
-    return CampaignResult(plan, tuple(rows), 0, judgement, known=prior_knowledge(plan))
+    return CampaignResult(plan, tuple(rows), 0, _judged(plan, rows), known=prior_knowledge(plan))
 
 
 def detectors_of(plan: AnyPlan) -> list[str]:
@@ -133,7 +115,7 @@ def _check_table(checks: Sequence[HeldOutCheck]) -> ResultTable:
 
 
 def write_result(result: CampaignResult, folder: Path) -> list[Path]:
-    """Write tables (and the calibration, where there is one) into the folder; return the files."""
+    """Write the tables into the folder; return the files."""
     make_folder(folder)
     unit = result.plan.unit
     part = result.plan.part if isinstance(result.plan, SimulatedPlan) else ""
@@ -142,8 +124,4 @@ def write_result(result: CampaignResult, folder: Path) -> list[Path]:
         rows_table(result.rows, detectors_of(result.plan), unit),
         _check_table(result.checks),
     ]
-    files = write_tables(folder, tables)
-    if result.judgement.calibration is not None:
-        save(result.judgement.calibration, folder / CALIBRATION)
-        files.append(folder / CALIBRATION)
-    return files
+    return write_tables(folder, tables)

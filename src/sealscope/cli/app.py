@@ -57,7 +57,6 @@ for command in (
     datasets.datasets,
     reproduction.reproduce,
     fmu.fmu,
-    campaign.calibrate,
 ):
     app.command()(command)
 app.add_typer(campaign.campaign)
@@ -95,10 +94,10 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
     So `FILE... --baseline FILE...` works with a shell's wildcards. All words after `--baseline` up to the next option
     belong to it; but where no other word could be a FILE, only the first one does.
     """
-    if not arguments or arguments[0] not in ("diagnose", "report", "calibrate"):
+    if not arguments or arguments[0] not in ("diagnose", "report"):
         return list(arguments)
-    takes_value = {"--format", "--map", "--rate", "--false-alarm", "--output", "-o", "--calibration", "--rig"}
-    takes_value |= {"--area", "--displacement", "--limit", "--fail-on", "--detector"}
+    takes_value = {"--format", "--map", "--rate", "--false-alarm", "--output", "-o", "--rig"}
+    takes_value |= {"--area", "--displacement", "--limit", "--fail-on"}
     groups: list[list[str]] = []
     plain: list[str] = []
     index, files = 1, 0
@@ -125,7 +124,6 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
                 files += 1
     if not all(groups):
         raise InputError("--baseline must be followed by one file or more, got none")
-    files = files or (arguments[0] == "calibrate")  # which takes no FILE beside its baseline
     options = [word for group in groups for name in (group if files else group[:1]) for word in ("--baseline", name)]
     left = [] if files else [name for group in groups for name in group[1:]]
     return [arguments[0], *options, *left, *plain]

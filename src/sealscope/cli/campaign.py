@@ -1,29 +1,16 @@
-"""The commands that measure: campaign run, status and report; calibrate."""
+"""The commands that measure: campaign run, status and report."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sealscope.cli.options import (
-    AssumeOption,
-    FalseAlarmOption,
-    JobsOption,
-    MapOption,
-    RateOption,
-    assumed_rig,
-    attempt,
-    channel_map_of,
-    check_folder,
-    complain,
-    say_jobs,
-)
+from sealscope.cli.options import JobsOption, complain, say_jobs
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,17 +34,8 @@ def complete_plans(incomplete: str) -> list[str]:
     return [name for name in plan_names() if name.startswith(incomplete)]
 
 
-def complete_detectors(incomplete: str) -> list[str]:
-    """Return the names of scorers, and of detectors with a calibrated threshold, that begin so."""
-    from sealscope.diagnosis.calibration.scorers import CALIBRATED, SCORERS
-    from sealscope.diagnosis.registry import detectors
-
-    names = [*SCORERS, *(f"{name}{CALIBRATED}" for name in detectors())]
-    return [name for name in names if name.startswith(incomplete)]
-
-
 PlanArgument = Annotated[
-    str, typer.Argument(metavar="PLAN", help="SimulatedPlan by name, or a TOML file.", autocompletion=complete_plans)
+    str, typer.Argument(metavar="PLAN", help="Plan by name, or a TOML file.", autocompletion=complete_plans)
 ]
 FolderOption = Annotated[
     Path | None,
@@ -140,7 +118,7 @@ def status(plan: PlanArgument, folder: FolderOption = None) -> None:
 
 @campaign.command()
 def report(plan: PlanArgument, folder: FolderOption = None, sheet: SheetOption = None, data: DataOption = None) -> None:
-    """Judge the rows that are there; write tables, calibration and page."""
+    """Judge the rows that are there; write tables and page."""
     from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
@@ -261,96 +239,3 @@ def _sheet_samples(folder: Path | None) -> MeasuredSamples:
     if path is None:
         raise InputError(MISSING)
     return samples_of(read_sheet(path)[0])
-
-
-def calibrate(
-    baseline: Annotated[
-        list[Path],
-        typer.Option("--baseline", metavar="FILE...", help="Leak-free recordings of the machine."),
-    ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration to write (JSON).")],
-    detectors: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--detector",
-            help="Detector to calibrate; repeat, the first makes the verdict.",
-            autocompletion=complete_detectors,
-        ),
-    ] = None,
-    false_alarm: FalseAlarmOption = 0.01,
-    promise: Annotated[
-        str, typer.Option("--promise", help="'average': the probability holds on average; 'bound': with --confidence.")
-    ] = "average",
-    confidence: Annotated[float, typer.Option("--confidence", help="Confidence of the stated intervals.")] = 0.95,
-    split: Annotated[
-        float, typer.Option("--split", help="Where recordings are split, as share of their length.")
-    ] = 0.5,
-    maps: MapOption = None,
-    rate: RateOption = None,
-    rig: AssumeOption = None,
-) -> None:
-    """Set thresholds from leak-free recordings of your own machine, for `diagnose --calibration`.
-
-    It takes 5 recordings or more of an operating point. By default the channels that are there decide: the volume
-    balance judges, else the pressure response, else rms change, with details of the pressures beside it.
-    """
-    from hashlib import sha256
-
-    from sealscope import __version__
-    from sealscope.diagnosis.calibration.calibrated import calibrate_on
-    from sealscope.diagnosis.calibration.thresholds import save
-    from sealscope.evaluation.thresholds import FEWEST
-    from sealscope.recordings import read
-
-    check_folder(output)
-    if len({path.resolve() for path in baseline}) < len(baseline):
-        raise InputError("baseline recordings must be given once each")
-    if output.resolve() in {path.resolve() for path in baseline}:
-        raise InputError(f"a calibration must not replace a recording, got {output}")
-    if promise not in ("average", "bound"):
-        raise InputError(f"--promise must be average or bound, got {promise}")
-    assumed = assumed_rig(rig)
-    channel_map = channel_map_of(maps)
-    recordings = {}
-    for path in baseline:
-        recording = attempt(path, partial(read, path, map=channel_map or None, rate=rate))
-        if recording is not None:
-            recordings[str(path)] = recording
-    if len(recordings) < len(baseline):
-        raise typer.Exit(1)
-    files = [{"file": path.name, "sha256": sha256(path.read_bytes()).hexdigest()} for path in baseline]
-    calibration = calibrate_on(
-        recordings,
-        tuple(detectors or ()),
-        false_alarm_probability=false_alarm,
-        split_share=split,
-        rig=assumed or "thesis",
-        promise=promise,
-        confidence=confidence,
-        made_from={
-            "recordings": files,
-            "channel_map": channel_map if isinstance(channel_map, str) else dict(channel_map),
-            "version": str(__version__),
-            "assumed_rig": rig or "thesis",
-        },
-    )
-    save(calibration, output)
-    for group in calibration.groups:
-        point = group.point
-        parts = [f"{group.records} recordings at {point.rate:g} Hz"]
-        parts += [f"command {point.command_rms:.3g} V rms"] if point.command_rms is not None else []
-        parts += [f"stroke {point.direction:+d}"] if point.direction else []
-        typer.echo(", ".join(parts))
-        for name in calibration.detectors:
-            limit = group.thresholds.get(name)
-            if limit is None and group.judges(name):
-                typer.echo(f"  {name}: each stroke against these {group.records}")
-            elif limit is None:
-                typer.echo(f"  {name}: fewer than {FEWEST} of them have a score, and no verdict comes from it")
-            else:
-                tail = "" if limit.rank else ", by an extrapolated tail"
-                typer.echo(
-                    f"  {name}: threshold {limit.value:.4g}, false alarms {100 * limit.expected:.3g} % expected "
-                    f"({100 * limit.low:.2g} % to {100 * limit.high:.2g} %){tail}"
-                )
-    typer.echo(f"calibration: {output}")

@@ -104,14 +104,6 @@ BaselineOption = Annotated[
 FalseAlarmOption = Annotated[
     float, typer.Option("--false-alarm", help="Probability of `leak` on a leak-free recording.")
 ]
-CalibrationOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--calibration",
-        metavar="FILE",
-        help="Thresholds of `sealscope calibrate` or of a campaign; they hold for the false-alarm rate in the file.",
-    ),
-]
 SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the instruments' noise.")]
 
 

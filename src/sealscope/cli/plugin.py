@@ -131,15 +131,11 @@ onset = "90 s"
 rate = "500 Hz"
 false_alarm = 0.01
 seed = 1
-detectors = ["{words}", "{words}, calibrated", "rms change, own threshold", "diagnose"]
+detectors = ["{words}", "rms change", "diagnose"]
 
 [factors]
 command = ["3 sin(4t)", "5 sin(2t)"]
 closed = ["0 %", "50 %"]
-
-[[records]]
-use = "calibrate"
-count = 400
 
 [[records]]
 count = 400

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -34,47 +33,38 @@ def predict(
     overrides: SetOption = None,
     detectors: Annotated[
         list[str] | None,
-        typer.Option("--detector", help="A detail's change, 'd3 of p_A fell'; repeat. [default: the thesis's]"),
+        typer.Option("--detector", help="A rule of the thesis, 'd3 of p_A fell'; repeat. [default: nine]"),
     ] = None,
     bench: Annotated[
         str,
         typer.Option("--bench", help="Machines and drifts from this bench profile (name or file), not noise alone."),
     ] = "",
-    results: Annotated[
-        Path | None,
-        typer.Option("--results", help="Folder of a campaign with this duty: its records, not a simulation, tell."),
-    ] = None,
     draws: Annotated[int, typer.Option("--draws", help="Machines drawn from the bench.")] = 24,
     start: Annotated[
         str | None,
         typer.Option("--start-position", help="Piston at the start, from mid-stroke [m]; by default centred."),
     ] = None,
     compare: Annotated[
-        bool, typer.Option("--compare/--no-compare", help="Compare the standard commands and throttles.")
+        bool, typer.Option("--compare/--no-compare", help="Compare the thesis's commands, with and without throttles.")
     ] = True,
     seed: Annotated[int, typer.Option("--seed", help="Seed of noise and draws.")] = 0,
     output: Annotated[
         PredictionFormat, typer.Option("--format", help="Text, or one JSON object.")
     ] = PredictionFormat.text,
 ) -> None:
-    """Predict the smallest leak that each detector finds, with the Cramer-Rao bound beside it.
+    """Predict the smallest leak that diagnose finds, with the Cramer-Rao bound and the thesis's rules beside it.
 
-    The thesis's detectors, or those of --detector, are given the onset; volume balance and pressure response, which
-    make the verdict of diagnose, look for it.
+    The rules are given the onset of the leak; the detectors of diagnose look for it.
     """
-    from sealscope.campaigns.prediction.detection import THESIS_DETECTORS, change_detector
-    from sealscope.campaigns.prediction.predict import (
-        STANDARD_COMMANDS,
-        DetectionTarget,
-        experiment_for,
-    )
+    from sealscope.campaigns.prediction.predict import STANDARD_COMMANDS, experiment_for
     from sealscope.campaigns.prediction.predict import predict as predict_leaks
+    from sealscope.campaigns.prediction.rules import THESIS_RULES, DetectionTarget, check_rule
     from sealscope.units import parse_quantity
 
     target = DetectionTarget(
         false_alarm=false_alarm,
         detection=detection,
-        detectors=tuple(change_detector(name) for name in dict.fromkeys(detectors)) if detectors else THESIS_DETECTORS,
+        rules=tuple(map(check_rule, dict.fromkeys(detectors))) if detectors else THESIS_RULES,
         seed=seed,
     )
     experiment = experiment_for(
@@ -90,7 +80,6 @@ def predict(
             commands=STANDARD_COMMANDS if compare else (),
             bench=bench,
             draws=draws,
-            results=results,
             progress=update,
         )
     typer.echo(json.dumps(report.as_dict(), allow_nan=False) if output is PredictionFormat.json else report.text())

@@ -24,7 +24,6 @@ from sealscope.cli.options import (
     AreaOption,
     AssumeOption,
     BaselineOption,
-    CalibrationOption,
     DisplacementOption,
     FalseAlarmOption,
     JoinOption,
@@ -163,7 +162,6 @@ def _diagnoses(
     maps: Sequence[str] | None,
     rate: float | None,
     false_alarm: float,
-    calibration: Path | None,
     rig: Rig | None,
     limit: str | None = None,
     quick: bool = False,
@@ -175,11 +173,6 @@ def _diagnoses(
     check_probability(false_alarm)
     RepairLimit.of(limit)
     reading = _Reading.of(maps, rate, rig)
-    if calibration is not None:
-        if quick:
-            raise InputError("--quick must stand without --calibration, which asks every method")
-        yield from _calibrated(files, join_them, baseline, reading, calibration, rig, limit)
-        return
     for file in files if baseline else ():
         if all(path.resolve() == file.resolve() for path in baseline):
             raise InputError(f"a baseline must be another recording than the file itself, got {file}")
@@ -211,30 +204,6 @@ def _diagnoses(
         yield None if diagnosis is None else (recording, diagnosis)
 
 
-def _calibrated(
-    files: Sequence[Path],
-    join_them: bool,
-    baseline: Sequence[Path],
-    reading: _Reading,
-    calibration: Path,
-    rig: Rig | None,
-    limit: str | None,
-) -> Iterator[tuple[Recording, Diagnosis] | None]:
-    """Yield recording and diagnosis of each file by the thresholds of a calibration."""
-    from sealscope.diagnosis.calibration.calibrated import diagnose_calibrated
-    from sealscope.diagnosis.calibration.thresholds import load
-
-    if baseline:
-        raise InputError("--calibration must stand without --baseline: its leak-free recordings are in it")
-    known = load(calibration)
-    for file, recording in _read_parts(files, reading, join_them):
-        diagnosis = None
-        if recording is not None:
-            work = partial(diagnose_calibrated, recording, known, file=str(file), rig=rig, limit=limit)
-            diagnosis = attempt(file, work)
-        yield None if recording is None or diagnosis is None else (recording, diagnosis)
-
-
 def diagnose(
     context: typer.Context,
     files: Annotated[
@@ -247,7 +216,6 @@ def diagnose(
     rate: RateOption = None,
     join: JoinOption = False,
     false_alarm: FalseAlarmOption = 0.01,
-    calibration: CalibrationOption = None,
     rig: AssumeOption = None,
     area: AreaOption = None,
     displacement: DisplacementOption = None,
@@ -282,7 +250,6 @@ def diagnose(
         maps=maps,
         rate=rate,
         false_alarm=false_alarm,
-        calibration=calibration,
         rig=assumed_rig(rig, area, displacement),
         limit=limit,
         quick=quick,
@@ -381,7 +348,6 @@ def report(
     rate: RateOption = None,
     join: JoinOption = False,
     false_alarm: FalseAlarmOption = 0.01,
-    calibration: CalibrationOption = None,
     rig: AssumeOption = None,
     area: AreaOption = None,
     displacement: DisplacementOption = None,
@@ -411,7 +377,7 @@ def report(
     complete = True
     written: list[tuple[Path, Diagnosis]] = []
     assumed = assumed_rig(rig, area, displacement)
-    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, calibration, assumed, limit):
+    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, assumed, limit):
         if result is None:
             complete = False
             continue

@@ -7,15 +7,20 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from sealscope.campaigns.cases.row import CaseRow, error_text
+import numpy as np
+
+from sealscope.campaigns.cases.row import STROKE, CaseRow, error_text
 from sealscope.campaigns.cases.scoring import stated
 from sealscope.campaigns.plans.model import RecordedPlan, RecordingSet
 from sealscope.errors import InputError, SealscopeError
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.recording import Recording
 
+#: Share of the rms of p_A - p_B that its mean exceeds in a stroke of one direction.
+_ONE_WAY = 0.5
 _log = logging.getLogger(__name__)
 #: Called with how many records have their row, how many there are, and how many of those failed.
 ProgressCallback = Callable[[int, int, int], None]
@@ -49,19 +54,28 @@ def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback |
     return [rows[name] for name in sorted(rows)]
 
 
+def _direction(recording: Recording) -> str:
+    """Return the direction of a single stroke by the mean of p_A - p_B, against its rms; `both` where it has none."""
+    if not all(name in recording for name in CHAMBERS):
+        return "both"
+    dp = recording["p_A"] - recording["p_B"]
+    share = float(dp.mean() / max(np.sqrt(np.mean(dp**2)), np.finfo(float).tiny))
+    return "both" if abs(share) <= _ONE_WAY else "out" if share > 0 else "in"
+
+
 def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
     from sealscope.diagnosis.baseline.inspection import inspected
-    from sealscope.diagnosis.calibration.calibrated import look_at
-    from sealscope.diagnosis.calibration.thresholds import Place
+    from sealscope.diagnosis.diagnose import Examination
     from sealscope.recordings import read
 
+    label = recordings.label or recordings.files
     row = partial(
         CaseRow,
         id=hashlib.sha256(os.fsencode(name)).hexdigest()[:16],
         use=recordings.use,
         leak_lpm=recordings.size,
         fault="",
-        levels={"set": recordings.label or recordings.files},
+        levels={"set": label, STROKE: "unknown"},
         replicate=0,
     )
     try:
@@ -69,9 +83,10 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
         record = inspected(recording)
         if record.defect is not None:
             return row(error=f"{name}: {record.defect}")
-        look = look_at(record.part, 0.5, plan.false_alarm, plan.assumed or "thesis")
-        scores, statements = stated(look, plan.detectors, plan.views)
-        return row(place=asdict(Place.of(record.part)), scores=scores, statements=statements)
+        part, levels = record.part, {"set": label, STROKE: _direction(record.part)}
+        examination = Examination(part, false_alarm_probability=plan.false_alarm, rig=plan.assumed or "thesis")
+        scores, statements = stated(examination, float(part.t[0]) + part.duration / 2, plan.detectors, plan.views)
+        return row(levels=levels, scores=scores, statements=statements)
     except Exception as error:  # one recording must not end the others; the table says it
         if not isinstance(error, SealscopeError):
             _log.debug("cannot judge %s", path, exc_info=True)

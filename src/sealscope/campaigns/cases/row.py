@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any, get_args
 
 from sealscope.campaigns.cases.case import CampaignCase
+from sealscope.campaigns.plans.duty import COMMAND
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Verdict
 from sealscope.errors import SealscopeError
 from sealscope.evaluation.confusion import CANNOT_TELL
-from sealscope.storage.plain_values import as_type
 
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
+#: The level that tells strokes in either direction, of recordings.
+STROKE = "stroke"
 #: First words of a fault as plans have it, and the cause that a detector should name for it.
 _CAUSES = (
     ("pump leak", "pump leak"),
@@ -37,6 +39,11 @@ STATED = (
 def cause_of(fault: str) -> str:
     """Return the cause behind a fault as text; a fault that has no cause of its own is its own."""
     return next((cause for beginning, cause in _CAUSES if fault.startswith(beginning)), fault)
+
+
+def duty_of(levels: Mapping[str, str | float]) -> str:
+    """Return what must be alike before scores are compared: the command, and the direction of a stroke."""
+    return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
 
 def covers(named: str, true: str) -> bool:
@@ -105,13 +112,12 @@ def error_text(error: Exception) -> str:
 
 @dataclass(frozen=True)
 class CaseRow:
-    """What a campaign stores of a case: its inputs, where the record was made, the scores; or the `error` of it.
+    """What a campaign stores of a case: its inputs and the scores; or the `error` of it.
 
-    `flow_lpm`: mean leak [L/min] while open, as the run really had it; `place`: operating point and length of the
-    record, plain values; `bound_lpm`: standard deviation [L/min] of the best unbiased estimate of the change at the
-    onset, from pressures and command (`bound.change_bound`), None where it was not asked for or there is none;
-    `scores` by the plan's name of a detector, `statements` (evidence with the `STATED` figures alone) by
-    `PlanDetector.key`; `seconds`: processor time, which takes no part in the result.
+    `flow_lpm`: mean leak [L/min] while open, as the run really had it; `bound_lpm`: standard deviation [L/min] of the
+    best unbiased estimate of the change at the onset, from pressures and command (`bound.change_bound`), None where it
+    was not asked for or there is none; `scores` and `statements` (evidence with the `STATED` figures alone) by the
+    plan's name of a detector; `seconds`: processor time, which takes no part in the result.
     """
 
     id: str
@@ -121,7 +127,6 @@ class CaseRow:
     levels: Mapping[str, str | float]
     replicate: int
     flow_lpm: float | None = None
-    place: Mapping[str, Any] = field(default_factory=dict)
     scores: Scores = field(default_factory=dict)
     error: str | None = None
     seconds: float = 0.0
@@ -146,13 +151,9 @@ class CaseRow:
     @classmethod
     def from_dict(cls, tree: Mapping[str, Any]) -> CaseRow:
         """Return the row of plain values; raise TypeError, KeyError or ValueError where they are none."""
-        from sealscope.diagnosis.calibration.thresholds import Place
-
         error = tree.get("error")
         if not isinstance(error, str | None) or not isinstance(tree["id"], str):
             raise TypeError("an error and an id are texts")
-        if error is None:
-            as_type(Place, tree["place"])
         scores = {str(name): (_number(score), _number(onset)) for name, (score, onset, *_) in tree["scores"].items()}
         statements = {str(key): stated_evidence(plain) for key, plain in tree.get("statements", {}).items()}
         numbers = {name: _number(tree.get(name)) for name in ("flow_lpm", "bound_lpm")}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +32,7 @@ def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow
     from sealscope.campaigns.cases.bound import change_bound
     from sealscope.campaigns.cases.scoring import stated
     from sealscope.diagnosis.baseline.inspection import inspected
-    from sealscope.diagnosis.calibration.scorers import Look
-    from sealscope.diagnosis.calibration.thresholds import Place
+    from sealscope.diagnosis.diagnose import Examination
     from sealscope.simulation.simulate import simulate_with_truth
 
     experiment = experiment_of(plan, case)
@@ -45,8 +44,8 @@ def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow
     record = inspected(simulated.recording, INSPECTED)
     if record.defect is not None:
         raise InputError(f"the record cannot be judged: {record.defect}")
-    look = Look(record.part, plan.onset_s, plan.false_alarm, plan.assumed or plan.rig)
-    scores, statements = stated(look, plan.detectors, plan.views)
+    examination = Examination(record.part, false_alarm_probability=plan.false_alarm, rig=plan.assumed or plan.rig)
+    scores, statements = stated(examination, plan.onset_s, plan.detectors, plan.views)
     bound = None
     if case.leak_lpm in plan.bounded:
         truth = simulated.truth
@@ -56,7 +55,6 @@ def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow
     return CaseRow.of(
         case,
         flow_lpm=simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0,
-        place=asdict(Place.of(record.part)),
         scores=scores,
         statements=statements,
         bound_lpm=bound,

@@ -1,8 +1,8 @@
 """A plan's cases many at a time: simulated side by side, scored from the RMS of the details on both sides of the onset.
 
 The scores are the same functions of the same samples as those of a recording (`scorers.Sides`); nothing else of a
-record is there, so that a plan is refused where something asks for more. The solver's step and the operating point
-of a case come from a few seconds of its machine.
+record is there, so that a plan is refused where something asks for more. The solver's step of a case comes from a few
+seconds of its machine.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import asdict, replace
-from functools import lru_cache
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,15 +22,10 @@ from sealscope.campaigns.cases.scoring import scored
 from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.campaigns.plans.duty import fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.diagnosis.baseline.operating_point import operating_point
-from sealscope.diagnosis.calibration.scorers import Sides, scorer, side_bounds
-from sealscope.diagnosis.calibration.thresholds import Place
+from sealscope.campaigns.plans.scorers import Sides, side_bounds
 from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.cycle import find_cycle
-from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.signals.filters import IntArray
-from sealscope.simulation.commands import Sine
 from sealscope.simulation.integrate import oversampling, trajectory
 
 if TYPE_CHECKING:
@@ -43,8 +37,6 @@ RUNS = {"cpu": 256, "gpu": 4096}
 #: Machines of a cell on which its step is chosen, and how long [s] each of them runs for that: the first window that
 #: `integrate` checks, and two more.
 SCOUTS, SCOUTED = 4, 4.0
-#: Shortest run [s] that tells an operating point, and the periods of a sine that it holds; the later half is looked at.
-LEAST_SECONDS, PERIODS = 4.0, 2
 
 
 def mode_of(device: str) -> str:
@@ -66,8 +58,7 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
 
     for name in plan.detectors:
-        detector = plan_detector(name)
-        if detector.detector or scorer(detector.of).of_sides is None:
+        if plan_detector(name).scorer is None:
             raise no(
                 f"detectors of the RMS on both sides of the onset alone, got {name!r}, which needs whole recordings"
             )
@@ -155,7 +146,6 @@ class _Batches:
 
         cases = [case for case, _ in drawn]
         experiments = self._sized([experiment for _, experiment in drawn])
-        places = [asdict(place_of_run(experiment)) for experiment in experiments]
         edges = self._bounds.ravel() / self._plan.rig.daq.sample_rate
         batch = simulate_batch(experiments, bounds=edges, threads=self._threads, device=self._device)
         squares = batch.rms[:, :, [0, 2]] ** 2
@@ -166,7 +156,6 @@ class _Batches:
                 CaseRow.of(
                     case,
                     flow_lpm=float(batch.mean_leak_lpm[k]) if case.leak_lpm else 0.0,
-                    place=places[k],
                     scores=scored(sides, self._plan.detectors, self._plan.views),
                 )
             )
@@ -257,47 +246,3 @@ def chosen_step(experiment: Experiment) -> float:
 def _chosen(experiment: Experiment) -> tuple[str, float]:
     path = trajectory(replace(experiment, duration=min(experiment.duration, SCOUTED), leaks=()), ())
     return path.method, path.step
-
-
-def place_of_run(experiment: Experiment) -> Place:
-    """Return where the record of an experiment with a stated step and sized leaks is made, as `Place.of` would.
-
-    Command and cycle are those of the whole record. Under a sine, pressure level and direction come from whole
-    periods of a short run before any leak, without instruments and later drifts; under another command, or with
-    another fault, from a run of full length. The strokes are not
-    measured: runs of a batch differ in them by command and rig alone.
-    """
-    command = experiment.commanded
-    samples = round(experiment.duration * experiment.rate)
-    duration = samples / experiment.rate
-    if experiment.faults or not isinstance(command, Sine) or not (command.amplitude and command.omega):
-        return Place(
-            replace(operating_point(_clean(experiment, 0.0, duration, with_command=True)), motion=None), duration
-        )
-    period = 2.0 * math.pi / abs(command.omega)
-    length = min(max(LEAST_SECONDS, PERIODS * period), experiment.duration)
-    looked = max(1, int(length / 2.0 / period)) * period
-    point = operating_point(_clean(experiment, max(0.0, length - looked), length))
-    rms, cycle = _of_command(command, samples, experiment.rate)
-    return Place(replace(point, command_rms=rms, cycle=cycle, motion=None), duration)
-
-
-def _clean(experiment: Experiment, start: float, stop: float, *, with_command: bool = False) -> Recording:
-    """Return the true x, p_A and p_B (and u) at the record's samples start <= t < stop [s]."""
-    whole = stop >= experiment.duration
-    short = experiment if whole else replace(experiment, duration=stop, leaks=())
-    path = trajectory(short, short.leaks)
-    factor = oversampling(short)
-    kept = slice(round(start * short.rate) * factor, round(stop * short.rate) * factor, factor)
-    channels = {name: path[name][kept] for name in ("x", *CHAMBERS)}
-    if with_command:
-        channels["u"] = experiment.commanded.volts(path.t[kept])
-    return Recording(path.t[kept], channels, CHANNEL_UNITS, short.rate)
-
-
-@lru_cache(maxsize=1024)
-def _of_command(command: Sine, samples: int, rate: float) -> tuple[float, float | None]:
-    """Return rms [V] and cycle [s] of a command over the record."""
-    t = np.arange(samples) / rate
-    u = command.volts(t)
-    return float(np.sqrt(np.mean(u**2))), find_cycle(Recording(t, {"u": u}, CHANNEL_UNITS, rate))

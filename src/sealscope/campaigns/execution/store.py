@@ -32,8 +32,8 @@ _SAME = {
     "plug_ins": "detectors of other distributions",
     "views": "channels that its detectors see",
 }
-#: The form of a row: 2 since rows hold what each detector stated.
-FORMAT = 2
+#: The form of a row: 3 since rows hold no operating point.
+FORMAT = 3
 ROWS, HEAD, LOCK = "rows.jsonl", "campaign.json", ".lock"
 #: Longest line of a row, and largest head [bytes].
 _LONGEST_ROW = _LARGEST_HEAD = 1_000_000
@@ -63,11 +63,8 @@ class CampaignProgress:
 
 def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
     """Return what a campaign's rows depend on, as plain values; `mode`: `RUN_BY_RUN` or `batches.mode_of`."""
-    from sealscope.diagnosis.calibration.scorers import scorer
-
-    # a detector that searches within the record sets its own threshold for the probability, and its score may follow
     detectors = [plan_detector(name) for name in plan.detectors]
-    searching = any(detector.detector or scorer(detector.of).timing == "search" for detector in detectors)
+    searching = any(detector.scorer is None for detector in detectors)  # its verdict follows from the probability
     assumed = plan.assumed or plan.rig
     return {
         "format": FORMAT,
@@ -89,7 +86,7 @@ def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
     from sealscope.diagnosis.plugins import PlugIn
     from sealscope.diagnosis.registry import detectors
 
-    run = {detector.of for name in plan.detectors if (detector := plan_detector(name)).detector}
+    run = {detector.of for name in plan.detectors if (detector := plan_detector(name)).scorer is None}
     return {
         name: plug_in.fingerprint
         for name, plug_in in detectors().items()
@@ -141,7 +138,6 @@ def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     """
     rows = read_rows(folder)
     wanted = set(plan.detectors)
-    stated = {detector.key for name in plan.detectors if (detector := plan_detector(name)).own}
     of_plan: dict[str, CaseRow] = {}
     for case in sorted(cases_of(plan), key=lambda case: case.id):
         row = rows.get(case.id)
@@ -149,9 +145,7 @@ def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
             continue
         if any(getattr(row, name) != getattr(case, name) for name in _INPUTS):
             raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({folder / ROWS})")
-        if row.error is not None or (
-            wanted <= set(row.scores) and (not row.statements or stated <= set(row.statements))
-        ):
+        if row.error is not None or wanted <= set(row.scores):
             of_plan[row.id] = row
     return of_plan
 

@@ -17,8 +17,6 @@ Array = npt.NDArray[np.float64]
 _MOST_STEPS = 100
 _SMALL = 1e-15
 _LEAST_SHARE = 1e-8
-#: Newton steps of whole length before a fit is done with shorter ones.
-_PLAIN_STEPS = 15
 #: Parts of the training samples in which features and ridge are chosen.
 _INNER = 5
 
@@ -44,98 +42,48 @@ class MeasuredSamples:
         return np.column_stack([self.features[name] for name in names])
 
 
-@dataclass(frozen=True)
-class LogisticFit:
-    """``ln(P/(1 - P)) = intercept + sum weights (x - centre)/scale``."""
-
-    intercept: float
-    weights: Array
-    centre: Array
-    scale: Array
-
-    def log_odds(self, x: Array) -> Array:
-        """Return the log odds of a leak for samples (n, f)."""
-        return np.asarray(self.intercept + ((x - self.centre) / self.scale) @ self.weights)
-
-
-def fit_logistic(x: Array, leaks: npt.NDArray[np.bool_], ridge: float) -> LogisticFit:
-    """Fit a logistic regression by Newton's method, maximising ``sum ln P(y|x) - ridge/2 |weights|^2``.
-
-    `x` (n, f), each feature standardised to mean 0 and standard deviation 1 of these samples; the intercept is not
-    penalised. Raises InputError for a single class, a constant feature, or where no finite maximum is reached (no
-    ridge and separable classes). Source: le Cessie and van Houwelingen, Appl. Stat. 41 (1992) 191-201, doi
-    10.2307/2347628.
-    """
-    from scipy.special import expit
-
-    if leaks.all() or not leaks.any():
-        raise InputError(f"a classifier needs both classes, got {int(leaks.sum())} leaks of {leaks.size}")
-    centre, scale = x.mean(axis=0), x.std(axis=0)
-    if not np.all(scale > 0):
-        raise InputError(f"a feature must vary, got a constant one (number {int(np.argmin(scale > 0)) + 1})")
-    design = np.column_stack([np.ones(len(x)), (x - centre) / scale])
-    penalty = np.concatenate([[0.0], np.full(x.shape[1], ridge)])
-    beta = np.zeros(design.shape[1])
-
-    def objective(at: Array) -> float:
-        eta = design @ at
-        return float(np.logaddexp(0.0, np.where(leaks, -eta, eta)).sum() + 0.5 * (penalty * at * at).sum())
-
-    value = objective(beta)
-    for _ in range(_MOST_STEPS):
-        p = expit(design @ beta)
-        slope = design.T @ (p - leaks) + penalty * beta
-        curvature = (design.T * (p * (1.0 - p))) @ design + np.diag(penalty)
-        try:
-            step = np.linalg.solve(curvature, slope)
-        except np.linalg.LinAlgError:
-            break
-        share = 1.0
-        while objective(beta - share * step) > value * (1.0 + 1e-12) and share > _LEAST_SHARE:
-            share /= 2.0
-        beta = beta - share * step
-        value = objective(beta)
-        if abs(float(slope @ step)) <= _SMALL * (1.0 + value):  # twice what a further step would gain
-            if ridge == 0 and np.all(np.where(leaks, 1.0, -1.0) * (design @ beta) > 0):
-                break  # separable: the further the weights grow the better
-            return LogisticFit(float(beta[0]), beta[1:], centre, scale)
-    raise InputError(f"a classifier must reach a maximum, got none with ridge {ridge:g}; give a larger ridge")
-
-
 def fold_log_odds(x: Array, leaks: npt.NDArray[np.bool_], folds: npt.NDArray[np.bool_], ridge: float) -> Array:
-    """Return the log odds of all samples from one fit for each fold, fitted to the samples of its mask alone, (k, n).
+    """Return the log odds of a leak for all samples from one logistic regression for each fold, (k, n).
 
-    `x` (n, f), `folds` (k, n). The same fits as `fit_logistic`'s, all folds in one Newton iteration; folds that plain
-    steps do not bring to the maximum are fitted by it one by one, and it raises what it raises.
+    `x` (n, f); `folds` (k, n): the samples that each is fitted to. A fit maximises ``sum ln P(y|x) - ridge/2
+    |weights|^2`` by Newton's method, each feature standardised over its samples, the intercept not penalised; `ridge` >
+    0. Raises InputError for a fold with a single class or a constant feature. Source: le Cessie and van Houwelingen,
+    Appl. Stat. 41 (1992) 191-201, doi 10.2307/2347628.
     """
     from scipy.special import expit
 
-    odds = np.empty(folds.shape)
-    single = np.ones(len(folds), dtype=bool)
+    if not (np.any(folds & leaks, axis=1) & np.any(folds & ~leaks, axis=1)).all():
+        raise InputError("a classifier needs both classes, got leaks alone or none in a part of the samples")
     weight = folds.astype(np.float64)
     count = weight.sum(axis=1)
-    centre = weight @ x / np.maximum(count, 1.0)[:, None]
-    off = x[None] - centre[:, None, :]
-    scale = np.sqrt(np.einsum("kn,knf->kf", weight, off**2) / np.maximum(count, 1.0)[:, None])
-    both = np.any(folds & leaks, axis=1) & np.any(folds & ~leaks, axis=1)
-    if ridge > 0 and np.all(scale > 0) and np.all(both):
-        design = np.concatenate([np.ones((*folds.shape, 1)), off / scale[:, None, :]], axis=2)
-        penalty = np.concatenate([[0.0], np.full(x.shape[1], ridge)])
-        beta = np.zeros((len(folds), design.shape[2]))
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(_PLAIN_STEPS):
-                p = expit(np.einsum("knf,kf->kn", design, beta))
-                slope = np.einsum("kn,knf->kf", weight * (p - leaks), design) + penalty * beta
-                inner = (design * (weight * p * (1.0 - p))[:, :, None]).transpose(0, 2, 1) @ design + np.diag(penalty)
-                step = np.linalg.solve(inner, slope[:, :, None])[:, :, 0]
-                beta[single] -= step[single]  # a fold that is done waits: no other changes its last bits
-                single &= ~(np.abs(np.sum(slope * step, axis=1)) <= _SMALL)
-                if not single.any() or not np.all(np.isfinite(beta)):
-                    break
-        odds = np.einsum("knf,kf->kn", design, beta)
-    for k in np.flatnonzero(single):
-        odds[k] = fit_logistic(x[folds[k]], leaks[folds[k]], ridge).log_odds(x)
-    return odds
+    off = x[None] - (weight @ x / count[:, None])[:, None, :]
+    scale = np.sqrt(np.einsum("kn,knf->kf", weight, off**2) / count[:, None])
+    if not np.all(scale > 0):
+        raise InputError(f"a feature must vary, got a constant one (number {int(scale.min(axis=0).argmin()) + 1})")
+    design = np.concatenate([np.ones((*folds.shape, 1)), off / scale[:, None, :]], axis=2)
+    penalty = np.concatenate([[0.0], np.full(x.shape[1], ridge)])
+    against = np.where(leaks, -1.0, 1.0)
+
+    def objective(at: Array) -> Array:
+        losses = np.logaddexp(0.0, against * np.einsum("knf,kf->kn", design, at))
+        return np.asarray((weight * losses).sum(axis=1) + 0.5 * (penalty * at * at).sum(axis=1))
+
+    beta = np.zeros((len(folds), design.shape[2]))
+    value, going = objective(beta), np.ones(len(folds), dtype=bool)
+    for _ in range(_MOST_STEPS):
+        p = expit(np.einsum("knf,kf->kn", design, beta))
+        slope = np.einsum("kn,knf->kf", weight * (p - leaks), design) + penalty * beta
+        inner = (design * (weight * p * (1.0 - p))[:, :, None]).transpose(0, 2, 1) @ design + np.diag(penalty)
+        step = np.linalg.solve(inner, slope[:, :, None])[:, :, 0]
+        share = going.astype(np.float64)  # a fold that is done waits: no other changes its last bits
+        while (worse := (tried := objective(beta - share[:, None] * step)) > value * (1.0 + 1e-12)).any():
+            share[worse] = np.where(share[worse] > _LEAST_SHARE, share[worse] / 2.0, 0.0)
+        beta -= share[:, None] * step
+        value = tried
+        going &= np.abs(np.sum(slope * step, axis=1)) > _SMALL * (1.0 + value)  # twice what a further step would gain
+        if not going.any():
+            break
+    return np.asarray(np.einsum("knf,kf->kn", design, beta))
 
 
 def group_numbers(samples: MeasuredSamples, leave_out: str) -> npt.NDArray[np.intp]:

@@ -1,4 +1,4 @@
-"""Judge a campaign's rows: thresholds from its leak-free records, verdicts on all the others, and what they add up to.
+"""Judge a campaign's rows: thresholds from its leak-free records, verdicts on all others, and what they add up to.
 
 The verdicts give detection and false alarms by size of leak; what detectors state beyond a verdict is compared with the
 truth: when the leak began, how large it is, what the fault is.
@@ -7,35 +7,34 @@ truth: when the leak began, how large it is, what the fault is.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, covers, named_cause
-from sealscope.campaigns.judging.families import FamilyFinding, family_findings
-from sealscope.campaigns.plans.detectors import Views, plan_detector
-from sealscope.diagnosis.calibration.scorers import scorer
-from sealscope.diagnosis.calibration.thresholds import Calibration, Place, calibrate
+from sealscope.campaigns.cases.bound import smallest_found
+from sealscope.campaigns.cases.case import FAMILY
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, covers, duty_of, named_cause
+from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.confusion import CANNOT_TELL, Confusion, confusion_matrix
-from sealscope.evaluation.estimates import (
-    EstimateError,
-    OnsetErrors,
-    estimate_error,
-    onset_errors,
-    quantile_of,
-)
+from sealscope.evaluation.estimates import EstimateError, OnsetErrors, estimate_error, onset_errors, quantile_of
 from sealscope.evaluation.pod import HitMiss, SizeDetection, by_size, fit_hit_miss, proven_size
 from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 from sealscope.evaluation.table import ALWAYS, NEVER, JudgedRecord, SummaryRow, summary
-from sealscope.storage.plain_values import as_type
+from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
 #: (detector, row id) -> verdict
 Verdicts = Mapping[tuple[str, str], str]
+#: (detector, duty) -> threshold from leak-free records of that duty
+Thresholds = Mapping[tuple[str, str], Threshold]
+#: What stands for all families together, and for all laws of a leak.
+ALL, ANY_LAW = "all", "any"
+#: Probability with which the best test finds a leak that the bound allows.
+ALLOWED_DETECTION = 0.9
 
 
 @dataclass(frozen=True)
@@ -64,28 +63,30 @@ class SizeRoc:
 
 
 @dataclass(frozen=True)
-class CellAlarms:
-    """Alarms of one detector at one size of leak (0: none) in one cell of the factors."""
+class AlarmShares:
+    """Alarms of one detector on records that have something in common.
 
-    detector: str
-    leak_lpm: float
-    levels: Mapping[str, str | float]
-    alarms: Proportion
-
-
-@dataclass(frozen=True)
-class FaultAlarms:
-    """Alarms of one detector on records with a fault that is no piston leak.
-
-    `named`: alarms that name the fault's cause, alone or with the piston (`piston or pump leak` of a pump leak); None
-    where the detector names no cause.
+    `leak_lpm` (0: no leak) and `law` of the leak, `fault` that is no leak, `family` of machines, `levels` of the
+    factors: what they have in common, where it was asked for. `coverage`: how often a stated interval holds the flow
+    that there was; `named`: alarms that name the fault's cause, alone or with the piston, None where the detector names
+    no cause; `reachable`: records whose leak the Cramer-Rao bound of their machine allows to find, over those that have
+    a bound, and `allowed`: alarms over these, both None where there is no bound; `failed`: records without a result,
+    which are among those that cannot be told.
     """
 
     detector: str
-    fault: str
     alarms: Proportion
     cannot_tell: Proportion
+    coverage: Proportion
+    leak_lpm: float = 0.0
+    law: str = ANY_LAW
+    fault: str = ""
+    family: str = ALL
+    levels: Mapping[str, str | float] = field(default_factory=dict)
     named: Proportion | None = None
+    reachable: Proportion | None = None
+    allowed: Proportion | None = None
+    failed: int = 0
 
 
 @dataclass(frozen=True)
@@ -128,13 +129,14 @@ class Judgement:
     """What a campaign shows.
 
     `table` by size, `overall` with all leaks together; `onsets`, `flows` and `causes`: of detectors that state them;
-    `calibration`: None where every detector has a threshold of its own; `calibrated_on`, `judged`: records that had a
-    result; `failed`: rows that had none (they are `cannot tell` for every detector); `realised`: size -> mean and
-    standard deviation of the flow the leaks really had [L/min]; `families`: what is found in each family of machines.
+    `thresholds`: of scorers, from `leak_free` records; `judged`: records that had a result; `failed`: rows that had
+    none (they are `cannot tell` for every detector); `cells`, `faults`, `families`: alarms by cell of the factors, by
+    fault that is no leak, by family of machines; `realised`: size -> mean and standard deviation of the flow the leaks
+    really had [L/min].
     """
 
-    calibration: Calibration | None
-    calibrated_on: int
+    thresholds: Thresholds
+    leak_free: int
     judged: int
     failed: tuple[CaseRow, ...]
     table: tuple[SummaryRow, ...]
@@ -144,101 +146,82 @@ class Judgement:
     causes: tuple[NamedCauses, ...]
     pods: tuple[DetectorPod, ...]
     rocs: tuple[SizeRoc, ...]
-    cells: tuple[CellAlarms, ...]
-    faults: tuple[FaultAlarms, ...]
+    cells: tuple[AlarmShares, ...]
+    faults: tuple[AlarmShares, ...]
+    families: tuple[AlarmShares, ...]
     realised: Mapping[float, tuple[float, float]]
-    families: tuple[FamilyFinding, ...] = ()
 
 
-def place_from(tree: Mapping[str, Any]) -> Place:
-    """Return the place of a row from its plain values; ValueError where they are none."""
-    return as_type(Place, dict(tree))
-
-
-def calibration_of(
-    rows: Sequence[CaseRow],
+def thresholds_of(
+    rows: Iterable[CaseRow],
     detectors: Sequence[str],
-    *,
     false_alarm: float,
-    promise: Any = "average",
+    promise: Promise = "average",
     confidence: float = 0.95,
-    split_share: float = 0.5,
-    made_from: Mapping[str, Any] | None = None,
-    views: Views | None = None,
-) -> Calibration | None:
-    """Return thresholds of the detectors that need them, from the rows to calibrate; None where none needs any."""
-    wanted = [name for name in detectors if plan_detector(name).needs_calibration]
-    leak_free = [row for row in rows if row.use == "calibrate" and row.error is None]
-    if not wanted:
-        return None
-    return calibrate(
-        [place_from(row.place) for row in leak_free],
-        {name: [row.scores[name][0] for row in leak_free] for name in wanted},
-        false_alarm_probability=false_alarm,
-        promise=promise,
-        confidence=confidence,
-        split_share=split_share,
-        made_from={**(made_from or {}), "records": len(leak_free)},
-        views=views,
-    )
+) -> Thresholds:
+    """Return the thresholds of the scorers that need one, from the leak-free rows of each duty.
 
-
-def own_threshold(name: str) -> float | None:
-    """Return a scorer's own threshold; None where records must set it, or a detector's verdict counts."""
-    detector = plan_detector(name)
-    return None if detector.detector else scorer(detector.of).threshold
-
-
-def verdict_on(row: CaseRow, detector: str, calibration: Calibration | None, own: float | None) -> str:
-    """Return a detector's verdict on a row.
-
-    It is the one it stated, or by its own threshold, else by the calibration's at the row's operating point.
+    A row without a score raises no alarm and counts as the lowest. Raises InputError where no duty has enough rows,
+    saying how many it takes.
     """
-    if row.error is not None:
-        return CANNOT_TELL
-    if row.statements and plan_detector(detector).own:
-        return row.statements[plan_detector(detector).key].verdict
-    value, threshold = row.scores[detector][0], own
-    if threshold is None and calibration is not None:
-        group = calibration.find(place_from(row.place))
-        if isinstance(group, str) or detector not in group.thresholds:
-            return CANNOT_TELL
-        threshold = group.thresholds[detector].value
-    if value is None or threshold is None:
-        return CANNOT_TELL
-    return "leak" if value > threshold else "no leak"
+    wanted = [name for name in detectors if plan_detector(name).needs_threshold]
+    by_duty: dict[str, list[CaseRow]] = {}
+    for row in rows:
+        if row.use == "calibrate" and row.error is None:
+            by_duty.setdefault(duty_of(row.levels), []).append(row)
+    needed = records_needed(false_alarm, confidence if promise == "bound" else None)
+    most = max(map(len, by_duty.values()), default=0)
+    if wanted and most < needed:
+        raise InputError(f"leak-free records must be at least {needed} of a duty, got at most {most}")
+    thresholds = {}
+    for name in wanted:
+        for duty, own in by_duty.items():
+            known = [value for row in own if (value := row.scores[name][0]) is not None]
+            if known and len(own) >= needed:
+                scores = known + [min(known)] * (len(own) - len(known))
+                thresholds[name, duty] = quantile_threshold(scores, false_alarm, confidence, promise)
+    return thresholds
 
 
 def judge(
     rows: Sequence[CaseRow],
     detectors: Sequence[str],
-    calibration: Calibration | None,
     *,
-    thresholds: Mapping[str, float | None] | None = None,
+    false_alarm: float = 0.01,
+    promise: Promise = "average",
+    confidence: float = 0.95,
+    own: Mapping[str, float] | None = None,
     onset_s: float | None = None,
     hours: float | None = None,
-    confidence: float = 0.95,
-    false_alarm: float = 0.01,
 ) -> Judgement:
     """Return verdicts and figures of all rows to judge.
 
-    `thresholds`: the detectors' own, by default those of their scorers; `onset_s` [s]: true onset in leaky records,
-    `hours`: operating time of a record; without them no errors of onsets or alarms per hour are given.
-    `false_alarm`: the probability at which the bound's best test is taken. Raises InputError where there is no row to
-    judge.
+    A detector's verdict is the one it stated, or its score's against a threshold: `own` ones by name, those of scorers
+    that have one, else the one from the leak-free rows of the row's duty (`thresholds_of`). `onset_s` [s]: true onset
+    in leaky records, `hours`: operating time of a record; without them no errors of onsets or alarms per hour are
+    given. `false_alarm` is also the probability at which the bound's best test is taken. Raises InputError where there
+    is no row to judge.
     """
-    own = {name: own_threshold(name) for name in detectors} if thresholds is None else thresholds
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:
         raise InputError("a campaign needs at least one record to judge, got none")
-    verdicts = {(name, row.id): verdict_on(row, name, calibration, own[name]) for name in detectors for row in judged}
+    thresholds = {} if own is not None else thresholds_of(rows, detectors, false_alarm, promise, confidence)
+    fixed = own or {
+        name: rule.threshold
+        for name in detectors
+        if (rule := plan_detector(name).scorer) is not None and rule.threshold is not None
+    }
+    verdicts = {
+        (name, row.id): _verdict(row, name, fixed.get(name), thresholds) for name in detectors for row in judged
+    }
     plain = [row for row in judged if not row.fault]
     records = [
         JudgedRecord(name, row.id, row.leak_lpm, verdicts[name, row.id], hours) for name in detectors for row in plain
     ]
+    group = _Groups(detectors, verdicts, confidence, false_alarm)
     return Judgement(
-        calibration=calibration,
-        calibrated_on=sum(row.use == "calibrate" and row.error is None for row in rows),
+        thresholds=thresholds,
+        leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,
         judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
         table=tuple(summary(records, confidence)) if plain else (),
@@ -248,15 +231,120 @@ def judge(
         causes=tuple(_causes(judged, detectors, confidence)),
         pods=tuple(_pods(plain, detectors, verdicts, confidence)),
         rocs=tuple(_rocs(plain, detectors, confidence)),
-        cells=tuple(_cells(plain, detectors, verdicts, confidence)),
-        faults=tuple(_faults(judged, detectors, verdicts, confidence)),
+        cells=tuple(group.by_cell(plain)),
+        faults=tuple(group.by_fault(judged)),
+        families=tuple(group.by_family(plain)),
         realised=_realised(plain),
-        families=tuple(family_findings(plain, detectors, verdicts, false_alarm=false_alarm, confidence=confidence)),
     )
 
 
-def _leak_sizes(rows: Sequence[CaseRow]) -> list[float]:
+def _verdict(row: CaseRow, detector: str, own: float | None, thresholds: Thresholds) -> str:
+    if row.error is not None:
+        return CANNOT_TELL
+    if detector in row.statements:
+        return row.statements[detector].verdict
+    value, limit = row.scores[detector][0], own
+    if limit is None and (set_by := thresholds.get((detector, duty_of(row.levels)))) is not None:
+        limit = set_by.value
+    if value is None or limit is None:
+        return CANNOT_TELL
+    return "leak" if value > limit else "no leak"
+
+
+def _statement(row: CaseRow, detector: str) -> Evidence | None:
+    """Return what a detector stated on a row; None where it states nothing, or the record failed."""
+    return row.statements.get(detector) if row.error is None else None
+
+
+def _stating(rows: Sequence[CaseRow], detectors: Sequence[str]) -> list[str]:
+    """Return the detectors that state evidence."""
+    return [name for name in detectors if any(name in row.statements for row in rows)]
+
+
+def _flow(row: CaseRow) -> float:
+    return row.leak_lpm if row.flow_lpm is None else row.flow_lpm
+
+
+def _sizes(rows: Sequence[CaseRow]) -> list[float]:
     return sorted({row.leak_lpm for row in rows if row.leak_lpm > 0})
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Alarms of the detectors on groups of rows."""
+
+    detectors: Sequence[str]
+    verdicts: Verdicts
+    confidence: float
+    false_alarm: float
+
+    def by_cell(self, rows: Sequence[CaseRow]) -> Iterator[AlarmShares]:
+        """Yield the alarms at each size in each cell of the factors."""
+        groups: dict[tuple[float, tuple[tuple[str, str | float], ...]], list[CaseRow]] = {}
+        for row in rows:
+            groups.setdefault((row.leak_lpm, tuple(row.levels.items())), []).append(row)
+        for name in self.detectors:
+            for size, levels in sorted(groups, key=lambda key: (key[0], repr(key[1]))):
+                yield self._shares(name, groups[size, levels], leak_lpm=size, levels=dict(levels))
+
+    def by_fault(self, rows: Sequence[CaseRow]) -> Iterator[AlarmShares]:
+        """Yield the alarms on records with each fault that is no piston leak."""
+        faults = sorted({row.fault for row in rows if row.fault and row.leak_lpm == 0})
+        for name in (*self.detectors, ALWAYS, NEVER) if faults else ():
+            for fault in faults:
+                here = [row for row in rows if row.fault == fault and row.leak_lpm == 0]
+                yield self._shares(name, here, fault=fault)
+
+    def by_family(self, rows: Sequence[CaseRow]) -> Iterator[AlarmShares]:
+        """Yield the alarms by family, size and law; all families together first, none where there are no families."""
+        names = sorted({str(row.levels[FAMILY]) for row in rows if FAMILY in row.levels})
+        for name in self.detectors if names else ():
+            for family in (ALL, *names):
+                own = [row for row in rows if family in (ALL, row.levels.get(FAMILY))]
+                for size, law, here in _kinds(own):
+                    yield self._shares(name, here, family=family, leak_lpm=size, law=law)
+
+    def _shares(self, detector: str, rows: Sequence[CaseRow], **common: Any) -> AlarmShares:
+        given = [{ALWAYS: "leak", NEVER: "no leak"}.get(detector) or self.verdicts[detector, row.id] for row in rows]
+        stated = [_statement(row, detector) for row in rows]
+        held = [
+            ev.leak_interval_lpm[0] <= _flow(row) <= ev.leak_interval_lpm[1]
+            for row, ev in zip(rows, stated, strict=True)
+            if ev is not None and ev.leak_interval_lpm is not None
+        ]
+        named = [
+            ev is not None and verdict == "leak" and covers(named_cause(ev), cause_of(row.fault))
+            for row, ev, verdict in zip(rows, stated, given, strict=True)
+        ]
+        bounded = sum(row.bound_lpm is not None for row in rows) if common.get("leak_lpm") else 0
+        found = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if self._allowed(row)]
+        return AlarmShares(
+            detector=detector,
+            alarms=proportion(given.count("leak"), len(rows), self.confidence),
+            cannot_tell=proportion(given.count(CANNOT_TELL), len(rows), self.confidence),
+            coverage=proportion(sum(held), len(held), self.confidence),
+            named=proportion(sum(named), len(named), self.confidence) if any(stated) else None,
+            reachable=proportion(len(found), bounded, self.confidence) if bounded else None,
+            allowed=proportion(sum(found), len(found), self.confidence) if bounded else None,
+            failed=sum(row.error is not None for row in rows),
+            **common,
+        )
+
+    def _allowed(self, row: CaseRow) -> bool:
+        """Whether the best test at this false-alarm probability finds the leak of a row nine times in ten."""
+        bound = row.bound_lpm
+        return bound is not None and smallest_found(bound, self.false_alarm, ALLOWED_DETECTION) <= _flow(row)
+
+
+def _kinds(rows: Sequence[CaseRow]) -> Iterator[tuple[float, str, list[CaseRow]]]:
+    """Yield size, law and rows: each size with its laws apart, and together where there are several."""
+    for size in sorted({row.leak_lpm for row in rows}):
+        here = [row for row in rows if row.leak_lpm == size]
+        laws = sorted({row.law for row in here}) if size else []
+        if len(laws) != 1:
+            yield size, ANY_LAW, here
+        for law in laws:
+            yield size, law, [row for row in here if row.law == law]
 
 
 def _any_size(records: Sequence[JudgedRecord], confidence: float) -> list[SummaryRow]:
@@ -267,11 +355,10 @@ def _any_size(records: Sequence[JudgedRecord], confidence: float) -> list[Summar
 
 def _pods(
     rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, confidence: float
-) -> list[DetectorPod]:
+) -> Iterator[DetectorPod]:
     leaky = [row for row in rows if row.leak_lpm > 0]
-    pods = []
+    sizes = [row.leak_lpm for row in leaky]
     for name in detectors if leaky else ():
-        sizes = [row.leak_lpm for row in leaky]
         hits = [verdicts[name, row.id] == "leak" for row in leaky]
         detections = by_size(sizes, hits, confidence)
         curve, why = None, ""
@@ -279,81 +366,32 @@ def _pods(
             curve = fit_hit_miss(sizes, hits)
         except InputError as error:
             why = str(error)
-        pods.append(DetectorPod(name, tuple(detections), curve, why, proven_size(detections)))
-    return pods
+        yield DetectorPod(name, tuple(detections), curve, why, proven_size(detections))
 
 
-def _rocs(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[SizeRoc]:
-    """Return curves over the scores, with no threshold; a record that cannot be judged counts as the lowest score."""
-    rocs = []
-    sizes = _leak_sizes(rows)
+def _rocs(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> Iterator[SizeRoc]:
+    """Yield curves over the scores, with no threshold; a record that cannot be judged counts as the lowest score."""
+    sizes = _sizes(rows)
     for name in detectors:
-        known = [value for row in rows if row.error is None and (value := row.scores[name][0]) is not None]
-        if not known:
+        value = {row.id: row.scores[name][0] if row.error is None else None for row in rows}
+        lowest = min((score for score in value.values() if score is not None), default=None)
+        if lowest is None:
             continue
-        lowest = min(known) - 1.0
-
-        def scores(size: float, name: str = name, lowest: float = lowest) -> list[float]:
-            chosen = [row for row in rows if (row.leak_lpm > 0 if math.isnan(size) else row.leak_lpm == size)]
-            values = [row.scores[name][0] if row.error is None else None for row in chosen]
-            return [lowest if value is None else value for value in values]
-
-        free = scores(0.0)
-        for size in (math.nan, *sizes) if len(free) > 1 and sizes else ():
-            leaky = scores(size)
+        by_leak: dict[float, list[float]] = {}
+        for row in rows:
+            score = value[row.id]
+            by_leak.setdefault(row.leak_lpm, []).append(lowest - 1.0 if score is None else score)
+        free = by_leak.pop(0.0, [])
+        by_leak[math.nan] = [score for scores in by_leak.values() for score in scores]
+        for size in (math.nan, *sizes) if len(free) > 1 else ():
+            leaky = by_leak[size]
             if len(leaky) > 1:
-                rocs.append(SizeRoc(name, size, roc_curve(free, leaky, confidence), auc(free, leaky, confidence)))
-    return rocs
-
-
-def _cells(
-    rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, confidence: float
-) -> list[CellAlarms]:
-    groups: dict[tuple[float, tuple[tuple[str, str | float], ...]], list[CaseRow]] = {}
-    for row in rows:
-        groups.setdefault((row.leak_lpm, tuple(row.levels.items())), []).append(row)
-    cells = []
-    for name in detectors:
-        for size, levels in sorted(groups, key=lambda key: (key[0], repr(key[1]))):
-            here = groups[size, levels]
-            count = sum(verdicts[name, row.id] == "leak" for row in here)
-            cells.append(CellAlarms(name, size, dict(levels), proportion(count, len(here), confidence)))
-    return cells
-
-
-def _faults(
-    rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, confidence: float
-) -> list[FaultAlarms]:
-    faults = []
-    by_fault: dict[str, list[CaseRow]] = {}
-    for row in sorted(rows, key=lambda row: row.fault):
-        if row.fault and row.leak_lpm == 0:
-            by_fault.setdefault(row.fault, []).append(row)
-    for name in (*detectors, ALWAYS, NEVER) if by_fault else ():
-        for fault, here in by_fault.items():
-            given = [{ALWAYS: "leak", NEVER: "no leak"}.get(name) or verdicts[name, row.id] for row in here]
-            alarms, unsure = (proportion(given.count(word), len(here), confidence) for word in ("leak", CANNOT_TELL))
-            faults.append(FaultAlarms(name, fault, alarms, unsure, _naming(name, here, given, confidence)))
-    return faults
-
-
-def _naming(name: str, rows: Sequence[CaseRow], verdicts: Sequence[str], confidence: float) -> Proportion | None:
-    """Return how many alarms on records of a fault name its cause; None where the detector states no cause."""
-    if name in (ALWAYS, NEVER):
-        return None
-    statements = [_statement(row, name) for row in rows]
-    if not any(statements):
-        return None
-    named = [
-        stated is not None and verdict == "leak" and covers(named_cause(stated), cause_of(row.fault))
-        for row, stated, verdict in zip(rows, statements, verdicts, strict=True)
-    ]
-    return proportion(sum(named), len(named), confidence)
+                yield SizeRoc(name, size, roc_curve(free, leaky, confidence), auc(free, leaky, confidence))
 
 
 def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
     realised = {}
-    for size in _leak_sizes(rows):
+    for size in _sizes(rows):
         flows = [row.flow_lpm for row in rows if row.leak_lpm == size and row.flow_lpm is not None]
         if flows:
             spread = float(np.std(flows, ddof=1)) if len(flows) > 1 else math.nan
@@ -361,88 +399,56 @@ def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
     return realised
 
 
-def _statement(row: CaseRow, detector: str) -> Evidence | None:
-    """Return what a detector stated on a row; None where it states nothing, or the record failed."""
-    return row.statements.get(plan_detector(detector).key) if row.statements and row.error is None else None
-
-
-def _ends(pairs: Sequence[tuple[float, float] | None]) -> tuple[list[float], list[float]]:
+def _ends(pairs: Iterable[tuple[float, float] | None]) -> tuple[list[float], list[float]]:
     ends = [(math.nan, math.nan) if pair is None else pair for pair in pairs]
     return [low for low, _ in ends], [high for _, high in ends]
 
 
 def _onsets(
     rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, onset_s: float | None, confidence: float
-) -> list[OnsetAccuracy]:
-    """Return, for detectors that search for the onset, its error over the alarms, by size."""
-    onsets = []
+) -> Iterator[OnsetAccuracy]:
+    """Yield, for detectors that search for the onset, its error over the alarms, by size."""
     for name in detectors if onset_s is not None else ():
-        for size in _leak_sizes(rows):
+        for size in _sizes(rows):
             alarmed = [row for row in rows if row.leak_lpm == size and verdicts[name, row.id] == "leak"]
             timed = [(at, row) for row in alarmed if (at := row.scores[name][1]) is not None]
             if not timed or onset_s is None:
                 continue
-            statements = [_statement(row, name) for _, row in timed]
-            low, high = _ends([None if stated is None else stated.onset_interval_s for stated in statements])
+            stated = [_statement(row, name) for _, row in timed]
+            low, high = _ends(None if ev is None else ev.onset_interval_s for ev in stated)
             errors = onset_errors([at for at, _ in timed], [onset_s] * len(timed), low, high, confidence)
-            onsets.append(OnsetAccuracy(name, size, errors))
-    return onsets
+            yield OnsetAccuracy(name, size, errors)
 
 
-def _flows(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[FlowAccuracy]:
-    """Return, for detectors that state a flow, its errors against the flow that the record really had, by size."""
-    flows = []
+def _flows(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> Iterator[FlowAccuracy]:
+    """Yield, for detectors that state a flow, its errors against the flow that the record really had, by size."""
     for name in _stating(rows, detectors):
         for size in sorted({row.leak_lpm for row in rows}):
             own = [(row, ev) for row in rows if row.leak_lpm == size and (ev := _statement(row, name)) is not None]
-            truth = [row.leak_lpm if row.flow_lpm is None else row.flow_lpm for row, _ in own]
+            truth = [_flow(row) for row, _ in own]
             given = [math.nan if ev.leak_lpm is None else ev.leak_lpm for _, ev in own]
             if not np.isfinite(given).any():
                 continue
-            low, high = _ends([ev.leak_interval_lpm for _, ev in own])
+            low, high = _ends(ev.leak_interval_lpm for _, ev in own)
             error = np.array(given) - np.array(truth)
             error = error[np.isfinite(error)]
-            flows.append(
-                FlowAccuracy(
-                    name,
-                    size,
-                    estimate_error(given, truth, low, high, confidence),
-                    quantile_of(error, 0.5, confidence),
-                    quantile_of(np.abs(error), 0.5, confidence),
-                )
-            )
-    return flows
+            errors = estimate_error(given, truth, low, high, confidence)
+            medians = quantile_of(error, 0.5, confidence), quantile_of(np.abs(error), 0.5, confidence)
+            yield FlowAccuracy(name, size, errors, *medians)
 
 
-def _causes(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> list[NamedCauses]:
-    """Return, for detectors judged by their own verdict, the causes they name, where there are faults.
+def _causes(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> Iterator[NamedCauses]:
+    """Yield the causes that detectors name, where there are faults.
 
     A record with a leak and another fault is left out; one that failed is `cannot tell`.
     """
     single = [row for row in rows if not (row.leak_lpm > 0 and row.fault)]
-    if not any(row.fault for row in single):
-        return []
     order = sorted({cause_of(row.fault) for row in single if row.fault})
     truth = [PISTON_LEAK if row.leak_lpm > 0 else cause_of(row.fault) if row.fault else NO_CAUSE for row in single]
     causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + order
-    tables = []
-    for name in _stating(rows, detectors):
-        if not plan_detector(name).own:
-            continue
+    for name in _stating(rows, detectors) if order else ():
         statements = [_statement(row, name) for row in single]
-        named = [CANNOT_TELL if stated is None else named_cause(stated) for stated in statements]
+        named = [CANNOT_TELL if ev is None else named_cause(ev) for ev in statements]
         others = sorted(set(named) - set(causes) - {CANNOT_TELL})
         covered = proportion(sum(map(covers, named, truth)), len(truth), confidence)
-        tables.append(NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], confidence), covered))
-    return tables
-
-
-def _stating(rows: Sequence[CaseRow], detectors: Sequence[str]) -> list[str]:
-    """Return the detectors that state evidence, each once: by a calibrated threshold it states the same."""
-    keys = {key for row in rows for key in row.statements}
-    by_key: dict[str, str] = {}
-    for name in detectors if keys else ():
-        detector = plan_detector(name)
-        if detector.key in keys and (detector.own or detector.key not in by_key):
-            by_key[detector.key] = name
-    return list(by_key.values())
+        yield NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], confidence), covered)

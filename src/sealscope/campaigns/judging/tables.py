@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.families import ALLOWED_DETECTION
-from sealscope.campaigns.judging.judge import Judgement
+from sealscope.campaigns.judging.judge import ALLOWED_DETECTION, Judgement
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.evaluation.binomial import Proportion
 from sealscope.storage.atomic import atomic_write
@@ -116,18 +115,14 @@ def _families(judgement: Judgement, unit: str, known: Mapping[str, PriorKnowledg
 
 def _thresholds(judgement: Judgement) -> ResultTable:
     columns = (
-        "detector", "command rms [V]", "cycle [s]", "leak-free records", "threshold", "asked probability",
-        "expected probability", "low", "high",
+        "detector", "duty", "leak-free records", "threshold", "asked probability", "expected probability", "low",
+        "high",
     )  # fmt: skip
-    rows: list[tuple[Value, ...]] = []
-    calibration = judgement.calibration
-    for name in calibration.detectors if calibration is not None else ():
-        for group in calibration.groups if calibration is not None else ():
-            values: tuple[Value, ...] = (None,) * 5
-            if (limit := group.thresholds.get(name)) is not None:
-                values = (limit.value, limit.false_alarm_probability, limit.expected, limit.low, limit.high)
-            rows.append((name, group.point.command_rms, group.point.cycle, group.records, *values))
-    return ResultTable("thresholds", columns, tuple(rows))
+    rows = tuple(
+        (name, duty, at.n, at.value, at.false_alarm_probability, at.expected, at.low, at.high)
+        for (name, duty), at in judgement.thresholds.items()
+    )
+    return ResultTable("thresholds", columns, rows)
 
 
 def _pods(judgement: Judgement, unit: str) -> ResultTable:

@@ -255,12 +255,12 @@ def _records(given: Any, onset: float, bound: bool, place: str) -> tuple[RecordG
 
 
 def _enough_records(plan: SimulatedPlan) -> None:
-    """Refuse a plan without records to judge, or with too few to calibrate."""
+    """Refuse a plan without records to judge, or with too few for the scorers' thresholds."""
     from sealscope.evaluation.thresholds import records_needed
 
     if not any(group.use == "judge" for group in plan.records):
         raise InputError(f"a plan must have records to judge, got none ({plan.place})")
-    if not any(plan_detector(name).needs_calibration for name in plan.detectors):
+    if not any(plan_detector(name).needs_threshold for name in plan.detectors):
         return
     count = sum(group.count for group in plan.records if group.use == "calibrate")
     needed = records_needed(plan.false_alarm, plan.confidence if plan.promise == "bound" else None)
@@ -345,8 +345,8 @@ def _classifier(table: PlanTable) -> Classifier:
     name = table.text("name")
     if "choose" not in table.left:
         features, ridge = table.texts("features"), table.number("ridge", 1.0)
-        if ridge < 0:
-            raise table.fail(f"ridge must be >= 0, got {ridge:g}")
+        if not ridge > 0:
+            raise table.fail(f"ridge must be > 0, got {ridge:g}")
         table.end()
         return LogisticClassifier(name, features, ridge)
     given, rule = table.take("choose"), "choose must be a list of lists of names"

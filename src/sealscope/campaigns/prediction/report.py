@@ -1,82 +1,61 @@
-"""The prediction report: smallest leaks by detector, the bound, commands compared; as plain values and as text."""
+"""The prediction report: the smallest leak that is found, by what, and with which command; as values and as text."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from typing import Any
 
-from sealscope.campaigns.prediction.detection import CONFIDENCE, DetectorPrediction
-from sealscope.campaigns.prediction.judges import RECORDS, JudgePrediction
+import numpy as np
 
-#: Size [L/min] whose probability of detection the text shows: the thesis's smallest leak; one of `CURVE_SIZES`.
-SHOWN = 0.0042
-#: Longest line of text [1].
-_WIDEST = 160
+from sealscope.campaigns.prediction.rules import STATED, RulePrediction
+
+
+@dataclass(frozen=True)
+class FindableLeak:
+    """The smallest step of the leak [L/min] that a judging detector finds, given `channels`.
+
+    `smallest`: None where it finds none, for the `reason`.
+    """
+
+    detector: str
+    channels: tuple[str, ...]
+    smallest: float | None
+    reason: str = ""
 
 
 @dataclass(frozen=True)
 class BoundFigures:
-    """The Cramer-Rao bound as mean leaks [L/min] at the rig's own pressure difference.
+    """The leak [L/min] that the best test of all finds from pressures and command, by the Cramer-Rao bound.
 
-    `half_s`: length of one half [s]; `known`, `unknown`: standard deviation of the leak of one half, all else known or
-    `unknown_parameters` unknown in each; `change_*`: of its change between the halves; `smallest_*`: the change that
-    the best one-sided test finds at the target's probabilities.
+    All else known, or `unknown_parameters` unknown before the leak and after it.
     """
 
-    half_s: float
-    known_lpm: float
-    unknown_lpm: float
-    change_known_lpm: float
-    change_unknown_lpm: float
     smallest_known_lpm: float
     smallest_unknown_lpm: float
     unknown_parameters: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class CommandRow:
-    """One line of the comparison: a command and a closing of the throttles; `note` says why where there is no figure.
-
-    `detectors`: name -> smallest leak [L/min], None where none is found; `smallest_known` [L/min]: the bound's.
-    """
+class DutyRow:
+    """One line of the comparison: a command and a closing of the throttles; `note`: why there are no figures."""
 
     command: str
     orifices: str
-    detectors: Mapping[str, float | None]
-    smallest_known: float | None
+    leaks: tuple[FindableLeak, ...]
     note: str = ""
-
-    @property
-    def best(self) -> str | None:
-        """The detector that finds the smallest leak, None where none finds any."""
-        sizes = {name: size for name, size in self.detectors.items() if size is not None}
-        return min(sizes, key=lambda name: sizes[name]) if sizes else None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the row as plain values."""
-        best = self.best
-        return {
-            "command": self.command,
-            "orifices": self.orifices,
-            "best_detector": best,
-            "smallest_leak_lpm": None if best is None else self.detectors[best],
-            "detectors_lpm": dict(self.detectors),
-            "bound_smallest_known_lpm": self.smallest_known,
-            "note": self.note,
-        }
 
 
 @dataclass(frozen=True)
 class PredictionReport:
     """The prediction for one rig, command, length and false-alarm probability.
 
-    `pressure_difference` [Pa]: mean |p_A - p_B| that drives a leak; `noise`: channel -> standard deviation of a sample
-    [Pa]; `origin`: where the scatter comes from, as text; `records`: leak-free records behind it; `largest` [L/min]:
-    the largest leak tried, `largest_compared` [L/min] that of the comparison. The `detectors` compare the two halves
-    of a record, so they are given the onset: the leak opens in its middle. The `judges` make the verdict of `diagnose`;
-    they look for the onset and are given the rig.
+    `pressure_difference` [Pa]: mean |p_A - p_B| that drives a leak; `origin`: where the scatter comes from, as text;
+    `records`: leak-free records that the detectors were asked about; `largest` [L/min]: largest leak that the thesis's
+    rules were tried on. The detectors of `leaks` make the verdict of `diagnose`: they look for the onset, and know the
+    rig. The `rules` of the thesis compare the two halves of a record: they are given the onset, its middle.
     """
 
     rig: str
@@ -89,19 +68,24 @@ class PredictionReport:
     false_alarm: float
     detection: float
     pressure_difference: float
-    noise: Mapping[str, float]
     origin: str
     records: int
     largest: float
-    detectors: tuple[DetectorPrediction, ...]
+    leaks: tuple[FindableLeak, ...]
+    rules: tuple[RulePrediction, ...]
     bound: BoundFigures
-    commands: tuple[CommandRow, ...]
-    largest_compared: float
-    judges: tuple[JudgePrediction, ...] = ()
+    duties: tuple[DutyRow, ...]
+
+    @property
+    def best(self) -> FindableLeak | None:
+        """What finds the smallest leak; None where nothing finds any."""
+        return min((own for own in self.leaks if own.smallest is not None), key=_size_of, default=None)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain JSON values; sizes in L/min, None where no leak up to the largest is found."""
+        """Return the report as plain JSON values; sizes in L/min, None where no leak is found."""
+        best = self.best
         return {
+            "smallest_leak_lpm": None if best is None else best.smallest,
             "rig": self.rig,
             "overrides": dict(self.overrides),
             "command": self.command,
@@ -113,125 +97,75 @@ class PredictionReport:
             "false_alarm_probability": self.false_alarm,
             "detection_probability": self.detection,
             "pressure_difference_pa": self.pressure_difference,
-            "noise_pa": dict(self.noise),
             "scatter_from": self.origin,
             "records": self.records,
-            "largest_leak_lpm": self.largest,
-            "interval_confidence": CONFIDENCE,
-            "given_to_detectors": {"onset": True, "channels": list(self.noise), "rig": False},
-            "detectors": [_detector(detector) for detector in self.detectors],
-            "judges": [
+            "detectors": [_plain(own) for own in self.leaks],
+            "largest_leak_of_rules_lpm": self.largest,
+            "rules": [
                 {
-                    "name": judge.detector,
-                    "smallest_leak_lpm": judge.smallest,
-                    "reason": judge.reason,
-                    "given": {"onset": False, "channels": list(judge.channels), "rig": True},
-                    "records": RECORDS,
+                    "name": own.rule,
+                    "smallest_leak_lpm": own.smallest,
+                    "scatter": own.scatter,
+                    "detection_probability_at": {"leak_lpm": STATED, "probability": own.found},
+                    "given": {"onset": True, "rig": False},
                 }
-                for judge in self.judges
+                for own in self.rules
             ],
             "bound": {**asdict(self.bound), "unknown_parameters": list(self.bound.unknown_parameters)},
-            "largest_leak_compared_lpm": self.largest_compared,
-            "commands": [row.as_dict() for row in self.commands],
-        }
+            "commands": [
+                {"command": row.command, "orifices": row.orifices, "detectors": list(map(_plain, row.leaks)),
+                 "note": row.note}
+                for row in self.duties
+            ],
+        }  # fmt: skip
 
     def text(self) -> str:
-        """Return the report as lines of text for a terminal."""
-        bound = self.bound
-        unknown = ", ".join(name.rpartition(".")[2] for name in bound.unknown_parameters)
+        """Return the report as lines of text for a terminal, the answer first."""
+        best = self.best
+        answer = "no leak" if best is None else f"{_size(best.smallest)} L/min"
         lines = [
-            f"{self.rig}: {self.command}, throttles {self.orifices}, {self.duration_s:g} s at {self.sample_rate_hz:g} "
-            f"Hz, leak from {self.duration_s / 2:g} s",
-            f"{100 * self.false_alarm:g} % false alarms, {100 * self.detection:g} % found; {self.origin} "
-            f"({self.records} leak-free records)",
-            f"noise {', '.join(f'{name} {value / 1e3:.3g} kPa' for name, value in self.noise.items())}; the leak is "
-            f"driven by {self.pressure_difference / 1e6:.3g} MPa",
-            "",
-            f"{'detector':<20}{'smallest leak [L/min]':>22}{f'{100 * CONFIDENCE:g} % interval':>20}"
-            f"{'scatter':>10}{f'found at {SHOWN:g}':>18}",
-            *(self._line(detector) for detector in self.detectors),
-            f"(true onset given: every detector compares the {self.duration_s / 2:g} s before the leak with those "
-            f"after; given {', '.join(self.noise)} and no rig)",
-            *self._judges(),
-            "",
-            f"Cramer-Rao bound [L/min], halves of {bound.half_s:g} s  {'all known':>12}{'unknown':>12}",
-            f"  standard deviation, one half{bound.known_lpm:>20.2g}{bound.unknown_lpm:>12.2g}",
-            f"  of the change between halves{bound.change_known_lpm:>20.2g}{bound.change_unknown_lpm:>12.2g}",
-            f"  smallest found by any test  {bound.smallest_known_lpm:>20.2g}{bound.smallest_unknown_lpm:>12.2g}",
-            f"  (pressures and command; unknown in each half: {unknown})",
+            f"{answer} is found in {100 * self.detection:g} % of records, at {100 * self.false_alarm:g} % false alarms",
+            *(
+                f"  {own.detector:<18}{_size(own.smallest):>8} L/min  from {', '.join(own.channels)}"
+                if own.smallest is not None
+                else f"  {own.detector:<18}{'-':>8}        {own.reason}"
+                for own in self.leaks
+            ),
+            f"  bound             {_size(self.bound.smallest_known_lpm):>8} L/min  from u, p_A, p_B (known machine); "
+            f"{_size(self.bound.smallest_unknown_lpm)} unknown",
+            f"{self.rig}: {self.command}, throttles {self.orifices}, {self.duration_s:g} s, "
+            f"{self.pressure_difference / 1e6:.3g} MPa; {self.records} records, {self.origin}",
         ]
-        if self.commands:
-            title = "commands compared under instrument noise alone, smallest leak [L/min]"
-            lines += ["", f"{title} (-: none up to {self.largest_compared:.2g})"]
-            lines += _comparison(self.commands)
-            lines += ["", self.advice()]
+        if self.rules:
+            lines.append(f"rules of the thesis, given the onset [L/min] ({STATED:g} L/min found):")
+            for change, own in groupby(self.rules, lambda rule: rule.rule.partition(" of ")[2]):
+                lines.append(f"  {change:<12} " + ", ".join(map(self._rule, own)))
+        if self.duties:
+            names = [own.detector for own in self.leaks]
+            lines.append(f"{'other duties [L/min]':<30}" + "".join(f"{name:>19}" for name in names))
+            for row in self.duties:
+                sizes = "".join(f"{_size(own.smallest):>19}" for own in row.leaks)
+                lines.append(f"  {f'{row.command}, throttles {row.orifices}':<28}{sizes or f'  {row.note}'}")
         return "\n".join(lines)
 
-    def _judges(self) -> list[str]:
-        if not self.judges:
-            return []
-        lines = ["", f"{'judging detector':<20}{'smallest leak [L/min]':>22}  sees"]
-        for judge in self.judges:
-            size = "cannot tell" if judge.smallest is None else f"{judge.smallest:.2g}"
-            sees = f"{', '.join(judge.channels)}{': ' if judge.reason else ''}{judge.reason}"
-            lines.append(f"{judge.detector:<20}{size:>22}  {sees}"[:_WIDEST])
-        return [
-            *lines,
-            f"(these make the verdict of diagnose; onset not given, rig given; found in all of {RECORDS} records, "
-            "instrument noise alone)",
-        ]
-
-    def _line(self, detector: DetectorPrediction) -> str:
-        if detector.smallest is None:
-            known = math.isfinite(detector.largest_detection)
-            size = f"> {self.largest:.2g}" if known else "cannot tell"
-            reach = f"at most {100 * detector.largest_detection:.0f} %" if known else ""
-        else:
-            size = f"{detector.smallest:.2g}"
-            ends = (detector.low, detector.high)
-            reach = " .. ".join(f"{end:.2g}" if end is not None else f"> {self.largest:.2g}" for end in ends)
-        again = f"  lost again above {detector.lost_above:.2g}" if detector.lost_above is not None else ""
-        probability = dict(detector.curve).get(SHOWN)
-        shown = "-" if probability is None else f"{100 * probability:.0f} %"
-        scatter = f"{100 * detector.scatter:.2g} %" if math.isfinite(detector.scatter) else "-"
-        return f"{detector.detector:<20}{size:>22}{reach:>20}{scatter:>10}{shown:>18}{again}"
-
-    def advice(self) -> str:
-        """Return which of the compared commands finds the smallest leak."""
-        smallest = [(row.detectors[row.best], row) for row in self.commands if row.best is not None]
-        if not smallest:
-            return f"no command makes these detectors find a leak up to {self.largest_compared:.2g} L/min"
-        size, row = min(smallest, key=lambda pair: pair[0] or math.inf)
-        return f"smallest of all: {size:.2g} L/min with {row.command}, throttles {row.orifices}, by {row.best}"
+    def _rule(self, own: RulePrediction) -> str:
+        size = _size(own.smallest) if own.smallest is not None else f"> {_size(self.largest)}"
+        found = "cannot tell" if own.found is None else f"{size} ({100 * own.found:.0f} %)"
+        return f"{own.rule.partition(' of ')[0]} {found}"
 
 
-def _detector(detector: DetectorPrediction) -> dict[str, Any]:
-    known = math.isfinite(detector.scatter)
+def _plain(own: FindableLeak) -> dict[str, Any]:
     return {
-        "name": detector.detector,
-        "smallest_leak_lpm": detector.smallest,
-        "interval_lpm": [detector.low, detector.high],
-        "lost_above_lpm": detector.lost_above,
-        "scatter": detector.scatter if known else None,
-        "threshold": detector.threshold if known else None,
-        "largest_detection_probability": detector.largest_detection if known else None,
-        "detection_probability_at": [{"leak_lpm": size, "probability": value} for size, value in detector.curve],
+        "name": own.detector,
+        "smallest_leak_lpm": own.smallest,
+        "reason": own.reason,
+        "given": {"onset": False, "channels": list(own.channels), "rig": True},
     }
 
 
-def _comparison(rows: tuple[CommandRow, ...]) -> list[str]:
-    first = "d3 of p_A fell"
-    lines = [f"{'command':<14}{'throttles':<12}{first:>16}{'best':>10}  {'by':<20}{'bound, all known':>16}"]
-    for row in rows:
-        if row.note:
-            lines.append(f"{row.command:<14}{row.orifices:<12}{row.note}")
-            continue
-        best = row.best
-        named, smallest = (_size(row.detectors.get(name)) if name else "-" for name in (first, best))
-        bound = _size(row.smallest_known)
-        lines.append(f"{row.command:<14}{row.orifices:<12}{named:>16}{smallest:>10}  {best or '-':<20}{bound:>16}")
-    return lines
+def _size_of(own: FindableLeak) -> float:
+    return math.inf if own.smallest is None else own.smallest
 
 
 def _size(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2g}"
+    return "-" if value is None else np.format_float_positional(value, 2, fractional=False, trim="-")

@@ -16,7 +16,6 @@ from sealscope.campaigns.judging.tables import PriorKnowledge
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, SimulatedPlan
 from sealscope.campaigns.results import CampaignResult
-from sealscope.diagnosis.calibration.scorers import SCORERS
 from sealscope.diagnosis.registry import detectors
 from sealscope.evaluation.roc import Area
 from sealscope.evaluation.table import SummaryRow
@@ -189,18 +188,18 @@ def _notes(result: CampaignResult) -> list[str]:
     if isinstance(plan, HeldOutPlan):
         notes.append(f"Each {plan.leave_out} was held out whole in turn; an alarm is a probability over 50 %.")
     else:
-        if judgement.calibration is not None:
+        if judgement.thresholds:
             records, others = "recordings", "others"
             if isinstance(plan, SimulatedPlan):
                 records, others = "records", "others, each with seeds of its own"
             notes.append(
-                f"Thresholds for {100 * plan.false_alarm:g} % false alarms from {judgement.calibrated_on} leak-free "
+                f"Thresholds for {100 * plan.false_alarm:g} % false alarms from {judgement.leak_free} leak-free "
                 f"{records}; judged on {judgement.judged} {others}."
             )
-        own = [name for name in plan.detectors if plan_detector(name).own]
+        own = [name for name in plan.detectors if plan_detector(name).scorer is None]
         if own:
             notes.append(
-                f"By thresholds of their own, set for {100 * plan.false_alarm:g} % false alarms: {', '.join(own)}. "
+                f"By their own verdict at {100 * plan.false_alarm:g} % false alarms: {', '.join(own)}. "
                 "What they state of flow, onset and cause is in estimates.csv, onsets.csv and causes.csv."
             )
     notes += _known_notes(result)
@@ -303,7 +302,7 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
         *([("simulated", result.mode)] if _batched(result) else []),
         *((f"seen by @ {name}" if name else "seen", ", ".join(channels)) for name, channels in plan.views.items()),
     ]
-    if any(plan_detector(name).detector for name in plan.detectors):
+    if any(plan_detector(name).scorer is None for name in plan.detectors):
         facts.append(("assumed by detectors", _assumed(plan)))
     for size, (mean, spread) in judgement.realised.items():
         about = "" if math.isnan(spread) else f" ± {spread:.2g}"
@@ -356,14 +355,13 @@ def _about(name: str) -> str:
     """Return what a detector's score is, "" for one that is known here by its name alone."""
     detector = plan_detector(name)
     through = f", given the channels of {detector.view} alone" if detector.view else ""
-    if detector.of in SCORERS and not detector.detector:
-        return SCORERS[detector.of].about + through
+    if detector.scorer is not None:
+        return detector.scorer.about + through
     if detector.of == DIAGNOSE:
         return f"score over threshold of the detector that judged{through}"
     if detector.of not in detectors():
         return ""
-    how = "by its own threshold" if detector.own else "against a threshold from leak-free records"
-    return f"the score of the detector {detector.of!r} {how}{through}"
+    return f"the score of the detector {detector.of!r}{through}"
 
 
 def _pod_plot(pod: DetectorPod, unit: str) -> CurvePlot | None:

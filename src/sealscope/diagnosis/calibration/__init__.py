@@ -1,1 +1,0 @@
-"""Thresholds for a stated false-alarm probability from leak-free recordings."""
