@@ -143,7 +143,7 @@ def test_what_says_nothing_is_left_at_zero() -> None:
 def leak_of(values: np.ndarray) -> float:
     """One coefficient of the leak, from the weighted sums of blocks that are closed one after the other."""
     weighting = Weighting((columns(),))
-    total = sum(weighting.close([[block]])[0].sum(axis=0)[0] for block in values)
+    total = sum(weighting.close([block], np.array([len(block)]))[0, 0] for block in values)
     chosen = [STROKE, OIL, ZERO, TESTED]
     return float(solve(total[np.ix_(chosen, chosen)], total[chosen, LEFT])[-1])
 

@@ -77,14 +77,13 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     stride = phi.shape[1]
     pieces = len(increments[0]) // stride
     count = max(0, pieces - SPAN + 1)
-    cut = np.stack([own[: pieces * stride] for own in increments]).reshape(len(increments) * pieces, stride)
-    parts = (cut @ phi.T).reshape(len(increments), pieces, SPAN)
-    missing = np.asarray(~(np.abs(parts) < LARGEST).all(axis=(0, 2)))
+    parts = np.stack([own[: pieces * stride].reshape(pieces, stride) @ phi.T for own in increments], axis=2)
+    missing = np.asarray(~(np.abs(parts) < LARGEST).all(axis=(1, 2)))
     if missing.any():
-        parts[:, missing] = 0.0
-    values, touched = np.zeros((len(increments), count)), np.zeros(count, dtype=bool)
+        parts[missing] = 0.0
+    values, touched = np.zeros((count, len(increments))), np.zeros(count, dtype=bool)
     for piece in range(SPAN):
-        values += parts[:, piece : piece + count, piece]
+        values += parts[piece : piece + count, piece]
         touched |= missing[piece : piece + count]
     time = start + (np.arange(count) + 0.5 * SPAN) * stride / rate
-    return Rows(time, values.T, ~touched)
+    return Rows(time, values, ~touched)
