@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.row_weights import SUPPORT, weighted
 from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation, Prior, priors
-from sealscope.diagnosis.inference.weak_form import SPAN, test_function
+from sealscope.diagnosis.inference.weak_form import OVERLAP
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import array_of, part_of, plain_array
@@ -239,17 +239,6 @@ def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces:
     return Information(blocks.time, precision, vector, columns[0].level(test, blocks))
 
 
-def overlap(rate: float = 1000.0) -> float:
-    """Return the long-run variance of white noise in the rows over their variance: overlapping rows repeat each other.
-
-    The sum of the test function's correlations with its neighbours.
-    """
-    phi = test_function(rate).ravel()
-    stride = len(phi) // SPAN
-    energy = float(phi @ phi)
-    return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
-
-
 def _drifts(blocks: Blocks) -> tuple[Array, float]:
     """Return the drifts' shapes over the blocks, shape (K, DRIFT_DEGREE + 1), and the recording's length in minutes."""
     minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
@@ -319,9 +308,9 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
     for _ in range(_MOST):
         belief, mean = np.zeros((2, len(believed.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
-            belief[:, 1:] = (overlap() * variance / believed.drift**2)[:, None]
+            belief[:, 1:] = (OVERLAP * variance / believed.drift**2)[:, None]
         if believed.zero > 0.0:
-            belief[-1, 0], mean[-1, 0] = overlap() * variance / believed.zero**2, -believed.at
+            belief[-1, 0], mean[-1, 0] = OVERLAP * variance / believed.zero**2, -believed.at
         # a coefficient that is zero drifts by nothing
         precision = np.minimum(belief.ravel(), 1e9 * np.diag(normal.cross))
         lead = precision * mean.ravel()
@@ -329,7 +318,7 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
         before, variance = variance, max(square - float(left @ coefficients), least) / rows
         if abs(variance - before) <= _TOLERANCE * before:
             break
-    return _Fitted(coefficients, precision, lead, max(overlap() * variance, np.finfo(float).tiny))
+    return _Fitted(coefficients, precision, lead, max(OVERLAP * variance, np.finfo(float).tiny))
 
 
 class _Fit(NamedTuple):

@@ -210,4 +210,3 @@ def weighted(values: Array, ends: Array, fast: Array, own: Array, known: Array, 
     gram = np.empty((len(ends), values.shape[1], values.shape[1]))
     weigh(values, ends, fast, own, known, share, room, gram)
     return gram
-

@@ -56,6 +56,17 @@ def test_function(rate: float) -> Array:
     return np.asarray(phi * (rate / phi.sum())).reshape(SPAN, stride)
 
 
+def _overlap() -> float:
+    phi = test_function(1e4).ravel()
+    stride, energy = len(phi) // SPAN, float(phi @ phi)
+    return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
+
+
+#: Long-run variance of white noise in the rows over their variance, for overlapping rows repeat each other: the sum of
+#: the test function's correlations with its neighbours.
+OVERLAP = _overlap()
+
+
 def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     """Return the rows of increments over sampling intervals.
 
