@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, information, overlap, solve
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, information, solve
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term, priors
-from sealscope.diagnosis.inference.weak_form import rows
+from sealscope.diagnosis.inference.weak_form import OVERLAP, rows
 
 FIELDS = tuple(Blocks.__dataclass_fields__)
 STROKE, OIL, ZERO, TESTED, OTHER, LEFT = range(6)
@@ -71,13 +71,13 @@ def oracle(values: np.ndarray, seconds: float = 3.0) -> tuple[np.ndarray, np.nda
     for _ in range(100):
         believed = np.zeros((6, drifting.shape[1] + count))
         for row, (k, power) in enumerate((k, power) for k in range(3) for power in (1, 2)):
-            believed[row, 3 * k + power] = np.sqrt(overlap() * variance) / width[k]
+            believed[row, 3 * k + power] = np.sqrt(OVERLAP * variance) / width[k]
         design = np.vstack([np.hstack([drifting, free]), believed])
         target = np.concatenate([flat[:, LEFT], np.zeros(6)])
         coefficients = np.linalg.lstsq(design, target, rcond=None)[0]
         weight = (target - design @ coefficients) @ target
         variance = weight / len(flat)
-    covariance = np.linalg.inv(design.T @ design) * overlap() * variance
+    covariance = np.linalg.inv(design.T @ design) * OVERLAP * variance
     return coefficients[-count:], covariance[-count:, -count:]
 
 
@@ -143,7 +143,7 @@ def test_what_says_nothing_is_left_at_zero() -> None:
 def leak_of(values: np.ndarray) -> float:
     """One coefficient of the leak, from the weighted sums of blocks that are closed one after the other."""
     weighting = Weighting((columns(),))
-    total = sum(weighting.close([[block]])[0].sum(axis=0)[0] for block in values)
+    total = sum(weighting.close([block], np.array([len(block)]))[0, 0] for block in values)
     chosen = [STROKE, OIL, ZERO, TESTED]
     return float(solve(total[np.ix_(chosen, chosen)], total[chosen, LEFT])[-1])
 
@@ -186,4 +186,4 @@ def test_overlap_is_the_ratio_of_variances_of_means() -> None:
     made = rows([random.standard_normal(round(4000.0 * rate)) / rate], rate).values[:, 0]
     each = 200
     means = made[: len(made) // each * each].reshape(-1, each).mean(axis=1)
-    assert np.var(means) * each / np.var(made) == pytest.approx(overlap(), rel=0.3)
+    assert np.var(means) * each / np.var(made) == pytest.approx(OVERLAP, rel=0.3)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.blocks import PRESSURE_PARTS, SMOOTHED, SUPPORT, Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.blocks import PRESSURE_PARTS, SMOOTHED, Blocks, Columns, Weighting
 from sealscope.diagnosis.inference.onset import FEWEST
+from sealscope.diagnosis.inference.row_weights import SUPPORT
 from sealscope.diagnosis.inference.terms import (
     ATMOSPHERE,
     HALF_DIFFERENCE,
@@ -29,6 +32,8 @@ if TYPE_CHECKING:
 
 #: Longest and shortest block, and how many a recording has where it is long enough for these [s].
 LONGEST, SHORTEST, WANTED = 3.0, 0.5, 20
+#: Samples whose increments are computed at once: they stay in the processor's cache.
+AT_ONCE = 8192
 
 
 class BlockStream:
@@ -147,77 +152,95 @@ class BlockStream:
         self._pushed += len(speed)
         return {**samples, "omega": speed, START: np.exp(-drive.pace * index / self._rate)}
 
-    def _oriented(self, signals: Signals) -> tuple[float, ...]:
+    def _oriented(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Return the sign of each left side: friction takes work, so that p_A - p_B goes with the flow into A.
 
         An encoder, or the sides, may be connected the other way round.
         """
-        pressure = signals.pressure_difference
         signs = []
-        for balance in self._balances:
-            left = balance.left(signals)
-            known = ~np.isnan(pressure + left)
-            work = float(np.sum((pressure[known] - pressure[known].mean()) * left[known])) if known.any() else 0.0
+        for balance, columns, own in zip(self._balances, self.columns, rows, strict=True):
+            pressure, left = own[:, columns.leak], own[:, columns.left]
+            work = float((pressure - pressure.mean()) @ left) if len(own) else 0.0
             signs.append(-1.0 if work * balance.takes < 0.0 else 1.0)
         return tuple(signs)
 
     def _close(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
-        """Return blocks `first` to `end`."""
+        """Return blocks `first` to `end`, whose rows are weighted together."""
+        length = self._strides * self._stride
+        if self._zeros is None:
+            early = slice(0, (self._support or end) * length)
+            self._zeros = {name: _zero(samples[name][early]) for name in ("p_A", "p_B") if name in samples}
+        each = max(1, AT_ONCE // length)
+        cuts = [self._cut(samples, k, min(k + each, end)) for k in range(first, end, each)]
+        whole = np.concatenate([cut.whole for cut in cuts])
+        values = [np.concatenate(of)[whole] for of in zip(*(cut.rows for cut in cuts), strict=True)]
+        self._signs = self._signs or self._oriented(values)
+        for own, columns, sign in zip(values, self.columns, self._signs, strict=True):
+            own[:, columns.left] *= sign
+        weights = whole.reshape(-1, self._strides).sum(axis=1)
+        gram = self._weighting.close(values, np.cumsum(weights))
+        start = self._begin + (np.arange(first, end) * self._strides + 0.5 * SPAN) * self._stride / self._rate
+        last = start + (self._strides - 1) * self._stride / self._rate
+        means, pressures = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("means", "pressures"))
+        zeros = np.zeros(end - first)
+        return Blocks(start, last, gram, weights.astype(float), means, pressures, zeros)
+
+    def _cut(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
+        """Return the rows of blocks `first` to `end`."""
         length = self._strides * self._stride
         start = first * length
         begin = max(self._first, start - self._margin)
         stop = end * length + (SPAN - 1) * self._stride + 1
         reach = stop + self._margin - self._first
         cut = {name: values[begin - self._first : reach] for name, values in samples.items()}
-        if self._zeros is None:
-            early = slice(0, (self._support or end) * length)
-            self._zeros = {name: _zero(cut[name][early]) for name in ("p_A", "p_B") if name in cut}
-            self._signs = self._oriented(Signals({name: cut[name][early] for name in cut}, self._rate, self._zeros))
-        begins = self._begin + start / self._rate
-        signals = Signals(cut, self._rate, self._zeros)
+        signals = Signals(cut, self._rate, self._zeros or {})
         inner = slice(start - begin, stop - 1 - begin)
         whole = np.ones((end - first) * self._strides, dtype=bool)
         cut_rows = []
-        for balance, sign in zip(self._balances, self._signs, strict=True):
-            columns = [*(term.increments(signals) for term in balance.terms), sign * balance.left(signals)]
-            cut_rows.append(rows([column[inner] for column in columns], self._rate, begins))
-            whole &= cut_rows[-1].whole
-        cuts = np.arange(self._strides, len(whole), self._strides)
-        kept = np.split(whole, cuts)
-        values = [
-            [block[keep] for block, keep in zip(np.split(own.values, cuts), kept, strict=True)] for own in cut_rows
-        ]
-        gram, weights = self._weighting.close(values)
-        times = cut_rows[0].time.reshape(end - first, self._strides)
-        means, pressures = self._means(signals, inner, end - first), self._pressures(signals, inner, end - first)
-        return Blocks(times[:, 0], times[:, -1], gram, weights, means, pressures, np.zeros(end - first))
+        for balance in self._balances:
+            columns = [*(term.increments(signals) for term in balance.terms), balance.left(signals)]
+            made = rows([column[inner] for column in columns], self._rate)
+            whole &= made.whole
+            cut_rows.append(made.values)
+        pressure = signals.pressure_difference[inner][: (end - first) * length].reshape(-1, length)
+        rate = self._balances[0].left(signals)[inner][: (end - first) * length].reshape(-1, length) * self._rate
+        return _Cut(tuple(cut_rows), whole, _means(pressure, rate), self._pressures(pressure))
 
-    def _means(self, signals: Signals, inner: slice, count: int) -> Array:
-        """Return the means of abs(p_A - p_B), of its root and of the left side's rate over each block."""
-        size = np.abs(signals.pressure_difference)
-        rate = np.abs(self._balances[0].left(signals)) * self._rate
-        length = self._strides * self._stride
-        cut = [of[inner][: count * length].reshape(count, length) for of in (size, np.sqrt(size), rate)]
-        missing = np.isnan(cut[0]) | np.isnan(cut[2])
-        number = np.maximum((~missing).sum(axis=1), 1)
-        return np.column_stack([np.where(missing, 0.0, of).sum(axis=1) / number for of in cut])
-
-    def _pressures(self, signals: Signals, inner: slice, count: int) -> Array:
-        """Return the distribution of the smoothed p_A - p_B over each block (K, PRESSURE_PARTS)."""
+    def _pressures(self, pressure: Array) -> Array:
+        """Return the distribution of the smoothed p_A - p_B (K, n) over each block (K, PRESSURE_PARTS)."""
         piece = max(1, round(SMOOTHED * self._rate))
-        length = self._strides * self._stride
-        cut = signals.pressure_difference[inner][: count * length].reshape(count, length)
-        smooth = cut[:, : length // piece * piece].reshape(count, -1, piece).mean(axis=2)
-        return np.array([_parts(row[~np.isnan(row)]) for row in smooth])
+        count, length = pressure.shape
+        smooth = pressure[:, : length // piece * piece].reshape(count, -1, piece).mean(axis=2)
+        smooth.sort(axis=1)  # what is missing goes last
+        there = smooth.shape[1] - np.isnan(smooth).sum(axis=1)
+        return np.array([own[:size] @ _parts(int(size)) for own, size in zip(smooth, there, strict=True)])
 
 
-def _parts(values: Array) -> Array:
-    """Return the means of PRESSURE_PARTS equal parts of the sorted values, 0 without any."""
-    if len(values) and len(values) % PRESSURE_PARTS == 0:
-        return np.asarray(np.sort(values).reshape(PRESSURE_PARTS, -1).mean(axis=1))
-    ends = np.linspace(0.0, len(values), PRESSURE_PARTS + 1)
-    sums = np.interp(ends, np.arange(len(values) + 1), np.concatenate([[0.0], np.cumsum(np.sort(values))]))
-    return np.asarray(np.diff(sums) / max(ends[1], 1e-9))
+class _Cut(NamedTuple):
+    """Rows (r, m) of each equation, whether each is `whole` (r,), and `Blocks.means` and `Blocks.pressures`."""
+
+    rows: tuple[Array, ...]
+    whole: NDArray[np.bool_]
+    means: Array
+    pressures: Array
+
+
+def _means(pressure: Array, rate: Array) -> Array:
+    """Return the means of abs(p_A - p_B), of its root and of the left side's rate, (K, n) each, over each block."""
+    size = np.abs(pressure)
+    missing = np.isnan(pressure) | np.isnan(rate)
+    number = np.maximum((~missing).sum(axis=1), 1)
+    means = [np.where(missing, 0.0, of).sum(axis=1) / number for of in (size, np.sqrt(size), np.abs(rate))]
+    return np.column_stack(means)
+
+
+@lru_cache(maxsize=64)
+def _parts(count: int) -> Array:
+    """Return the shares by which sorted values make the means of PRESSURE_PARTS equal parts of them, as a matrix."""
+    ends = np.linspace(0.0, count, PRESSURE_PARTS + 1)
+    index = np.arange(count)[:, None]
+    within = np.minimum(index + 1, ends[1:]) - np.maximum(index, ends[:-1])
+    return np.asarray(np.maximum(within, 0.0) * PRESSURE_PARTS / max(count, 1))
 
 
 def _zero(pressure: Array) -> float:

@@ -2,7 +2,7 @@
 
 A block keeps, of the rows within it, the Gram matrix of all columns (terms and left side). Blocks add: the sum of their
 matrices is that of their union, so that a stream and a whole recording are handled alike, and a recording of hours
-costs no more than one of minutes. Rows are weighted once, when their block is closed (`Weighting`).
+costs no more than one of minutes. Rows are weighted once, when their block is closed (`row_weights`).
 
 For one coefficient g, a number for each block, everything else is eliminated (`information`). The other coefficients
 are a level with a slow drift, c_j(t) = sum_p c_jp P_p(t), whose size is believed within a width (`terms.toml`):
@@ -11,8 +11,6 @@ are a level with a slow drift, c_j(t) = sum_p c_jp P_p(t), whose size is believe
 
 with the sums N_k of d^2 and n_k of d y, B_k of d o, M of o o' (plus the beliefs) and m of o y over the rows of block
 k (d the column of g, o the others with their drifts, y the left side); its likelihood is exp(eta' g - g' Lambda g/2).
-
-Source: P. J. Huber, Ann. Math. Statist. 35 (1964) 73 (weights).
 """
 
 from __future__ import annotations
@@ -23,17 +21,15 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sealscope.diagnosis.inference.row_weights import SUPPORT, weighted
 from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation, Prior, priors
-from sealscope.diagnosis.inference.weak_form import SPAN, test_function
+from sealscope.diagnosis.inference.weak_form import OVERLAP
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import array_of, part_of, plain_array
 
-#: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
-HUBER = 1.345
-#: Blocks whose rows are weighted together at the beginning, and that stand for what is known later.
-SUPPORT = 5
 #: Most blocks that are handled at once; neighbours are added up beyond.
 MOST_BLOCKS = 240
 #: Degree of the drifts.
@@ -145,6 +141,7 @@ class Columns:
         self.between = np.array([differs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in ("leak", "pump", "bias"))
+        self.fast = tuple(k for k in self.nuisance if k not in self.support)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.driven = tuple(term.driven for term in equation.terms)
         self.healthy = priors()["healthy"][equation.healthy].value if equation.healthy else float("inf")
@@ -173,7 +170,7 @@ class Weighting:
 
     def __init__(self, columns: Sequence[Columns]) -> None:
         self._columns = columns
-        self._known: list[Array | None] = [None] * len(columns)
+        self._known = [np.zeros((len(of.support) + 1, len(of.support) + 1)) for of in columns]
         self._count = 0
 
     @property
@@ -183,75 +180,29 @@ class Weighting:
 
     def state(self) -> dict[str, Any]:
         """Return what is known as plain values that JSON holds."""
-        return {"count": self._count, "known": [None if of is None else plain_array(of) for of in self._known]}
+        return {"count": self._count, "known": [plain_array(of) for of in self._known]}
 
     def recall(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state`; raises InputError where it does not fit."""
         self._count = int(part_of(state, "count", int))
-        self._known = [None if of is None else array_of(of, "known") for of in part_of(state, "known", list)]
-        if len(self._known) != len(self._columns):
-            raise InputError(f"saved state's known must be {len(self._columns)} matrices, got {len(self._known)}")
+        known = [array_of(of, "known") for of in part_of(state, "known", list)]
+        shapes = [of.shape for of in self._known]
+        if [of.shape for of in known] != shapes:
+            raise InputError(f"saved state's known must be of the shapes {shapes}, got {[of.shape for of in known]}")
+        self._known = known
 
-    def close(self, values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
-        """Return the Gram matrices (K, E, m, m) and the sums of weights (K,) of K blocks that are weighted together.
+    def close(self, values: Sequence[Array], ends: NDArray[np.intp]) -> Array:
+        """Return the Gram matrices (K, E, m, m) of K blocks that are weighted together.
 
-        `values`: of each equation, the rows (r, m) of each block.
+        `values`: of each equation, the rows (r, m) of all of them; `ends`: index past the last row of each block.
         """
-        grams = []
-        rows = np.array([len(block) for block in values[0]], dtype=float)
-        self._count += len(rows)
+        self._count += len(ends)
         share = min(1.0, SUPPORT / self._count)
-        for e, columns in enumerate(self._columns):
-            before = self._known[e]
-            weights = _weights(values[e], columns, before)
-            pairs = zip(values[e], np.split(weights, np.cumsum(rows[:-1]).astype(int)), strict=True)
-            grams.append(np.array([(block * w[:, None]).T @ block for block, w in pairs]))
-            # what stands for the blocks before is worth SUPPORT blocks, however many these were
-            known = _supported(grams[-1].sum(axis=0), columns) * (SUPPORT / len(rows))
-            self._known[e] = known if before is None else (1.0 - share) * before + share * known
-        return np.stack(grams, axis=1), rows
-
-
-def _supported(gram: Array, columns: Columns) -> Array:
-    """Return what a Gram matrix says of the columns that change slowly, whatever leak and zero of the flow are."""
-    slow = np.array([*columns.support, columns.left])
-    fast = np.array([k for k in columns.nuisance if k not in columns.support], dtype=int)
-    inner, cross = gram[fast[:, None], fast], gram[slow[:, None], fast]
-    reduced = np.zeros_like(gram)
-    reduced[slow[:, None], slow] = gram[slow[:, None], slow] - cross @ solve(inner, cross.T)
-    return reduced
-
-
-def _weights(blocks: Sequence[Array], columns: Columns, known: Array | None) -> Array:
-    """Return Huber's weight of each row, from a fit to the rows and what is known.
-
-    Leak and zero of the flow are free in each block: their change is no outlier.
-    """
-    values = np.concatenate(blocks)
-    ends = np.cumsum([len(block) for block in blocks])
-    places = [slice(end - len(block), end) for block, end in zip(blocks, ends, strict=True) if len(block)]
-    weights, slow = np.ones(len(values)), list(columns.support)
-    fast = values[:, [k for k in columns.nuisance if k not in columns.support]]
-    own = values[:, [*slow, columns.left]]
-    reduced = np.empty_like(own)
-    prior = 0.0 if known is None else known[np.ix_(slow, slow)]
-    lead = 0.0 if known is None else known[slow, columns.left]
-    for _ in range(_MOST if len(values) else 0):
-        before = weights
-        for at in places:
-            weighted = (fast[at] * weights[at, None]).T
-            reduced[at] = own[at] - fast[at] @ solve(weighted @ fast[at], weighted @ own[at])
-        x, y = reduced[:, :-1], reduced[:, -1]
-        along = (x * weights[:, None]).T
-        residual = np.abs(y - x @ solve(along @ x + prior, along @ y + lead))
-        ordered = np.sort(residual)
-        scale = 1.4826 * 0.5 * float(ordered[(len(y) - 1) // 2] + ordered[len(y) // 2])  # the median
-        if not scale > 0.0:
-            return np.ones(len(values))
-        weights = np.minimum(1.0, HUBER * scale / np.maximum(residual, np.finfo(float).tiny))
-        if np.abs(weights / before - 1.0).mean() < _TOLERANCE:
-            break
-    return weights
+        grams = []
+        for own, columns, known in zip(values, self._columns, self._known, strict=True):
+            fast, slow = columns.fast, (*columns.support, columns.left)
+            grams.append(weighted(own, ends, np.array(fast), np.array(slow), known, share))
+        return np.stack(grams, axis=1)
 
 
 def solve(matrix: Array, right: Array) -> Array:
@@ -289,17 +240,6 @@ def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces:
         precision += part
         vector += lead
     return Information(blocks.time, precision, vector, columns[0].level(test, blocks))
-
-
-def overlap(rate: float = 1000.0) -> float:
-    """Return the long-run variance of white noise in the rows over their variance: overlapping rows repeat each other.
-
-    The sum of the test function's correlations with its neighbours.
-    """
-    phi = test_function(rate).ravel()
-    stride = len(phi) // SPAN
-    energy = float(phi @ phi)
-    return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
 
 
 def _drifts(blocks: Blocks) -> tuple[Array, float]:
@@ -371,9 +311,9 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
     for _ in range(_MOST):
         belief, mean = np.zeros((2, len(believed.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
-            belief[:, 1:] = (overlap() * variance / believed.drift**2)[:, None]
+            belief[:, 1:] = (OVERLAP * variance / believed.drift**2)[:, None]
         if believed.zero > 0.0:
-            belief[-1, 0], mean[-1, 0] = overlap() * variance / believed.zero**2, -believed.at
+            belief[-1, 0], mean[-1, 0] = OVERLAP * variance / believed.zero**2, -believed.at
         # a coefficient that is zero drifts by nothing
         precision = np.minimum(belief.ravel(), 1e9 * np.diag(normal.cross))
         lead = precision * mean.ravel()
@@ -381,7 +321,7 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
         before, variance = variance, max(square - float(left @ coefficients), least) / rows
         if abs(variance - before) <= _TOLERANCE * before:
             break
-    return _Fitted(coefficients, precision, lead, max(overlap() * variance, np.finfo(float).tiny))
+    return _Fitted(coefficients, precision, lead, max(OVERLAP * variance, np.finfo(float).tiny))
 
 
 class _Fit(NamedTuple):

@@ -116,7 +116,8 @@ class Signals:
     def outward(self) -> Array:
         """1 where the piston moves towards B or rests, else 0, at each sample, by a central difference."""
         half = max(1, round(HALF_DIFFERENCE * self.rate))
-        padded = np.pad(self._channels["x"], half, mode="edge")
+        x = self._channels["x"]
+        padded = np.concatenate([np.full(half, x[0]), x, np.full(half, x[-1])])
         return (padded[2 * half :] >= padded[: -2 * half]).astype(float)
 
     @cached_property
@@ -127,13 +128,8 @@ class Signals:
     def moved(self, outward: bool, by_A: bool) -> Array:
         """Return the increments of x of one direction while one side carries the pressure [m]."""
         out_A, out, by = self._ways
-        shares = {
-            (True, True): out_A,
-            (True, False): out - out_A,
-            (False, True): by - out_A,
-            (False, False): 1.0 - out - by + out_A,
-        }
-        return shares[outward, by_A] * self.step("x")
+        share = (out_A if by_A else out - out_A) if outward else (by - out_A if by_A else 1.0 - out - by + out_A)
+        return np.asarray(share * self.step("x"))
 
     @cached_property
     def _ways(self) -> tuple[Array, Array, Array]:

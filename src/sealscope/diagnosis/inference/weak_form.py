@@ -56,6 +56,17 @@ def test_function(rate: float) -> Array:
     return np.asarray(phi * (rate / phi.sum())).reshape(SPAN, stride)
 
 
+def _overlap() -> float:
+    phi = test_function(1e4).ravel()
+    stride, energy = len(phi) // SPAN, float(phi @ phi)
+    return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
+
+
+#: Long-run variance of white noise in the rows over their variance, for overlapping rows repeat each other: the sum of
+#: the test function's correlations with its neighbours.
+OVERLAP = _overlap()
+
+
 def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     """Return the rows of increments over sampling intervals.
 
@@ -77,14 +88,13 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     stride = phi.shape[1]
     pieces = len(increments[0]) // stride
     count = max(0, pieces - SPAN + 1)
-    cut = np.stack([own[: pieces * stride] for own in increments]).reshape(len(increments) * pieces, stride)
-    parts = (cut @ phi.T).reshape(len(increments), pieces, SPAN)
-    missing = np.asarray(~(np.abs(parts) < LARGEST).all(axis=(0, 2)))
+    parts = np.stack([own[: pieces * stride].reshape(pieces, stride) @ phi.T for own in increments], axis=2)
+    missing = np.asarray(~(np.abs(parts) < LARGEST).all(axis=(1, 2)))
     if missing.any():
-        parts[:, missing] = 0.0
-    values, touched = np.zeros((len(increments), count)), np.zeros(count, dtype=bool)
+        parts[missing] = 0.0
+    values, touched = np.zeros((count, len(increments))), np.zeros(count, dtype=bool)
     for piece in range(SPAN):
-        values += parts[:, piece : piece + count, piece]
+        values += parts[piece : piece + count, piece]
         touched |= missing[piece : piece + count]
     time = start + (np.arange(count) + 0.5 * SPAN) * stride / rate
-    return Rows(time, values.T, ~touched)
+    return Rows(time, values, ~touched)

@@ -1,14 +1,8 @@
 """The volume balance of a running machine: what each block says of the leakage conductance.
 
 The sums are those of a recording (`balance.BlockStream`). All coefficients but the leak's are what the last blocks say
-of them: the leak's column is eliminated from the sums M_k of each block, which are added up and forgotten over `MEMORY`
-blocks; with C, m these sums over the other columns and their products with the left side,
-
-    c = C^-1 m,    g_k = (n_k - b_k' c) / N_k,    Var g_k = s^2 / N_k,
-
-N_k, n_k and b_k the products of the leak's column with itself, the left side and the others over the rows of block
-k, s^2 the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step of the leak. What passes
-the pump beside the piston is part of g: piston and pump lie in parallel. Whether g stepped is for `sequential` to say.
+of them (`known`). What passes the pump beside the piston is part of the conductance: piston and pump lie in parallel.
+Whether it stepped is for `sequential` to say.
 """
 
 from __future__ import annotations
@@ -20,8 +14,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sealscope.compiled import kernel
 from sealscope.diagnosis.inference.balance import BlockStream
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, overlap, solve
+from sealscope.diagnosis.inference.blocks import Blocks, Columns
+from sealscope.diagnosis.inference.live.known import (
+    RESTS,
+    TINY,
+    Known,
+    Said,
+    add,
+    begin,
+    known_shapes,
+    motion,
+    says,
+    take,
+)
 from sealscope.diagnosis.inference.terms import Term, equations, priors
 from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.errors import InputError
@@ -34,14 +41,12 @@ if TYPE_CHECKING:
 
 #: About how long a block is [s].
 BLOCK_SECONDS = 3.0
-#: Blocks after which what they said of the other coefficients counts for 1/e, and blocks before anything is said.
-MEMORY, LEARNED = 60.0, 20
-#: A block that leaves more than this many deviations counts for less.
-JUMP = 4.0
-#: A block rests whose motion is below this share of the usual one, unless it tells of the leak more than so much of it.
-_RESTS, _TELLS = 1e-4, 0.1
+#: Blocks before anything is said.
+LEARNED = 20
+#: A block that rests counts all the same where it tells of the leak more than so much of what the usual one does.
+TELLS = 0.1
 #: ... and after so many that move so much more, all before were of a machine at rest.
-_WAKES = 3
+WAKES = 3
 #: Two samples follow each other where their times differ by so many steps.
 _FOLLOWS = (0.5, 1.5)
 
@@ -78,128 +83,63 @@ class NotJudged(NamedTuple):
     apart: bool = False
 
 
-_TINY = float(np.finfo(float).tiny)
-#: What is left after a block of how far the series stands from the level that the coefficients give now.
-_RETURNS = math.exp(-1.0 / 1200.0)
-#: Where the leak's column stands in the sums.
-_LEAK = -2
 #: What a block says, or why nothing.
 Shown = Sequence[BlockConductance] | NotJudged
 
 
-class _Said(NamedTuple):
-    """What a block says of the leak's coefficient, sums over the equations.
-
-    `precision`; that times its estimate, `lead`, and times what is to be taken from it so that the series does not move
-    with the other coefficients, `shift`; `leaning`: the variance that these leave, times the precision squared.
-    """
-
-    precision: float
-    lead: float
-    shift: float
-    leaning: float
+@kernel
+def _learns(known: Known, grams: Any, place: Any, rows: Any) -> None:
+    for k in range(len(grams)):
+        take(known, grams[k], place)
+        add(known, rows[k], 1.0, False)
+    begin(known)
 
 
-_SUMS, _NUMBERS = ("sums", "coefficients", "along"), ("rows", "motion", "noise", "energy", "shift")
+@kernel
+def _says(known: Known, gram: Any, place: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
+    take(known, gram, place)
+    return says(known, rows, adds)  # type: ignore[no-any-return]
+
+
+_SAVED = ("sums", "coefficients", "along", "numbers")
 
 
 class _Known:
-    """What the last blocks say of all coefficients of one equation: sums over its columns, the leak's next to last."""
+    """What the last blocks say of all coefficients of one equation (`known`)."""
 
     def __init__(self, columns: Columns) -> None:
-        self.others = [k for k in columns.nuisance if k != columns.leak]
-        self._place = np.ix_(*2 * ([*self.others, columns.leak, columns.left],))
-        self.relearn()
+        others = [k for k in columns.nuisance if k != columns.leak]
+        self._place = np.array([*others, columns.leak, columns.left])
+        self._sums = Known(*(np.zeros(shape) for shape in known_shapes(len(others))))
 
     def relearn(self) -> None:
         """Forget all."""
-        count = len(self.others)
-        self.sums = np.zeros((count + 2, count + 2))
-        self.coefficients, self.along = np.zeros(count), np.zeros(count)
-        self.rows = self.motion = self.noise = self.energy = self.shift = 0.0
+        for name in _SAVED:
+            getattr(self._sums, name)[:] = 0.0
 
-    def add(self, gram: Array, rows: float, weight: float = 1.0, stepped: bool = False) -> None:
-        """Add what a block says; forget a part of what those before said.
+    def learn(self, grams: Array, rows: Array) -> None:
+        """Take what the first blocks (K, m, m) say together."""
+        _learns(self._sums, np.ascontiguousarray(grams), self._place, rows)
 
-        The leak walks between blocks by as much as a block tells of it, or any distance where it `stepped`.
-        """
-        own, keep = gram[self._place], math.exp(-1.0 / MEMORY)
-        along = self.sums[_LEAK]
-        walked = float(along[_LEAK]) + (0.0 if stepped else max(float(own[_LEAK, _LEAK]), _TINY))
-        if walked > 0.0:
-            self.sums = self.sums - np.outer(along, along) / walked
-        self.sums = keep * self.sums + weight * own
-        self.along, self.energy = keep * self.along + own[:_LEAK, _LEAK], keep * self.energy + float(own[_LEAK, _LEAK])
-        self.rows = keep * self.rows + weight * rows
-        self.motion = keep * self.motion + weight * float(own[-1, -1])
-
-    def begin(self) -> None:
-        """Take coefficients and the variance of a row from all that was added."""
-        self.coefficients = self._solved(np.zeros((len(self.others), 0)))[:, 0]
-        left = self._left(self.sums, self.coefficients)
-        self.noise = max(left, 1e-14 * float(self.sums[-1, -1]), _TINY) / self.rows
-
-    def says(self, gram: Array, rows: float, adds: bool = True) -> _Said:
+    def says(self, gram: Array, rows: float, adds: bool) -> Said:
         """Return what a block says, beside what those before it say; with `adds` it is one of these from now on."""
-        own = gram[self._place]
-        along, energy = own[:_LEAK, _LEAK], max(float(own[_LEAK, _LEAK]), _TINY)
-        usual = self.along / max(self.energy, _TINY)
-        apart = along - energy * usual
-        solved = self._solved(np.column_stack([along, apart]))
-        coefficients, weight = solved[:, 0], 1.0
-        g = float(own[_LEAK, -1] - along @ coefficients) / energy
-        self.shift = _RETURNS * self.shift - float(usual @ (coefficients - self.coefficients))
-        self.coefficients = coefficients
-        if adds:
-            left = max(self._left(own, coefficients), 0.0) / rows
-            weight = min(1.0, JUMP**2 * self.noise / max(left, _TINY))
-            before, known = self.sums[_LEAK], max(float(self.sums[_LEAK, _LEAK]), _TINY)
-            moved = g - float(before[-1] - before[:_LEAK] @ coefficients) / known
-            spread = overlap() * self.noise * (2.0 / (energy * weight) + 1.0 / known)
-            self.add(gram, rows, weight, moved**2 > JUMP**2 * spread)
-            self.noise += (1.0 - math.exp(-1.0 / MEMORY)) * (left * weight - self.noise)
-        # beside its rows' noise a block has what it leans on the others otherwise than the usual one
-        variance = overlap() * self.noise * (1.0 / weight + max(float(apart @ solved[:, 2]), 0.0) / energy)
-        precision = energy / variance
-        leaning = max(float(along @ solved[:, 1]), 0.0) * overlap() * self.noise / variance**2
-        return _Said(precision, precision * g, precision * self.shift, leaning)
+        return Said(*_says(self._sums, gram, self._place, rows, adds))
 
-    def _solved(self, right: Array) -> Array:
-        """Return the other coefficients, whatever the leak is, and C^-1 times further right sides."""
-        leak = self.sums[_LEAK]
-        sums = self.sums - np.outer(leak, leak) / max(float(leak[_LEAK]), _TINY)
-        return solve(sums[:_LEAK, :_LEAK], np.column_stack([sums[:_LEAK, -1], right]))
-
-    @staticmethod
-    def _left(sums: Array, coefficients: Array) -> float:
-        """Return the sum of squares that the other coefficients leave, whatever the leak is."""
-        vector = np.concatenate([-coefficients, [0.0, 1.0]])
-        of = sums @ vector
-        return float(vector @ of - of[_LEAK] ** 2 / max(float(sums[_LEAK, _LEAK]), _TINY))
+    def moves(self, gram: Array, rows: float) -> float:
+        """Return the motion of a block over the usual one."""
+        return motion(float(gram[-1, -1]), rows, self._sums.numbers)
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
-        return {name: plain_array(getattr(self, name)) for name in _SUMS} | {
-            name: getattr(self, name) for name in _NUMBERS
-        }
+        return {name: plain_array(getattr(self._sums, name)) for name in _SAVED}
 
     def recall(self, state: Any) -> None:
         """Continue from a `state`; raises InputError where it does not fit."""
-        for name in _SUMS:
-            values = array_of(part_of(state, name, Mapping), name)
-            if values.shape != getattr(self, name).shape:
-                raise InputError(f"saved state's {name} must be {getattr(self, name).shape}, got {values.shape}")
-            setattr(self, name, values)
-        for name in _NUMBERS:
-            setattr(self, name, _number(state, name))
-
-    def wakes(self, gram: Array, rows: float) -> bool:
-        """Return whether a block moves so much more that those before were of a machine at rest."""
-        return _RESTS * float(gram[-1, -1]) * self.rows > self.motion * rows
-
-    def rests(self, gram: Array, rows: float) -> bool:
-        """Return whether a block moves so much less that its machine stands."""
-        return float(gram[-1, -1]) * self.rows < _RESTS * self.motion * rows
+        for name in _SAVED:
+            values, own = array_of(part_of(state, name, Mapping), name), getattr(self._sums, name)
+            if values.shape != own.shape:
+                raise InputError(f"saved state's {name} must be {own.shape}, got {values.shape}")
+            own[:] = values
 
 
 class LiveBalance:
@@ -278,8 +218,8 @@ class LiveBalance:
         if not rows:
             return NotJudged(end, "missing values", "blocks: missing values")
         if self._precision > 0.0:
-            self._woken = self._woken + 1 if self._known[0].wakes(block.gram[0, 0], rows) else 0
-            if self._woken >= _WAKES:
+            self._woken = self._woken + 1 if self._known[0].moves(block.gram[0, 0], rows) > 1.0 / RESTS else 0
+            if self._woken >= WAKES:
                 self.relearn()
                 return NotJudged(end, "learning", "blocks: moves as never before", True)
             shown = self._shown(block)
@@ -291,30 +231,28 @@ class LiveBalance:
             return NotJudged(end, "learning")
         waiting, self._waiting = self._waiting, None
         for e, known in enumerate(self._known):
-            for gram, own in zip(waiting.gram[:, e], waiting.rows, strict=True):
-                known.add(gram, own)
-            known.begin()
+            known.learn(waiting.gram[:, e], waiting.rows)
         self._precision = float(np.median([self._says(part, adds=False).precision for part in _parts(waiting)]))
         parts = [self._shown(part, adds=False) for part in _parts(waiting)]
         return [part for part in parts if not isinstance(part, NotJudged)] or NotJudged(end, "at rest")
 
-    def _says(self, block: Blocks, adds: bool = True) -> _Said:
+    def _says(self, block: Blocks, adds: bool = True) -> Said:
         """Return what a block says by all equations."""
         rows = float(block.rows[0])
         said = [known.says(gram, rows, adds) for known, gram in zip(self._known, block.gram[0], strict=True)]
-        return _Said(*(sum(values) for values in zip(*said, strict=True)))
+        return Said(*(sum(values) for values in zip(*said, strict=True)))
 
     def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
         begin, end = float(block.start[0]) - 0.5 * self._stride, float(block.end[0]) + 0.5 * self._stride
-        at_rest = self._known[0].rests(block.gram[0, 0], float(block.rows[0]))
+        at_rest = self._known[0].moves(block.gram[0, 0], float(block.rows[0])) < RESTS
         precision, lead, shift, leaning = self._says(block, adds)
-        if not precision > (_TELLS * self._precision if at_rest else 0.0):
+        if not precision > (TELLS * self._precision if at_rest else 0.0):
             return NotJudged(end, "at rest", "blocks: at rest")
         total, offset = (
             lead / precision,
             math.hypot(math.sqrt(leaning) / precision, self._size_error * lead / precision),
         )
-        pressure, _, rate = (max(float(value), _TINY) for value in block.means[0])
+        pressure, _, rate = (max(float(value), TINY) for value in block.means[0])
         duty = math.log(pressure), math.log(rate)
         g, sd = total - shift / precision, precision**-0.5
         return BlockConductance(begin, end, g, sd, total, offset, pressure / LITRE_PER_MINUTE, duty)

@@ -1,0 +1,190 @@
+"""What the last blocks say of all coefficients of an equation: sums that are added up and forgotten, compiled.
+
+Columns are in the order others, leak, left side. With C, m the sums over the others, and with the left side, from which
+the leak's column is eliminated,
+
+    c = C^-1 m,    g_k = (n_k - b_k' c) / N_k,    Var g_k = s^2 / N_k,
+
+N_k, n_k, b_k the products of the leak's column with itself, the left side and the others over the rows of block k, s^2
+the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step of the leak. Nothing here
+allocates: a unit for other simulators (`fmu`) runs the same laws in C.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from sealscope.compiled import law
+from sealscope.diagnosis.inference.row_weights import solve_in_place
+from sealscope.diagnosis.inference.weak_form import OVERLAP
+
+#: Blocks after which what they said of the other coefficients counts for 1/e.
+MEMORY = 60.0
+#: A block that leaves more than this many deviations counts for less.
+JUMP = 4.0
+#: A block rests whose motion is below this share of the usual one.
+RESTS = 1e-4
+#: What is left after a block of how far the series stands from the level that the coefficients give now.
+_RETURNS = math.exp(-1.0 / 1200.0)
+_KEEP = math.exp(-1.0 / MEMORY)
+TINY = 2.2250738585072014e-308
+
+#: Places in `Known.numbers`: rows and motion that the sums are of, variance of a row, energy of the leak's column, how
+#: far the series stands from the level, and the variance of the last block's rows over the usual one.
+NUMBERS = ("rows", "motion", "noise", "energy", "shift", "misfit")
+ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(len(NUMBERS))
+
+
+class Known(NamedTuple):
+    """The sums over n other columns, and arrays to work in.
+
+    `sums` (n + 2, n + 2); `coefficients`, `along` (n,), the leak's products with the others; `numbers`; `own` (n + 2,
+    n + 2), those of the block; `matrix` (n, n); `right` (n, 3); `scale` (n,).
+    """
+
+    sums: Any
+    coefficients: Any
+    along: Any
+    numbers: Any
+    own: Any
+    matrix: Any
+    right: Any
+    scale: Any
+
+
+class Said(NamedTuple):
+    """What a block says of the leak's coefficient.
+
+    `precision`; that times its estimate, `lead`, and times what is to be taken from it so that the series does not move
+    with the other coefficients, `shift`; `leaning`: the variance that these leave, times the precision squared.
+    """
+
+    precision: float
+    lead: float
+    shift: float
+    leaning: float
+
+
+def known_shapes(n: int) -> tuple[tuple[int, ...], ...]:
+    """Return the shapes of a `Known`."""
+    return (n + 2, n + 2), (n,), (n,), (len(NUMBERS),), (n + 2, n + 2), (n, n), (n, 3), (n,)
+
+
+@law
+def take(known: Any, gram: Any, place: Any) -> None:
+    """Put a block's sums (m, m) into `known.own`: of the columns `place`, the others, the leak's and the left side."""
+    for i in range(len(place)):
+        for j in range(len(place)):
+            known.own[i, j] = gram[place[i], place[j]]
+
+
+@law
+def add(known: Any, rows: float, weight: float, stepped: bool) -> None:
+    """Add the block `known.own`; forget a part of what those before said.
+
+    The leak walks between blocks by as much as a block tells of it, or any distance where it `stepped`.
+    """
+    sums, own, n, leak = known.sums, known.own, len(known.own), len(known.own) - 2
+    walked = sums[leak, leak] + (0.0 if stepped else max(own[leak, leak], TINY))
+    for i in range(n):  # the leak's row is needed until the last
+        for j in range(n):
+            if i != leak and j != leak:
+                less = sums[i, leak] * sums[leak, j] / walked if walked > 0.0 else 0.0
+                sums[i, j] = _KEEP * (sums[i, j] - less) + weight * own[i, j]
+    rest = 1.0 - sums[leak, leak] / walked if walked > 0.0 else 1.0
+    for i in range(n):
+        if i != leak:
+            sums[leak, i] = sums[i, leak] = _KEEP * rest * sums[i, leak] + weight * own[i, leak]
+    sums[leak, leak] = _KEEP * rest * sums[leak, leak] + weight * own[leak, leak]
+    for i in range(leak):
+        known.along[i] = _KEEP * known.along[i] + own[i, leak]
+    known.numbers[ENERGY] = _KEEP * known.numbers[ENERGY] + own[leak, leak]
+    known.numbers[ROWS] = _KEEP * known.numbers[ROWS] + weight * rows
+    known.numbers[MOTION] = _KEEP * known.numbers[MOTION] + weight * own[n - 1, n - 1]
+
+
+@law
+def _solve(known: Any) -> None:
+    """Put the other coefficients, whatever the leak is, and C^-1 times the other right sides into `known.right`."""
+    sums, n = known.sums, len(known.matrix)
+    leak = max(sums[n, n], TINY)
+    for i in range(n):
+        known.right[i, 0] = sums[i, n + 1] - sums[i, n] * sums[n, n + 1] / leak
+        for j in range(n):
+            known.matrix[i, j] = sums[i, j] - sums[i, n] * sums[n, j] / leak
+    solve_in_place(known.matrix, known.right, known.scale)
+
+
+@law
+def _left(sums: Any, right: Any) -> float:
+    """Return the sum of squares that the coefficients right[:, 0] leave, whatever the leak is."""
+    n, square, along = len(right), 0.0, 0.0
+    for i in range(n + 2):
+        rest = sums[i, n + 1]
+        for j in range(n):
+            rest -= sums[i, j] * right[j, 0]
+        if i < n:
+            square -= right[i, 0] * rest
+        elif i == n:
+            along = rest
+        else:
+            square += rest
+    return float(square - along**2 / max(sums[n, n], TINY))
+
+
+@law
+def begin(known: Any) -> None:
+    """Take coefficients and the variance of a row from all that was added."""
+    n = len(known.matrix)
+    for i in range(n):
+        known.right[i, 1] = known.right[i, 2] = 0.0
+    _solve(known)
+    for i in range(n):
+        known.coefficients[i] = known.right[i, 0]
+    left = _left(known.sums, known.right)
+    known.numbers[NOISE] = max(left, max(1e-14 * known.sums[n + 1, n + 1], TINY)) / known.numbers[ROWS]
+
+
+@law
+def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
+    """Return what the block `known.own` says (`Said`), beside those before it; with `adds` it is one of them then."""
+    own, right, n, numbers = known.own, known.right, len(known.matrix), known.numbers
+    energy, usual = max(own[n, n], TINY), max(numbers[ENERGY], TINY)
+    for i in range(n):
+        right[i, 1] = own[i, n]
+        right[i, 2] = own[i, n] - energy * (known.along[i] / usual)
+    _solve(known)
+    lead, numbers[SHIFT], turned, leaning = own[n, n + 1], _RETURNS * numbers[SHIFT], 0.0, 0.0
+    for i in range(n):
+        lead -= own[i, n] * right[i, 0]
+        numbers[SHIFT] -= known.along[i] / usual * (right[i, 0] - known.coefficients[i])
+        turned += (own[i, n] - energy * (known.along[i] / usual)) * right[i, 2]
+        leaning += own[i, n] * right[i, 1]
+        known.coefficients[i] = right[i, 0]
+    g, weight = lead / energy, 1.0
+    if adds:
+        left = max(_left(own, right), 0.0) / rows
+        numbers[MISFIT] = left / numbers[NOISE]
+        weight = min(1.0, JUMP**2 * numbers[NOISE] / max(left, TINY))
+        before, told = known.sums[n, n + 1], max(known.sums[n, n], TINY)
+        for i in range(n):
+            before -= known.sums[n, i] * right[i, 0]
+        spread = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / told)
+        add(known, rows, weight, (g - before / told) ** 2 > JUMP**2 * spread)
+        numbers[NOISE] += (1.0 - _KEEP) * (left * weight - numbers[NOISE])
+    # beside its rows' noise a block has what it leans on the others otherwise than the usual one
+    variance = OVERLAP * numbers[NOISE] * (1.0 / weight + max(turned, 0.0) / energy)
+    precision = energy / variance
+    leaning = max(leaning, 0.0) * OVERLAP * numbers[NOISE] / variance**2
+    return precision, precision * g, precision * numbers[SHIFT], leaning
+
+
+@law
+def motion(square: float, rows: float, numbers: Any) -> float:
+    """Return a block's motion, by the left side's sum of squares, over the usual one of as many rows.
+
+    Infinite where none was usual.
+    """
+    usual = numbers[MOTION] * rows
+    return square * numbers[ROWS] / usual if usual > 0.0 else (math.inf if square > 0.0 else 1.0)
