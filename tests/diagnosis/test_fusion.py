@@ -21,7 +21,7 @@ NONE = Evidence("no leak", "it does not", 1.0, 3.0)
 UNFIT = Evidence("cannot tell", "the model does not fit")
 DRIFT = Evidence("cannot tell", "a drift and a leak look alike", 9.0, 3.0)
 COURSE = LeakCourse(np.arange(3.0), np.ones(3), np.zeros(3), np.full(3, 2.0))
-BALANCE, CYCLES, MODEL, OBSERVER, RMS = ORDER
+BALANCE, MODEL, OBSERVER, RMS = ORDER
 
 
 def fused(**evidences: Evidence) -> Evidence:

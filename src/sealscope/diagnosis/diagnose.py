@@ -35,7 +35,7 @@ _PROBABILITIES = (1e-4, 0.2)
 #: Least share of a recording that `no leak` rests on.
 WHOLE = 0.95
 #: Detectors that name a cause by the pressures: they do so of nothing that another cause explains, alone either.
-_ISOLATED = ("cycle balance", "pressure model", "observer")
+_ISOLATED = ("pressure model", "observer")
 #: Why the change of RMS alone judges no valve-controlled machine.
 _DAMPED = "behind a servo valve, whose edges damp the ringing as well, that tells no leak from a sound machine"
 #: Why it calls no single rod sound: of 24 leaks of 0.05 L/min and 24 of 0.5 on development machines it saw none.
@@ -275,7 +275,7 @@ def diagnose(
     """Say whether oil bypasses the piston in a recording.
 
     Every detector that the channels allow is run. The most specific of those with a verdict judges (volume balance,
-    cycle balance, pressure model, observer, rms change, then plug-ins); the others are stated beside it.
+    pressure model, observer, rms change, then plug-ins); the others are stated beside it.
 
     Parameters
     ----------

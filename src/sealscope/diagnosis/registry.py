@@ -24,7 +24,6 @@ def _built_in(module: str, name: str) -> Factory:
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
     "volume balance": _built_in("inference.detector", "VolumeBalance"),
-    "cycle balance": _built_in("inference.cycle_balance.detector", "CycleBalance"),
     "pressure model": _built_in("pressure_model.detector", "PressureModel"),
     "observer": _built_in("observer.detector", "Observer"),
     "rms change": _built_in("rms_change.detector", "RmsChange"),

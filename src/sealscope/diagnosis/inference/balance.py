@@ -208,10 +208,10 @@ class BlockStream:
         length = self._strides * self._stride
         cut = signals.pressure_difference[inner][: count * length].reshape(count, length)
         smooth = cut[:, : length // piece * piece].reshape(count, -1, piece).mean(axis=2)
-        return np.array([_parts(row[~np.isnan(row)]) for row in smooth])
+        return np.array([pressure_parts(row[~np.isnan(row)]) for row in smooth])
 
 
-def _parts(values: Array) -> Array:
+def pressure_parts(values: Array) -> Array:
     """Return the means of PRESSURE_PARTS equal parts of the sorted values, 0 without any."""
     if len(values) and len(values) % PRESSURE_PARTS == 0:
         return np.asarray(np.sort(values).reshape(PRESSURE_PARTS, -1).mean(axis=1))
@@ -227,7 +227,7 @@ def _zero(pressure: Array) -> float:
     return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
 
 
-def _without_rails(name: str, values: Array) -> Array:
+def without_rails(name: str, values: Array) -> Array:
     """Return the samples, NaN where a pressure is cut off at an end of its sensor's range."""
     rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
     return np.where(np.isin(values, rails), np.nan, values) if rails else values
@@ -250,7 +250,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
     samples = {name: recording[name] for name in names if name in needed}
     if recording.bridged is not None:
         samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
-    samples = {name: _without_rails(name, values) for name, values in samples.items()}
+    samples = {name: without_rails(name, values) for name, values in samples.items()}
     seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
     stream = BlockStream(balances, recording.rate, seconds, support=None, start=float(recording.t[0]))
     blocks = stream.push(samples, last=True)

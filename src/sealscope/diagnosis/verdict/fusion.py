@@ -12,9 +12,9 @@ from dataclasses import replace
 
 from sealscope.diagnosis.verdict.evidence import LEAK_WORTH_FINDING, LEAKS, LEAST_SPECIFIC, Evidence, Figure
 
-#: The most specific first: what accounts for every litre, or for those of whole cycles, what models the pressures, what
+#: The most specific first: what accounts for every litre, what models the pressures, what
 #: estimates a state, what sees that something changed. A user's own detectors follow in the order of their names.
-ORDER = ("volume balance", "cycle balance", "pressure model", "observer", LEAST_SPECIFIC)
+ORDER = ("volume balance", "pressure model", "observer", LEAST_SPECIFIC)
 #: How many times its threshold a change within a recording must be for the least specific detector to call it a leak
 #: where the machine wanders more than a healthy one may. Of 38 sound loops whose friction sticks (development) the
 #: largest change was 1.42 times it; 5 of 14 leaks of 0.0042 and 0.05 L/min were at 2.4 to 5.
