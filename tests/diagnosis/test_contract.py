@@ -15,8 +15,6 @@ from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import CHANNEL_UNITS, COUNTS, Recording
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
 
 P = 0.01
 VERDICTS = {"leak", "no leak", "cannot tell"}
@@ -96,7 +94,7 @@ EVERY = {**detectors(), "ringing energy": example}
 #: Detectors that only say whether something changed, and not when.
 UNDATED = ("ringing energy",)
 #: Detectors to which the size of a pressure means something.
-PHYSICAL = ("volume balance", "cycle balance", "pressure response")
+PHYSICAL = ("volume balance", "pressure response")
 COURSE = ("t", "lpm", "low", "high")
 
 
@@ -105,32 +103,6 @@ def detector(request: pytest.FixtureRequest):  # type: ignore[no-untyped-def]
     made = EVERY[request.param](load_rig("thesis"))
     assert made.name == request.param
     return made
-
-
-@pytest.fixture(scope="module")
-def loaded() -> dict[str, Recording]:
-    """120 s of a loop closed under a load, with a leak of 0.0042 L/min from second 60, and without."""
-    leaks = {"leaky": "0.0042 L/min from 60 s", "sound": None}
-    duty = {"rig": "thesis-closed-loop", "command": "position 40 mm sin(1.6t)", "load": "1.2 kN", "duration": 120.0}
-    return {case: simulate_with_truth(Experiment.of(**duty, leak=leak)).recording for case, leak in leaks.items()}
-
-
-def _own(case: str, detector, request: pytest.FixtureRequest) -> Recording:  # type: ignore[no-untyped-def]
-    under_load = detector.name == "cycle balance"
-    recording: Recording = request.getfixturevalue("loaded")[case] if under_load else request.getfixturevalue(case)
-    return recording
-
-
-@pytest.fixture
-def its_leaky(detector, request: pytest.FixtureRequest) -> Recording:  # type: ignore[no-untyped-def]
-    """A leaky recording of a duty that the detector judges."""
-    return _own("leaky", detector, request)
-
-
-@pytest.fixture
-def its_sound(detector, request: pytest.FixtureRequest) -> Recording:  # type: ignore[no-untyped-def]
-    """A sound recording of a duty that the detector judges."""
-    return _own("sound", detector, request)
 
 
 def examined(detector, recording: Recording, probability: float = P) -> Evidence:  # type: ignore[no-untyped-def]
@@ -180,20 +152,20 @@ def test_cannot_tell_where_it_must_and_says_why(change: str, leaky: Recording) -
     assert found.onset_s is None
 
 
-def test_unusable_is_one_line(detector, its_leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+def test_unusable_is_one_line(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
     assert isinstance(detector.name, str)
     for change in ("no samples", "30 samples", "no pressure", "constant pressure"):
-        reason = detector.usable(HOPELESS[change][0](its_leaky))
+        reason = detector.usable(HOPELESS[change][0](leaky))
         assert isinstance(reason, str)
         assert reason
         assert "\n" not in reason
 
 
-def test_deterministic(detector, its_leaky: Recording) -> None:  # type: ignore[no-untyped-def]
-    assert alike(first_examined(detector, its_leaky), examined(detector, its_leaky))
+def test_deterministic(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    assert alike(first_examined(detector, leaky), examined(detector, leaky))
 
 
-@pytest.mark.parametrize("case", ["its_leaky", "its_sound"])
+@pytest.mark.parametrize("case", ["leaky", "sound"])
 @pytest.mark.parametrize("factor, offset", [(3.0, 0.0), (1.0, 1.0e5), (1.0 / 6894.757, -50.0)])
 def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
     detector, factor: float, offset: float, case: str, request: pytest.FixtureRequest
@@ -217,21 +189,21 @@ def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
 
 
 def test_never_sees_the_flow_meter_or_where_the_data_come_from_or_what_it_does_not_read(
-    detector, its_leaky: Recording
+    detector, leaky: Recording
 ) -> None:  # type: ignore[no-untyped-def]
-    plain = first_examined(detector, its_leaky)
+    plain = first_examined(detector, leaky)
     reads = getattr(detector, "reads", ("u", "theta", "omega", "x", "p_A", "p_B"))
     assert set(reads) <= set(CHANNEL_UNITS) - {"q_leak"}
-    unread = {name: np.linspace(0.0, 1.0, len(its_leaky)) for name in its_leaky.channels if name not in reads}
+    unread = {name: np.linspace(0.0, 1.0, len(leaky)) for name in leaky.channels if name not in reads}
     assert "q_leak" in unread
-    assert alike(examined(detector, with_channels(its_leaky, **unread)), plain)
-    told = replace(its_leaky, provenance={"experiment": {"leak": "none"}}, history=("no leak",))
+    assert alike(examined(detector, with_channels(leaky, **unread)), plain)
+    told = replace(leaky, provenance={"experiment": {"leak": "none"}}, history=("no leak",))
     assert alike(examined(detector, told), plain)
-    assert alike(examined(detector, its_leaky.only(name for name in its_leaky.channels if name in reads)), plain)
+    assert alike(examined(detector, leaky.only(name for name in leaky.channels if name in reads)), plain)
 
 
-def test_onset_is_on_the_recordings_own_clock(detector, its_leaky: Recording) -> None:  # type: ignore[no-untyped-def]
-    here, later = first_examined(detector, its_leaky), examined(detector, replace(its_leaky, t=its_leaky.t + 1000.0))
+def test_onset_is_on_the_recordings_own_clock(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    here, later = first_examined(detector, leaky), examined(detector, replace(leaky, t=leaky.t + 1000.0))
     assert here.verdict == later.verdict == "leak"
     assert here.score == pytest.approx(later.score, rel=1e-9)
     if detector.name in UNDATED:
@@ -244,24 +216,24 @@ def test_onset_is_on_the_recordings_own_clock(detector, its_leaky: Recording) ->
 
 
 @pytest.mark.parametrize("names", [["x"], ["theta"], ["x", "theta", "omega"], ["p_1", "p_2"]])
-def test_holes_in_other_channels_are_no_fault(detector, names: list[str], its_leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+def test_holes_in_other_channels_are_no_fault(detector, names: list[str], leaky: Recording) -> None:  # type: ignore[no-untyped-def]
     """Only the pressures and the command are promised to be whole."""
-    holes = np.arange(len(its_leaky)) % 7919 == 100
-    recording = with_channels(its_leaky, **{name: np.where(holes, np.nan, its_leaky[name]) for name in names})
+    holes = np.arange(len(leaky)) % 7919 == 100
+    recording = with_channels(leaky, **{name: np.where(holes, np.nan, leaky[name]) for name in names})
     if detector.usable(recording) is None:
         found = detector.examine(recording, [], P)
         assert found.verdict in VERDICTS
         assert found.score is None or np.isfinite(found.score)
 
 
-def test_a_smaller_false_alarm_probability_asks_for_more(detector, its_leaky: Recording) -> None:  # type: ignore[no-untyped-def]
-    thresholds = [first_examined(detector, its_leaky, p).threshold for p in (0.2, 0.05, 0.01)]
+def test_a_smaller_false_alarm_probability_asks_for_more(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    thresholds = [first_examined(detector, leaky, p).threshold for p in (0.2, 0.05, 0.01)]
     assert thresholds == sorted(thresholds)
     assert len(set(thresholds)) == 3
 
 
-def test_methods_state_their_own_evidence(detector, its_leaky: Recording) -> None:  # type: ignore[no-untyped-def]
-    found = first_examined(detector, its_leaky)
+def test_methods_state_their_own_evidence(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    found = first_examined(detector, leaky)
     if detector.name == "rms change":
         assert found.parts
     for method in found.parts:
@@ -273,7 +245,7 @@ def test_methods_state_their_own_evidence(detector, its_leaky: Recording) -> Non
             assert method.verdict != "leak"  # noise alone never is a leak
 
 
-@pytest.mark.parametrize("case", ["its_leaky", "its_sound"])
+@pytest.mark.parametrize("case", ["leaky", "sound"])
 @pytest.mark.parametrize("with_baseline", [False, True])
 def test_the_chance_agrees_with_score_and_threshold(
     detector,  # type: ignore[no-untyped-def]

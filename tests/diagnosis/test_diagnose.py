@@ -120,7 +120,7 @@ def test_quick_stops_at_the_detector_that_judges(recording: Recording, monkeypat
     """The most specific first; one that abstains does not judge; verdict and figures are those of all together."""
 
     class Abstains(Looker):
-        name = "cycle balance"
+        name = "volume balance"
 
         def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
             return Evidence("cannot tell", "too little")
@@ -129,11 +129,11 @@ def test_quick_stops_at_the_detector_that_judges(recording: Recording, monkeypat
         name = "pressure response"
 
     monkeypatch.setattr(
-        registry, "DETECTORS", {"looker": Looker, "pressure response": Judges, "cycle balance": Abstains}
+        registry, "DETECTORS", {"looker": Looker, "pressure response": Judges, "volume balance": Abstains}
     )
     whole = Examination(recording, false_alarm_probability=0.05).fused()
     seen.clear()
     quick = Examination(recording, false_alarm_probability=0.05).fused(quick=True)
-    assert [part.detector for part in quick.parts] == ["pressure response", "cycle balance"]
+    assert [part.detector for part in quick.parts] == ["pressure response", "volume balance"]
     assert len(seen) == 1
     assert (quick.verdict, quick.score, quick.detector) == (whole.verdict, whole.score, whole.detector)

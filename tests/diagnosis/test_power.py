@@ -11,12 +11,11 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth
 
 #: The larger sizes need a duty whose pump delivers as much; in that one the details hardly show a leak.
-FAST, SLOW, LOADED = "3 sin(4t)", "8 sin(t)", "position 40 mm sin(1.6t)"
+FAST, SLOW = "3 sin(4t)", "8 sin(t)"
 SIZES = {FAST: (0.0005, 0.0042, 0.02, 0.1, 0.2, 0.4), SLOW: (0.0005, 0.0042, 0.02, 0.1, 0.4, 1.0)}
-SIZES[LOADED] = SIZES[SLOW]
-DUTY = {"volume balance": SLOW, "pressure response": SLOW, "cycle balance": LOADED}
+DUTY = {"volume balance": SLOW, "pressure response": SLOW}
 #: Detectors that take seconds here.
-QUICK = ("volume balance", "cycle balance")
+QUICK = ("volume balance",)
 #: A score may be below the highest of all smaller leaks by this share: noise, and the saturation of a likelihood ratio.
 TOLERANCE = 0.2
 THROTTLES = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"}
@@ -24,17 +23,12 @@ THROTTLES = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_
 
 def leaking(lpm: float, command: str) -> Recording:
     leak = f"{lpm} L/min from 60 s"
-    if command == LOADED:
-        experiment = Experiment.of(
-            rig="thesis-closed-loop", command=command, load="1.2 kN", duration=120.0, leak=leak, seed=3
-        )
-    else:
-        experiment = Experiment.of(command=command, duration=120.0, leak=leak, set=THROTTLES, seed=3)
+    experiment = Experiment.of(command=command, duration=120.0, leak=leak, set=THROTTLES, seed=3)
     return simulate_with_truth(experiment).recording
 
 
 #: How long a detector's turn takes, where it is not slow.
-MARKS = {"volume balance": (), "cycle balance": (), "pressure response": (pytest.mark.slow, pytest.mark.long)}
+MARKS = {"volume balance": (), "pressure response": (pytest.mark.slow, pytest.mark.long)}
 
 
 @pytest.mark.parametrize(

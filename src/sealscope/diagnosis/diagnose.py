@@ -14,10 +14,10 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.baseline.inspection import comparable, inspected
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.other import other_step
+from sealscope.diagnosis.judgement import judged, judging, rank
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.verdict.judgement import judged, judging, rank
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError

@@ -24,7 +24,6 @@ def _built_in(module: str, name: str) -> Factory:
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
     "volume balance": _built_in("inference.detector", "VolumeBalance"),
-    "cycle balance": _built_in("inference.cycle_balance.detector", "CycleBalance"),
     "pressure response": _built_in("inference.pressures.detector", "PressureResponse"),
     "rms change": _built_in("rms_change.detector", "RmsChange"),
 }

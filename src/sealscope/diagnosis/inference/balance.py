@@ -213,7 +213,7 @@ class BlockStream:
         smooth = pressure[:, : length // piece * piece].reshape(count, -1, piece).mean(axis=2)
         smooth.sort(axis=1)  # what is missing goes last
         there = smooth.shape[1] - np.isnan(smooth).sum(axis=1)
-        return np.array([own[:size] @ _parts(int(size)) for own, size in zip(smooth, there, strict=True)])
+        return np.array([pressure_parts(own[:size]) for own, size in zip(smooth, there, strict=True)])
 
 
 class _Cut(NamedTuple):
@@ -243,6 +243,11 @@ def _parts(count: int) -> Array:
     return np.asarray(np.maximum(within, 0.0) * PRESSURE_PARTS / max(count, 1))
 
 
+def pressure_parts(ordered: Array) -> Array:
+    """Return the means of PRESSURE_PARTS equal parts of values in rising order, 0 without any."""
+    return np.asarray(ordered @ _parts(len(ordered)))
+
+
 def _zero(pressure: Array) -> float:
     """Return what makes a gauge pressure absolute: the atmosphere, or more where its zero is surely too low."""
     finite = pressure[np.isfinite(pressure)]
@@ -250,7 +255,7 @@ def _zero(pressure: Array) -> float:
     return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
 
 
-def _without_rails(name: str, values: Array) -> Array:
+def without_rails(name: str, values: Array) -> Array:
     """Return the samples, NaN where a pressure is cut off at an end of its sensor's range."""
     rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
     return np.where(np.isin(values, rails), np.nan, values) if rails else values
@@ -273,7 +278,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
     samples = {name: recording[name] for name in names if name in needed}
     if recording.bridged is not None:
         samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
-    samples = {name: _without_rails(name, values) for name, values in samples.items()}
+    samples = {name: without_rails(name, values) for name, values in samples.items()}
     seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
     stream = BlockStream(balances, recording.rate, seconds, support=None, start=float(recording.t[0]))
     blocks = stream.push(samples, last=True)

@@ -71,8 +71,12 @@ class RecordedBalance:
     equations: tuple[Equation, ...]
     columns: tuple[Columns, ...]
     rig: Rig
-    units: frozenset[tuple[str, str]]
-    recording: Recording | None = None
+    recording: Recording
+
+    @property
+    def units(self) -> frozenset[tuple[str, str]]:
+        """Channels with their units."""
+        return frozenset(self.recording.units.items())
 
     @cached_property
     def leak(self) -> Information:
@@ -98,7 +102,7 @@ class RecordedBalance:
     @cached_property
     def other(self) -> OtherStep | None:
         """What stepped in what a leak does not move."""
-        return None if self.recording is None else other_step(self.recording)
+        return other_step(self.recording)
 
     @cached_property
     def zero(self) -> float:

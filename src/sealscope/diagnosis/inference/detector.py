@@ -10,9 +10,10 @@ import numpy as np
 
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Blocks
-from sealscope.diagnosis.inference.decision import RecordedBalance, judge
-from sealscope.diagnosis.inference.terms import equations
+from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
+from sealscope.diagnosis.inference.terms import circulation, equations
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
+from sealscope.diagnosis.inference.without_position import circulations
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
@@ -20,6 +21,12 @@ from sealscope.recordings.recording import Recording, remembered
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: Why a recording has no balance, with its position and without.
+_NO_BALANCE = {
+    True: "too short for a balance: {:.3g} s",
+    False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
+    "that what leaks moves it: record its position x",
+}
 #: Fewest samples between neighbouring test functions.
 RESOLVED = 2
 
@@ -27,53 +34,54 @@ RESOLVED = 2
 class VolumeBalance:
     """Leakage from the balance of volumes: what the pump delivers and the piston does not displace.
 
-    It needs both chamber pressures, the piston's position, and the pump's angle, its speed or the command; behind a
-    servo valve position, command, both chambers, supply and return.
+    It needs both chamber pressures, and the pump's angle, its speed, a flow meter or the command; the piston's
+    position, or a loop that brings the piston back or holds it (`without_position`). Behind a servo valve it needs
+    position, command, both chambers, supply and return.
     """
 
     name = "volume balance"
-    reads = ("u", "theta", "omega", "x", "p_1", "p_2", *CHAMBERS)
+    reads = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", *CHAMBERS)
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
         """Return None where the recording has what the balance needs, else the reason why not."""
-        if not equations(self.rig, frozenset(recording.channels)):
+        channels = frozenset(recording.channels)
+        if not equations(self.rig, channels) and circulation(self.rig, channels) is None:
             if self.rig.valve.spool == "present":
                 return "needs x, u, p_A, p_B and the pressures of supply and return, p_1 and p_2"
-            return "needs x, p_A, p_B and the pump's theta or omega, or the command u"
+            return "needs p_A, p_B and the pump's theta or omega, a flow meter q_pump or the command u"
         if stride_samples(recording.rate) < RESOLVED:
             return f"needs {RESOLVED / STRIDE:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
         fewest = shortest(recording.rate)
         if len(recording) < fewest:
             return f"needs {fewest} samples or more at {recording.rate:g} Hz, got {len(recording)}"
         for name in ("x", *CHAMBERS):
+            if name not in recording:
+                continue
             values = recording[name][np.isfinite(recording[name])]
             if not values.size or values.min() == values.max():
                 return f"{name} is constant or missing"
         return None
 
     def balance(self, recording: Recording) -> RecordedBalance | None:
-        """Return the recording's balance; None where it is too short for any block."""
-        made = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
-        if made is None:
-            return None
-        blocks, columns = made
-        return RecordedBalance(
-            blocks,
-            equations(self.rig, frozenset(recording.channels)),
-            columns,
-            self.rig,
-            frozenset(recording.units.items()),
-            recording,
-        )
+        """Return the recording's balance, that of the smallest bound where it has several; None where it has none.
+
+        Where the position is not recorded a balance says nothing unless the pump makes good what a pump loses.
+        """
+        if "x" not in recording:
+            made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), self.reads)
+            return min(made, key=lambda own: bound_of(own, None), default=None)
+        blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
+        balances = equations(self.rig, frozenset(recording.channels))
+        return None if blocks is None else RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording)
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a step of the leakage, and of its rise against the baseline."""
         own = self.balance(recording)
         if own is None:
-            return Evidence("cannot tell", f"too short for a balance: {recording.duration:.3g} s")
+            return Evidence("cannot tell", _NO_BALANCE["x" in recording].format(recording.duration), usable=False)
         healthy: list[Blocks] = []
         for other in baseline:
             compared = self.balance(other)

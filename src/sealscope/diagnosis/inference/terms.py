@@ -485,6 +485,33 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     return (_with_channels(balance, channels | {START}),)
 
 
+def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
+    """Return the balance of what a pump delivers where the piston displaces nothing; None where no channel gives it.
+
+    Over whole cycles or at rest: neither motion nor position is in it. A zero of the flow is not told from leakage
+    under a steady load, and is taken for none.
+    """
+    left = pump_volume(rig, channels - {"u"} | ({"omega"} if "u" in channels else set()))
+    if rig.valve.spool == "present" or left is None or not {"p_A", "p_B"} <= channels:
+        return None
+    stored = (term for side in "AB" for term in _of_side(side) if term.drift == "compliance" and "x" not in term.needs)
+    return Equation("circulation", left, (_START, *stored, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
+
+
+def of_store(rig: Rig) -> Equation:
+    """Return the balance of the oil in the accumulator that makes up what leaves the circuit.
+
+    Its gas expands, -V dp/(n p), as oil is lost, and as it warms; the lower of the chambers' pressures is its own.
+    """
+
+    def expanded(s: Signals) -> Array:
+        lower = np.minimum(s.absolute["p_A"], s.absolute["p_B"])
+        return np.asarray(-rig.makeup.V_gas / rig.makeup.n_gas * _steps(np.log(lower)))
+
+    warmed = _BIAS._replace(cause="external leak")
+    return Equation("accumulator", expanded, (warmed, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
+
+
 #: Channels that give what the pump delivers, the first recorded one is taken.
 _SOURCES = ("theta", "omega", "q_pump")
 

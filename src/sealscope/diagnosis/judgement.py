@@ -14,7 +14,7 @@ from sealscope.diagnosis.inference.other import OtherStep
 from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, Evidence
 
 #: Detectors that state a size or a bound: by every litre, then by a model of the pressures.
-ORDER = ("volume balance", "cycle balance", "pressure response")
+ORDER = ("volume balance", "pressure response")
 #: Least share of a recording that `no leak` rests on.
 WHOLE = 0.95
 

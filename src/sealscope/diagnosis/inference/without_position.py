@@ -1,0 +1,238 @@
+"""Blocks of a balance without the piston's position: over whole cycles of the duty, or while the piston is held.
+
+Test functions that annihilate what repeats take the displacement out of the balance. A box of one cycle, convolved with
+itself, has a double zero at every harmonic of the duty: over it a piston that a loop brings back displaces nothing,
+
+    integral of phi D dtheta = G integral of phi (p_A - p_B) dt + sum_j c_j integral of phi f_j dg_j,
+
+so that what the pump delivers is what leaks. While a loop holds the piston at rest any test function will do. Rows that
+touch a missing sample weigh nothing, nor do rows of a single rod that touch a change of the side that carries: the
+circuit exchanges oil there. Of the mean pressure difference only what zeros of the sensors cannot make counts,
+d - z^2/d beyond z (Breiman's garrote). A loop makes good what leaks; where the pump delivers less than any pump loses,
+none does, and the balance says nothing.
+
+Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1995) 373.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.control.drive import Drive
+from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, without_rails
+from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting, information
+from sealscope.diagnosis.inference.causes import StepHypothesis
+from sealscope.diagnosis.inference.decision import RecordedBalance
+from sealscope.diagnosis.inference.onset import FEWEST, StepTest, step_test
+from sealscope.diagnosis.inference.terms import (
+    LEAK,
+    ORIFICE,
+    START,
+    Equation,
+    Signals,
+    circulation,
+    of_store,
+    priors,
+)
+from sealscope.recordings.cycle import cycle_of, fundamental
+from sealscope.recordings.recording import Array, Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Half-width of a test function while the piston is held, and the time it settles for before, as it moves slower than
+#: a share of its largest speed, averaged over a while [s].
+HELD, SETTLES, SLOW, AVERAGED = 0.25, 0.25, 0.1, 0.05
+#: Half-widths of the accumulator's test functions in a recording: a pressure's noise hides what leaves at once.
+STORED = 24
+_95 = 1.96
+_READ = ("u", "omega", "theta", "q_pump", "p_A", "p_B")
+
+
+class _Rows(NamedTuple):
+    """Rows of a regression: `time` (r,), `values` (r, c), and whether each counts, `whole` (r,)."""
+
+    time: Array
+    values: Array
+    whole: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Circulation(RecordedBalance):
+    """A recorded balance without a position, with what the accumulator says of oil that leaves the circuit.
+
+    `lost`: tests of a step of the external leak of either side by the accumulator's own balance, by the term's name.
+    """
+
+    lost: Mapping[str, StepTest]
+
+    @cached_property
+    def hypotheses(self) -> tuple[StepHypothesis, ...]:
+        """Tests of all terms' coefficients; an external leak must empty the accumulator as well, by as much.
+
+        Twice the logarithm of the likelihood of what the accumulator lost, beside that of none, is added to its score.
+        """
+        tested = []
+        for own in super().hypotheses:
+            store = self.lost.get(own.name)
+            if store is not None:
+                at = int(np.abs(store.onsets - own.test.onsets[own.test.best]).argmin())
+                seen, expected = np.array([store.size[at], own.test.fitted[0]]) / store.deviation[at]
+                tested.append(own._replace(score=own.score + float(seen**2 - (seen - expected) ** 2)))
+            else:
+                tested.append(own)
+        return tuple(sorted(tested, key=lambda own: -own.score))
+
+
+def circulations(recording: Recording, rig: Rig) -> list[Circulation]:
+    """Return the balances over cycles and over holds of a recording, as far as a loop makes good what leaks in them."""
+    equation = circulation(rig, frozenset(recording.channels))
+    if equation is None:
+        return []
+    signals = Signals(_samples(recording, rig), recording.rate, {})
+    speed, dp = equation.left(signals) * recording.rate, signals.pressure_difference
+    if float(np.nansum((dp - np.nanmean(dp)) * speed)) < 0.0:  # friction takes work: shaft or sides are the other way
+        forward = equation.left
+        equation, speed = equation._replace(left=lambda s: -forward(s)), -speed
+    known = np.isfinite(speed + signals.pressure_difference)
+    if not known.any() or not np.ptp(speed[known]) > 0.0:
+        return []
+    still = _held(np.where(known, speed, np.inf), recording.rate)
+    cycle = _cycle(np.where(known, speed, 0.0), recording.rate)
+    begin, made = float(recording.t[0]), list[Circulation]()
+    for half, counts in ((cycle, known), (HELD, known & still)):
+        blocks = None if half is None else _blocks(signals, equation, rig, half, counts, begin)
+        if half is not None and blocks is not None:
+            long = recording.duration / STORED
+            lost = _lost(signals, rig, long if cycle is None else cycle * np.ceil(long / cycle), known, begin)
+            made.append(Circulation(blocks, (equation,), (Columns(equation),), rig, recording, lost))
+    return [own for own in made if made_good(own)]
+
+
+def _lost(signals: Signals, rig: Rig, half: float, counts: NDArray[np.bool_], begin: float) -> dict[str, StepTest]:
+    """Return the tests of what leaves the circuit by the accumulator's balance, empty where there is none."""
+    if rig.makeup.check_valves == "absent":
+        return {}
+    store = of_store(rig)
+    columns, blocks = Columns(store), _blocks(signals, store, rig, half, counts, begin)
+    if blocks is None:
+        return {}
+    names = [name for name in columns.names if name.startswith("external")]
+    tests = {name: step_test(information(blocks, [columns], columns.names.index(name))) for name in names}
+    return {name: test for name, test in tests.items() if test is not None}
+
+
+def made_good(balance: RecordedBalance) -> bool:
+    """Whether the pump surely delivers what any pump loses: a loop brings the piston back, or holds it."""
+    return balance.level.low * balance.mean(0) > priors()["held"]["share"].value * balance.mean(2)
+
+
+def _samples(recording: Recording, rig: Rig) -> dict[str, Array]:
+    """Return the samples that the balance reads, NaN where missing, with the speed that the drive makes of a command.
+
+    The thesis's drive takes 19 s to make good what the load costs it: what of that is left at first fades (`START`).
+    """
+    samples = {name: without_rails(name, recording[name]) for name in _READ if name in recording.channels}
+    drive = Drive.of(rig)
+    if "u" in samples and samples.keys().isdisjoint(("theta", "omega", "q_pump")):
+        difference = samples["p_A"] - samples["p_B"]
+        u, dp = (np.where(np.isnan(of), 0.0, of) for of in (samples["u"], difference))
+        sense = -1.0 if float((u - u.mean()) @ (dp - dp.mean())) < 0.0 else 1.0
+        samples["omega"] = drive.flow(u, sense * dp, recording.rate) / drive.displacement
+    samples[START] = np.exp(-np.arange(len(recording)) / (recording.rate * drive.lag))
+    if recording.bridged is not None:
+        samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
+    return samples
+
+
+def _cycle(speed: Array, rate: float) -> float | None:
+    """Return the duration of a stroke to and fro [s], or of the strongest line of the speed; None without one."""
+    cycle, seconds = cycle_of(speed, rate), speed.size / rate
+    if cycle is None:
+        spectrum = np.abs(np.fft.rfft((speed - speed.mean()) * np.hanning(speed.size)))
+        line = int(spectrum.argmax())
+        if line < FEWEST:
+            return None
+        cycle = seconds / line
+    return 1.0 / fundamental(speed, np.arange(speed.size) / rate, cycle)
+
+
+def _held(speed: Array, rate: float) -> NDArray[np.bool_]:
+    """Return in which samples the piston is held at rest, after it has settled."""
+    size, settles = max(1, round(AVERAGED * rate)), max(1, round(SETTLES * rate))
+    slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))
+    finite = np.isfinite(slow)
+    moves = ~finite | (slow > SLOW * slow[finite].max(initial=0.0))
+    return np.asarray(np.convolve(moves, np.ones(settles))[: speed.size] == 0)
+
+
+def _blocks(
+    signals: Signals, equation: Equation, rig: Rig, half: float, counts: NDArray[np.bool_], begin: float
+) -> Blocks | None:
+    """Return the blocks of test functions of a half-width [s]; None for fewer than `FEWEST`."""
+    left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
+    increments = [*(term.increments(signals) for term in equation.terms), left]
+    rows = _rows(increments, counts, half, rate)
+    _less_the_zero(rows.values, [term.name for term in equation.terms])
+    if rig.cylinder.single_rod:
+        side = _rows([signals.carried_by_A[1:] / rate], counts, half, rate).values[:, 0]
+        one_side = np.minimum(side, 1.0 - side) < priors()["held"]["elsewhere"].value
+        rows = rows._replace(whole=rows.whole & one_side)
+    each = 2 if half > HELD else round(2.0 * LONGEST / half)
+    parts = [slice(k * each, (k + 1) * each) for k in range(len(rows.time) // each)]
+    if sum(bool(rows.whole[part].any()) for part in parts) < FEWEST:
+        return None
+    kept = np.array([np.count_nonzero(rows.whole[part]) for part in parts])
+    whole = rows.values[: len(parts) * each][rows.whole[: len(parts) * each]]
+    gram = Weighting((Columns(equation),)).close([whole], np.cumsum(kept))
+    ends = np.array([[rows.time[part][0], rows.time[part][-1]] for part in parts]) + np.array([-0.25, 0.25]) * half
+    measured = [_measured(dp[a:b], left[a:b], rate) for a, b in np.round(ends * rate).astype(int)]
+    means, pressures = (np.array(of) for of in zip(*measured, strict=True))
+    start, end = begin + ends.T
+    return Blocks(start, end, gram, kept.astype(float), means, pressures, np.zeros(len(parts))).merged()
+
+
+def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate: float) -> _Rows:
+    """Return the rows of increments, c times (n,), for triangles of a half-width [s], half of it apart.
+
+    The integral over a triangle is the second difference of the twice integrated increments.
+    """
+    length, n = half * rate, len(counts)
+    centres = np.arange(length, n - length, 0.5 * length)
+    places = np.arange(n + 1)
+
+    def over(values: Array) -> Array:
+        once = np.concatenate([[0.0], np.cumsum(values)])
+        twice = np.concatenate([[0.0], np.cumsum(0.5 * (once[1:] + once[:-1]))])
+        before, middle, after = (np.interp(centres + shift, places, twice) for shift in (-length, 0.0, length))
+        return np.asarray((before - 2.0 * middle + after) / length**2)
+
+    missing = np.concatenate([[0], np.cumsum(~counts)])
+    first, last = (np.clip(centres + shift, 0, n).astype(int) for shift in (-length, length + 1.0))
+    values = np.column_stack([over(np.where(counts, own, 0.0)) * rate for own in increments])
+    return _Rows(centres / rate, values, missing[last] == missing[first])
+
+
+def _less_the_zero(values: Array, names: list[str]) -> None:
+    """Take from the mean pressure difference of each row what zeros of the sensors may have made."""
+    zero = _95 * priors()["zero"]["pressure"].value
+    mean = values[:, names.index(LEAK)]
+    share = np.maximum(1.0 - (zero / np.maximum(np.abs(mean), zero)) ** 2, 0.0)
+    for name in (LEAK, ORIFICE):
+        values[:, names.index(name)] *= share
+
+
+def _measured(dp: Array, left: Array, rate: float) -> tuple[list[float], Array]:
+    """Return `Blocks.means` and `Blocks.pressures` of a block's samples."""
+    piece = max(1, round(SMOOTHED * rate))
+    smooth = dp[: len(dp) // piece * piece].reshape(-1, piece).mean(axis=1)
+    smooth = smooth[np.isfinite(smooth)] if np.isfinite(smooth).any() else np.zeros(1)
+    size, flow = np.abs(smooth), left[np.isfinite(left)]
+    moved = float(np.abs(flow).mean()) * rate if flow.size else 0.0
+    return [float(size.mean()), float(np.sqrt(size).mean()), moved], pressure_parts(np.sort(smooth))
