@@ -14,13 +14,14 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.baseline.inspection import comparable, inspected
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.other import other_step
-from sealscope.diagnosis.judgement import judged, judging, rank
+from sealscope.diagnosis.judgement import ORDER, judged, judging, rank
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
+from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -113,6 +114,8 @@ class Examination:
         if detector.name != name:
             raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
         reason = unusable(detector, self.recording) or self.distrust
+        if reason is None and name != ORDER[0] and not self.baseline:
+            reason = does_not_move(self.recording)
         baseline = self.baseline
         if reason is None and baseline:
             reasons = [unusable(detector, own) for own in baseline]

@@ -10,11 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.features import DUTY, features
+from sealscope.diagnosis.inference.features import BLOCKS, DUTY, ORDER, features
 from sealscope.diagnosis.inference.levels import level_tests
 from sealscope.diagnosis.inference.onset import StepTest, two_sided
 from sealscope.diagnosis.verdict.evidence import RAREST, Cause
 from sealscope.recordings.recording import Recording, remembered
+
+#: Fewest samples: a noise in each block.
+FEWEST_SAMPLES = BLOCKS * (ORDER + 2)
 
 
 class OtherStep(NamedTuple):
@@ -34,13 +37,30 @@ def other_step(recording: Recording) -> OtherStep | None:
 
 @np.errstate(all="ignore")
 def _other_step(recording: Recording) -> OtherStep | None:
+    if len(recording) < FEWEST_SAMPLES:
+        return None
+    try:
+        return _duty(recording) or _feature(recording) or _level(recording)
+    except (ArithmeticError, np.linalg.LinAlgError):  # numbers that cannot be computed with are no machine's
+        return None
+
+
+def _duty(recording: Recording) -> OtherStep | None:
     sizes = [test for _, own in features(recording, DUTY) if (test := two_sided(own)) is not None]
     if sizes and max(2.0 * test.chance for test in sizes) < RAREST and _alike(sizes):
         return _of_test("changed duty", "size of the duty", min(sizes, key=lambda test: test.score))
+    return None
+
+
+def _feature(recording: Recording) -> OtherStep | None:
     tests = [(feature, test) for feature, own in features(recording) if (test := two_sided(own)) is not None]
     for feature, test in tests:
         if 2.0 * len(tests) * test.chance < RAREST:
             return _of_test(feature.cause, feature.name, test)
+    return None
+
+
+def _level(recording: Recording) -> OtherStep | None:
     patterns = level_tests(recording)
     best = patterns[0] if patterns else None
     if best is None or best.cause is None or len(patterns) * best.chance >= RAREST:
