@@ -14,6 +14,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.compiled import large_law, law
 from sealscope.recordings.recording import Array
@@ -25,6 +26,9 @@ HUBER = 1.345
 _RIDGE = 1e-10  # of a matrix whose diagonal is 1
 _MOST, _TOLERANCE = 50, 1e-2  # turns to a fixed point at most, and the mean change of a weight that ends them
 _SIGMA = 1.4826  # standard deviation of normal values over the median of their size
+
+
+_Places = NDArray[np.intp]
 
 
 class Room(NamedTuple):
@@ -204,7 +208,7 @@ def weigh(values: Any, ends: Any, fast: Any, own: Any, known: Any, share: float,
             known[i, j] += share * (SUPPORT / blocks * room.total[i, j] - known[i, j])
 
 
-def weighted(values: Array, ends: Array, fast: Array, own: Array, known: Array, share: float) -> Array:
+def weighted(values: Array, ends: _Places, fast: _Places, own: _Places, known: Array, share: float) -> Array:
     """Return the Gram matrices (K, m, m) of blocks, and learn from them (`weigh`)."""
     room = Room(*(np.empty(shape) for shape in room_shapes(len(values), len(ends), len(fast), len(own) - 1)))
     gram = np.empty((len(ends), values.shape[1], values.shape[1]))
