@@ -258,17 +258,23 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
         return self._for_python(*arguments, **named)
 
 
-def _law(function: _F, fastmath: Any) -> _F:
+def _law(function: _F, fastmath: Any, inline: bool = True) -> _F:
     if config.DISABLE_JIT:
         return function
-    options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": True}
+    options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": inline}
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {} if inline else {"_nrt": False}
     return _Law(function, targetoptions=options, pipeline_class=_Compiler)  # type: ignore[return-value]
 
 
 def law(function: _F) -> _F:
     """Compile a small law that only other compiled functions call: inlined there, cached with them, never alone."""
     return _law(function, False)
+
+
+def large_law(function: _F) -> _F:
+    """Compile a law that is too large to be inlined at each of its calls; else as `law`."""
+    return _law(function, False, inline=False)
 
 
 def contracted(function: _F) -> _F:

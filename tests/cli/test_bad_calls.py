@@ -109,8 +109,8 @@ def test_an_unresolved_run_comes_through_only_when_asked_for_and_is_marked(call,
         (("fmu", "-o", "leak.fmu", "--sensor", "volume", "--step", "1 ms"), "--step is of a rig's solver, got it with"),
         (("fmu", "-o", "eha.fmu", "--rate", "100 Hz"), "--rate is of a soft sensor, got it without --sensor"),
         (
-            ("fmu", "-o", "leak.fmu", "--sensor", "speed", "--rate", "100 Hz"),
-            "rate of the sensor speed must be >= 250 Hz",
+            ("fmu", "-o", "leak.fmu", "--sensor", "volume", "--rate", "10 Hz"),
+            "rate of a soft sensor must be >= 16 Hz",
         ),
         (
             ("parameters", "nowhere"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, information, solve
+from sealscope.diagnosis.inference.row_weights import HUBER, SUPPORT, weighted
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term, priors
 from sealscope.diagnosis.inference.weak_form import OVERLAP, rows
 
@@ -187,3 +188,50 @@ def test_overlap_is_the_ratio_of_variances_of_means() -> None:
     each = 200
     means = made[: len(made) // each * each].reshape(-1, each).mean(axis=1)
     assert np.var(means) * each / np.var(made) == pytest.approx(OVERLAP, rel=0.3)
+
+
+def by_iteration(blocks: np.ndarray, turns: int = 60) -> np.ndarray:
+    """Huber's weights of rows of blocks (K, r, 6) by dense least squares: stroke and oil common, the others free."""
+    count, each, _ = blocks.shape
+    design = np.zeros((count, each, 2 + 2 * count))
+    design[..., :2] = blocks[..., [STROKE, OIL]]
+    for k in range(count):
+        design[k, :, 2 + 2 * k : 4 + 2 * k] = blocks[k][:, [ZERO, TESTED]]
+    flat, left = design.reshape(count * each, -1), blocks[..., LEFT].ravel()
+    weights = np.ones(len(left))
+    for _ in range(turns):
+        root = np.sqrt(weights)
+        fit = np.linalg.lstsq(flat * root[:, None], left * root, rcond=None)[0]
+        size = np.abs(left - flat @ fit)
+        weights = np.minimum(1.0, HUBER * 1.4826 * np.median(size) / size)
+    return weights
+
+
+@pytest.mark.parametrize("each", [11, 24])
+def test_compiled_sums_are_those_of_a_dense_iteration(each: int) -> None:
+    """The fixed point of the weights, to the iteration's tolerance, for an even and an odd number of rows."""
+    values = recorded(3, each, noise=0.2)
+    values[1, 3, LEFT] += 5.0
+    flat = values.reshape(-1, 6)
+    ends, known = each * np.arange(1, 4), np.zeros((3, 3))
+    gram = weighted(flat, ends, np.array([ZERO, TESTED]), np.array([STROKE, OIL, LEFT]), known, 1.0)
+    root = np.sqrt(by_iteration(values)).reshape(3, each, 1)
+    expected = np.einsum("kri,krj->kij", values * root, values * root)
+    assert gram == pytest.approx(expected, abs=0.02 * np.abs(expected).max())
+    assert np.abs(gram - np.einsum("kri,krj->kij", values, values)).max() > 0.1 * np.abs(expected).max()
+    inner = [np.ix_(*2 * ([STROKE, OIL, LEFT],)), np.ix_([STROKE, OIL, LEFT], [ZERO, TESTED])]
+    free = [own[inner[0]] - own[inner[1]] @ solve(own[2:4, 2:4], own[inner[1]].T) for own in gram]
+    assert known == pytest.approx(SUPPORT / 3 * sum(free), rel=1e-6)
+
+
+def test_what_is_known_weighs_a_block_that_cannot_tell_alone() -> None:
+    """One block of five rows has four coefficients: the outlier shows by what the blocks before say."""
+    values = steady(1)
+    before, known = values[:9].reshape(-1, 6), np.zeros((3, 3))
+    fast, own = np.array([ZERO, TESTED]), np.array([STROKE, OIL, LEFT])
+    weighted(before, 24 * np.arange(1, 10), fast, own, known, 1.0)
+    block = values[9, :5].copy()
+    block[2, LEFT] += 1.0
+    alone = weighted(block, np.array([5]), fast, own, np.zeros((3, 3)), 0.0)[0, ZERO, ZERO]
+    beside = weighted(block, np.array([5]), fast, own, known, 0.0)[0, ZERO, ZERO]
+    assert beside < alone

@@ -31,8 +31,8 @@ def fmu(
         str | None,
         typer.Option(
             "--sensor",
-            help="Write a soft sensor of leakage instead, which reads the chamber pressures and: angle and position "
-            "(volume), speed, or command.",
+            help="Write a soft sensor of leakage instead: volume, which reads the chamber pressures, the pump's angle "
+            "and the piston's position.",
         ),
     ] = None,
     rate: Annotated[str | None, typer.Option("--rate", help="Sampling rate of the soft sensor (500 Hz).")] = None,

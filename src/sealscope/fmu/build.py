@@ -19,8 +19,8 @@ from types import MappingProxyType
 from typing import Literal
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.observer.evidence import MEANS
-from sealscope.diagnosis.observer.stream import Formulation
+from sealscope.diagnosis.inference.detector import RESOLVED
+from sealscope.diagnosis.inference.weak_form import STRIDE
 from sealscope.errors import InputError
 from sealscope.fmu.description import description_2, description_3
 from sealscope.fmu.machine import FAILURES, Choice, code, object_code
@@ -41,6 +41,8 @@ from sealscope.physics.state import STATES
 from sealscope.storage.atomic import atomic_write
 
 Version = Literal[2, 3]
+#: What a soft sensor reads: pressures of both chambers, the pump's angle and the piston's position.
+Sensor = Literal["volume"]
 #: rms error [Pa] of a pressure by which a unit's step is chosen, and the commands under which.
 ERROR = 1.0
 COMMANDS = ("3 sin(4t)", "5 sin(2t)")
@@ -275,7 +277,7 @@ def write_fmu(
 def write_sensor_fmu(
     path: str | os.PathLike[str],
     *,
-    sensor: Formulation = "volume",
+    sensor: Sensor = "volume",
     rig: Rig | str | os.PathLike[str] = "thesis",
     rate: float = 500.0,
     fmi: Version = 2,
@@ -284,19 +286,18 @@ def write_sensor_fmu(
     """Write a soft sensor of leakage as a functional mock-up unit for co-simulation.
 
     Readings go in, the leakage in m^3/s with its 95 % interval comes out, and its rise over the first minute. Its code
-    is that of the detector ``observer``, compiled; there is no Python in it.
+    is that of the live volume balance, compiled; there is no Python in it.
 
     Parameters
     ----------
     path : str or path-like
         File to write (.fmu).
-    sensor : {"volume", "speed", "command"}, optional
-        What it reads beside the chamber pressures: the motor's angle and the piston's position, the motor's speed, or
-        the command.
+    sensor : {"volume"}, optional
+        What it reads beside the chamber pressures: the pump's angle and the piston's position.
     rig : Rig, str or path-like, optional
         The assumed machine: a rig, the name of a packaged one, or the path of a TOML file.
     rate : float, optional
-        Sampling rate [Hz], whatever the communication steps are; 250 at least without a position, else 10.
+        Sampling rate [Hz], 16 at least, whatever the communication steps are.
     fmi : {2, 3}, optional
         Version of the Functional Mock-up Interface.
     platforms : sequence of str, optional
@@ -319,29 +320,28 @@ def write_sensor_fmu(
     >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['p_A', 'p_B', 'theta', 'x']
     """
-    from sealscope.diagnosis.observer.detector import SLOWEST
     from sealscope.fmu import sensor as own
 
     path, wanted = Path(path), _checked(path, fmi, platforms)
-    if sensor not in own.INPUTS:
-        raise InputError(f"sensor must be one of {', '.join(own.INPUTS)}, got {sensor!r}")
-    if not rate >= SLOWEST[sensor]:
-        raise InputError(f"rate of the sensor {sensor} must be >= {SLOWEST[sensor]:g} Hz, got {rate:g}")
+    if sensor != "volume":
+        raise InputError(f"sensor must be volume, got {sensor!r}")
+    if not rate >= RESOLVED / STRIDE:
+        raise InputError(f"rate of a soft sensor must be >= {RESOLVED / STRIDE:g} Hz, got {rate:g}")
     machine = _pump_controlled(rig)
-    listed = tuple(own.variables(machine, sensor, rate))
+    choice = own.SensorChoice.of(machine, float(rate))
     unit = MockUp(
-        f"soft sensor of leakage ({MEANS[sensor]}) for {machine.title}",
-        own.sensor_code(own.SensorChoice.of(machine, sensor)),
-        listed,
-        (*_values(machine), *(variable.start or 0.0 for variable in listed if variable.name in own.SAMPLING)),
-        len(own.INPUTS[sensor]),
+        f"soft sensor of leakage (volume balance of angle and position at {rate:g} Hz) for {machine.title}",
+        own.sensor_code(choice),
+        tuple(own.variables(machine)),
+        _values(machine),
+        len(own.INPUTS),
         len(own.RESULTS),
-        own.size(sensor),
+        own.size(choice),
         1.0 / rate,
         own.FAILURES,
     )
     unit.write(path, fmi, wanted)
-    return listed
+    return unit.listed
 
 
 def _pump_controlled(rig: Rig | str | os.PathLike[str]) -> Rig:

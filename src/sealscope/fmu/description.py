@@ -32,7 +32,7 @@ def base_units(unit: str) -> dict[str, str] | None:
 
 def _units(parent: ElementTree.Element, variables: Sequence[Variable]) -> None:
     definitions = ElementTree.SubElement(parent, "UnitDefinitions")
-    for unit in sorted({variable.unit for variable in variables} - {"1"}):
+    for unit in sorted({"s", *(variable.unit for variable in variables)} - {"1"}):  # that of the time is always needed
         element = ElementTree.SubElement(definitions, "Unit", name=unit)
         base = base_units(unit)
         if base:

@@ -1,9 +1,20 @@
-"""The code of a soft sensor: the observer's filters, sample by sample, as functions that C can call.
+"""The code of a soft sensor: the live volume balance, sample by sample, as functions that C can call.
 
-Its laws are those of `diagnosis.observer`, compiled for a rig. A run has three phases: the noise of the readings and
-the senses of the channels are estimated (`SEARCH_SECONDS`); where there is no position, a bank of filters finds the
-oil's stiffness (as long again); then the filter runs whose estimates are reported (`sensor_memory`). No samples are
-stored.
+Its laws are those of a running machine's balance (`diagnosis.inference`): each sample adds the increments of the terms
+to the open rows of the weak form, a block's rows are weighted and summed, and the sums tell the conductance of the
+block. No samples are kept but those of `HALF_DIFFERENCE` around the present one.
+
+The mean conductance of the last n blocks (`WINDOW` at most) has the interval
+
+    G +- hypot(t_(n-1) sqrt(v/n), 1.96 o),    v = max(s^2, mean of sd^2)
+
+with the scatter s of the blocks, the deviations sd that the sums tell, Student's t, and the deviation o of the level,
+by the other coefficients and the size of the machine. Its rise over the first N = `WINDOW` blocks, d blocks before, is
+uncertain by theirs and by the walk of a healthy machine, w times a block's noise a block:
+
+    variance of the rise = v/n + v_0/N + w d sigma^2,    sigma^2 = v_0/(1 + w (N + 1)/6)
+
+(N blocks of such a walk scatter by w (N + 1)/6 beside their noise). The flow is G times the mean of abs(p_A - p_B).
 """
 
 from __future__ import annotations
@@ -11,86 +22,39 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
-from itertools import accumulate
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import numpy as np
 from numba import carray
 
-from sealscope.compiled import law, pointer_at
-from sealscope.diagnosis.observer.detector import BLOCK_SECONDS, EXPECTED_WALK
-from sealscope.diagnosis.observer.estimates import LEAD, SUMS
-from sealscope.diagnosis.observer.evidence import SIZE_ERROR
-from sealscope.diagnosis.observer.model import PARAMETERS as FACTORS
-from sealscope.diagnosis.observer.model import (
-    STIFFNESS,
-    WALKS,
-    assume,
-    compliance,
-    displacement,
-    mean_area,
-    start_parameters,
+from sealscope.compiled import large_law, law, pointer_at
+from sealscope.diagnosis.inference.blocks import Columns
+from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
+from sealscope.diagnosis.inference.live.known import (
+    MISFIT,
+    RESTS,
+    TINY,
+    Known,
+    add,
+    begin,
+    known_shapes,
+    motion,
+    says,
+    take,
 )
-from sealscope.diagnosis.observer.pressure_filter import (
-    COVARIANCE,
-    LONGEST_STEP,
-    MEANS,
-    ROOM,
-    ROUNDS,
-    SEARCH_SECONDS,
-    Room,
-    start_pressures,
-    take_pressures,
-)
-from sealscope.diagnosis.observer.stream import LEAST_PRESSURE, LEAST_VOLUME, Formulation
-from sealscope.diagnosis.observer.volume_filter import VOLUME_STATES, start_volume, take_volume
-from sealscope.fmu.machine import numbers_of, unit_code
-from sealscope.fmu.sensor_memory import (
-    BLOCKS,
-    CHOOSES,
-    CLOCK,
-    COUNT,
-    FINE,
-    LENGTH,
-    N_TAPS,
-    NOISE_A,
-    OMEGA,
-    PHASE,
-    PUSH,
-    ROUND,
-    RUNS,
-    SEARCHES,
-    THETA,
-    TURN,
-    WINDOW,
-    X,
-    fresh,
-    keep,
-    search,
-    senses,
-    write_results,
-)
+from sealscope.diagnosis.inference.row_weights import SUPPORT, Room, median, room_shapes, weigh
+from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE
+from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
+from sealscope.errors import InputError
+from sealscope.fmu.machine import unit_code
 from sealscope.fmu.variables import INPUT_BASE, RESULT_BASE, VALUE_BASE, VALUES, Variable
 from sealscope.parameters import Rig
 from sealscope.parameters.fields import leaves, unit_of
-from sealscope.physics.rig import NUMBERS, throttle_readings
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
-#: Channels that a soft sensor reads, by its formulation.
-INPUTS: Mapping[Formulation, tuple[str, ...]] = MappingProxyType(
-    {
-        "volume": ("p_A", "p_B", "theta", "x"),
-        "speed": ("p_A", "p_B", "omega"),
-        "command": ("p_A", "p_B", "u"),
-    }
-)
-#: Parameters beside those of the rig: unit, words.
-SAMPLING = {
-    "sample": ("s", "interval of the samples that are taken"),
-    "block": ("s", "length of a block, best whole cycles of the duty"),
-}
+#: Channels that a soft sensor reads, in the order of the samples.
+INPUTS = ("p_A", "p_B", "theta", "x")
 _MEAN, _RISE = "pump and piston together, mean of the last blocks", "rise over the first blocks"
 #: Outputs: unit, words.
 RESULTS = {
@@ -101,272 +65,411 @@ RESULTS = {
     "q_rise_low": ("m^3/s", "leakage, lower end of the rise's 95 % interval"),
     "q_rise_high": ("m^3/s", "leakage, upper end of the rise's 95 % interval"),
     "conductance": ("m^3/(s Pa)", f"conductance between the chambers, {_MEAN}"),
-    "misfit": ("1", "mean square of the normalised innovations of the last block, 1 where the model describes it"),
+    "misfit": ("1", "variance of the last block's rows over the usual one"),
     "blocks": ("1", "blocks that were estimated"),
     "settled": ("1", "1 from the first block after those of the baseline on, else 0"),
 }
 #: What a function of a soft sensor returns where it fails.
-FAILURES = MappingProxyType({1: "sample must be > 0 s, and a block two samples at least"})
-#: Parameters of the rig that the filters read.
-_GEOMETRY = ("pump.q_b", "cylinder.A_A", "cylinder.A_B", "cylinder.V", "fluid.K_oil")
-_FRICTION = tuple(f"friction.{name}" for name in ("F_pr", "F_cfr", "C_c", "K_brk", "F_v", "v_th"))
-_DRIVE = tuple(
-    f"motor.{name}"
-    for name in ("R_c", "L_c", "C_e", "C_m", "J_M", "B_M", "k_p", "K_i", "omega_per_volt", "V_max", "i_max")
-)
-READ: Mapping[Formulation, tuple[str, ...]] = MappingProxyType(
-    {
-        "volume": _GEOMETRY,
-        "speed": (*_GEOMETRY, "cylinder.M_eq", *_FRICTION),
-        "command": (*_GEOMETRY, "cylinder.M_eq", *_FRICTION, *_DRIVE),
-    }
-)
-_N_VALUES = len(VALUES) + len(SAMPLING)
-_SAMPLE, _BLOCK = len(VALUES), len(VALUES) + 1
-_CANDIDATES = tuple(float(factor) for factor in np.geomspace(*STIFFNESS))
-_STIFFNESS = FACTORS.index("stiffness")
-_N_FACTORS, _N_STATES = len(FACTORS), len(VOLUME_STATES)
-#: A pressure filter's memory, and blocks that never end.
-_EACH = MEANS + _N_FACTORS + COVARIANCE**2 + SUMS
-_NEVER = 1e18
+FAILURES = MappingProxyType({1: "pump.q_b must be > 0 m^3/rev"})
+#: The parameter of the rig that the balance reads.
+READ = "pump.q_b"
+#: Blocks of a mean, and of the baseline.
+WINDOW = 20
+#: Walk of a block over its noise (variances) in a healthy machine: the oil's warming shows from block to block.
+WALK = 3.0
+_95 = 1.96
+_SIZE = VALUES.index(READ)
+#: The columns in the order of `_increments`: the terms' names, and the left side.
+COLUMNS = (
+    *(f"motion {way}, {side} carries" for way in ("out", "in") for side in "AB"),
+    *(name for s in "AB" for name in (f"compliance {s}", f"compliance {s} over the stroke", f"free air {s}",
+                                      f"dissolving air {s}")),
+    "lag", "bias", "leak", "left",
+)  # fmt: skip
+_WIDTH, _LEAK, _LEFT = len(COLUMNS), len(COLUMNS) - 2, len(COLUMNS) - 1
+_PLACE = tuple(range(_WIDTH))
+_SCALARS = (
+    "clock", "count", "sign", "closed", "pending", "rows", "waiting", "precision", "woken", "blocks", "base",
+    "base_square", "base_variance",
+)  # fmt: skip
+(_CLOCK, _COUNT, _SIGN, _CLOSED, _PENDING, _ROWS, _WAITING, _PRECISION, _WOKEN, _BLOCKS, _BASE, _BASE_SQUARE,
+ _BASE_VARIANCE) = range(len(_SCALARS))  # fmt: skip
 
 
-def variables(rig: Rig, formulation: Formulation, rate: float) -> Iterator[Variable]:
-    """Yield the variables of a soft sensor that takes samples at `rate` [Hz]."""
-    for k, name in enumerate(INPUTS[formulation]):
+def variables(rig: Rig) -> Iterator[Variable]:
+    """Yield the variables of a soft sensor."""
+    for k, name in enumerate(INPUTS):
         yield Variable(
             INPUT_BASE + k, name, "input", "continuous", CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}", 0.0
         )
-    declared = dict(leaves(Rig))
-    for name in READ[formulation]:
-        field = declared[name]
-        words, value = str(field.title or name), attrgetter(name)(rig)
-        yield Variable(VALUE_BASE + VALUES.index(name), name, "parameter", "fixed", unit_of(field), words, float(value))
-    for k, ((name, (unit, words)), value) in enumerate(
-        zip(SAMPLING.items(), (1.0 / rate, BLOCK_SECONDS), strict=True), len(VALUES)
-    ):
-        yield Variable(VALUE_BASE + k, name, "parameter", "fixed", unit, words, value)
+    field, value = dict(leaves(Rig))[READ], float(attrgetter(READ)(rig))
+    yield Variable(VALUE_BASE + _SIZE, READ, "parameter", "fixed", unit_of(field), str(field.title or READ), value)
     for k, (name, (unit, words)) in enumerate(RESULTS.items()):
         yield Variable(RESULT_BASE + k, name, "output", "continuous", unit, words, None)
 
 
 class SensorChoice(NamedTuple):
-    """What the code of a soft sensor depends on: formulation, laws of the rig, where the parameters start."""
+    """What the code of a soft sensor depends on.
 
-    formulation: Formulation
-    choices: tuple[bool | tuple[bool, ...], ...]
-    exponent: float
-    literal: bool
-    start: tuple[float, ...]
-    deviations: tuple[float, ...]
+    `rate` [Hz]; `size_error`: how far the machine's size is known; `fast`, `own`: columns as `weigh` takes them.
+    """
+
+    rate: float
+    size_error: float
+    fast: tuple[int, ...]
+    own: tuple[int, ...]
 
     @classmethod
-    def of(cls, rig: Rig, formulation: Formulation) -> SensorChoice:
-        """Return a rig's choice."""
-        start, deviations = (tuple(map(float, values)) for values in start_parameters(assume(rig)))
-        choices = tuple(assume(rig))[len(NUMBERS) :]
-        return cls(formulation, choices, *throttle_readings(rig), start, deviations)
+    def of(cls, rig: Rig, rate: float) -> SensorChoice:
+        """Return a rig's choice; raise InputError where its balance has other terms than the code."""
+        (balance,) = live_equations(rig, INPUTS)
+        columns = Columns(balance)
+        if columns.names != COLUMNS[:-1]:
+            raise InputError(f"a soft sensor's terms must be {', '.join(COLUMNS[:-1])}, got {', '.join(columns.names)}")
+        return cls(rate, size_error(rig), columns.fast, (*columns.support, columns.left))
 
 
-def layout(formulation: Formulation) -> dict[str, tuple[int, int]]:
-    """Return where each part of a soft sensor's memory begins, and its length."""
-    if formulation == "volume":
-        n = _N_STATES
-        parts = {"y": n, "P": n**2, "sums": SUMS, "walk": n, "row": LEAD + 2 * n, "held": n**2 + n, "room": 2 * n}
-    else:
-        n = _N_FACTORS
-        parts = {"bank": len(_CANDIDATES) * _EACH, "likelihood": len(_CANDIDATES), "filter": _EACH, "start": n}
-        parts |= {"deviations": n, "walk": n, "row": LEAD + 2 * n, "room": sum(math.prod(shape) for shape in ROOM)}
-    begins = accumulate((LENGTH, *parts.values()))
-    return {name: (begin, size) for (name, size), begin in zip(parts.items(), begins, strict=False)}
+class _Numbers(NamedTuple):
+    """Counts that the code is made for: samples of a stride, strides of a block, half the samples of a difference."""
+
+    stride: int
+    strides: int
+    half: int
+
+    @classmethod
+    def of(cls, rate: float) -> _Numbers:
+        return cls(stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate)))
 
 
-def size(formulation: Formulation) -> int:
+class _Memory(NamedTuple):
+    """A soft sensor's memory.
+
+    `ring`: the last samples; `increments`, `opened`: of an interval, and the rows that it is part of; `rows`, `ends`,
+    `gram`: of the blocks that are weighted together; `sizes`: sum and number of abs(p_A - p_B) in the last blocks;
+    `support`: what supports the weights; `waits`, `waiting`, `ordered`: sums, rows and size, and precisions of the
+    blocks that are learned from; `last`: of each of the last blocks total, conductance, its variance, that of the
+    level, and abs(p_A - p_B).
+    """
+
+    scalars: Any
+    ring: Any
+    increments: Any
+    opened: Any
+    rows: Any
+    ends: Any
+    gram: Any
+    sizes: Any
+    support: Any
+    waits: Any
+    waiting: Any
+    ordered: Any
+    last: Any
+
+
+def _shapes(choice: SensorChoice) -> tuple[tuple[tuple[int, ...], ...], ...]:
+    """Return the shapes of a memory's parts: those of `_Memory`, of a `Room` and of a `Known`."""
+    n, slow = _Numbers.of(choice.rate), len(choice.own) - 1
+    rows = SUPPORT * n.strides
+    own = _Memory(
+        (len(_SCALARS),), (len(INPUTS), 2 * n.half + 3), (_WIDTH,), (SPAN, _WIDTH), (rows, _WIDTH), (SUPPORT,),
+        (SUPPORT, _WIDTH, _WIDTH), (SUPPORT + 1, 2), (slow + 1, slow + 1), (LEARNED, _WIDTH, _WIDTH), (LEARNED, 3),
+        (LEARNED,), (WINDOW, 5),
+    )  # fmt: skip
+    return tuple(own), room_shapes(rows, SUPPORT, len(choice.fast), slow), known_shapes(_LEAK)
+
+
+def size(choice: SensorChoice) -> int:
     """Return the length of a soft sensor's memory."""
-    return sum(layout(formulation)["room"])
+    return sum(math.prod(shape) for part in _shapes(choice) for shape in part)
+
+
+def _place_of(choice: SensorChoice, name: str) -> int:
+    """Return where a part of `_Memory` begins."""
+    return sum(math.prod(shape) for shape in _shapes(choice)[0][: _Memory._fields.index(name)])
+
+
+def _arrays(shapes: tuple[tuple[int, ...], ...], at: int) -> Callable[..., Any]:
+    """Return the law that makes a tuple of arrays of these shapes, one behind the other, from the place `at` on."""
+    if not shapes:
+        return law(_nothing)
+    shape, others = shapes[0], _arrays(shapes[1:], at + math.prod(shapes[0]))
+
+    @law
+    def arrays(memory: Any) -> Any:
+        return (carray(pointer_at(memory, at), shape), *others(memory))
+
+    return arrays  # type: ignore[no-any-return]
+
+
+def _nothing(memory: Any) -> Any:
+    return ()
 
 
 def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """Return the functions of a soft sensor, to be compiled: ``start``, ``advance`` and ``report`` as of a machine."""
-    formulation = choice.formulation
-    sample = _sample_of_volumes(choice) if formulation == "volume" else _sample_of_pressures(choice)
-    length, row, n_inputs, n_results = (
-        size(formulation),
-        layout(formulation)["row"][0],
-        len(INPUTS[formulation]),
-        len(RESULTS),
-    )
-    size_error, expected, quantiles = SIZE_ERROR[formulation], EXPECTED_WALK[formulation], _quantiles()
+    sample, length, interval = _sample(choice), size(choice), 1.0 / choice.rate
+    last_at = _place_of(choice, "last")
+    misfit_at = length - sum(math.prod(shape) for shape in _shapes(choice)[2][3:]) + MISFIT
+    n_inputs, n_results, n_values = len(INPUTS), len(RESULTS), len(VALUES)
+    quantiles, error = _quantiles(), choice.size_error
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        v = carray(values, _N_VALUES)
-        fresh(carray(y, length))
-        return 0 if v[_SAMPLE] > 0.0 and v[_BLOCK] >= 2.0 * v[_SAMPLE] else 1
+        m = carray(y, length)
+        for k in range(length):
+            m[k] = 0.0
+        return 0 if carray(values, n_values)[_SIZE] > 0.0 else 1
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        v, m = carray(values, _N_VALUES), carray(y, length)
+        m, displacement = carray(y, length), carray(values, n_values)[_SIZE] / (2.0 * math.pi)
         a, b = carray(inputs, n_inputs), carray(slopes, n_inputs)
-        t, h = m[CLOCK], v[_SAMPLE]
-        while t < span - 1e-6 * h:  # a sample at the end is the next step's first
-            sample(y, v, a[0] + b[0] * t, a[1] + b[1] * t, a[2] + b[2] * t, a[n_inputs - 1] + b[n_inputs - 1] * t)
-            t += h
-        m[CLOCK] = t - span
+        t = m[_CLOCK]
+        while t < span - 1e-6 * interval:  # a sample at the end is the next step's first
+            sample(y, displacement, a[0] + b[0] * t, a[1] + b[1] * t, a[2] + b[2] * t, a[3] + b[3] * t)
+            t += interval
+        m[_CLOCK] = t - span
         return 0
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        m = carray(y, length)
-        misfit = m[row + 2] if m[BLOCKS] > 0.0 else 0.0
-        block_s, out = carray(values, _N_VALUES)[_BLOCK], carray(results, n_results)
-        walk = expected * (block_s / BLOCK_SECONDS) ** 2
-        write_results(m, block_s, misfit, size_error, walk, quantiles, out)
+        m, last = carray(y, length), carray(pointer_at(y, last_at), (WINDOW, 5))
+        _write_results(m, last, m[misfit_at], error, quantiles, carray(results, n_results))
         return 0
 
     return {"start": start, "advance": advance, "report": report}
 
 
-def _sample_of_volumes(choice: SensorChoice) -> Callable[..., Any]:
-    """Return the law that takes a sample of pressures, angle and position."""
-    where, n = layout("volume"), _N_STATES
-    y_at, P_at, sums_at, walk_at, row_at, held_at, room_at = (begin for begin, _ in where.values())
-    length = size("volume")
-    numbers = numbers_of(choice.choices, choice.exponent, choice.literal)
-    displaced, area_of, stored = law(displacement), law(mean_area), law(compliance)
+def _sample(choice: SensorChoice) -> Callable[..., Any]:
+    """Return the law that takes a sample of the channels `INPUTS`."""
+    parts, room, known = _shapes(choice)
+    room_at = sum(math.prod(shape) for shape in parts)
+    of_memory = _arrays(parts, 0)
+    of_room, of_known = _arrays(room, room_at), _arrays(known, room_at + sum(math.prod(shape) for shape in room))
+    (stride, strides, half), rate = _Numbers.of(choice.rate), choice.rate
+    support, weight = SPAN * stride, float(test_function(rate)[0, 0]) / (1.0 - (1.0 / (SPAN * stride) - 1.0) ** 2) ** 4
+    close, length = _close(choice), stride * strides
+    rows_at, ends_at = (_place_of(choice, name) for name in ("rows", "ends"))
 
     @law
-    def sample(memory: Any, v: Any, p_A: float, p_B: float, theta: float, x: float) -> None:
-        m, p, h = carray(memory, length), numbers(v, 0.0, 0.0), v[_SAMPLE]
-        area, D, c = area_of(p), displaced(p), stored(p)
-        y, P = carray(pointer_at(memory, y_at), n), carray(pointer_at(memory, P_at), (n, n))
-        sums, walk = carray(pointer_at(memory, sums_at), SUMS), carray(pointer_at(memory, walk_at), n)
-        if m[PHASE] == SEARCHES:
-            search(m, theta, x, p_A - p_B, theta, x, p_A - p_B, h, True)
-            if m[COUNT] < round(SEARCH_SECONDS / h):
-                return
-            senses(m)
-            of_theta, of_x, of_dp = D * m[TURN], -area, -c * m[PUSH]
-            power = of_theta**2 * m[FINE] + of_x**2 * m[FINE + 1] + of_dp**2 * m[FINE + 2]
-            power += 2.0 * of_theta * (of_x * m[FINE + 3] + of_dp * m[FINE + 4]) + 2.0 * of_x * of_dp * m[FINE + 5]
-            m[NOISE_A] = max(power / (m[COUNT] - N_TAPS + 1.0), LEAST_VOLUME**2)
-            start_volume(area, c, p.K_oil, v[_BLOCK], y, P, sums, walk)
-            m[PHASE], m[THETA], m[X] = RUNS, theta, x
+    def sample(memory: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
+        m = _Memory(*of_memory(memory))
+        count, width = int(m.scalars[_COUNT]), m.ring.shape[1]
+        at = count % width
+        m.ring[0, at], m.ring[1, at], m.ring[2, at], m.ring[3, at] = p_A, p_B, theta, x
+        m.scalars[_COUNT] += 1.0
+        k = count - half - 1  # the interval from sample k on, which half a difference is known after
+        if k < 0:
             return
-        row, room = carray(pointer_at(memory, row_at), LEAD + 2 * n), carray(pointer_at(memory, room_at), (2, n))
-        held, swept = carray(pointer_at(memory, held_at), (n + 1, n)), area * (x - m[X])
-        z, dp = D * m[TURN] * (theta - m[THETA]) - swept, m[PUSH] * (p_A - p_B)
-        block = max(2.0, round(v[_BLOCK] / h))
-        if take_volume(z, swept, dp, h, area, y, P, sums, m[NOISE_A], walk, block, row, held, room):
-            keep(m, row, v[_BLOCK])
+        _increments(m.ring, k, half, rate, displacement, m.increments)
+        piece, inside, slot = k // stride, k % stride, (k // length) % (SUPPORT + 1)
+        if k % length == 0:
+            m.sizes[slot, 0] = m.sizes[slot, 1] = 0.0
+        if not math.isnan(m.increments[_WIDTH - 2] + m.increments[_WIDTH - 1]):
+            m.sizes[slot, 0] += abs(m.increments[_WIDTH - 2]) * rate
+            m.sizes[slot, 1] += 1.0
+        for p in range(SPAN):
+            row = (piece - p) % SPAN
+            s = (p * stride + inside + 0.5) * 2.0 / support - 1.0
+            phi = weight * (1.0 - s * s) ** 4
+            for j in range(_WIDTH):
+                before = 0.0 if p == 0 and inside == 0 else m.opened[row, j]
+                m.opened[row, j] = before + phi * m.increments[j]
+        row = piece - SPAN + 1
+        if inside < stride - 1 or row < 0:
+            return
+        whole, place = True, int(m.scalars[_ROWS])
+        for j in range(_WIDTH):
+            m.rows[place, j] = m.opened[row % SPAN, j]
+            whole = whole and abs(m.rows[place, j]) < LARGEST
+        m.scalars[_ROWS] += whole
+        if row % strides == strides - 1:
+            taken = carray(pointer_at(memory, rows_at), (int(m.scalars[_ROWS]), _WIDTH))
+            ends = carray(pointer_at(memory, ends_at), (int(m.scalars[_PENDING]) + 1,))
+            close(m, taken, ends, Room(*of_room(memory)), Known(*of_known(memory)), row // strides)
 
     return sample  # type: ignore[no-any-return]
 
 
-def _sample_of_pressures(choice: SensorChoice) -> Callable[..., Any]:
-    """Return the law that takes a sample of pressures and speed, or command."""
-    commanded, where, n = choice.formulation == "command", layout(choice.formulation), _N_FACTORS
-    bank_at, alive_at, filter_at, start_at, spread_at, walk_at, row_at, room_at = (begin for begin, _ in where.values())
-    length, candidates = size(choice.formulation), len(_CANDIDATES)
-    numbers = numbers_of(choice.choices, choice.exponent, choice.literal)
-    rooms = tuple(accumulate((room_at, *(math.prod(shape) for shape in ROOM))))
-    start_of, deviation_of, walk_of = choice.start, choice.deviations, tuple(value**2 / 60.0 for value in WALKS)
-    (first_stop, left), (last_stop, _) = ROUNDS
+@large_law
+def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
+    """Put the increments of the interval from sample k on, in the order of `COLUMNS`, into `out`."""
+    width = ring.shape[1]
+    here, there = k % width, (k + 1) % width
+    dx, x = ring[3, there] - ring[3, here], 0.5 * (ring[3, there] + ring[3, here])
+    out_A, outward, by_A = 0.0, 0.0, 0.0
+    for i in range(k, k + 2):
+        moves = 0.5 * (ring[3, (i + half) % width] >= ring[3, max(i - half, 0) % width])
+        carries = ring[0, i % width] > ring[1, i % width]
+        out_A, outward, by_A = out_A + moves * carries, outward + moves, by_A + 0.5 * carries
+    out[0], out[1] = out_A * dx, (outward - out_A) * dx
+    out[2], out[3] = (by_A - out_A) * dx, (1.0 - outward - by_A + out_A) * dx
+    for side in range(2):
+        before, after = ring[side, here], ring[side, there]
+        low, high = max(before + ATMOSPHERE, LEAST_ABSOLUTE), max(after + ATMOSPHERE, LEAST_ABSOLUTE)
+        at = 4 + 4 * side
+        out[at], out[at + 1] = after - before, x * (after - before)
+        out[at + 2], out[at + 3] = 1.0 / high - 1.0 / low, math.log(high) - math.log(low)
+    earlier, later = max(k - 1, 0), k + 1
+    slope = ring[3, (later + 1) % width] - ring[3, later % width]
+    slope -= ring[3, (earlier + 1) % width] - ring[3, earlier % width]
+    out[12] = rate * slope / (later - earlier)
+    out[13] = 1.0 / rate
+    out[14] = 0.5 * (ring[0, here] + ring[0, there] - ring[1, here] - ring[1, there]) / rate
+    out[15] = displacement * (ring[2, there] - ring[2, here])
 
-    @law
-    def room_of(memory: Any) -> Any:
-        J, E = carray(pointer_at(memory, rooms[0]), ROOM[0]), carray(pointer_at(memory, rooms[1]), ROOM[1])
-        T, B = carray(pointer_at(memory, rooms[2]), ROOM[2]), carray(pointer_at(memory, rooms[3]), ROOM[3])
-        S, W = carray(pointer_at(memory, rooms[4]), ROOM[4]), carray(pointer_at(memory, rooms[5]), ROOM[5])
-        k1, k2 = carray(pointer_at(memory, rooms[6]), MEANS), carray(pointer_at(memory, rooms[7]), MEANS)
-        k3, k4 = carray(pointer_at(memory, rooms[8]), MEANS), carray(pointer_at(memory, rooms[9]), MEANS)
-        mid, gain = carray(pointer_at(memory, rooms[10]), MEANS), carray(pointer_at(memory, rooms[11]), COVARIANCE)
-        return Room(J, E, T, B, S, W, k1, k2, k3, k4, mid, gain)
 
-    @law
-    def parts(memory: Any, at: int) -> Any:
-        q_at, P_at = at + MEANS, at + MEANS + n
-        z, q = carray(pointer_at(memory, at), MEANS), carray(pointer_at(memory, q_at), n)
-        P = carray(pointer_at(memory, P_at), (COVARIANCE, COVARIANCE))
-        return z, q, P, carray(pointer_at(memory, P_at + COVARIANCE * COVARIANCE), SUMS)
+@law
+def _orient(m: Any, count: int) -> None:
+    """Write the sign in which the left side counts (`BlockStream`), by the first rows."""
+    mean, work = 0.0, 0.0
+    for r in range(count):
+        mean += m.rows[r, _LEAK] / count
+    for r in range(count):
+        work += (m.rows[r, _LEAK] - mean) * m.rows[r, _LEFT]
+    m.scalars[_SIGN] = -1.0 if work < 0.0 else 1.0
 
-    @law
-    def begin(memory: Any, at: int, stiffness: float) -> None:
-        start, deviations = carray(pointer_at(memory, start_at), n), carray(pointer_at(memory, spread_at), n)
-        for k in range(n):
-            start[k], deviations[k] = start_of[k], deviation_of[k]
-        start[_STIFFNESS], deviations[_STIFFNESS] = stiffness, deviation_of[_STIFFNESS] * stiffness
-        z, q, P, sums = parts(memory, at)
-        start_pressures(start, deviations, carray(pointer_at(memory, NOISE_A), 2), z, q, P, sums)
 
-    @law
-    def drop_least_likely(m: Any) -> None:
-        alive = 0
-        for k in range(candidates):
-            alive += m[alive_at + k] > -math.inf
-        for _ in range(alive - left):
-            worst = -1
-            for k in range(candidates):
-                likelihood = m[alive_at + k]
-                if likelihood > -math.inf and (worst < 0 or likelihood < m[alive_at + worst]):
-                    worst = k
-            m[alive_at + worst] = -math.inf
+@large_law
+def _show(m: Any, known: Any, error: float, rows: float, size: float, adds: bool) -> None:
+    """Put what the block `known.own` shows among the last ones."""
+    scalars, moved = m.scalars, motion(known.own[-1, -1], rows, known.numbers)
+    precision, lead, shift, leaning = says(known, rows, adds)
+    if not precision > (TELLS * scalars[_PRECISION] if moved < RESTS else 0.0):
+        return
+    total, last, k = lead / precision, m.last, int(scalars[_BLOCKS]) % WINDOW
+    g = total - shift / precision
+    last[k, 0], last[k, 1], last[k, 2], last[k, 4] = total, g, 1.0 / precision, size
+    last[k, 3] = leaning / precision**2 + (error * total) ** 2
+    scalars[_BLOCKS] += 1.0
+    if scalars[_BLOCKS] <= WINDOW:
+        scalars[_BASE] += g
+        scalars[_BASE_SQUARE] += g * g
+        scalars[_BASE_VARIANCE] += 1.0 / precision
 
-    @law
-    def end_search(memory: Any, m: Any) -> None:
-        senses(m)
-        for k in range(2):
-            m[NOISE_A + k] = max(m[FINE + 1 + k] / (m[COUNT] - N_TAPS + 1.0), LEAST_PRESSURE**2)
-        for k in range(candidates):
-            begin(memory, bank_at + k * _EACH, _CANDIDATES[k])
-            m[alive_at + k] = 0.0
-        m[PHASE], m[COUNT], m[ROUND] = CHOOSES, 0.0, 0.0
 
-    @law
-    def end_choice(memory: Any, m: Any, block_s: float) -> None:
-        best = 0
-        for k in range(candidates):
-            if m[alive_at + k] > m[alive_at + best]:
-                best = k
-        begin(memory, filter_at, parts(memory, bank_at + best * _EACH)[1][_STIFFNESS])
-        for k in range(n):
-            m[walk_at + k] = walk_of[k] * block_s
-        m[PHASE] = RUNS
+@large_law
+def _learn(m: Any, known: Any, error: float) -> None:
+    """Learn from the blocks that wait, and show them."""
+    for again in range(3):
+        for k in range(LEARNED):
+            rows, size = m.waiting[k, 0], m.waiting[k, 1]
+            take(known, m.waits[k], _PLACE)
+            if again == 0:
+                add(known, rows, 1.0, False)
+            elif again == 1:
+                m.ordered[k] = says(known, rows, False)[0]
+            else:
+                _show(m, known, error, rows, size, False)
+        if again == 0:
+            begin(known)
+        elif again == 1:
+            m.scalars[_PRECISION] = median(m.ordered, LEARNED)
+    m.scalars[_WAITING] = 0.0
 
-    @law
-    def sample(memory: Any, v: Any, p_A: float, p_B: float, given: float, _: float) -> None:
-        m, h, drive = carray(memory, length), v[_SAMPLE], given
-        if not commanded:  # the mean speed since the sample before
-            drive = 0.5 * (given + m[OMEGA]) if m[COUNT] + m[PHASE] > 0.0 else given
-            m[OMEGA] = given
-        if m[PHASE] == SEARCHES:
-            search(m, given, p_A, p_B, given, p_A - p_B, 0.0, h, False)
-            if m[COUNT] >= round(SEARCH_SECONDS / h):
-                end_search(memory, m)
+
+@large_law
+def _take(m: Any, known: Any, error: float, b: int, rows: float, size: float) -> None:
+    """Take the sums of a block: `LEARNED` blocks are learned from together, the others one by one."""
+    scalars = m.scalars
+    if scalars[_PRECISION] > 0.0:
+        moved = motion(m.gram[b, _LEFT, _LEFT], rows, known.numbers)
+        scalars[_WOKEN] = scalars[_WOKEN] + 1.0 if moved > 1.0 / RESTS else 0.0
+        if scalars[_WOKEN] >= WAKES:  # all before were of a machine at rest: nothing is compared with them
+            for i in range(len(known.own)):
+                for j in range(len(known.own)):
+                    known.sums[i, j] = 0.0
+            for i in range(len(known.along)):
+                known.along[i] = 0.0
+            for i in range(len(known.numbers)):
+                known.numbers[i] = 0.0
+            for i in range(_PRECISION, len(_SCALARS)):
+                scalars[i] = 0.0
             return
-        drive *= m[TURN]
-        running = m[PHASE] == RUNS
-        p, room, noise = numbers(v, 0.0, 0.0), room_of(memory), carray(pointer_at(memory, NOISE_A), 2)
-        walk, row = carray(pointer_at(memory, walk_at), n), carray(pointer_at(memory, row_at), LEAD + 2 * n)
-        steps = int(max(1.0, math.ceil(h / (LONGEST_STEP if running else 2.0 * LONGEST_STEP) - 1e-9)))
-        block = max(2.0, round(v[_BLOCK] / h)) if running else _NEVER
-        for k in range(1 if running else candidates):
-            if running or m[alive_at + k] > -math.inf:
-                z, q, P, sums = parts(memory, filter_at if running else bank_at + k * _EACH)
-                closed = take_pressures(
-                    drive, p_A, p_B, commanded, h, steps, p, z, q, P, sums, noise, walk, block, row, room
-                )
-                if closed:
-                    keep(m, row, v[_BLOCK])
-                if not running:
-                    m[alive_at + k] = sums[1] if math.isfinite(sums[1]) else -math.inf
-        if running:
-            return
-        m[COUNT] += 1.0
-        if m[ROUND] == 0.0 and m[COUNT] >= round(first_stop / h):
-            m[ROUND] = 1.0
-            drop_least_likely(m)
-        if m[COUNT] >= round(last_stop / h):
-            end_choice(memory, m, v[_BLOCK])
+        take(known, m.gram[b], _PLACE)
+        _show(m, known, error, rows, size, True)
+        return
+    waiting = int(scalars[_WAITING])
+    if waiting == 0 and not m.gram[b, _LEFT, _LEFT] > 0.0:
+        return
+    m.waiting[waiting, 0], m.waiting[waiting, 1] = rows, size
+    for i in range(_WIDTH):
+        for j in range(_WIDTH):
+            m.waits[waiting, i, j] = m.gram[b, i, j]
+    scalars[_WAITING] += 1.0
+    if waiting + 1 == LEARNED:
+        _learn(m, known, error)
 
-    return sample  # type: ignore[no-any-return]
+
+def _close(choice: SensorChoice) -> Callable[..., Any]:
+    """Return the law that closes a block."""
+    fast, own, error = choice.fast, choice.own, choice.size_error
+
+    @large_law
+    def close(m: Any, rows: Any, ends: Any, room: Any, known: Any, block: int) -> None:
+        scalars, count, pending, first = m.scalars, len(rows), len(ends), m.scalars[_CLOSED] == 0.0
+        ends[pending - 1] = count
+        scalars[_PENDING] = pending
+        if first and pending < SUPPORT:
+            return
+        if first:
+            _orient(m, count)
+        for r in range(count):
+            rows[r, _LEFT] *= scalars[_SIGN]
+        scalars[_CLOSED] += pending
+        weigh(rows, ends, fast, own, m.support, min(1.0, SUPPORT / scalars[_CLOSED]), room, m.gram)
+        scalars[_PENDING] = scalars[_ROWS] = 0.0
+        for b in range(pending):
+            of_block = ends[b] - (ends[b - 1] if b else 0.0)
+            slot = (block - pending + 1 + b) % (SUPPORT + 1)
+            if of_block > 0.0:
+                _take(m, known, error, b, of_block, max(m.sizes[slot, 0] / max(m.sizes[slot, 1], 1.0), TINY))
+
+    return close  # type: ignore[no-any-return]
+
+
+@large_law
+def _mean(last: Any, newest: int, n: int, column: int) -> float:
+    """Return the mean of a column of the last n blocks up to the `newest`."""
+    total = 0.0
+    for k in range(n):
+        total += last[(newest - k) % WINDOW, column] / n
+    return float(total)
+
+
+@large_law
+def _variance(last: Any, newest: int, n: int) -> float:
+    """Return the variance of the mean conductance of the last n blocks up to the `newest`."""
+    mean, square = _mean(last, newest, n, 1), 0.0
+    for k in range(n):
+        square += (last[(newest - k) % WINDOW, 1] - mean) ** 2 / (n - 1.0)
+    return float(max(square, _mean(last, newest, n, 2)) / n)
+
+
+@law
+def _write_results(m: Any, last: Any, misfit: float, error: float, quantiles: Any, out: Any) -> None:
+    """Write the outputs (`RESULTS`).
+
+    `error`: that of the machine's size, relative; `quantiles`: Student's t for 1, 2, ... degrees of freedom.
+    """
+    for k in range(len(out)):
+        out[k] = 0.0
+    count, newest = int(m[_BLOCKS]), int(m[_BLOCKS]) - 1
+    out[7], out[8], n = misfit, m[_BLOCKS], min(count, WINDOW)
+    if n < 2:
+        return
+    G, flow = _mean(last, newest, n, 0), _mean(last, newest, n, 4)
+    half = math.hypot(
+        quantiles[n - 2] * math.sqrt(_variance(last, newest, n)), _95 * math.sqrt(_mean(last, newest, n, 3))
+    )
+    out[0], out[1], out[2], out[6] = flow * G, flow * (G - half), flow * (G + half), G
+    n = min(count - WINDOW, WINDOW)
+    if n < 2:
+        return
+    base, flow = m[_BASE] / WINDOW, _mean(last, newest, n, 4)
+    rise = _mean(last, newest, n, 1) - base
+    before = max((m[_BASE_SQUARE] - WINDOW * base**2) / (WINDOW - 1.0), m[_BASE_VARIANCE] / WINDOW)
+    walked = WALK * (count - 0.5 * (n + WINDOW)) / (1.0 + WALK * (WINDOW + 1.0) / 6.0)
+    variance = _variance(last, newest, n) + before * (1.0 / WINDOW + walked)
+    half = math.hypot(quantiles[n - 2] * math.sqrt(variance), _95 * error * rise)
+    out[3], out[4], out[5], out[9] = flow * rise, flow * (rise - half), flow * (rise + half), 1.0
 
 
 def _quantiles() -> tuple[float, ...]:

@@ -179,7 +179,8 @@ class BlockStream:
             own[:, columns.left] *= sign
         weights = whole.reshape(-1, self._strides).sum(axis=1)
         gram = self._weighting.close(values, np.cumsum(weights))
-        start = self._begin + (np.arange(first, end) * self._strides + 0.5 * SPAN) * self._stride / self._rate
+        index = np.arange(first, end, dtype=float)
+        start = self._begin + (index * self._strides + 0.5 * SPAN) * (self._stride / self._rate)
         last = start + (self._strides - 1) * self._stride / self._rate
         means, pressures = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("means", "pressures"))
         zeros = np.zeros(end - first)

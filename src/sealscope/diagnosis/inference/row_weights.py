@@ -14,8 +14,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sealscope.compiled import law
+from sealscope.compiled import large_law, law
 from sealscope.recordings.recording import Array
 
 #: Blocks whose rows are weighted together at the beginning of a stream, and that stand for what is known later.
@@ -27,11 +28,14 @@ _MOST, _TOLERANCE = 50, 1e-2  # turns to a fixed point at most, and the mean cha
 _SIGMA = 1.4826  # standard deviation of normal values over the median of their size
 
 
+_Places = NDArray[np.intp]
+
+
 class Room(NamedTuple):
     """Arrays to work in, for r rows of K blocks, f fast and s slow columns.
 
-    `weights`, `residual`, `ordered` (r,); `inner` (f, f); `cross` (K, f, s + 1); `total` (s + 1, s + 1); `normal` (s, s); `right`
-    (s, 1); `scale` (f + s,).
+    `weights`, `residual`, `ordered` (r,); `inner` (f, f); `cross` (K, f, s + 1); `total` (s + 1, s + 1); `normal` (s,
+    s); `right` (s, 1); `scale` (f + s,).
     """
 
     weights: Any
@@ -52,7 +56,7 @@ def room_shapes(rows: int, blocks: int, fast: int, slow: int) -> tuple[tuple[int
     return *by_row, (fast, fast), (blocks, fast, own), (own, own), (slow, slow), (slow, 1), (fast + slow,)
 
 
-@law
+@large_law
 def solve_in_place(matrix: Any, right: Any, scale: Any) -> None:
     """Put matrix^-1 right into `right` (n, k), of a symmetric matrix >= 0 (n, n) that is lost, with `scale` (n,).
 
@@ -89,7 +93,7 @@ def solve_in_place(matrix: Any, right: Any, scale: Any) -> None:
 
 
 @law
-def _median(values: Any, n: int) -> float:
+def median(values: Any, n: int) -> float:
     """Return the median of the first n values, whose order is lost (Hoare's selection)."""
     k, low, high = (n - 1) // 2, 0, n - 1
     while low < high:
@@ -128,7 +132,7 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
                 gram[i, j] += value * values[r, j]
 
 
-@law
+@large_law
 def _add_reduced(gram: Any, fast: Any, own: Any, room: Any, cross: Any) -> None:
     """Add to `room.total` what a block says of the columns `own`, whatever the fast ones' coefficients are.
 
@@ -148,7 +152,7 @@ def _add_reduced(gram: Any, fast: Any, own: Any, room: Any, cross: Any) -> None:
             room.total[i, j] += value
 
 
-@law
+@large_law
 def _reweigh(values: Any, ends: Any, fast: Any, own: Any, room: Any) -> bool:
     """Put Huber's weights at a fit into the room; return whether they are those at which it was made."""
     count, slow, b = len(values), len(own) - 1, 0
@@ -165,7 +169,7 @@ def _reweigh(values: Any, ends: Any, fast: Any, own: Any, room: Any) -> bool:
             residual -= room.right[i, 0] * of_slow
         room.residual[r] = abs(residual)
         room.ordered[r] = abs(residual)
-    size, change = HUBER * _SIGMA * _median(room.ordered, count), 0.0
+    size, change = HUBER * _SIGMA * median(room.ordered, count), 0.0
     for r in range(count):
         weight = size / room.residual[r] if size > 0.0 and room.residual[r] > size else 1.0
         change += abs(weight / room.weights[r] - 1.0)
@@ -173,7 +177,7 @@ def _reweigh(values: Any, ends: Any, fast: Any, own: Any, room: Any) -> bool:
     return change < _TOLERANCE * count or not size > 0.0
 
 
-@law
+@large_law
 def weigh(values: Any, ends: Any, fast: Any, own: Any, known: Any, share: float, room: Any, gram: Any) -> None:
     """Put the sums of weighted products of rows (r, m), of K blocks that end before the rows `ends`, into `gram`.
 
@@ -189,7 +193,7 @@ def weigh(values: Any, ends: Any, fast: Any, own: Any, known: Any, share: float,
             for j in range(slow + 1):
                 room.total[i, j] = 0.0
         for b in range(blocks):
-            _sum_products(values, ends[b - 1] if b else 0, ends[b], room.weights, gram[b])
+            _sum_products(values, int(ends[b - 1]) if b else 0, int(ends[b]), room.weights, gram[b])
             _add_reduced(gram[b], fast, own, room, room.cross[b])
         if settled or turn == _MOST:
             break
@@ -204,7 +208,7 @@ def weigh(values: Any, ends: Any, fast: Any, own: Any, known: Any, share: float,
             known[i, j] += share * (SUPPORT / blocks * room.total[i, j] - known[i, j])
 
 
-def weighted(values: Array, ends: Array, fast: Array, own: Array, known: Array, share: float) -> Array:
+def weighted(values: Array, ends: _Places, fast: _Places, own: _Places, known: Array, share: float) -> Array:
     """Return the Gram matrices (K, m, m) of blocks, and learn from them (`weigh`)."""
     room = Room(*(np.empty(shape) for shape in room_shapes(len(values), len(ends), len(fast), len(own) - 1)))
     gram = np.empty((len(ends), values.shape[1], values.shape[1]))

@@ -29,7 +29,7 @@ from sealscope.diagnosis.inference.live.known import (
     says,
     take,
 )
-from sealscope.diagnosis.inference.terms import Term, equations, priors
+from sealscope.diagnosis.inference.terms import Equation, equations, priors
 from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -159,8 +159,7 @@ class LiveBalance:
     """
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:
-        balances = equations(rig, frozenset(names))
-        self._balances = [own._replace(terms=tuple(filter(_is_told, own.terms))) for own in balances]
+        self._balances = live_equations(rig, names)
         if not self._balances:
             raise InputError(f"a live balance must have {_needed(rig)}, got {', '.join(names) or 'nothing'}")
         needed = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
@@ -323,9 +322,11 @@ def states_flow(rig: Rig) -> bool:
     return rig.states(*(("cylinder.A_A", "cylinder.A_B") if rig.valve.spool == "present" else ("pump.q_b",)))
 
 
-def _is_told(term: Term) -> bool:
-    """Return whether a term has a column: what may be zero, or lies beside the leak, has none."""
-    return term.nuisance and term.name != "pump leak"
+def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
+    """Return a machine's balances with the terms that have a column: none has what is zero or lies beside the leak."""
+    balances = equations(rig, frozenset(names))
+    told = [tuple(term for term in own.terms if term.nuisance and term.name != "pump leak") for own in balances]
+    return [own._replace(terms=terms) for own, terms in zip(balances, told, strict=True)]
 
 
 def _needed(rig: Rig) -> str:

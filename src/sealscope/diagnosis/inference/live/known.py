@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from sealscope.compiled import law
+from sealscope.compiled import large_law, law
 from sealscope.diagnosis.inference.row_weights import solve_in_place
 from sealscope.diagnosis.inference.weak_form import OVERLAP
 
@@ -79,7 +79,7 @@ def take(known: Any, gram: Any, place: Any) -> None:
             known.own[i, j] = gram[place[i], place[j]]
 
 
-@law
+@large_law
 def add(known: Any, rows: float, weight: float, stepped: bool) -> None:
     """Add the block `known.own`; forget a part of what those before said.
 
@@ -89,7 +89,7 @@ def add(known: Any, rows: float, weight: float, stepped: bool) -> None:
     walked = sums[leak, leak] + (0.0 if stepped else max(own[leak, leak], TINY))
     for i in range(n):  # the leak's row is needed until the last
         for j in range(n):
-            if i != leak and j != leak:
+            if leak not in (i, j):
                 less = sums[i, leak] * sums[leak, j] / walked if walked > 0.0 else 0.0
                 sums[i, j] = _KEEP * (sums[i, j] - less) + weight * own[i, j]
     rest = 1.0 - sums[leak, leak] / walked if walked > 0.0 else 1.0
@@ -104,7 +104,7 @@ def add(known: Any, rows: float, weight: float, stepped: bool) -> None:
     known.numbers[MOTION] = _KEEP * known.numbers[MOTION] + weight * own[n - 1, n - 1]
 
 
-@law
+@large_law
 def _solve(known: Any) -> None:
     """Put the other coefficients, whatever the leak is, and C^-1 times the other right sides into `known.right`."""
     sums, n = known.sums, len(known.matrix)
@@ -116,7 +116,7 @@ def _solve(known: Any) -> None:
     solve_in_place(known.matrix, known.right, known.scale)
 
 
-@law
+@large_law
 def _left(sums: Any, right: Any) -> float:
     """Return the sum of squares that the coefficients right[:, 0] leave, whatever the leak is."""
     n, square, along = len(right), 0.0, 0.0
@@ -133,7 +133,7 @@ def _left(sums: Any, right: Any) -> float:
     return float(square - along**2 / max(sums[n, n], TINY))
 
 
-@law
+@large_law
 def begin(known: Any) -> None:
     """Take coefficients and the variance of a row from all that was added."""
     n = len(known.matrix)
@@ -143,10 +143,10 @@ def begin(known: Any) -> None:
     for i in range(n):
         known.coefficients[i] = known.right[i, 0]
     left = _left(known.sums, known.right)
-    known.numbers[NOISE] = max(left, max(1e-14 * known.sums[n + 1, n + 1], TINY)) / known.numbers[ROWS]
+    known.numbers[NOISE] = max(left, 1e-14 * known.sums[n + 1, n + 1], TINY) / known.numbers[ROWS]
 
 
-@law
+@large_law
 def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
     """Return what the block `known.own` says (`Said`), beside those before it; with `adds` it is one of them then."""
     own, right, n, numbers = known.own, known.right, len(known.matrix), known.numbers
