@@ -26,7 +26,6 @@ from sealscope.campaigns.plans.scorers import Sides
 from sealscope.campaigns.prediction.report import BoundFigures, DutyRow, FindableLeak, PredictionReport
 from sealscope.campaigns.prediction.rules import DetectionTarget, change_of, smallest_leaks
 from sealscope.diagnosis.diagnose import Examination
-from sealscope.diagnosis.registry import DETECTORS
 from sealscope.errors import InputError, SealscopeError, SimulationFailed
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array, Recording
@@ -42,11 +41,10 @@ from sealscope.units import LITRE_PER_MINUTE
 
 ProgressCallback = Callable[[str, float], None]
 _T = TypeVar("_T")
-#: Detectors that make the verdict of `diagnose`, as far as they are registered, and the channels that each is given.
+#: Detectors that make the verdict of `diagnose`, and the channels that each is given.
 _JUDGES = {
     "volume balance": ("u", "theta", "omega", "x", "p_A", "p_B", "p_1", "p_2"),
     "pressure response": ("u", "p_A", "p_B"),
-    "pressure model": ("u", "p_A", "p_B"),
 }
 #: Probability of detection that `Passage.findable_lpm` states.
 _FINDABLE = 0.9
@@ -160,10 +158,10 @@ def _findable(records: Sequence[Recording], rig: Rig, target: DetectionTarget) -
 
     leaks = []
     examinations = [Examination(own, false_alarm_probability=target.false_alarm, rig=rig) for own in records]
-    for name in (name for name in _JUDGES if name in DETECTORS):
+    for name, channels in _JUDGES.items():
         sizes, reason = [], ""
         for examination in examinations:
-            evidence = examination.through(_JUDGES[name]).evidence(name)
+            evidence = examination.through(channels).evidence(name)
             step = None if evidence.passage is None else evidence.passage.findable_lpm
             reason = reason or (evidence.reason if step is None else "")
             root = math.sqrt(max(evidence.threshold or 0.0, 0.0))
@@ -171,7 +169,7 @@ def _findable(records: Sequence[Recording], rig: Rig, target: DetectionTarget) -
             sizes.append(math.inf if step is None else step * max(ratio, 0.0))
         smallest = float(np.quantile(sizes, target.detection, method="higher"))
         known = math.isfinite(smallest)
-        leaks.append(FindableLeak(name, _JUDGES[name], smallest if known else None, "" if known else reason))
+        leaks.append(FindableLeak(name, channels, smallest if known else None, "" if known else reason))
     return tuple(leaks)
 
 
