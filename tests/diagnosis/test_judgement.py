@@ -8,8 +8,8 @@ from itertools import permutations
 import pytest
 
 from sealscope.diagnosis.inference.other import OtherStep
-from sealscope.diagnosis.verdict.evidence import LEAST_SPECIFIC, Evidence
 from sealscope.diagnosis.judgement import ORDER, judged, judging
+from sealscope.diagnosis.verdict.evidence import LEAST_SPECIFIC, Evidence
 
 LEAK = Evidence("leak", "it leaks", 9.0, 3.0, onset_s=40.0)
 NONE = Evidence("no leak", "it does not", 1.0, 3.0)

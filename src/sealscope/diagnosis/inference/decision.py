@@ -258,11 +258,14 @@ def _questions(balance: RecordedBalance, against: Rise | None, probability: floa
 
 
 def is_leak(causes: dict[Cause, float]) -> bool:
-    """Whether a leak past piston or pump, which lie in parallel, is more probable than every other cause."""
+    """Whether a leak past piston or pump is more probable than every other cause; either may be the pump's alone.
+
+    They lie in parallel, and often are one hypothesis under two names: their probabilities do not add.
+    """
     pump = causes.get("pump leak", 0.0)
     leak = sum(causes.get(cause, 0.0) for cause in LEAKS)
     others = max((share for cause, share in causes.items() if cause not in (*LEAKS, "pump leak")), default=0.0)
-    return leak + pump > others and leak > RAREST * pump
+    return max(leak, pump) > others and leak > RAREST * pump
 
 
 def _together(balance: RecordedBalance) -> Cause:
