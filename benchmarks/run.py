@@ -2,7 +2,7 @@
 
     python benchmarks/run.py [--quick] [--into FOLDER]
 
-Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib), batch.json, variants.json and streams.json
+Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib), batch.json and variants.json
 into `benchmarks/results` or the folder that is given.
 """
 
@@ -38,14 +38,11 @@ def main() -> None:
     variants = ["bench_variants.py", "--json", str(results / "variants.json")]
     if chosen.quick:
         variants += ["--rounds", "1", "--runs", "8", "--duration", "20"]
-    streams = ["bench_streams.py", "--json", str(results / "streams.json")]
-    if chosen.quick:
-        streams += ["--rounds", "3"]
     gpu = ["bench_gpu.py", "--json", str(results / "gpu.json")]
     if chosen.quick:
         gpu += ["--runs", "2000", "--rounds", "2"]
     print(f"{platform.machine()}, {platform.python_implementation()} {platform.python_version()}", flush=True)
-    for words in (solvers, batch, variants, streams, gpu):
+    for words in (solvers, batch, variants, gpu):
         subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=True)
 
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sealscope import datasets
     from sealscope.diagnosis.diagnose import diagnose
-    from sealscope.diagnosis.fleet.fleet import Fleet
     from sealscope.diagnosis.inference.live.stream import SequentialBalance
     from sealscope.diagnosis.trend.trend import Trend, trend
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -33,7 +32,6 @@ _HOMES = {
     "DetailStream": "signals.streams",
     "Diagnosis": "diagnosis.verdict.diagnosis",
     "Experiment": "simulation.experiment",
-    "Fleet": "diagnosis.fleet.fleet",
     "Recording": "recordings.recording",
     "Rig": "parameters",
     "RmsStream": "signals.windows",
@@ -62,7 +60,6 @@ __all__ = [
     "DetailStream",
     "Diagnosis",
     "Experiment",
-    "Fleet",
     "Recording",
     "Rig",
     "RmsStream",

@@ -7,7 +7,7 @@ from itertools import permutations
 
 import pytest
 
-from sealscope.diagnosis.inference.other import OtherStep
+from sealscope.diagnosis.inference.other_steps.step import OtherStep
 from sealscope.diagnosis.judgement import ORDER, judged, judging
 from sealscope.diagnosis.verdict.evidence import LEAST_SPECIFIC, Evidence
 

@@ -13,7 +13,7 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.baseline.inspection import comparable, inspected
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
-from sealscope.diagnosis.inference.other import other_step
+from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.judgement import ORDER, judged, judging, rank
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sealscope.diagnosis.inference.other import OtherStep
+from sealscope.diagnosis.inference.other_steps.step import OtherStep
 from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, Evidence
 
 #: Detectors that state a size or a bound: by every litre, then by a model of the pressures.

@@ -7,11 +7,9 @@ of PyWavelets, behind `details.details`, to rounding.
 
 from __future__ import annotations
 
-import math
-
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.lanes import WIDTH, load, spread, store
-from sealscope.signals.filters import Array, IntArray
+from sealscope.signals.filters import Array
 
 #: New samples that a level's buffer takes before its history moves back to the front: with it the rows that a level's
 #: filter reads stay in the processor's first cache.
@@ -133,101 +131,6 @@ def advance_details(
                     for j in range(levels):
                         for i in range(m):
                             out[c, WIDTH * g + lane, j, done + i] = flat[(j * CHUNK + i) * WIDTH + lane]
-                at += m
-                done += m
-    return at
-
-
-@contracted
-def _add_squares(
-    details: Array, buffers: Array, row: int, first: int, last: int, levels: int, opened: Array, at: int
-) -> None:
-    """Add the squares of details first <= i < last, of the last two levels' product and of the signal to the open sums.
-
-    `row`: of the sample that details[:, 0] belong to; `at`: the first of the channel's rows in `opened`.
-    """
-    for j in range(levels):
-        total = load(opened, at + j)
-        for i in range(first, last):
-            x = load(details, j * CHUNK + i)
-            total = total + x * x
-        store(opened, at + j, total)
-    product, signal = load(opened, at + levels), load(opened, at + levels + 1)
-    for i in range(first, last):
-        x = load(details, (levels - 2) * CHUNK + i) * load(details, (levels - 1) * CHUNK + i)
-        product = product + x * x
-        y = load(buffers, row + i)
-        signal = signal + y * y
-    store(opened, at + levels, product)
-    store(opened, at + levels + 1, signal)
-
-
-@kernel
-def advance_rms(
-    groups: tuple[int, int],
-    block: Array,
-    buffers: Array,
-    fill: int,
-    history: int,
-    low: Array,
-    high: Array,
-    details: Array,
-    delay: int,
-    column: int,
-    windows: IntArray,
-    opened: Array,
-    pieces: Array,
-    out: Array,
-) -> int:
-    """Filter `block` and write the RMS of each window that it completes to `out`; returns the buffers' new fill.
-
-    The first arguments are those of `advance_details`. `column`: columns so far less those to be skipped; `windows`:
-    samples a piece, pieces a window, pieces from a window to the next; `opened`: (groups, channels, levels + 2, WIDTH)
-    sums of squares in the piece that is not full yet, `pieces`: (groups, channels, ring, levels + 2, WIDTH) of the full
-    ones; `out`: (windows, channels, levels + 2, actuators). A window adds its pieces in their order.
-    """
-    channels, actuators, n = block.shape
-    levels, capacity = buffers.shape[2], buffers.shape[3]
-    quantities, ring = opened.shape[2], pieces.shape[2]
-    size, per_window, per_step = windows[0], windows[1], windows[2]
-    flat = pieces.reshape(-1)
-    at = fill
-    for g in range(groups[0], groups[1]):
-        lanes = min(WIDTH, actuators - WIDTH * g)
-        for c in range(channels):
-            channel = g * channels + c
-            start = channel * levels * capacity
-            sums = channel * quantities
-            at, done, window = fill, 0, 0
-            while done < n:
-                if at == capacity:
-                    _turn_back(buffers, start, levels, capacity, history)
-                    at = history
-                m = min(n - done, capacity - at)
-                samples = block[c, WIDTH * g : WIDTH * g + lanes]
-                _take(samples, done, m, buffers, start, at, low, high, levels, capacity, details)
-                i = min(m, max(0, -(column + done)))
-                while i < m:
-                    place = column + done + i
-                    last = min(m, i + size - place % size)
-                    _add_squares(details, buffers, start + at - delay, i, last, levels, opened, sums)
-                    i = last
-                    if (column + done + i) % size:
-                        continue
-                    full = (column + done + i) // size
-                    slot = (channel * ring + (full - 1) % ring) * quantities
-                    for q in range(quantities):
-                        store(pieces, slot + q, load(opened, sums + q))
-                        store(opened, sums + q, spread(0.0))
-                    if full < per_window or (full - per_window) % per_step:
-                        continue
-                    for q in range(quantities):
-                        for lane in range(lanes):
-                            total = 0.0
-                            for p in range(full - per_window, full):
-                                total += flat[((channel * ring + p % ring) * quantities + q) * WIDTH + lane]
-                            out[window, c, q, WIDTH * g + lane] = math.sqrt(total / (size * per_window))
-                    window += 1
                 at += m
                 done += m
     return at

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from sealscope.errors import InputError
 from sealscope.signals.filters import (
     Array,
-    IntArray,
     check_saved,
     checked_levels,
     decomposition_filters,
@@ -29,7 +28,6 @@ from sealscope.signals.filters import (
     saved_part,
     whole_number,
 )
-from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP, WindowedRms
 
 if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
@@ -208,101 +206,6 @@ class DetailStream:
         )
         stream.load_state(state)
         return stream
-
-
-class FleetRms:
-    """RMS over sliding windows of every detail, of the product of the deepest two, and of the signal, of a fleet.
-
-    The windows are those of ``windowed_rms(details(signal), size, step)``: the first covers samples
-    ``first .. first + size - 1``. `quantities`: names of the rows, such as d1, d2, d3, d4, d3d4, signal. A missing
-    sample spoils the windows of its own actuator and channel in which its details lie, and no other. Raises InputError
-    for a count below 1, fewer than two levels, or a wavelet that `details` refuses.
-    """
-
-    def __init__(
-        self,
-        actuators: int,
-        channels: int = 2,
-        levels: int = 4,
-        *,
-        size: int = WINDOW_SIZE,
-        step: int = WINDOW_STEP,
-        wavelet: str = "db8",
-        threads: int = 1,
-    ) -> None:
-        if checked_levels(levels) < 2:
-            raise InputError(f"levels must be 2 or more for windows over a fleet, got {levels}")
-        self.actuators, self.channels, self.levels = whole_number(actuators, "actuators"), channels, levels
-        self.details = DetailStream((channels, actuators), levels, wavelet=wavelet, threads=threads)
-        self.size, self.step = whole_number(size, "size"), whole_number(step, "step")
-        names = [f"d{j}" for j in range(1, levels + 1)]
-        self.quantities = (*names, names[-2] + names[-1], "signal")
-        piece = math.gcd(self.size, self.step)
-        self._windows = np.array([piece, self.size // piece, self.step // piece], dtype=np.int64)
-        groups, _, _, _, width = self.details.state[0].shape
-        rows = len(self.quantities)
-        self._opened = aligned((groups, channels, rows, width))
-        self._pieces = aligned((groups, channels, self.size // piece, rows, width))
-
-    @property
-    def samples(self) -> int:
-        """How many samples of each channel have come in."""
-        return self.details.samples
-
-    def _windows_at(self, samples: int) -> int:
-        columns = samples - self.details.settling
-        return 0 if columns < self.size else (columns - self.size) // self.step + 1
-
-    def windows(self, samples: int) -> int:
-        """Return how many windows the next `samples` samples complete."""
-        return self._windows_at(self.samples + samples) - self._windows_at(self.samples)
-
-    def ends(self, samples: int) -> IntArray:
-        """Return, of those windows, the sample one past the last of each."""
-        before = self._windows_at(self.samples)
-        count = self.windows(samples)
-        return self.details.first + self.size + self.step * np.arange(before, before + count, dtype=np.int64)
-
-    def update(self, block: ArrayLike, out: Array | None = None) -> WindowedRms:
-        """Return the windows that `block` (channels, actuators, n) completes: rms (w, channels, quantities, actuators).
-
-        Written into `out` where one is given: C-contiguous doubles of shape (at least w, channels, quantities,
-        actuators), of which the first w are returned. Raises InputError for a wrong shape.
-        """
-        from sealscope.signals.kernels import advance_rms
-
-        inner = self.details
-        x = inner.checked(block)
-        n = x.shape[-1]
-        count = self.windows(n)
-        shape = (count, self.channels, len(self.quantities), self.actuators)
-        out = np.empty(shape) if out is None else checked_out(out, shape, at_least=True)
-        windows = WindowedRms(self.ends(n), out[:count])
-        counts = (inner.delay, inner.samples - inner.settling, self._windows, self._opened, self._pieces)
-        inner.run(x, lambda share, work: advance_rms(share, x, *inner.state, work, *counts, out))
-        return windows
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the details' state with `size`, `step`, and sums of squares so far, `opened` and `pieces`."""
-        return {
-            **self.details.state_dict(),
-            "size": self.size,
-            "step": self.step,
-            "opened": unpacked(self._opened, self.actuators),
-            "pieces": unpacked(self._pieces, self.actuators),
-        }
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` of a stream with the same settings returned; raises InputError."""
-        for name in ("size", "step"):
-            check_saved(state, name, getattr(self, name), "fleet")
-        parts = [
-            (saved_array(state, name, (*own.shape[1:-1], self.actuators), "fleet"), own)
-            for name, own in (("opened", self._opened), ("pieces", self._pieces))
-        ]
-        self.details.load_state(state, "fleet")
-        for values, own in parts:
-            pack(values, own)
 
 
 def aligned(shape: tuple[int, ...]) -> Array:

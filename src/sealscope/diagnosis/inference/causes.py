@@ -24,7 +24,7 @@ from sealscope.diagnosis.inference.blocks import (
     zero_of,
 )
 from sealscope.diagnosis.inference.onset import StepTest, step_test
-from sealscope.diagnosis.inference.other import OtherStep
+from sealscope.diagnosis.inference.other_steps.step import OtherStep
 from sealscope.diagnosis.inference.terms import LEAK, ORIFICE, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 

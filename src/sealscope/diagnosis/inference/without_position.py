@@ -55,7 +55,7 @@ _95 = 1.96
 _READ = ("u", "omega", "theta", "q_pump", "p_A", "p_B")
 
 
-class _Rows(NamedTuple):
+class _WideRows(NamedTuple):
     """Rows of a regression: `time` (r,), `values` (r, c), and whether each counts, `whole` (r,)."""
 
     time: Array
@@ -64,7 +64,7 @@ class _Rows(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Circulation(RecordedBalance):
+class RecordedCirculation(RecordedBalance):
     """A recorded balance without a position, with what the accumulator says of oil that leaves the circuit.
 
     `lost`: tests of a step of the external leak of either side by the accumulator's own balance, by the term's name.
@@ -90,7 +90,7 @@ class Circulation(RecordedBalance):
         return tuple(sorted(tested, key=lambda own: -own.score))
 
 
-def circulations(recording: Recording, rig: Rig) -> list[Circulation]:
+def circulations(recording: Recording, rig: Rig) -> list[RecordedCirculation]:
     """Return the balances over cycles and over holds of a recording, as far as a loop makes good what leaks in them."""
     equation = circulation(rig, frozenset(recording.channels))
     if equation is None:
@@ -105,13 +105,13 @@ def circulations(recording: Recording, rig: Rig) -> list[Circulation]:
         return []
     still = _held(np.where(known, speed, np.inf), recording.rate)
     cycle = _cycle(np.where(known, speed, 0.0), recording.rate)
-    begin, made = float(recording.t[0]), list[Circulation]()
+    begin, made = float(recording.t[0]), list[RecordedCirculation]()
     for half, counts in ((cycle, known), (HELD, known & still)):
         blocks = None if half is None else _blocks(signals, equation, rig, half, counts, begin)
         if half is not None and blocks is not None:
             long = recording.duration / STORED
             lost = _lost(signals, rig, long if cycle is None else cycle * np.ceil(long / cycle), known, begin)
-            made.append(Circulation(blocks, (equation,), (Columns(equation),), rig, recording, lost))
+            made.append(RecordedCirculation(blocks, (equation,), (Columns(equation),), rig, recording, lost))
     return [own for own in made if made_good(own)]
 
 
@@ -198,7 +198,7 @@ def _blocks(
     return Blocks(start, end, gram, kept.astype(float), means, pressures, np.zeros(len(parts))).merged()
 
 
-def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate: float) -> _Rows:
+def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate: float) -> _WideRows:
     """Return the rows of increments, c times (n,), for triangles of a half-width [s], half of it apart.
 
     The integral over a triangle is the second difference of the twice integrated increments.
@@ -216,7 +216,7 @@ def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate:
     missing = np.concatenate([[0], np.cumsum(~counts)])
     first, last = (np.clip(centres + shift, 0, n).astype(int) for shift in (-length, length + 1.0))
     values = np.column_stack([over(np.where(counts, own, 0.0)) * rate for own in increments])
-    return _Rows(centres / rate, values, missing[last] == missing[first])
+    return _WideRows(centres / rate, values, missing[last] == missing[first])
 
 
 def _less_the_zero(values: Array, names: list[str]) -> None:

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.features import BLOCKS, DUTY, ORDER, features
-from sealscope.diagnosis.inference.levels import level_tests
 from sealscope.diagnosis.inference.onset import StepTest, two_sided
+from sealscope.diagnosis.inference.other_steps.features import BLOCKS, DUTY, ORDER, features
+from sealscope.diagnosis.inference.other_steps.levels import level_tests
 from sealscope.diagnosis.verdict.evidence import RAREST, Cause
 from sealscope.recordings.recording import Recording, remembered
 

@@ -1,1 +1,0 @@
-"""Many actuators watched live: details, windowed RMS and sequential tests."""
