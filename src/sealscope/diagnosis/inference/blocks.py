@@ -265,10 +265,12 @@ class _Normal(NamedTuple):
 
 
 def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int) -> _Normal:
-    size = len(others) * powers.shape[1]
-    cross = np.einsum("kij,kp,kq->ipjq", gram[:, others][:, :, others], powers, powers, optimize=True)
+    n, degrees = len(others), powers.shape[1]
+    size = n * degrees
+    squares = (powers[:, :, None] * powers[:, None, :]).reshape(len(gram), degrees**2)
+    cross = gram[:, others][:, :, others].reshape(len(gram), n * n).T @ squares
     return _Normal(
-        cross.reshape(size, size),
+        cross.reshape(n, n, degrees, degrees).transpose(0, 2, 1, 3).reshape(size, size),
         np.einsum("ki,kp->ip", gram[:, others, left], powers).ravel(),
         np.einsum("ki,kp->kip", gram[:, others, test], powers).reshape(len(gram), size),
         gram[:, test, test],
