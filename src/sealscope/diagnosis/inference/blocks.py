@@ -351,9 +351,10 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     for turn in range(_TURNS + 1):
         normal = _normal(_about(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
         fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
-        if turn == _TURNS or not width > 0.0:
+        step = float(fitted.coefficients[-degrees])
+        if turn == _TURNS or not width > 0.0 or (turn > 0 and abs(step) <= _TOLERANCE * width):
             break
-        zero += float(fitted.coefficients[-degrees])
+        zero += step
         slope = (normal.lead - normal.along @ fitted.coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)
     return _Fit(normal, fitted, zero)
 
