@@ -325,6 +325,11 @@ def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = Tru
     channel that rests at two levels, such as a square wave, has as many samples at the other. A run among `held`, as
     `stuck` gives them, at an end of the values is a cut-off too.
     """
+    if not values.size:
+        return []
+    at_ends = max(np.count_nonzero(values == end) for end in (values.min(), values.max()))
+    if held is None and at_ends < _FEWEST_AT_RAIL:
+        return []
     levels, counts = np.unique(values, return_counts=True)
     if levels.size < 3:
         return []

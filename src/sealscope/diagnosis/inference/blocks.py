@@ -265,10 +265,12 @@ class _Normal(NamedTuple):
 
 
 def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int) -> _Normal:
-    size = len(others) * powers.shape[1]
-    cross = np.einsum("kij,kp,kq->ipjq", gram[:, others][:, :, others], powers, powers, optimize=True)
+    n, degrees = len(others), powers.shape[1]
+    size = n * degrees
+    squares = (powers[:, :, None] * powers[:, None, :]).reshape(len(gram), degrees**2)
+    cross = gram[:, others][:, :, others].reshape(len(gram), n * n).T @ squares
     return _Normal(
-        cross.reshape(size, size),
+        cross.reshape(n, n, degrees, degrees).transpose(0, 2, 1, 3).reshape(size, size),
         np.einsum("ki,kp->ip", gram[:, others, left], powers).ravel(),
         np.einsum("ki,kp->kip", gram[:, others, test], powers).reshape(len(gram), size),
         gram[:, test, test],
@@ -349,9 +351,10 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     for turn in range(_TURNS + 1):
         normal = _normal(_about(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
         fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
-        if turn == _TURNS or not width > 0.0:
+        step = float(fitted.coefficients[-degrees])
+        if turn == _TURNS or not width > 0.0 or (turn > 0 and abs(step) <= _TOLERANCE * width):
             break
-        zero += float(fitted.coefficients[-degrees])
+        zero += step
         slope = (normal.lead - normal.along @ fitted.coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)
     return _Fit(normal, fitted, zero)
 

@@ -16,7 +16,6 @@ import numpy as np
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     Columns,
-    Information,
     cost_of_zero,
     information,
     solve,
@@ -58,17 +57,11 @@ def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[C
     cost = cost_of_zero(zero_of(blocks, columns))
     for name, cause, own in tested:
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
-        best = step_of_sign(own, signs)
+        best = step_test(own, signs)
         if best is not None:
             score = best.score - (cost if name in (LEAK, ORIFICE) else 0.0)  # the zero that it needs
             stepped.append(StepHypothesis(name, cause, best, score))
     return tuple(sorted(stepped, key=lambda own: -own.score))
-
-
-def step_of_sign(information: Information, signs: Sequence[float]) -> StepTest | None:
-    """Return the likeliest test of a step of either of the `signs`; None where too few blocks say anything."""
-    tests = (step_test(information._replace(vector=sign * information.vector)) for sign in signs)
-    return max((test for test in tests if test is not None), key=lambda test: test.score, default=None)
 
 
 def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Blocks:

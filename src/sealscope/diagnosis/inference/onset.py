@@ -39,6 +39,7 @@ D. D. Boos, J. Am. Statist. Assoc. 89 (1994) 1012 (supremum over a confidence se
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -216,8 +217,11 @@ class NullLaw(NamedTuple):
         return min(1.0, 0.5 * float(betainc(0.5 * (n - 1), 0.5, away)) + tube)
 
 
-def step_test(information: Information) -> StepTest | None:
-    """Return the test of a step; None where too few blocks say anything."""
+def step_test(information: Information, signs: Sequence[float] = (1.0,)) -> StepTest | None:
+    """Return the likeliest test of a step of one of the `signs`; None where too few blocks say anything.
+
+    The chance of one of two is twice that stated.
+    """
     time, precision, vector = _with_level(information)
     count = len(time)
     values, vectors = np.linalg.eigh(precision)
@@ -239,17 +243,15 @@ def step_test(information: Information) -> StepTest | None:
     eigen, basis = np.linalg.eigh(unit * covariance)
     at = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
     steps = np.clip(index[:, None] + 1.0 - at, 0.0, 1.0)
-    parts = basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0)
-    return _scan(*parts, _onset_times(time, at), unit, -np.log1p(WALKS * unit * count / information.walk**2))
+    z, steps, eigen = basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0)
+    onsets, believed = _onset_times(time, at), -np.log1p(WALKS * unit * count / information.walk**2)
+    tests = [_scan(sign * z, steps, eigen, onsets, unit, believed) for sign in signs]
+    return max(tests, key=lambda test: test.score)
 
 
 def two_sided(information: Information) -> StepTest | None:
-    """Return the test of a step up or down, the likelier; None where too few blocks say anything.
-
-    Its chance is twice that stated.
-    """
-    tests = [step_test(information._replace(vector=sign * information.vector)) for sign in (1.0, -1.0)]
-    return max((test for test in tests if test is not None), key=lambda test: test.score, default=None)
+    """Return the likelier test of a step up or down (`step_test`)."""
+    return step_test(information, (1.0, -1.0))
 
 
 def _with_level(information: Information) -> tuple[Array, Array, Array]:
@@ -288,7 +290,11 @@ def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float, beli
     score = 2.0 * float(beside[walk, best] - without[plain])
     likeliest = beside.max(axis=1)
     allowed = (without > without.max() - ALLOWED) | (likeliest > likeliest.max() - ALLOWED)
-    law = NullLaw(min(n, 0.5 * n + 2.0), max(_length(own, steps) for own in weight[allowed]))
+    norm = np.sqrt(square[allowed])
+    cosines = (weight[allowed] @ (steps[:, 1:] * steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
+    # of the curve of whitened steps on the unit sphere
+    length = np.arccos(np.clip(cosines, -1.0, 1.0)).sum(axis=1).max()
+    law = NullLaw(min(n, 0.5 * n + 2.0), float(length))
     noise = float(rest[walk, best]) / n
     fitted = float(along[walk, best] / square[walk, best]), float(np.sqrt(noise / square[walk, best]))
     size = along[plain] / square[plain]
@@ -305,11 +311,3 @@ def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float, beli
         noise=(float(total[plain]) / n, noise),
         law=law,
     )
-
-
-def _length(weight: Array, steps: Array) -> float:
-    """Return the length of the curve of whitened steps (n, o) on the unit sphere."""
-    whitened = np.sqrt(weight)[:, None] * steps
-    whitened /= np.maximum(np.linalg.norm(whitened, axis=0), np.finfo(float).tiny)
-    cosines = np.clip((whitened[:, 1:] * whitened[:, :-1]).sum(axis=0), -1.0, 1.0)
-    return float(np.arccos(cosines).sum())

@@ -29,7 +29,7 @@ from sealscope.diagnosis.inference.terms import priors
 from sealscope.recordings.recording import Array
 
 #: Blocks that the zero is estimated from; neighbours are added up beyond.
-ENOUGH = 60
+ENOUGH = 40
 #: Zeros that are tried at first, within three times what is believed of one that is far off.
 TRIED = 21
 _RANK = 1e-9  # directions that carry less of the largest precision carry nothing

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.inference.causes import StepHypothesis, probabilities, step_of_sign
+from sealscope.diagnosis.inference.causes import StepHypothesis, probabilities
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.decision import AGAINST, SECOND, WITHIN, Question, is_leak
 from sealscope.diagnosis.inference.onset import StepTest, course, step_test
@@ -79,7 +79,7 @@ class PressureReading:
             tested.append(StepHypothesis("F_v", CAUSES["F_v"], self.test, self.test.score))
         else:
             for index, name in enumerate(response.PARAMETERS):
-                test = None if name == "G" else step_of_sign(self.response.information(index), (1.0, -1.0))
+                test = None if name == "G" else step_test(self.response.information(index), (1.0, -1.0))
                 if test is not None:
                     tested.append(StepHypothesis(name, CAUSES[name], test, test.score))
         return tuple(sorted(tested, key=lambda own: -own.score))
