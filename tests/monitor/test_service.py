@@ -72,7 +72,7 @@ def test_kills_at_random_instants_change_no_row(undisturbed, tmp_path):
 
 
 def test_an_actuator_without_a_position_is_stored_alike_whatever_the_restarts(tmp_path):
-    """The observer's state comes back with the same bits, before its search of the stiffness and after."""
+    """The response's state comes back with the same bits, before its first fit and after."""
     pressed = simulate(command="5 sin(2t)", duration=75.0, seed=1).only(("p_A", "p_B", "u"))
     lines = lines_of({"press 1": pressed}, 2500)
     (tmp_path / "whole").mkdir()
@@ -83,7 +83,7 @@ def test_an_actuator_without_a_position_is_stored_alike_whatever_the_restarts(tm
         service, _ = served(settings, lines[: round(share * len(lines))])
     rows = rows_of(settings.database)
     assert rows == rows_of(whole.database)
-    assert [row[3] for row in rows["estimates"]] == ["settling"] * 23
+    assert [row[3] for row in rows["estimates"]] == ["settling"] * 10 + ["learning"] * 2
     summaries = service.actuators.plain()
     assert summaries["press 1"]["by"] == "pressures"
     assert 'sealscope_watched{actuator="press 1",by="pressures"} 1.0' in metrics_text(summaries, {})

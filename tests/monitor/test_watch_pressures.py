@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.observer.model import G_UNIT
 from sealscope.errors import InputError
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.monitor.stream.watch import Watch
@@ -72,7 +71,7 @@ def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
     assert all(estimate.leak_interval_lpm[0] == 0.0 for estimate in sound)
     assert all(estimate.total_lpm is None for estimate in estimates)  # the level is not known well enough
     assert watch.baseline.lpm is None
-    assert watch.baseline.level == pytest.approx(2e-13, abs=1.5 * G_UNIT)
+    assert watch.baseline.level == pytest.approx(2e-13, abs=1.5e-12)
 
 
 @settings(
@@ -107,7 +106,7 @@ def test_a_short_gap_is_bridged_and_after_a_pause_nothing_before_counts(learned:
     shown = [estimate.leak_lpm for estimate in bridged if estimate.leak_lpm is not None]
     assert abs(np.mean(shown)) < 0.004
     _, paused = run(moved(part(640, 780), 3600.0), 5_000, watch)  # it leaks, and the onset lies within the pause
-    assert {estimate.status for estimate in paused} == {"settling"}
+    assert {estimate.status for estimate in paused} <= {"settling", "at rest"}  # too little is known, or nothing
     assert watch.leak is None and watch.baseline.level == level
     assert watch.counters["gap"] == 2
 
@@ -129,7 +128,7 @@ def test_another_duty_and_a_lost_machine_are_not_judged(learned: str):
 def test_slow_samples_are_said_to_be_too_slow():
     slow = simulated(duration=90.0, rate=100.0)
     watch, estimates = run(slow, 10_000)
-    assert {estimate.status for estimate in estimates} == {"sampled at less than 250 Hz"}
+    assert {estimate.status for estimate in estimates} == {"sampled at less than 200 Hz"}
     assert watch.leak is None
 
 
@@ -155,7 +154,7 @@ def test_oil_that_warms_is_no_leak():
     assert estimates[-1].status == "watched"
 
 
-@pytest.mark.parametrize("damage", ["machine", "observer", "usual", "drive"])
+@pytest.mark.parametrize("damage", ["follower", "next", "settling"])
 def test_a_damaged_state_is_refused_in_one_line(damage: str):
     state = whole()[0].state()
     pressures = {**state["pressures"], damage: {"x": 1}}

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 7
+STATE_VERSION = 8
 #: The duty's cycle is looked for in so long a run without a hole [s], where there is no position.
 _LEARN_SECONDS = 60.0
 #: Blocks are not compared across a pause of over so many seconds.
@@ -451,7 +451,7 @@ class Watch:
         watch._samples = SampleJoiner.from_state(part_of(state, "samples", Mapping))
         live, pressures = (part_of(state, name, (Mapping, type(None))) for name in ("live", "pressures"))
         watch._live = None if live is None else LiveBalance.from_state(watch._rig, live)
-        watch._pressures = None if pressures is None else PressureEstimator.from_state(pressures)
+        watch._pressures = None if pressures is None else PressureEstimator.from_state(watch._rig, pressures)
         watch._learning = BaselineLearning.from_state(part_of(state, "learning", Mapping))
         baseline, leak = (part_of(state, name, (Mapping, type(None))) for name in ("baseline", "leak"))
         watch.baseline = None if baseline is None else plain_dataclass(WatchBaseline, baseline, "baseline")

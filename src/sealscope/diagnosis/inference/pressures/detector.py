@@ -20,7 +20,7 @@ from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.decision import AGAINST, SECOND, WITHIN, Question, is_leak
 from sealscope.diagnosis.inference.onset import StepTest, course, step_test
 from sealscope.diagnosis.inference.pressures import response, ring_down
-from sealscope.diagnosis.inference.pressures.evidence import PressureEvidence, priors, unusable
+from sealscope.diagnosis.inference.pressures.evidence import PressureEvidence, priors, states_flow, unusable
 from sealscope.diagnosis.inference.scatter import Rise, student
 from sealscope.diagnosis.inference.terms import priors as terms_priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, NO_RIG, RAREST, Cause, Evidence, LeakCourse, Passage
@@ -61,8 +61,7 @@ class PressureReading:
         if evidence is None:
             return None
         speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
-        stated = rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
-        return PressureReading(evidence, own, speed * rig.pump.q_b / (2.0 * np.pi), stated)
+        return PressureReading(evidence, own, speed * rig.pump.q_b / (2.0 * np.pi), states_flow(rig))
 
     @cached_property
     def test(self) -> StepTest | None:

@@ -80,10 +80,19 @@ def pressure_evidence(
     recording: Recording, edges: NDArray[np.int64], information: Information, laws: tuple[float, float]
 ) -> PressureEvidence:
     """Return the evidence of blocks between the samples `edges` (K + 1,), from what they say of g."""
-    known = priors("ring_down")
     dp = np.abs(recording["p_A"] - recording["p_B"])
-    pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
-    return PressureEvidence(information, pressure, math.hypot(known["mass"].width, 2.0 * known["area"].width), laws)
+    return PressureEvidence(information, np.add.reduceat(dp, edges[:-1]) / np.diff(edges), flow_scale(), laws)
+
+
+def flow_scale() -> float:
+    """Return the standard deviation of the factor that all conductances share [1]: M/A^2 is not known closer."""
+    known = priors("ring_down")
+    return math.hypot(known["mass"].width, 2.0 * known["area"].width)
+
+
+def states_flow(rig: Rig) -> bool:
+    """Return whether a rig states what turns a conductance into L/min."""
+    return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
 def middles(recording: Recording, edges: NDArray[np.int64]) -> Array:
@@ -110,12 +119,13 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
             return f"needs {name}"
         if recording.units[name] != unit:
             return f"needs {name} in a unit, got counts"
-        if not np.all(np.isfinite(recording[name])) or not np.ptp(recording[name]) > 0.0:
-            return f"{name} is constant or missing"
     if recording.duration < FEWEST * SHORTEST_BLOCK:
         return f"needs {FEWEST * SHORTEST_BLOCK:g} s or more, got {recording.duration:.3g} s"
     if recording.rate < SLOWEST:
         return f"needs {SLOWEST:g} Hz or more, got {recording.rate:.3g} Hz: the ringing after a reversal is not seen"
+    for name in ("u", "p_A", "p_B"):
+        if not np.all(np.isfinite(recording[name])) or not np.ptp(recording[name]) > 0.0:
+            return f"{name} is constant or has missing samples"
     return None
 
 

@@ -43,6 +43,7 @@ from sealscope.diagnosis.inference.pressures.evidence import (
     unusable,
     wander_of_conductance,
 )
+from sealscope.diagnosis.inference.pressures.ring_down import ring_down
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
@@ -77,6 +78,8 @@ _UNEXPLAINED = 3.0
 _CONDUCTANCES, _STIFFNESSES = np.geomspace(1e-12, 2e-10, SINGLE_WIDTH), np.geomspace(0.15, 1.2, SINGLE_WIDTH)
 #: Least share of a step that is tried; damping [1] of steps that did not gain, at first, at least and at most.
 _LEAST_SHARE, _DAMPED, _LEAST_DAMPED, _MOST_DAMPED = 0.02, 0.1, 1e-3, 100.0
+#: Beginning in which the ring gives the stiffness [s].
+_RING_WINDOW = 24.0
 #: The first fit: length of its window [s], width of the Gaussian that takes the ring out [periods], steps of the slow
 #: fit, and stiffnesses from which the whole is fitted.
 _WINDOW, _SLOW, _FIRST_STEPS, _STARTS = 12.0, 0.6, 6, 3
@@ -322,11 +325,12 @@ def held(theta: Array, paths: Array) -> Array:
     return np.asarray(paths)
 
 
-def first_fit(stretch: Stretch, beliefs: Beliefs) -> tuple[Array, float]:
+def first_fit(stretch: Stretch, beliefs: Beliefs, searched: bool) -> tuple[Array, float]:
     """Return parameters (p,) that hold over a stretch, and the variance that they leave [Pa^2].
 
     The ringing makes many local minima. So the slow part of the pressure is fitted first, from the best of several
-    gains; then the whole, from what was reached and from the best stiffnesses about the one believed.
+    gains; then the whole, from what was reached, and where the stiffness is to be `searched`, also from the best about
+    the one believed.
     """
     spread, belief = (
         np.linspace(-2.0, 2.0, SINGLE_WIDTH),
@@ -343,12 +347,15 @@ def first_fit(stretch: Stretch, beliefs: Beliefs) -> tuple[Array, float]:
     slow = replace(stretch, smooth=_SLOW * stretch.machine.period(beliefs.centre[K_OIL]))
     sets, squares = tried(slow, beliefs.centre, GAIN)
     theta = slow.descend(sets[int(np.argmin(squares))], belief, _FIRST_STEPS).theta
-    sets, squares = tried(stretch, theta, K_OIL)
-    beside = np.pad(squares, 1, constant_values=np.inf)
-    minima = np.flatnonzero((squares <= beside[2:]) & (squares <= beside[:-2]))
-    starts = [theta, *sets[minima[np.argsort(squares[minima])][:_STARTS]]]
+    starts = [theta]
+    if searched:
+        sets, squares = tried(stretch, theta, K_OIL)
+        beside = np.pad(squares, 1, constant_values=np.inf)
+        minima = np.flatnonzero((squares <= beside[2:]) & (squares <= beside[:-2]))
+        starts += list(sets[minima[np.argsort(squares[minima])][:_STARTS]])
     fits = [stretch.descend(start, belief, _FIRST_STEPS) for start in starts]
-    best = min(fits, key=lambda fit: float(np.nan_to_num(fit.left @ fit.left, nan=np.inf)))
+    noise = float(np.nanmin([stretch.spread(fit.left) for fit in fits]))
+    best = min(fits, key=lambda fit: float(np.nan_to_num(fit.cost(noise, belief, beliefs.unit), nan=np.inf)))
     best = stretch.descend(best.theta, belief, _STEPS)
     return best.theta, stretch.spread(best.left)
 
@@ -389,14 +396,14 @@ class Follower:
 
     `machine`, `beliefs`; `sense`: sign of p_A - p_B that goes with the command; then what changes from block to block:
     parameters `theta` (p,) and their `covariance` (p, p) in units, `variance` of the noise [Pa^2], `states` (6, 12) and
-    `last`, the command at the last sample [V].
+    `last`, the command at the last sample [V]; `excess` of the last block's chi square, in deviations.
     """
 
     def __init__(self, machine: Machine, beliefs: Beliefs, sense: float) -> None:
         self.machine, self.beliefs, self.sense = machine, beliefs, sense
         self.theta, self.variance, self.last = beliefs.centre, math.nan, math.nan
         self.covariance = np.diag((beliefs.width / beliefs.unit) ** 2)
-        self.states = np.zeros((6, _SIMULATED + 1))
+        self.states, self.excess = np.zeros((6, _SIMULATED + 1)), 0.0
 
     @staticmethod
     def begun(recording: Recording, rig: Rig) -> Follower:
@@ -404,10 +411,22 @@ class Follower:
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         total = float(np.mean(recording["p_A"] + recording["p_B"]))
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
-        follower = Follower(Machine.of(rig, recording.rate), beliefs_of(rig, total), sense)
-        window = recording.samples(slice(0, math.ceil(_WINDOW * recording.rate)))
-        follower.theta, follower.variance = first_fit(follower.stretch(window), follower.beliefs)
+        beliefs = beliefs_of(rig, total)
+        ring = ring_down(recording.samples(slice(0, math.ceil(_RING_WINDOW * recording.rate))), rig)
+        if ring is not None:
+            beliefs.centre[K_OIL] *= float(np.mean(ring.stiffness))
+            beliefs.width[K_OIL] = priors("response")["K_of_ring"].width * beliefs.centre[K_OIL]
+        follower = Follower(Machine.of(rig, recording.rate), beliefs, sense)
+        window = follower.stretch(recording.samples(slice(0, math.ceil(_WINDOW * recording.rate))))
+        follower.theta, follower.variance = first_fit(window, beliefs, searched=ring is None)
         return follower
+
+    def interrupt(self, seconds: float) -> None:
+        """Go on after so many seconds without samples, the parameters at most as little known as at first."""
+        beliefs = self.beliefs
+        spread = np.minimum(beliefs.wander**2 * (seconds / WANDER_TIME), beliefs.width**2) / beliefs.unit**2
+        self.covariance = self.covariance + np.diag(spread)
+        self.last = math.nan
 
     def stretch(self, block: Recording) -> Stretch:
         """Return the samples of a block after the last one."""
@@ -449,6 +468,8 @@ class Follower:
         stretch = self.stretch(block)
         look, belief = self._led(stretch, block.duration)
         own = linear(look, stretch.known, round(block.rate))
+        excess = look.cost(self.variance, belief, self.beliefs.unit) - own.samples
+        self.excess = excess / math.sqrt(2.0 * max(own.samples, 1.0))
         H = own.N / self.variance + belief.precision
         off = (look.theta - belief.mean) / self.beliefs.unit
         self.covariance = np.asarray(np.linalg.inv(H))
