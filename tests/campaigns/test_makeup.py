@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 
+import pytest
+
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
@@ -12,6 +14,7 @@ from sealscope.parameters import load_rig
 from sealscope.simulation.simulate import simulate_with_truth
 
 
+@pytest.mark.slow
 def test_a_circuit_that_fills_at_the_start_hides_no_small_leak() -> None:
     """The first block, into which a valve lets oil by one side, stood out beyond a step of 0.0002 L/min."""
     plan = load_plan("bench-detectors")

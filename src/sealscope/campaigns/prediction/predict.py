@@ -54,7 +54,7 @@ STANDARD_CLOSINGS = (None, 0.5)
 #: Sizes of leaks that the thesis's rules are tried on [L/min], and on machines of a bench.
 SIZES, BENCH_SIZES = (0.001, 0.002, 0.004, 0.008, 0.032, 0.128), (0.002, 0.008, 0.032, 0.128)
 #: Leak-free records that the detectors are asked about, and records of each size for the rules.
-RECORDS, RULE_RECORDS = 3, 12
+RECORDS, RULE_RECORDS = 3, 24
 #: Shortest record of a prediction [s]: each half must hold whole cycles of the slowest standard command.
 SHORTEST = 20.0
 #: How much of a command is looked at to centre its sweep [s].

@@ -142,10 +142,10 @@ class PredictionReport:
                 lines.append(f"  {change:<12} " + ", ".join(map(self._rule, own)))
         if self.duties:
             names = [own.detector for own in self.leaks]
-            lines.append(f"{'other duties [L/min]':<30}" + "".join(f"{name:>19}" for name in names))
+            lines.append(f"{'other duties, a record each [L/min]':<36}" + "".join(f"{name:>19}" for name in names))
             for row in self.duties:
                 sizes = "".join(f"{_size(own.smallest):>19}" for own in row.leaks)
-                lines.append(f"  {f'{row.command}, throttles {row.orifices}':<28}{sizes or f'  {row.note}'}")
+                lines.append(f"  {f'{row.command}, throttles {row.orifices}':<34}{sizes or f'  {row.note}'}")
         return "\n".join(lines)
 
     def _rule(self, own: RulePrediction) -> str:
