@@ -13,7 +13,7 @@ from sealscope.diagnosis.inference.blocks import Blocks
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
 from sealscope.diagnosis.inference.terms import circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.without_position import Circulation, circulations
+from sealscope.diagnosis.inference.without_position import RecordedCirculation, circulations
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
@@ -88,6 +88,6 @@ class VolumeBalance:
             if compared is not None and compared.columns[0].names == own.columns[0].names:
                 healthy.append(compared.blocks)
         evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
-        if isinstance(own, Circulation):
+        if isinstance(own, RecordedCirculation):
             return evidence
         return replace(evidence, share=float(rows.mean() / max(rows.max(), 1.0)))

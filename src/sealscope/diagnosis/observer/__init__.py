@@ -1,1 +1,0 @@
-"""Kalman filters with the leakage conductance among their states."""
