@@ -327,14 +327,14 @@ def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = Tru
     """
     if not values.size:
         return []
-    at_ends = max(np.count_nonzero(values == end) for end in (values.min(), values.max()))
-    if held is None and at_ends < _FEWEST_AT_RAIL:
+    starts, ends = np.empty(0) if held is None else values[held[:, 0]], (values.min(), values.max())
+    at_ends = max(np.count_nonzero(values == end) for end in ends)
+    if at_ends < _FEWEST_AT_RAIL and not np.isin(starts, ends).any():
         return []
     levels, counts = np.unique(values, return_counts=True)
     if levels.size < 3:
         return []
     fine = spacing(levels)
-    starts = np.empty(0) if held is None else values[held[:, 0]]
     rails = []
     for side, top, others in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
         if side == "low" and not low:
