@@ -278,7 +278,8 @@ def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float, beli
     walk, best = np.unravel_index(int(beside.argmax()), beside.shape)
     score = 2.0 * float(beside[walk, best] - without[plain])
     likeliest = beside.max(axis=1)
-    allowed = (without > without.max() - ALLOWED) | (likeliest > likeliest.max() - ALLOWED)
+    plainly, beside_it = without - believed, likeliest - believed  # the recording alone says how large a walk may be
+    allowed = (plainly > plainly.max() - ALLOWED) | (beside_it > beside_it.max() - ALLOWED)
     law = NullLaw(min(n, 0.5 * n + 2.0), max(_length(own, steps) for own in weight[allowed]))
     noise = float(rest[walk, best]) / n
     fitted = float(along[walk, best] / square[walk, best]), float(np.sqrt(noise / square[walk, best]))
