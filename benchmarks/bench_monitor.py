@@ -35,7 +35,7 @@ from sealscope.monitor.sources.source_block import decoded
 
 CHANNELS = {"volumes": ("p_A", "p_B", "x", "theta"), "pressures": ("p_A", "p_B", "u")}
 LEARN_H = 100.0 / 3600.0
-#: Messages until the baseline is learned, after the observer by pressures has settled, and how long the paced ones are
+#: Messages until the baseline is learned, after the response has settled, and how long the paced ones are
 #: measured [s].
 LEARNED, PACED_S = {"volumes": 180, "pressures": 330}, 60.0
 #: Seconds within which the paced ones begin.

@@ -3,7 +3,7 @@
     python benchmarks/monitor_pressures.py [--machines 8] [--pieces 6] [--piece-minutes 60] [--learn-hours 2]
 
 Nothing is composed here: every sample is simulated, in pieces of `--piece-minutes` with pauses of 1 or 20 min between
-them (a short one the observer bridges, after a long one it begins anew). Each machine is the thesis's rig with a
+them (a short one the response bridges, after a long one it begins anew). Each machine is the thesis's rig with a
 stiffness of 550 to 750 MPa, friction within 10 %, pump leakage of 0.6e-13 to 4e-13 m^3/(s Pa) in cold oil, zeros of the
 pressures within 2 psi, and a command in turn from three; the watch assumes the rig as designed. Over a shift
 

@@ -30,7 +30,7 @@ class Ring(NamedTuple):
 def recording_of(ring: Ring, rig: Rig, *, seconds: float = 60.0, seed: int = 0, mains: float = 0.0) -> Recording:
     """Return a recording of this ring after each reversal; `mains`: amplitude [Pa] of a line of 60.01 Hz on p_A."""
     t = np.arange(round(seconds * RATE)) / RATE
-    u, machine = ring.volts * np.sin(ring.turn * t), Machine.of(rig, 2.0 * CHARGE)
+    u, machine = ring.volts * np.sin(ring.turn * t), Machine.of(rig)
     half = np.pi / ring.turn
     number = np.floor(t / half)
     tau, sense = t - number * half, 1.0 - 2.0 * (number % 2)

@@ -31,7 +31,7 @@ from sealscope.recordings.recording import Recording
 from .ringing import step_of
 
 THESIS = load_rig("thesis")
-BELIEFS = beliefs_of(THESIS, 6e5)
+BELIEFS = beliefs_of(THESIS)
 RATE, UNITS = 500.0, {"u": "V", "p_A": "Pa", "p_B": "Pa"}
 
 

@@ -317,8 +317,8 @@ port = 8765
 # timeout_s = 10.0
 
 # An actuator is watched by p_A, p_B, x and theta or omega (balance of volumes: steps from 0.002 L/min on), or without
-# a position by p_A, p_B and u, omega or theta at 250 Hz or more (observer: steps from 0.005 L/min on). The first minute
-# of samples settles which; other names stand in `map`.
+# a position by p_A, p_B and u at 200 Hz or more (their response: steps from 0.005 L/min on). The first minute settles
+# which; other names stand in `map`.
 [[actuator]]
 name = "press 1"
 folder = "press 1"               # recordings that appear here are read, in any format that `sealscope diagnose` reads

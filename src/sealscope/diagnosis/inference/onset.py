@@ -289,7 +289,8 @@ def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float, beli
     walk, best = np.unravel_index(int(beside.argmax()), beside.shape)
     score = 2.0 * float(beside[walk, best] - without[plain])
     likeliest = beside.max(axis=1)
-    allowed = (without > without.max() - ALLOWED) | (likeliest > likeliest.max() - ALLOWED)
+    plainly, beside_it = without - believed, likeliest - believed  # the recording alone says how large a walk may be
+    allowed = (plainly > plainly.max() - ALLOWED) | (beside_it > beside_it.max() - ALLOWED)
     norm = np.sqrt(square[allowed])
     cosines = (weight[allowed] @ (steps[:, 1:] * steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
     # of the curve of whitened steps on the unit sphere

@@ -170,11 +170,11 @@ class Beliefs(NamedTuple):
         return np.asarray(_NUDGE * np.minimum(self.width, self.wander))
 
 
-def beliefs_of(rig: Rig, pressures: float) -> Beliefs:
-    """Return the beliefs on machines of a rig at a mean p_A + p_B [Pa]."""
+def beliefs_of(rig: Rig) -> Beliefs:
+    """Return the beliefs on machines of a rig at its charge pressure: zeros of the transducers change nothing."""
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"
-    coulomb = coulomb_friction(0.5 * pressures, 0.5 * pressures, friction.F_pr, friction.F_cfr, of_difference)
+    coulomb = coulomb_friction(rig.fluid.p_charge, rig.fluid.p_charge, friction.F_pr, friction.F_cfr, of_difference)
     own = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     own |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
     scale = np.array([own.get(name, 1.0) for name in PARAMETERS])
@@ -409,9 +409,8 @@ class Follower:
     def begun(recording: Recording, rig: Rig) -> Follower:
         """Return it fitted to the first seconds of a recording, about to take these."""
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
-        total = float(np.mean(recording["p_A"] + recording["p_B"]))
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
-        beliefs = beliefs_of(rig, total)
+        beliefs = beliefs_of(rig)
         ring = ring_down(recording.samples(slice(0, math.ceil(_RING_WINDOW * recording.rate))), rig)
         if ring is not None:
             beliefs.centre[K_OIL] *= float(np.mean(ring.stiffness))

@@ -78,11 +78,11 @@ class Machine:
     inertance: float
 
     @staticmethod
-    def of(rig: Rig, pressures: float) -> Machine:
-        """Return it at a mean of p_A + p_B [Pa]."""
+    def of(rig: Rig) -> Machine:
+        """Return it at the rig's charge pressure."""
         cylinder, friction = rig.cylinder, rig.friction
         area = 0.5 * (cylinder.A_A + cylinder.A_B)
-        coulomb = friction.F_pr + friction.F_cfr * pressures
+        coulomb = friction.F_pr + 2.0 * friction.F_cfr * rig.fluid.p_charge
         falling = coulomb * (friction.K_brk - 1.0) * friction.C_c
         return Machine(
             area * math.sqrt(2.0 * rig.fluid.K_oil / (cylinder.V * cylinder.M_eq)),
@@ -437,7 +437,7 @@ def ring_down(recording: Recording, rig: Rig) -> RingDown | None:
 
     def compute(recording: Recording) -> RingDown | None:
         edges, rate = block_edges(recording), recording.rate
-        machine = Machine.of(rig, float(np.mean(recording["p_A"] + recording["p_B"])))
+        machine = Machine.of(rig)
         lowest = 1.0 - 2.0 * priors("ring_down")["frequency"].width
         slow = machine.omega * lowest > 2.0 * math.pi * _HIGHEST * rate
         classes = [] if slow else windows_of(recording, machine, edges)
