@@ -118,6 +118,12 @@ class RecordedBalance:
         return float(np.average(values[chosen], weights=np.maximum(self.blocks.rows[chosen], 1e-9)))
 
     @cached_property
+    def moving(self) -> float:
+        """Mean flow while it flows [m^3/s]: the mean weighted by itself, so that rests do not count."""
+        flow = self.blocks.means[:, 2]
+        return float(flow @ flow / max(float(flow.sum()), np.finfo(float).tiny))
+
+    @cached_property
     def size(self) -> Size:
         """What turns a flow by the assumed displacement into that of the machine."""
         return _size(self)
@@ -204,7 +210,7 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Block
     if answered is None:
         judging = questions[0]
         bound = bound_of(balance, against)
-        enough = balance.mean(2) > 0.0 and bound <= priors()["worth"]["share"].value * balance.mean(2)
+        enough = balance.moving > 0.0 and bound <= priors()["worth"]["share"].value * balance.moving
         enough &= sum(causes.get(own, 0.0) for own in LEAKS) < 1.0 - _SURE  # a change that may as well be a leak
         cause = stepped_cause(balance.hypotheses, RAREST, balance.other)
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)

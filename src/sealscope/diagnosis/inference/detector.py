@@ -11,9 +11,9 @@ import numpy as np
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Blocks
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
-from sealscope.diagnosis.inference.terms import circulation, equations
+from sealscope.diagnosis.inference.terms import circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.without_position import circulations
+from sealscope.diagnosis.inference.without_position import RecordedCirculation, circulations
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 #: Why a recording has no balance, with its position and without.
 _NO_BALANCE = {
-    True: "too short for a balance: {:.3g} s",
+    True: "too short for a balance, or the piston is not held: {:.3g} s",
     False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
     "that what leaks moves it: record its position x",
 }
@@ -36,7 +36,7 @@ class VolumeBalance:
 
     It needs both chamber pressures, and the pump's angle, its speed, a flow meter or the command; the piston's
     position, or a loop that brings the piston back or holds it (`without_position`). Behind a servo valve it needs
-    position, command, both chambers, supply and return.
+    position, command, both chambers, supply and return. Without the latter it sees what holds lose.
     """
 
     name = "volume balance"
@@ -48,9 +48,9 @@ class VolumeBalance:
     def usable(self, recording: Recording) -> str | None:
         """Return None where the recording has what the balance needs, else the reason why not."""
         channels = frozenset(recording.channels)
-        if not equations(self.rig, channels) and circulation(self.rig, channels) is None:
+        if not (equations(self.rig, channels) or circulation(self.rig, channels) or locked(self.rig, channels)):
             if self.rig.valve.spool == "present":
-                return "needs x, u, p_A, p_B and the pressures of supply and return, p_1 and p_2"
+                return "needs x, u, p_A, p_B; for more than holds the pressures of supply and return, p_1 and p_2"
             return "needs p_A, p_B and the pump's theta or omega, a flow meter q_pump or the command u"
         if stride_samples(recording.rate) < RESOLVED:
             return f"needs {RESOLVED / STRIDE:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
@@ -70,11 +70,11 @@ class VolumeBalance:
 
         Where the position is not recorded a balance says nothing unless the pump makes good what a pump loses.
         """
-        if "x" not in recording:
+        balances = equations(self.rig, frozenset(recording.channels))
+        if not balances:
             made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), self.reads)
             return min(made, key=lambda own: bound_of(own, None), default=None)
         blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
-        balances = equations(self.rig, frozenset(recording.channels))
         return None if blocks is None else RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording)
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
@@ -87,5 +87,7 @@ class VolumeBalance:
             compared = self.balance(other)
             if compared is not None and compared.columns[0].names == own.columns[0].names:
                 healthy.append(compared.blocks)
-        rows = own.blocks.rows
-        return replace(judge(own, false_alarm_probability, healthy), share=float(rows.mean() / max(rows.max(), 1.0)))
+        evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
+        if isinstance(own, RecordedCirculation):
+            return evidence
+        return replace(evidence, share=float(rows.mean() / max(rows.max(), 1.0)))

@@ -233,6 +233,8 @@ LEAK, ORIFICE = "leak", "leak through an orifice"
 PUMP = "pump leak"
 #: What passes or is read whatever the pressures are; a zero of the pressures acts through it.
 BIAS = "bias"
+#: The balance of a load that shut valves hold, by name.
+LOCKED = "locked"
 #: What remains of a speed loop's state at the first sample, which nothing recorded tells.
 START = "start"
 
@@ -485,6 +487,11 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     return (_with_channels(balance, channels | {START}),)
 
 
+_STORED = tuple(
+    term for side in "AB" for term in _of_side(side) if term.drift == "compliance" and "x" not in term.needs
+)
+
+
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the balance of what a pump delivers where the piston displaces nothing; None where no channel gives it.
 
@@ -494,8 +501,24 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     left = pump_volume(rig, channels - {"u"} | ({"omega"} if "u" in channels else set()))
     if rig.valve.spool == "present" or left is None or not {"p_A", "p_B"} <= channels:
         return None
-    stored = (term for side in "AB" for term in _of_side(side) if term.drift == "compliance" and "x" not in term.needs)
-    return Equation("circulation", left, (_START, *stored, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
+    return Equation("circulation", left, (_START, *_STORED, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
+
+
+def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
+    """Return the balance of a load that shut valves hold: what the loaded side loses, the piston gives way by.
+
+    Whether seal, valve or line loses it, the channels do not tell; a command that rests tells that they are shut.
+    x grows as A fills.
+    None for a pump-controlled machine, or where position, command or a pressure is missing.
+    """
+    if rig.valve.spool != "present" or not {"x", "u", "p_A", "p_B"} <= channels:
+        return None
+
+    def gives_way(s: Signals) -> Array:
+        area = rig.cylinder.A_A if np.nanmean(s.pressure_difference) > 0.0 else rig.cylinder.A_B
+        return -area * s.step("x")
+
+    return Equation(LOCKED, gives_way, (*_STORED, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
 
 
 def of_store(rig: Rig) -> Equation:

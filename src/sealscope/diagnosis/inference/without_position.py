@@ -1,4 +1,4 @@
-"""Blocks of a balance without the piston's position: over whole cycles of the duty, or while the piston is held.
+"""Balances without position or without flow: over whole cycles of the duty, or while the piston is held.
 
 Test functions that annihilate what repeats take the displacement out of the balance. A box of one cycle, convolved with
 itself, has a double zero at every harmonic of the duty: over it a piston that a loop brings back displaces nothing,
@@ -9,7 +9,8 @@ so that what the pump delivers is what leaks. While a loop holds the piston at r
 touch a missing sample weigh nothing, nor do rows of a single rod that touch a change of the side that carries: the
 circuit exchanges oil there. Of the mean pressure difference only what zeros of the sensors cannot make counts,
 d - z^2/d beyond z (Breiman's garrote). A loop makes good what leaks; where the pump delivers less than any pump loses,
-none does, and the balance says nothing.
+none does, and the balance says nothing. Where nothing gives a flow, shut valves hold the piston, and what the loaded
+side loses shows by how it gives way; while a command moves the valve may feed what is lost, and nothing counts.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1995) 373.
 """
@@ -32,11 +33,13 @@ from sealscope.diagnosis.inference.decision import RecordedBalance
 from sealscope.diagnosis.inference.onset import FEWEST, StepTest, step_test
 from sealscope.diagnosis.inference.terms import (
     LEAK,
+    LOCKED,
     ORIFICE,
     START,
     Equation,
     Signals,
     circulation,
+    locked,
     of_store,
     priors,
 )
@@ -48,11 +51,11 @@ if TYPE_CHECKING:
 
 #: Half-width of a test function while the piston is held, and the time it settles for before, as it moves slower than
 #: a share of its largest speed, averaged over a while [s].
-HELD, SETTLES, SLOW, AVERAGED = 0.25, 0.25, 0.1, 0.05
+HELD, SETTLES, SLOW, AVERAGED = 0.25, 0.25, 0.1, 0.1
 #: Half-widths of the accumulator's test functions in a recording: a pressure's noise hides what leaves at once.
 STORED = 24
 _95 = 1.96
-_READ = ("u", "omega", "theta", "q_pump", "p_A", "p_B")
+_READ = ("u", "omega", "theta", "q_pump", "x", "p_A", "p_B")
 
 
 class _WideRows(NamedTuple):
@@ -91,25 +94,38 @@ class RecordedCirculation(RecordedBalance):
 
 
 def circulations(recording: Recording, rig: Rig) -> list[RecordedCirculation]:
-    """Return the balances over cycles and over holds of a recording, as far as a loop makes good what leaks in them."""
-    equation = circulation(rig, frozenset(recording.channels))
+    """Return the balances over cycles and over holds of a recording, as far as a loop makes good what leaks in them.
+
+    With a position and nothing that gives a flow, over holds by shut valves.
+    """
+    channels = frozenset(recording.channels)
+    equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
     if equation is None:
         return []
-    signals = Signals(_samples(recording, rig), recording.rate, {})
+    signals = Signals(_samples(recording, rig, equation), recording.rate, {})
     speed, dp = equation.left(signals) * recording.rate, signals.pressure_difference
-    if float(np.nansum((dp - np.nanmean(dp)) * speed)) < 0.0:  # friction takes work: shaft or sides are the other way
+    shut = equation.name == LOCKED
+    if not shut and float(np.nansum((dp - np.nanmean(dp)) * speed)) < 0.0:  # friction takes work: wired reversed
         forward = equation.left
         equation, speed = equation._replace(left=lambda s: -forward(s)), -speed
-    known = np.isfinite(speed + signals.pressure_difference)
+    known = np.isfinite(speed + dp)
     if not known.any() or not np.ptp(speed[known]) > 0.0:
         return []
-    still = _held(np.where(known, speed, np.inf), recording.rate)
+    area = max(rig.cylinder.A_A, rig.cylinder.A_B)
+    counts = known & (signals.step("u") == 0.0) if shut else known
+    still = _held(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
+    begin, made, long = float(recording.t[0]), list[RecordedCirculation](), recording.duration / STORED
+    if shut:
+        blocks = _blocks(signals, equation, rig, HELD, known & still, begin)
+        return (
+            []
+            if blocks is None
+            else [RecordedCirculation(blocks, (equation,), (Columns(equation),), rig, recording, {})]
+        )
     cycle = _cycle(np.where(known, speed, 0.0), recording.rate)
-    begin, made = float(recording.t[0]), list[RecordedCirculation]()
     for half, counts in ((cycle, known), (HELD, known & still)):
         blocks = None if half is None else _blocks(signals, equation, rig, half, counts, begin)
-        if half is not None and blocks is not None:
-            long = recording.duration / STORED
+        if blocks is not None:
             lost = _lost(signals, rig, long if cycle is None else cycle * np.ceil(long / cycle), known, begin)
             made.append(RecordedCirculation(blocks, (equation,), (Columns(equation),), rig, recording, lost))
     return [own for own in made if made_good(own)]
@@ -133,19 +149,20 @@ def made_good(balance: RecordedBalance) -> bool:
     return balance.level.low * balance.mean(0) > priors()["held"]["share"].value * balance.mean(2)
 
 
-def _samples(recording: Recording, rig: Rig) -> dict[str, Array]:
+def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Array]:
     """Return the samples that the balance reads, NaN where missing, with the speed that the drive makes of a command.
 
     The thesis's drive takes 19 s to make good what the load costs it: what of that is left at first fades (`START`).
     """
     samples = {name: without_rails(name, recording[name]) for name in _READ if name in recording.channels}
-    drive = Drive.of(rig)
-    if "u" in samples and samples.keys().isdisjoint(("theta", "omega", "q_pump")):
-        difference = samples["p_A"] - samples["p_B"]
-        u, dp = (np.where(np.isnan(of), 0.0, of) for of in (samples["u"], difference))
-        sense = -1.0 if float((u - u.mean()) @ (dp - dp.mean())) < 0.0 else 1.0
-        samples["omega"] = drive.flow(u, sense * dp, recording.rate) / drive.displacement
-    samples[START] = np.exp(-np.arange(len(recording)) / (recording.rate * drive.lag))
+    if equation.name != LOCKED:
+        drive = Drive.of(rig)
+        if "u" in samples and samples.keys().isdisjoint(("theta", "omega", "q_pump")):
+            difference = samples["p_A"] - samples["p_B"]
+            u, dp = (np.where(np.isnan(of), 0.0, of) for of in (samples["u"], difference))
+            sense = -1.0 if float((u - u.mean()) @ (dp - dp.mean())) < 0.0 else 1.0
+            samples["omega"] = drive.flow(u, sense * dp, recording.rate) / drive.displacement
+        samples[START] = np.exp(-np.arange(len(recording)) / (recording.rate * drive.lag))
     if recording.bridged is not None:
         samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
     return samples
@@ -163,12 +180,13 @@ def _cycle(speed: Array, rate: float) -> float | None:
     return 1.0 / fundamental(speed, np.arange(speed.size) / rate, cycle)
 
 
-def _held(speed: Array, rate: float) -> NDArray[np.bool_]:
-    """Return in which samples the piston is held at rest, after it has settled."""
+def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
+    """Return in which samples the piston is held at rest, after it has settled; with an `area`, creep is a rest."""
     size, settles = max(1, round(AVERAGED * rate)), max(1, round(SETTLES * rate))
     slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))
     finite = np.isfinite(slow)
-    moves = ~finite | (slow > SLOW * slow[finite].max(initial=0.0))
+    limit = max(SLOW * slow[finite].max(initial=0.0), priors()["held"]["creep"].value * area)
+    moves = ~finite | (slow > limit)
     return np.asarray(np.convolve(moves, np.ones(settles))[: speed.size] == 0)
 
 
