@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.diagnosis.baseline.inspection import comparable, inspected
+from sealscope.diagnosis.inspection import comparable, inspected
 from sealscope.diagnosis.observer import pressure_filter
 from sealscope.diagnosis.observer.detector import LEAST_SECONDS, Observer, block_length
 from sealscope.diagnosis.observer.model import (
