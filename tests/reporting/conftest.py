@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,9 @@ from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import CampaignResult, prior_knowledge
-from sealscope.diagnosis.baseline.level import Level
-from sealscope.diagnosis.baseline.operating_point import OperatingPoint
 from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend, trend_of
+from sealscope.diagnosis.trend.wear import Level
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.quality import Finding
@@ -153,17 +151,13 @@ def campaign_result(tmp_path_factory):
     return CampaignResult(plan, tuple(rows), 0, judgement, known=prior_knowledge(plan))
 
 
-POINT = OperatingPoint(0, 11.0, 500.0, ("Pa", "Pa"), ("p_A", "p_B"), 2.1, 1.57)
-
-
 @pytest.fixture(scope="session")
 def trend() -> Trend:
-    """40 days: wear from day 10 on, a repair on day 30; days 20 to 22 of another duty; day 5 states nothing."""
+    """40 days: wear from day 10 on, a repair on day 30; days 20 to 22 by another sensor; day 5 states nothing."""
     random = np.random.default_rng(2)
     days = []
     for k in range(40):
         level = 6.7e-13 * (1.0 + 0.05 * random.standard_normal() + (0.08 * (k - 10) if 10 < k < 30 else 0.0))
-        point = replace(POINT, command_rms=4.0) if 20 <= k <= 22 else POINT
         days.append(
             LeakReading(
                 f"<day> {k}.csv",
@@ -175,9 +169,8 @@ def trend() -> Trend:
                 633e-6,
                 1.1e5,
                 None,
-                1.0,
+                1.03 if 20 <= k <= 22 else 1.0,
                 None,
-                point,
                 bytes([k]),
                 "needs theta" if k == 5 else "",
             )

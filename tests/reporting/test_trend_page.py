@@ -1,4 +1,4 @@
-"""The page of a trend: what it shows of a life with an alarm, a repair, another duty and a recording left out."""
+"""The page of a trend: what it shows of a life with an alarm, a repair, another sensor and a recording left out."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.baseline.level import Level
 from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend, trend_of
+from sealscope.diagnosis.trend.wear import Level
 from sealscope.errors import InputError
 from sealscope.reporting.trend.chart import chart_of
 from sealscope.reporting.trend.page import render_trend_page, write_trend_page
@@ -44,7 +44,14 @@ def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
     assert tags.open == []
     assert page.count("<script") == 0 and "http" not in page.split("</style>")[1]
     assert "<day>" not in page and "&lt;day&gt; 5.csv" in page
-    for words in ("press 4", "the level fell", "another command", "needs theta", "The leakage does not grow", "95 %"):
+    for words in (
+        "press 4",
+        "the level fell",
+        "a sensor exchanged",
+        "needs theta",
+        "The leakage does not grow",
+        "95 %",
+    ):
         assert words in page, words
     key = page[page.index('class="key"') : page.index('class="card"')]
     assert "alarm" in key and "fell back" in key and "not before" in page  # nothing grows since the repair
@@ -66,7 +73,7 @@ def test_the_chart_stands_within_its_frame(trend: Trend) -> None:
 
 def test_without_a_level_there_is_a_page_without_a_chart(tmp_path: Path) -> None:
     only = LeakReading(
-        "a.csv", 1.7e9, 1.0, None, Level(np.nan, np.nan), False, None, np.nan, None, None, None, None, b"", "no x"
+        "a.csv", 1.7e9, 1.0, None, Level(np.nan, np.nan), False, None, np.nan, None, None, None, b"", "no x"
     )
     trend = trend_of([only])
     page = write_trend_page(tmp_path / "page.html", trend).read_text()

@@ -307,7 +307,7 @@ def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[Said
 
     None for a file that cannot be read; `options` of `_diagnoses`.
     """
-    from sealscope.diagnosis.baseline.sessions import start_seconds
+    from sealscope.recordings.joining import start_seconds
     from sealscope.reporting import diagnosis_text, short_text
 
     for result in _diagnoses(files, **options):

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.baseline.inspection import comparable, inspected
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.other_steps.step import other_step
+from sealscope.diagnosis.inspection import comparable, inspected
 from sealscope.diagnosis.judgement import ORDER, judged, judging, rank
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -170,7 +170,7 @@ def diagnose(
     recording : Recording
         The recording to judge.
     baseline : Recording or sequence of Recording, optional
-        Leak-free recordings of the same machine. Those that cannot be compared (other direction, command or rate,
+        Leak-free recordings of the same machine. Those that cannot be compared (other chambers or units,
         a pressure that does not move, copies) are left out, and a finding of the diagnosis says so. By default the
         recording's own beginning is the baseline, and the onset is looked for.
     false_alarm_probability : float, optional
@@ -218,11 +218,11 @@ def diagnose(
     compared = comparable(inspection, baselines)
     evidence = Examination(
         inspection.part,
-        compared.machine,
+        compared.parts,
         false_alarm_probability=false_alarm_probability,
         rig=known,
         distrust=inspection.distrust,
-        refusal=None if compared.machine else compared.refusal,
+        refusal=None if compared.parts else compared.refusal,
         share=inspection.share,
     ).fused(quick)
     return Diagnosis.of(
@@ -232,7 +232,7 @@ def diagnose(
         file=os.fspath(file) if file else None,
         false_alarm_probability=false_alarm_probability,
         quality=(*inspection.findings, *compared.findings),
-        baselines=len(compared.machine),
+        baselines=len(compared.parts),
         limit=repair,
     )
 

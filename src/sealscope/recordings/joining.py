@@ -1,7 +1,8 @@
-"""Recordings of one run, as loggers cut them into files, joined in the order of their clocks."""
+"""When recordings were made, and those of one run, as loggers cut them into files, joined in that order."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -14,6 +15,38 @@ from sealscope.recordings.timebase import seconds_of
 
 #: Files of the same start [s] have a clock that goes on from file to file.
 _SAME_START = 1e-6
+_YEAR_FIRST = re.compile(
+    r"(?<!\d)(?P<year>(?:19|20)\d\d)[-_.]?(?P<month>\d\d)[-_.]?(?P<day>\d\d)[-_ T.]?"
+    r"(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?(?!\d)"
+)
+#: Twelve hours, which loggers write with the month first.
+_TWELVE_HOURS = re.compile(
+    r"(?<!\d)(?P<month>\d{1,2})[-_.](?P<day>\d{1,2})[-_.](?P<year>(?:19|20)\d\d)[-_ .]"
+    r"(?P<hour>\d{1,2})[-_.:](?P<minute>[0-5]\d)[-_.:](?P<second>[0-5]\d)[-_ ]?(?P<half>[AP])M",
+    re.IGNORECASE,
+)
+
+
+def start_seconds(recording: Recording) -> float | None:
+    """Return when the recording's first sample was taken [s since 1970], None where it is not known."""
+    start = seconds_of(str(recording.provenance.get("start", "")))
+    if start is None:
+        start = _stamp_in_name(str(recording.provenance.get("file", "")))
+    return None if start is None else start + (float(recording.t[0]) if len(recording) else 0.0)
+
+
+def _stamp_in_name(name: str) -> float | None:
+    match = _YEAR_FIRST.search(name) or _TWELVE_HOURS.search(name)
+    if match is None:
+        return None
+    fields = match.groupdict()
+    hour = int(fields["hour"])
+    if fields.get("half"):
+        hour = hour % 12 + (12 if fields["half"].upper() == "P" else 0)
+    return seconds_of(
+        f"{fields['year']}-{int(fields['month']):02d}-{int(fields['day']):02d}"
+        f"T{hour:02d}:{fields['minute']}:{fields['second'] or '00'}"
+    )
 
 
 def _start(recording: Recording) -> float | None:

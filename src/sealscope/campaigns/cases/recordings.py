@@ -64,8 +64,8 @@ def _direction(recording: Recording) -> str:
 
 
 def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
-    from sealscope.diagnosis.baseline.inspection import inspected
     from sealscope.diagnosis.diagnose import Examination
+    from sealscope.diagnosis.inspection import inspected
     from sealscope.recordings import read
 
     label = recordings.label or recordings.files

@@ -31,8 +31,8 @@ def work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None = None) -> C
 def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow:
     from sealscope.campaigns.cases.bound import change_bound
     from sealscope.campaigns.cases.scoring import stated
-    from sealscope.diagnosis.baseline.inspection import inspected
     from sealscope.diagnosis.diagnose import Examination
+    from sealscope.diagnosis.inspection import inspected
     from sealscope.simulation.simulate import simulate_with_truth
 
     experiment = experiment_of(plan, case)

@@ -8,19 +8,18 @@ from typing import Literal
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.inspection import inspected
-from sealscope.diagnosis.baseline.level import DayToDay, Level
-from sealscope.diagnosis.baseline.operating_point import OperatingPoint
-from sealscope.diagnosis.baseline.sessions import start_seconds
 from sealscope.diagnosis.detector import unusable
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.evidence import priors
+from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole_log_rms
+from sealscope.diagnosis.trend.wear import DayToDay, Level
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
+from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.recording import Recording
 
 #: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
@@ -43,7 +42,7 @@ class LeakReading:
     index; `states_flow`: whether L/min can be stated of it, and `area` [m^2] of the piston by which a speed of creep is
     a flow in the level's unit, None where it is in none; `pressure`: mean |p_A - p_B|; `temperature` of the oil
     [deg C], None where the file does not say; `scale`: displacement over area, over the assumed one; `machine`: what
-    was assumed; `point`: operating point; `digest`: equal for copies.
+    was assumed; `digest`: equal for copies.
     """
 
     file: str
@@ -57,7 +56,6 @@ class LeakReading:
     temperature: float | None
     scale: float | None
     machine: AssumedMachine | None
-    point: OperatingPoint | None
     digest: bytes
     problem: str = ""
 
@@ -103,7 +101,6 @@ def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = 
         temperature=oil_temperature(recording),
         scale=stated.scale,
         machine=machine,
-        point=inspection.point if problem is None else None,
         digest=inspection.digest,
         problem=problem or "",
     )

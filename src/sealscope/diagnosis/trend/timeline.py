@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.operating_point import difference
 from sealscope.diagnosis.trend.reading import BASES, Basis, LeakReading
 from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding, Severity
@@ -109,9 +108,7 @@ def _apart(reading: LeakReading, other: LeakReading) -> str | None:
         change = reading.scale / other.scale - 1.0
         if abs(change) > SAME_SENSORS:
             return f"position or angle is scaled by {100.0 * change:+.2g} %: a sensor exchanged, or another machine"
-    if reading.point is None or other.point is None:
-        return None
-    return difference(reading.point, other.point, certain=True)
+    return None
 
 
 #: A clock is set back a few times; numbers that fall more often do not follow the order.

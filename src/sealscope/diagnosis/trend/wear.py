@@ -37,7 +37,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.baseline.level import DayToDay
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import IntArray
 
@@ -67,6 +66,22 @@ _DRAWS, _SEED = 4000, 20
 #: A wait for the next recording counts up to this time [days].
 LONGEST_WAIT = 30.0
 _TINY = 1e-10
+
+
+@dataclass(frozen=True)
+class Level:
+    """Level that a recording states, and the standard error of it."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True)
+class DayToDay:
+    """Prior on the standard deviation of the level from day to day: a `scale` with degrees of `freedom`."""
+
+    scale: float
+    freedom: float
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Inspection of recordings before any detector sees them: what of them can be analysed, trusted and compared.
 
-The judged recording and its leak-free baselines pass the same checks. Baselines that fail them, that were made at
-another operating point, or that hold the samples of another recording are left out for all detectors alike.
+The judged recording and its leak-free baselines pass the same checks. Baselines that fail them, or that hold the
+samples of another recording, are left out for all detectors alike.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from hashlib import sha256
 
 import numpy as np
 
-from sealscope.diagnosis.baseline.operating_point import OperatingPoint, difference, operating_point
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.gaps import MOST_BRIDGED, bridge
@@ -51,19 +50,18 @@ class Inspection:
     unreadable: str | None = None
 
     @property
-    def defect(self) -> str | None:
-        """Why the recording can neither be calibrated with nor stand for a leak-free machine; None where it can."""
+    def untrusted(self) -> str | None:
+        """Why the recording cannot stand for a leak-free machine; None where it can."""
         if lack := lack_of_chambers(self.part):
             return lack
         if len(self.part) < SHORTEST:
             return f"needs {SHORTEST} samples or more without a gap, got {len(self.part)}"
-        return self.distrust or self.doubt
+        return self.distrust or self.unreadable
 
-    @cached_property
-    def point(self) -> OperatingPoint:
-        """Operating point of a recording without a defect."""
-        with np.errstate(all="ignore"):
-            return operating_point(self.part)
+    @property
+    def defect(self) -> str | None:
+        """Why nothing can be stated of its pressures alone; None where it can."""
+        return self.untrusted or self.doubt
 
     @cached_property
     def digest(self) -> bytes:
@@ -126,25 +124,21 @@ class Baselines:
     """Leak-free recordings that a recording can be compared with.
 
     `parts`: what of them can be analysed; `findings`: which were left out, and why; `refusal`: why none is left, None
-    where some are, or where none was given; `machine`: all of the same machine that are no copies, whatever their
-    operating point, for what describes speed, load and temperature by terms of its own.
+    where some are, or where none was given.
     """
 
     parts: tuple[Recording, ...]
     findings: tuple[Finding, ...]
     refusal: str | None
-    machine: tuple[Recording, ...] = ()
 
 
 def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
-    Left out are baselines with a defect, the recording itself, baselines made at another operating point, and all but
-    one copy (that with the most channels) of the same recording.
+    Left out are baselines that cannot be trusted, that lack a chamber of the recording or state it in another unit, the
+    recording itself, and all but one copy (that with the most channels) of the same recording. What differs in speed,
+    load and temperature is for the detectors to describe.
     """
-    if judged.defect is not None:  # nothing is compared, and every detector states why
-        parts = tuple(inspected(recording).part for recording in baseline)
-        return Baselines(parts, (), None, tuple(own.part for own in _distinct(judged, baseline)))
     inspections = [inspected(recording) for recording in baseline]
     chosen: dict[bytes, int] = {}
     left_out: dict[tuple[Severity, str], list[int]] = {}
@@ -165,27 +159,19 @@ def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
     if baseline and not chosen:
         most = max(left_out, key=lambda kind: len(left_out[kind]))
         refusal = f"no baseline recording can be used: {most[1]}"
-    parts = tuple(inspections[k].part for k in sorted(chosen.values()))
-    return Baselines(parts, findings, refusal, tuple(own.part for own in _distinct(judged, baseline)))
-
-
-def _distinct(judged: Inspection, baseline: Sequence[Recording]) -> list[Inspection]:
-    """Return the inspections of the baselines that hold other samples than the judged recording and one another."""
-    distinct = {
-        own.digest: own
-        for own in map(inspected, baseline)
-        if own.distrust is None and own.unreadable is None and len(own.part) >= SHORTEST
-    }
-    return [own for digest, own in distinct.items() if digest != judged.digest]
+    return Baselines(tuple(inspections[k].part for k in sorted(chosen.values())), findings, refusal)
 
 
 def _refusal(judged: Inspection, own: Inspection) -> tuple[Severity, str | None]:
     """Return why a baseline recording cannot be compared, None where it can, and how much that matters."""
-    if own.defect is not None:
-        return "warning", own.defect
+    if (untrusted := own.untrusted) is not None:
+        return "warning", untrusted
     if own.digest == judged.digest:
         return "warning", "the same samples as the recording itself"
-    return "note", difference(judged.point, own.point)
+    chambers = chambers_of(judged.part)
+    units = [(name, recording.units.get(name)) for recording in (judged.part, own.part) for name in chambers]
+    alike = units[: len(chambers)] == units[len(chambers) :]
+    return "note", None if alike else "other channels or units"
 
 
 def _text(baseline: Sequence[Recording], numbers: Sequence[int], reason: str) -> str:

@@ -1,0 +1,93 @@
+"""What the RMS of a detail says of the machine's own part of it, within a recording and between recordings.
+
+Energy of a detail d_j is that of white noise, which every level holds alike (d1 holds hardly anything else), and the
+machine's own: E_j = (1 + g)^2 E_own,j + E_1. So the change g of the machine's amplitude is, to first order,
+
+    y = log RMS d_j - log sqrt(E_own,j + E_1) = w g + error,    w = E_own,j / (E_own,j + E_1),
+
+with E_1 of the same block or recording: noise that changes by any amount drops out, and where it drowns the machine
+the weight w is small. Of d1 y is the log RMS itself. What the duty explains is eliminated: g follows the logarithms of
+`blocks.DUTY` by exponents that are believed within a width (`priors.toml`).
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.inference.terms import Prior
+from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks
+from sealscope.recordings.recording import Array
+
+
+@cache
+def priors() -> Mapping[str, Mapping[str, Prior]]:
+    """Return what is believed of the RMS of the details, by table and name."""
+    tree = tomllib.loads((files("sealscope.diagnosis.rms_change") / "priors.toml").read_text("utf-8"))
+    return {table: {name: Prior(**row) for name, row in rows.items()} for table, rows in tree.items()}
+
+
+def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:
+    """Return y and w (n, 5 per chamber) of log RMS (n, 5 per chamber), the machine's own energy that of `known`."""
+    left, weight = np.array(log_rms), np.ones_like(log_rms)
+    least = priors()["walk"]["least"].value
+    for first in range(0, log_rms.shape[1], len(QUANTITIES)):
+        noise = np.exp(2.0 * log_rms[:, first])
+        for column in range(first + 1, first + QUANTITIES.index("d3d4")):
+            energy = np.exp(2.0 * known[:, [first, column]]).mean(axis=0)
+            own = max(energy[1] - energy[0], least * energy[1])
+            left[:, column] -= 0.5 * np.log(own + noise)
+            weight[:, column] = own / (own + noise)
+        d3, d4, product = (first + QUANTITIES.index(name) for name in ("d3", "d4", "d3d4"))
+        left[:, product] += left[:, d3] - log_rms[:, d3] + left[:, d4] - log_rms[:, d4]
+    return left, weight
+
+
+def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
+    """Return what the blocks say of the change g of each quantity, duty eliminated, and the mean of w of each."""
+    left, weight = beyond_noise(blocks.log_rms, blocks.log_rms)
+    error = np.mean(np.diff(left, axis=0) ** 2, axis=0) / 2.0
+    duty = blocks.duty - blocks.duty.mean(axis=0)
+    believed = np.array([float(priors()["duty"][name].value) for name in DUTY])
+    time, walks = blocks.edges[:-1] + 0.5 * blocks.seconds, priors()["walk"]
+    over_all = float(np.sqrt(len(time) * blocks.seconds / walks["time"].value))
+    stated = []
+    for name, y, w, variance in zip(blocks.names, left.T, weight.T, error, strict=True):
+        drift = walks["noise" if name.startswith("d1 ") else "machine"].value * over_all
+        precision, vector = w**2 / variance, w * y / variance
+        along = precision[:, None] * duty
+        gain = along @ np.linalg.inv(duty.T @ along + np.diag(believed**-2))
+        precision, vector = np.diag(precision) - gain @ along.T, vector - gain @ (duty.T @ vector)
+        stated.append(Information(time, precision, vector, slope=drift, walk=drift))
+    return stated, weight.mean(axis=0)
+
+
+def rises(log_rms: Array, duty: Array, known: Array, known_duty: Array) -> tuple[list[Rise], Array]:
+    """Return the rise g of each quantity of a recording beyond n leak-free ones of the machine, duty taken out, and w.
+
+    `log_rms` (5 per chamber,), `duty` (3,); `known` (n, 5 per chamber), `known_duty` (n, 3). The quantities of healthy
+    recordings are normal about a mean and what the duty explains (Gelman et al., Bayesian Data Analysis, 3rd ed.,
+    section 14.8); the rise is Student's, as in `inference.scatter`.
+    """
+    belief, n = priors()["recordings"], len(known)
+    freedom = belief["freedom"].value + n - 1
+    design = np.column_stack([np.ones(n), known_duty - duty])
+    exponents = np.array([priors()["duty"][name].value for name in DUTY])
+    values, weights = beyond_noise(np.vstack([log_rms, known]), known)
+    weight = weights[1:].mean(axis=0)
+    stated = []
+    for own, others, w in zip(values[0], values[1:].T, weight, strict=True):
+        scatter = float(np.hypot(w * belief["scatter"].value, belief["error"].value))
+        penalty = np.diag([0.0, *(scatter / (w * exponents)) ** 2])
+        inverse = np.linalg.inv(design.T @ design + penalty)
+        fitted = inverse @ design.T @ others
+        squares = np.sum((others - design @ fitted) ** 2) + fitted @ penalty @ fitted
+        variance = (belief["freedom"].value * scatter**2 + squares) / freedom * (1.0 + inverse[0, 0])
+        stated.append(Rise(float(own - fitted[0]) / w, float(np.sqrt(variance)) / w, freedom))
+    return stated, weight
