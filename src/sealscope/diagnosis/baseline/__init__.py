@@ -1,1 +1,0 @@
-"""Leak-free recordings beside the one that is judged."""
