@@ -190,8 +190,9 @@ def test_a_profiles_duty_is_refused_in_one_line(tmp_path, duty, told):
     assert "own.toml" in str(error.value)
 
 
-def test_the_bound_of_a_closed_loop_is_that_of_its_voltages():
+def test_the_bound_of_a_closed_loop_is_that_of_its_voltages(monkeypatch):
     """Put in again with the loop open, they move the piston as the controller did, and a leak shows as it would."""
+    monkeypatch.setattr("sealscope.campaigns.cases.bound.unknown_of", lambda rig: ("fluid.K_oil",))
     closed = Experiment.of(rig="thesis-closed-loop", command="position 20 mm sin(2t)", duration=4.0)
     opened = _opened(closed)
     assert opened.controlled is None

@@ -64,9 +64,10 @@ def few() -> Iterator[None]:
 
 
 @pytest.fixture
-def no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the bound, which takes longer than all else of a short prediction."""
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the bound and the response of the pressures, which take longer than all else."""
     monkeypatch.setattr(module, "_bound", lambda *given: BoundFigures(0.0, 0.0, ()))
+    monkeypatch.delitem(module._JUDGES, "pressure response")
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +77,8 @@ def made(rig: Rig) -> PredictionReport:
     )  # fmt: skip
 
 
-def test_what_is_predicted_is_found(rig: Rig, no_bound: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_predicted_is_found(rig: Rig, quick: None) -> None:
     """1.3 times the size is found in most records made afresh, and a third of it in none."""
-    monkeypatch.delitem(module._JUDGES, "pressure response")
     experiment = experiment_for(rig, "7 sin(4t)", 60.0)
     made = predict(experiment, DetectionTarget(rules=()), commands=())
     best = made.best
@@ -112,7 +112,7 @@ def test_the_answer_comes_first_and_fits_a_terminal(made: PredictionReport) -> N
     assert "must stay within +-10 V" in bad.note and bad.note in made.text()
 
 
-def test_the_seed_makes_the_records(rig: Rig, no_bound: None) -> None:
+def test_the_seed_makes_the_records(rig: Rig, quick: None) -> None:
     experiment = experiment_for(rig, "3 sin(4t)", 20.0)
     one, other, third = (
         predict(experiment, DetectionTarget(rules=("d3 of p_A fell",), seed=seed), commands=()).as_dict()
@@ -122,7 +122,7 @@ def test_the_seed_makes_the_records(rig: Rig, no_bound: None) -> None:
     assert one["rules"] != third["rules"] and one["smallest_leak_lpm"] != third["smallest_leak_lpm"]
 
 
-def test_a_bench_draws_machines_that_drift(rig: Rig, no_bound: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bench_draws_machines_that_drift(rig: Rig, quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "BENCH_SIZES", (0.008, 0.1))
     experiment, target = experiment_for(rig, "7 sin(4t)", 20.0), DetectionTarget(rules=("d3 of p_A fell",))
     still = predict(experiment, target, commands=())

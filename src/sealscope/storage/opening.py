@@ -80,7 +80,7 @@ def _opened(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"],
 def whole(what: str, place: str | os.PathLike[str]) -> Iterator[None]:
     """Turn whatever a damaged file raises in the block into an UnreadableFile of one line; the log has the original.
 
-    `what` it is ("a calibration") and its `place` stand in the message. MissingExtra and UnreadableFile pass.
+    `what` it is ("a rig") and its `place` stand in the message. MissingExtra and UnreadableFile pass.
     """
     try:
         yield
