@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.pressures.ring_down import Machine
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording

@@ -9,8 +9,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import binom
 
-from sealscope.diagnosis.inference.blocks import Information
-from sealscope.diagnosis.inference.onset import FEWEST, NullLaw, StepTest, course, step_test
+from sealscope.diagnosis.inference.onset import FEWEST, Information, NullLaw, StepTest, course, step_test
 
 SPACING = 3.0
 

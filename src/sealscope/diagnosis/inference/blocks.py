@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.row_weights import SUPPORT, weighted
 from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation, Prior, priors
 from sealscope.diagnosis.inference.weak_form import OVERLAP
@@ -109,22 +110,6 @@ class Blocks:
     def joined(cls, parts: Sequence[Blocks]) -> Blocks:
         """Return blocks one after the other."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
-
-
-class Information(NamedTuple):
-    """What K blocks say of one coefficient, one number g_k a block: likelihood exp(vector g - g precision g / 2).
-
-    `time` (K,) [s], `precision` (K, K), `vector` (K,). What is believed of the coefficient, infinite where nothing is:
-    `level`, its standard deviation before the first block; `slope`, that of an even change over all blocks; `walk`,
-    the scale of a half-Cauchy distribution of the deviation that a random walk reaches over all blocks.
-    """
-
-    time: Array
-    precision: Array
-    vector: Array
-    level: float = float("inf")
-    slope: float = float("inf")
-    walk: float = float("inf")
 
 
 class Columns:

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, Information, information, solve, total, zero_of
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, solve, total, zero_of
 from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, probabilities
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
-from sealscope.diagnosis.inference.onset import Course, Interval, StepTest, course, step_test
+from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
 from sealscope.diagnosis.inference.scatter import Rise, rise
 from sealscope.diagnosis.inference.terms import ORIFICE, PUMP, Equation, priors

@@ -46,7 +46,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Information
 from sealscope.recordings.recording import Array
 
 #: Fewest blocks: a level, a slope, a step and its deviation leave nothing below.
@@ -58,6 +57,22 @@ WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])
 #: How far below the largest a walk's log-likelihood may be for the null law to count with it: 99.7 % of chi square(1).
 ALLOWED = 4.5
 _RANK = 1e-9  # directions that carry less of the largest precision carry nothing
+
+
+class Information(NamedTuple):
+    """What K blocks say of one coefficient, one number g_k a block: likelihood exp(vector g - g precision g / 2).
+
+    `time` (K,) [s], `precision` (K, K), `vector` (K,). What is believed of the coefficient, infinite where nothing is:
+    `level`, its standard deviation before the first block; `slope`, that of an even change over all blocks; `walk`,
+    the scale of a half-Cauchy distribution of the deviation that a random walk reaches over all blocks.
+    """
+
+    time: Array
+    precision: Array
+    vector: Array
+    level: float = float("inf")
+    slope: float = float("inf")
+    walk: float = float("inf")
 
 
 class Interval(NamedTuple):

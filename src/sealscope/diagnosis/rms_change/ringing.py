@@ -19,7 +19,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.inference.terms import Prior
 from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks

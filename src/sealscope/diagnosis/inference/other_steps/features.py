@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array, Recording
 

@@ -24,8 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.blocks import Information
-from sealscope.diagnosis.inference.onset import two_sided
+from sealscope.diagnosis.inference.onset import Information, two_sided
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array, Recording
 

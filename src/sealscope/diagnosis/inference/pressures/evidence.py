@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.blocks import Information
-from sealscope.diagnosis.inference.onset import FEWEST
+from sealscope.diagnosis.inference.onset import FEWEST, Information
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 

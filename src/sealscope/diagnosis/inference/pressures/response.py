@@ -31,7 +31,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from sealscope.compiled import contracted, kernel
-from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.pressures.evidence import (
     WANDER_TIME,
     PressureEvidence,
@@ -360,7 +360,7 @@ def first_fit(stretch: Stretch, beliefs: Beliefs, searched: bool) -> tuple[Array
     return best.theta, stretch.spread(best.left)
 
 
-class Linear(NamedTuple):
+class LinearBlock(NamedTuple):
     """A block's sums about its own parameters `theta` (p,), in units of them.
 
     `N` (p, p) and `b` (p,): of the Jacobian's products with itself and the residual [Pa^2]; `squares` of the residual
@@ -377,10 +377,10 @@ class Linear(NamedTuple):
     cross: Array
 
 
-def linear(look: Look, known: Array, second: int) -> Linear:
+def linear(look: Look, known: Array, second: int) -> LinearBlock:
     """Return the sums of a look."""
     first, along = np.arange(0, look.left.size, second), look.slopes[:, G : G + 1]
-    return Linear(
+    return LinearBlock(
         look.theta,
         look.slopes.T @ look.slopes,
         look.slopes.T @ look.left,
@@ -462,7 +462,7 @@ class Follower:
                 led.append((stretch.descend(sets[int(squares.argmin())], belief, _STEPS, self.variance), belief))
         return min(led, key=lambda own: own[0].cost(self.variance, own[1], unit))
 
-    def take(self, block: Recording) -> Linear:
+    def take(self, block: Recording) -> LinearBlock:
         """Return the sums of the next block."""
         stretch = self.stretch(block)
         look, belief = self._led(stretch, block.duration)
@@ -487,7 +487,7 @@ class Response:
     """
 
     time: Array
-    blocks: tuple[Linear, ...]
+    blocks: tuple[LinearBlock, ...]
     beliefs: Beliefs
     mean: Array
     covariance: Array
@@ -495,7 +495,7 @@ class Response:
     variance: float
 
     @staticmethod
-    def of(time: Array, blocks: Sequence[Linear], beliefs: Beliefs, seconds: float) -> Response:
+    def of(time: Array, blocks: Sequence[LinearBlock], beliefs: Beliefs, seconds: float) -> Response:
         """Return it for blocks of so many seconds; the noise is scaled by its long-run variance in the score of G."""
         K, unit = len(blocks), beliefs.unit
         steps, level = np.diff(np.eye(K), axis=0), np.full((K, K), K**-2.0)
@@ -542,7 +542,7 @@ class Response:
         return Information(self.time, precision, vector / unit, slope=reach, walk=reach)
 
 
-def _noise(blocks: Sequence[Linear], off: Array, count: float) -> tuple[float, float]:
+def _noise(blocks: Sequence[LinearBlock], off: Array, count: float) -> tuple[float, float]:
     """Return the variance [Pa^2] left at deviations (K, p), and the long-run variance of G's score over it."""
     squares = sum(
         block.squares - 2.0 * block.b @ own + own @ block.N @ own for block, own in zip(blocks, off, strict=True)

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.blocks import Information
+from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.pressures.evidence import (
     WANDER_TIME,
     PressureEvidence,
