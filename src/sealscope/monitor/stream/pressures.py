@@ -37,7 +37,7 @@ CHANNELS = ("u", "p_A", "p_B")
 _SETTLING, _RESUMING = 10, 3
 #: Excess of a block's chi square, in deviations, from which on it is not described, and how many lose the machine.
 _DESCRIBED, _LOST = 6.0, 10
-#: Blocks over which the usual variance is taken.
+#: Blocks over which the usual variance is taken; over those of resuming while it is being found.
 _USUAL = 60
 #: Arrays of a follower that change, and those of its beliefs.
 _ARRAYS = ("theta", "covariance", "states", "beliefs")
@@ -87,10 +87,12 @@ class PressureEstimator:
         own = self._follower.take(block.only(CHANNELS))
         variance, follower = own.squares / max(own.samples, 1.0), self._follower
         settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
-        if not np.isfinite(follower.theta).all() or not follower.excess < _DESCRIBED:
+        described = bool(np.isfinite(follower.theta).all()) and follower.excess < _DESCRIBED
+        ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0)) if math.isfinite(variance) else 1.0
+        follower.variance *= ratio ** (1.0 / (_USUAL if described and not settling else _RESUMING))
+        if not described:
             return self._not_described(end, apart, settling)
         self._lost = 0
-        follower.variance *= (max(variance, 1.0) / follower.variance) ** (1.0 / _USUAL)
         if settling:
             return _passed_over(end, "settling", apart)
         width = priors("response")["G"].width

@@ -85,10 +85,10 @@ class PressureReading:
 
     @cached_property
     def level(self) -> tuple[float, float]:
-        """Level of g over the recording and its standard deviation [m^3/(s Pa)], about what is believed of it."""
-        own, believed = self.evidence.information, priors("response")["G"]
-        precision = float(own.precision.sum()) + believed.width**-2
-        return (float(own.vector.sum()) + believed.value * believed.width**-2) / precision, precision**-0.5
+        """Level of g over the recording and its standard deviation [m^3/(s Pa)]."""
+        own = self.evidence.information
+        precision = max(float(own.precision.sum()), np.finfo(float).tiny)
+        return float(own.vector.sum()) / precision, precision**-0.5
 
     def lpm(self, step: float, deviation: float) -> tuple[float, tuple[float, float]]:
         """Return a change of g as a flow [L/min], with its 95 % interval."""

@@ -78,8 +78,8 @@ _UNEXPLAINED = 3.0
 _CONDUCTANCES, _STIFFNESSES = np.geomspace(1e-12, 2e-10, SINGLE_WIDTH), np.geomspace(0.15, 1.2, SINGLE_WIDTH)
 #: Least share of a step that is tried; damping [1] of steps that did not gain, at first, at least and at most.
 _LEAST_SHARE, _DAMPED, _LEAST_DAMPED, _MOST_DAMPED = 0.02, 0.1, 1e-3, 100.0
-#: Beginning in which the ring gives the stiffness [s].
-_RING_WINDOW = 24.0
+#: Beginning in which the ring gives the stiffness, and blocks by which it is led along once [s].
+_RING_WINDOW, _BLOCK = 24.0, 6.0
 #: The first fit: length of its window [s], width of the Gaussian that takes the ring out [periods], steps of the slow
 #: fit, and stiffnesses from which the whole is fitted.
 _WINDOW, _SLOW, _FIRST_STEPS, _STARTS = 12.0, 0.6, 6, 3
@@ -418,6 +418,11 @@ class Follower:
         follower = Follower(Machine.of(rig, recording.rate), beliefs, sense)
         window = follower.stretch(recording.samples(slice(0, math.ceil(_WINDOW * recording.rate))))
         follower.theta, follower.variance = first_fit(window, beliefs, searched=ring is None)
+        covariance, states = follower.covariance, follower.states
+        length = round(_BLOCK * recording.rate)
+        for first in range(0, round(_RING_WINDOW * recording.rate), length):  # led on once, to begin where that ends
+            follower.take(recording.samples(slice(first, first + length)))
+        follower.covariance, follower.states, follower.last = covariance, states, math.nan
         return follower
 
     def interrupt(self, seconds: float) -> None:

@@ -1,0 +1,61 @@
+"""The verdict from pressures and command: leaks, what else may step, a baseline, and what is not read."""
+
+from __future__ import annotations
+
+import pytest
+
+import sealscope as ss
+from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.parameters import load_rig
+
+DETECTOR = PressureResponse(load_rig("thesis"))
+
+
+def examined(*baseline: ss.Recording, seed: int = 6, **values: object) -> Evidence:
+    return DETECTOR.examine(recorded(seed=seed, **values), baseline, 0.01)
+
+
+def recorded(**values: object) -> ss.Recording:
+    return ss.simulate(rig="thesis", command="3 sin(4t)", duration=80.0, **values).only(("u", "p_A", "p_B"))
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        ("friction +20 %", "friction change"),
+        ("air 1 %", "air in the oil"),
+        ("sensor p_A offset 5 psi", "sensor fault"),
+        ("sensor p_B gain 2 %", "sensor fault"),
+    ],
+)
+def test_what_else_steps_is_named_and_is_no_leak(fault: str, cause: str) -> None:
+    evidence = examined(fault=f"{fault} from 40 s")
+    assert evidence.verdict != "leak"
+    assert evidence.cause == cause
+
+
+def test_the_score_grows_with_the_leak_and_without_one_there_is_a_bound() -> None:
+    sound = examined()
+    assert sound.verdict == "no leak"
+    leaks = [examined(leak=f"{lpm} L/min from 40 s") for lpm in (0.01, 0.03, 0.1)]
+    assert [leak.verdict for leak in leaks] == ["leak"] * 3
+    scores = [sound.score, *(leak.score for leak in leaks)]
+    assert scores == sorted(scores)
+    assert sound.bound_lpm < 0.02
+
+
+def test_a_leak_from_the_first_sample_is_above_the_baseline_only() -> None:
+    healthy = [recorded(seed=seed) for seed in (11, 12, 13)]
+    assert examined(leak="0.05 L/min").verdict == "no leak"  # no change within the recording
+    above = examined(*healthy, leak="0.05 L/min")
+    assert (above.verdict, above.onset_s) == ("leak", None)
+    assert 0.025 < above.leak_lpm < 0.1
+    assert examined(*healthy).verdict == "no leak"
+
+
+def test_other_circuits_and_counts_are_refused_in_words() -> None:
+    recording = recorded(seed=1)
+    assert "position" in PressureResponse(load_rig("servo-valve")).usable(recording)
+    assert "position" in PressureResponse(load_rig("single-rod-eha")).usable(recording)
+    assert "u" in DETECTOR.usable(recording.only(("p_A", "p_B")))
