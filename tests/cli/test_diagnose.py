@@ -266,7 +266,7 @@ def test_every_real_stroke_gets_a_verdict(call, every):
     done = call("diagnose", *worn, "--baseline", *healthy, *FOREIGN, "--format", "jsonl")
     assert (done.status, done.err) == (0, "")
     assert [one["file"] for one in done.objects] == [str(file) for file in worn]
-    # another specimen on another day: a worn seal cannot be told from these (docs/decisions/0020-baselines.md)
+    # another specimen on another day: a worn seal cannot be told from these
     assert Counter(one["verdict"] for one in done.objects) == {"cannot tell": len(worn)}
     assert all("another machine, temperature or wear" in one["reason"] for one in done.objects)
     own = call("diagnose", *healthy[:15], "--baseline", *healthy[15:], *FOREIGN, "--format", "jsonl")
