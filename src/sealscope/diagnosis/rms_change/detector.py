@@ -28,7 +28,7 @@ from sealscope.signals.details import shortest
 #: Fewest blocks in which a change is looked for.
 FEWEST_BLOCKS = 12
 #: Chance below which a quantity has a say in the onset.
-MOVED = 0.1
+MOVED = 0.5
 #: Lowest rate [Hz] at which the ringing of the piston on its oil, 70 Hz on the packaged rigs, reaches into the judged
 #: details: d2 ends at a quarter of the rate, and d1 is noise. Below, leaks of up to 0.5 L/min changed nothing in them.
 RINGING_RATE = 250.0
