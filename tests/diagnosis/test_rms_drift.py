@@ -52,7 +52,7 @@ def test_noise_of_any_size_drops_out() -> None:
 def test_a_change_of_the_duty_is_no_step_of_the_machine() -> None:
     """Details that step with the command, by a power of 2, are explained; the same step beside an even command not."""
     random = np.random.default_rng(0)
-    duty = np.zeros((70, 3))
+    duty = np.zeros((70, 4))
     duty[:, 0] = 0.2 * (np.arange(70) >= 35)
     scatter = np.hstack([SCATTER[[0, 1, 2, 3, 3]] * random.standard_normal((70, 5)) for _ in range(2)])
     moved = scatter + np.tile(np.r_[0.0, np.full(4, 2.0)] * duty[:, :1], 2) + np.tile([-3.0, 0.0, 0.0, 0.0, 0.0], 2)
@@ -78,7 +78,7 @@ def test_the_rise_against_recordings_is_students() -> None:
     own = np.array([-5.0, 1.0, 2.0, 3.0, 4.0])
     belief = priors()["recordings"]
     freedom, scatter = belief["freedom"].value, belief["scatter"].value
-    stated, weight = rises(own, np.zeros(3), known, np.zeros((6, 3)))
+    stated, weight = rises(own, np.zeros(4), known, np.zeros((6, 4)))
     assert weight[1:] == pytest.approx(1.0, abs=1e-3)
     squares = freedom * (scatter**2 + belief["error"].value ** 2) + np.sum((known[:, 1] - known[:, 1].mean()) ** 2)
     deviation = np.sqrt(squares / (freedom + 5) * (1 + 1 / 6))
@@ -90,12 +90,12 @@ def test_the_rise_against_recordings_is_students() -> None:
 def test_recordings_of_another_duty_widen_the_rise() -> None:
     """Of a duty that no baseline recording had nothing is known; of one that lies among theirs the exponent is."""
     random = np.random.default_rng(2)
-    duty = np.c_[np.linspace(-0.5, 0.5, 12), np.zeros((12, 2))]
+    duty = np.c_[np.linspace(-0.5, 0.5, 12), np.zeros((12, 3))]
     known = np.c_[np.full(12, -5.0), 1.5 * duty[:, :1] + 0.01 * random.standard_normal((12, 4))]
-    alike, apart = (rises(known[0], np.array([log, 0.0, 0.0]), known, duty)[0][1] for log in (-0.5, 3.0))
+    alike, apart = (rises(known[0], np.array([log, 0.0, 0.0, 0.0]), known, duty)[0][1] for log in (-0.5, 3.0))
     assert abs(alike.value) < 3.0 * alike.deviation < 0.2
     assert apart.deviation > 1.4 * alike.deviation
-    single = rises(known[0], np.array([3.0, 0.0, 0.0]), known[:1], duty[:1])[0][1]
+    single = rises(known[0], np.array([3.0, 0.0, 0.0, 0.0]), known[:1], duty[:1])[0][1]
     assert single.deviation > 5.0
 
 

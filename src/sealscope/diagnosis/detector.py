@@ -36,7 +36,7 @@ class Detector(Protocol):
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`.
 
-        `baseline`: leak-free recordings of the same machine at the same operating point, no two of them copies; where
+        `baseline`: leak-free recordings of the same machine, at any duty, no two of them copies; where
         there is none, the recording's own beginning is the baseline.
         """
         ...

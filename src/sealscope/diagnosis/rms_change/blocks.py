@@ -25,7 +25,7 @@ QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Quantities that make the verdict; d1 holds noise alone, d3d4 follows from d3 and d4.
 JUDGED = ("d2", "d3", "d4")
 #: What is known of a block's duty, in the order of the columns of `RmsBlocks.duty`.
-DUTY = ("command", "rate", "load")
+DUTY = ("command", "rate", "load", "direction")
 #: Length a block should have [s]: long enough for the RMS of d4 to be steady, short enough to place an onset.
 BLOCK_SECONDS = 1.5
 #: ... and fewest samples it should have: two periods of the slowest oscillation in d4, whose memory then ends in the
@@ -43,11 +43,11 @@ _REST = 1e-3
 class RmsBlocks:
     """Log RMS of every quantity in every block.
 
-    `edges` (n + 1,): where each block begins and the last ends [s]; `log_rms` (n, 5 per chamber), `duty` (n, 3): log
-    RMS of the command, of its rate of change, and of the pressure difference, 0 without a command; the phase's own
-    level is taken out of both. `chambers`: their names; `phases`: blocks a cycle (1: none); `cycle`: its length [s],
-    None without a cycle; `still`: the first block in which a reading does not move, as text (its log RMS means
-    nothing); `left_out`: blocks with missing samples, which are not among these.
+    `edges` (n + 1,): where each block begins and the last ends [s]; `log_rms` (n, 5 per chamber), `duty` (n, 4): log
+    RMS of the command, of its rate of change, and of the pressure difference, and the mean of the latter over its RMS;
+    the phase's own level is taken out of both. `chambers`: their names; `phases`: blocks a cycle (1: none); `cycle`:
+    its length [s], None without a cycle; `still`: the first block in which a reading does not move, as text (its log
+    RMS means nothing); `left_out`: blocks with missing samples, which are not among these.
     """
 
     edges: Array
@@ -103,7 +103,7 @@ def whole_log_rms(recording: Recording) -> Array:
 
 
 def whole(recording: Recording) -> tuple[Array, Array]:
-    """Return the log RMS (5 per chamber,) and the duty (3,) of the whole recording but its edges."""
+    """Return the log RMS (5 per chamber,) and the duty (4,) of the whole recording but its edges."""
     transformed = [details(recording[chamber]) for chamber in chambers_of(recording)]
     inside = transformed[0].inside()
     log_rms, duty = _columns(recording, transformed, np.array([inside.start, inside.stop]))
@@ -111,7 +111,7 @@ def whole(recording: Recording) -> tuple[Array, Array]:
 
 
 def _columns(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
-    """Return log RMS (n, 5 per chamber) and duty (n, 3) between consecutive sample bounds."""
+    """Return log RMS (n, 5 per chamber) and duty (n, 4) between consecutive sample bounds."""
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
         load = recording["p_A"] - recording["p_B"]
@@ -122,7 +122,8 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
     rest = np.maximum(_REST**2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny)
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(own, bounds) for own in transformed], axis=1)
-        return 0.5 * np.log(energies), 0.5 * np.log(_means(squares, bounds) + rest).T
+        log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(_means(squares, bounds) + rest)
+    return log_rms, np.vstack([duty, _means(load[None], bounds) / np.exp(duty[-1:])]).T
 
 
 def cut(recording: Recording) -> RmsBlocks:

@@ -28,10 +28,12 @@ from sealscope.signals.details import shortest
 #: Fewest blocks in which a change is looked for.
 FEWEST_BLOCKS = 12
 #: Chance below which a quantity has a say in the onset.
-MOVED = 0.1
+MOVED = 0.5
 #: Lowest rate [Hz] at which the ringing of the piston on its oil, 70 Hz on the packaged rigs, reaches into the judged
 #: details: d2 ends at a quarter of the rate, and d1 is noise. Below, leaks of up to 0.5 L/min changed nothing in them.
 RINGING_RATE = 250.0
+#: Lowest rate [Hz]: the ringing of a hydraulic line of some metres lies over 4 Hz.
+SLOWEST_RATE = 8.0
 
 
 class _Change(NamedTuple):
@@ -86,6 +88,9 @@ class RmsChange:
 
 def _examine(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
     """Return the evidence on a recording, by what its details show."""
+    if recording.rate < SLOWEST_RATE:
+        reason = f"needs {SLOWEST_RATE:g} Hz or more to see the ringing that a leak damps, got {recording.rate:g} Hz"
+        return Evidence("cannot tell", f"{reason}: is the unit of the time right?")
     if baseline:
         return against(recording, baseline, probability)
     blocks = cut(recording)

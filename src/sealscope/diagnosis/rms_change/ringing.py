@@ -6,8 +6,8 @@ machine's own: E_j = (1 + g)^2 E_own,j + E_1. So the change g of the machine's a
     y = log RMS d_j - log sqrt(E_own,j + E_1) = w g + error,    w = E_own,j / (E_own,j + E_1),
 
 with E_1 of the same block or recording: noise that changes by any amount drops out, and where it drowns the machine
-the weight w is small. Of d1 y is the log RMS itself. What the duty explains is eliminated: g follows the logarithms of
-`blocks.DUTY` by exponents that are believed within a width (`priors.toml`).
+the weight w is small. Of d1 y is the log RMS itself. What the duty explains is eliminated: g follows `blocks.DUTY`
+by exponents that are believed within a width (`priors.toml`).
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """Return what the blocks say of the change g of each quantity, duty eliminated, and the mean of w of each."""
     left, weight = beyond_noise(blocks.log_rms, blocks.log_rms)
     error = np.mean(np.diff(left, axis=0) ** 2, axis=0) / 2.0
-    duty = blocks.duty - blocks.duty.mean(axis=0)
-    believed = np.array([float(priors()["duty"][name].value) for name in DUTY])
+    explaining = DUTY[:-1]  # the direction is that of the phase
+    duty = (blocks.duty - blocks.duty.mean(axis=0))[:, : len(explaining)]
+    believed = np.array([float(priors()["duty"][name].value) for name in explaining])
     time, walks = blocks.edges[:-1] + 0.5 * blocks.seconds, priors()["walk"]
     over_all = float(np.sqrt(len(time) * blocks.seconds / walks["time"].value))
     stated = []
@@ -71,7 +72,7 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
 def rises(log_rms: Array, duty: Array, known: Array, known_duty: Array) -> tuple[list[Rise], Array]:
     """Return the rise g of each quantity of a recording beyond n leak-free ones of the machine, duty taken out, and w.
 
-    `log_rms` (5 per chamber,), `duty` (3,); `known` (n, 5 per chamber), `known_duty` (n, 3). The quantities of healthy
+    `log_rms` (5 per chamber,), `duty` (4,); `known` (n, 5 per chamber), `known_duty` (n, 4). The quantities of healthy
     recordings are normal about a mean and what the duty explains (Gelman et al., Bayesian Data Analysis, 3rd ed.,
     section 14.8); the rise is Student's, as in `inference.scatter`.
     """
