@@ -1,6 +1,6 @@
-"""What `diagnose` says of the machines of packaged plans from all channels: a part of each kind of record.
+"""What `diagnose` says of the machines of packaged plans from all channels or some: a part of each kind of record.
 
-    python benchmarks/plan_verdicts.py [--records 200] [--false-alarm 0.01] [PLAN ...]
+    python benchmarks/plan_verdicts.py [--records 200] [--false-alarm 0.01] [--channels u,p_A,p_B] [PLAN ...]
 
 The records are the plan's own, each kind in its proportion. The verdict knows the channels and the rig as designed, not
 the drawn machine, no onset, no size, no baseline. "Interval", "onset": how many of the stated 95 % intervals hold the
@@ -36,14 +36,15 @@ class Kind:
     seconds: list[float] = field(default_factory=list)
 
 
-def judged(plan_name: str, records: int, false_alarm: float) -> dict[tuple[float, str], Kind]:
+def judged(plan_name: str, records: int, false_alarm: float, channels: str) -> dict[tuple[float, str], Kind]:
     """Return what is said of the first records of a plan, by leak [L/min] and fault."""
     plan = load_plan(plan_name)
     kinds: dict[tuple[float, str], Kind] = defaultdict(Kind)
     for case in interleaved(cases_of(plan))[:records]:
         simulated = simulate_with_truth(experiment_of(plan, case))
         kind, started = kinds[case.leak_lpm, case.fault], time.process_time()
-        verdict = diagnose(simulated.recording, rig=plan.rig, false_alarm_probability=false_alarm, quick=True)
+        seen = simulated.recording.only(channels.split(",")) if channels else simulated.recording
+        verdict = diagnose(seen, rig=plan.rig, false_alarm_probability=false_alarm, quick=True)
         kind.seconds.append(time.process_time() - started)
         kind.verdicts.append(verdict.verdict)
         if verdict.bound_lpm is not None:
@@ -61,11 +62,12 @@ def main() -> None:
     parser.add_argument("plans", nargs="*", default=PLANS)
     parser.add_argument("--records", type=int, default=200)
     parser.add_argument("--false-alarm", type=float, default=0.01)
+    parser.add_argument("--channels", default="", help="Channels, by commas (default: all).")
     options = parser.parse_args()
     print("| plan | leak [L/min] or fault | `leak` | `cannot tell` | interval | onset | bound [L/min] | s |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for name in options.plans:
-        for (leak, fault), kind in sorted(judged(name, options.records, options.false_alarm).items()):
+        for (leak, fault), kind in sorted(judged(name, options.records, options.false_alarm, options.channels).items()):
             count, unsure = (kind.verdicts.count(own) for own in ("leak", "cannot tell"))
             number = len(kind.verdicts)
             hold = (f"{sum(own)} of {len(own)}" if own else "" for own in (kind.intervals, kind.onsets))

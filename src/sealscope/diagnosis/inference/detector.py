@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Blocks
+from sealscope.diagnosis.inference.causes import StepHypothesis
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
-from sealscope.diagnosis.inference.terms import circulation, equations, locked
+from sealscope.diagnosis.inference.onset import StepTest
+from sealscope.diagnosis.inference.terms import LOCKED, circulation, equations, locked, priors
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.without_position import RecordedCirculation, circulations
+from sealscope.diagnosis.inference.without_position import circulations
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
@@ -29,6 +32,38 @@ _NO_BALANCE = {
 }
 #: Fewest samples between neighbouring test functions.
 RESOLVED = 2
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedCirculation(RecordedBalance):
+    """A recorded balance without a position, with what the accumulator says of oil that leaves the circuit.
+
+    `lost`: tests of a step of the external leak of either side by the accumulator's own balance, by the term's name.
+    """
+
+    lost: Mapping[str, StepTest]
+
+    @cached_property
+    def hypotheses(self) -> tuple[StepHypothesis, ...]:
+        """Tests of all terms' coefficients; an external leak must empty the accumulator as well, by as much.
+
+        Twice the logarithm of the likelihood of what the accumulator lost, beside that of none, is added to its score.
+        """
+        tested = []
+        for own in super().hypotheses:
+            store = self.lost.get(own.name)
+            if store is not None:
+                at = int(np.abs(store.onsets - own.test.onsets[own.test.best]).argmin())
+                seen, expected = np.array([store.size[at], own.test.fitted[0]]) / store.deviation[at]
+                tested.append(own._replace(score=own.score + float(seen**2 - (seen - expected) ** 2)))
+            else:
+                tested.append(own)
+        return tuple(sorted(tested, key=lambda own: -own.score))
+
+
+def made_good(balance: RecordedBalance) -> bool:
+    """Whether the pump surely delivers what any pump loses: a loop brings the piston back, or holds it."""
+    return balance.level.low * balance.mean(0) > priors()["held"]["share"].value * balance.mean(2)
 
 
 class VolumeBalance:
@@ -73,7 +108,12 @@ class VolumeBalance:
         balances = equations(self.rig, frozenset(recording.channels))
         if not balances:
             made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), self.reads)
-            return min(made, key=lambda own: bound_of(own, None), default=None)
+            recorded = [
+                RecordedCirculation(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
+                for own in made
+            ]
+            answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
+            return min(answering, key=lambda own: bound_of(own, None), default=None)
         blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
         return None if blocks is None else RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording)
 

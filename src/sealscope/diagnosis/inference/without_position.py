@@ -18,8 +18,6 @@ Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,8 +26,6 @@ from numpy.typing import NDArray
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, without_rails
 from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting, information
-from sealscope.diagnosis.inference.causes import StepHypothesis
-from sealscope.diagnosis.inference.decision import RecordedBalance
 from sealscope.diagnosis.inference.onset import FEWEST, StepTest, step_test
 from sealscope.diagnosis.inference.terms import (
     LEAK,
@@ -66,35 +62,20 @@ class _WideRows(NamedTuple):
     whole: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedCirculation(RecordedBalance):
-    """A recorded balance without a position, with what the accumulator says of oil that leaves the circuit.
+class Circulation(NamedTuple):
+    """A balance without a position, or without flow, over a recording.
 
     `lost`: tests of a step of the external leak of either side by the accumulator's own balance, by the term's name.
     """
 
+    blocks: Blocks
+    equation: Equation
+    columns: Columns
     lost: Mapping[str, StepTest]
 
-    @cached_property
-    def hypotheses(self) -> tuple[StepHypothesis, ...]:
-        """Tests of all terms' coefficients; an external leak must empty the accumulator as well, by as much.
 
-        Twice the logarithm of the likelihood of what the accumulator lost, beside that of none, is added to its score.
-        """
-        tested = []
-        for own in super().hypotheses:
-            store = self.lost.get(own.name)
-            if store is not None:
-                at = int(np.abs(store.onsets - own.test.onsets[own.test.best]).argmin())
-                seen, expected = np.array([store.size[at], own.test.fitted[0]]) / store.deviation[at]
-                tested.append(own._replace(score=own.score + float(seen**2 - (seen - expected) ** 2)))
-            else:
-                tested.append(own)
-        return tuple(sorted(tested, key=lambda own: -own.score))
-
-
-def circulations(recording: Recording, rig: Rig) -> list[RecordedCirculation]:
-    """Return the balances over cycles and over holds of a recording, as far as a loop makes good what leaks in them.
+def circulations(recording: Recording, rig: Rig) -> list[Circulation]:
+    """Return the balances over cycles and over holds of a recording.
 
     With a position and nothing that gives a flow, over holds by shut valves.
     """
@@ -114,21 +95,17 @@ def circulations(recording: Recording, rig: Rig) -> list[RecordedCirculation]:
     area = max(rig.cylinder.A_A, rig.cylinder.A_B)
     counts = known & (signals.step("u") == 0.0) if shut else known
     still = _held(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
-    begin, made, long = float(recording.t[0]), list[RecordedCirculation](), recording.duration / STORED
+    begin, made, long = float(recording.t[0]), list[Circulation](), recording.duration / STORED
     if shut:
         blocks = _blocks(signals, equation, rig, HELD, known & still, begin)
-        return (
-            []
-            if blocks is None
-            else [RecordedCirculation(blocks, (equation,), (Columns(equation),), rig, recording, {})]
-        )
+        return [] if blocks is None else [Circulation(blocks, equation, Columns(equation), {})]
     cycle = _cycle(np.where(known, speed, 0.0), recording.rate)
     for half, counts in ((cycle, known), (HELD, known & still)):
         blocks = None if half is None else _blocks(signals, equation, rig, half, counts, begin)
         if blocks is not None:
             lost = _lost(signals, rig, long if cycle is None else cycle * np.ceil(long / cycle), known, begin)
-            made.append(RecordedCirculation(blocks, (equation,), (Columns(equation),), rig, recording, lost))
-    return [own for own in made if made_good(own)]
+            made.append(Circulation(blocks, equation, Columns(equation), lost))
+    return made
 
 
 def _lost(signals: Signals, rig: Rig, half: float, counts: NDArray[np.bool_], begin: float) -> dict[str, StepTest]:
@@ -142,11 +119,6 @@ def _lost(signals: Signals, rig: Rig, half: float, counts: NDArray[np.bool_], be
     names = [name for name in columns.names if name.startswith("external")]
     tests = {name: step_test(information(blocks, [columns], columns.names.index(name))) for name in names}
     return {name: test for name, test in tests.items() if test is not None}
-
-
-def made_good(balance: RecordedBalance) -> bool:
-    """Whether the pump surely delivers what any pump loses: a loop brings the piston back, or holds it."""
-    return balance.level.low * balance.mean(0) > priors()["held"]["share"].value * balance.mean(2)
 
 
 def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Array]:
