@@ -1,8 +1,8 @@
 """One verdict from the evidence of many detectors: that of the first which accounts for what it says.
 
 Letting any of several raise the alarm would make the false-alarm probability the sum of theirs. So one judges: the
-first of `ORDER` with a verdict, then a user's own detectors. The change of RMS states no size and no bound, and judges
-only where no other detector can be used: a leak where nothing else stepped, never that there is none.
+first of `ORDER` with a verdict, then a user's own detectors. The change of RMS states no size, and a bound of the
+ringing alone; it judges only where no other detector can be used, and a leak only where nothing else stepped.
 """
 
 from __future__ import annotations
@@ -62,8 +62,6 @@ def judged(
         doubts = [] if refusal is None else [refusal]
         if judge.share < WHOLE:
             doubts.append(f"this rests on {judge.share:.0%} of the recording, {WHOLE:.0%} are needed")
-        if by_change:
-            doubts.append("a leak may change nothing in the details")
         reasons += doubts
         verdict = "cannot tell" if doubts else verdict
     others = [own for own in ranked if own is not judge]
