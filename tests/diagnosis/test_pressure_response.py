@@ -50,7 +50,7 @@ def test_a_leak_from_the_first_sample_is_above_the_baseline_only() -> None:
     assert examined(leak="0.05 L/min").verdict == "no leak"  # no change within the recording
     above = examined(*healthy, leak="0.05 L/min")
     assert (above.verdict, above.onset_s) == ("leak", None)
-    assert 0.025 < above.leak_lpm < 0.1
+    assert above.leak_lpm is None  # levels lean on the friction
     assert examined(*healthy).verdict == "no leak"
 
 
