@@ -17,8 +17,8 @@ import numpy as np
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.gaps import MOST_BRIDGED, bridge
-from sealscope.recordings.hydraulics import lack_of_chambers, no_machine, no_readings
-from sealscope.recordings.motion import does_not_move, runs_of
+from sealscope.recordings.hydraulics import lack_of_chambers, no_readings
+from sealscope.recordings.motion import runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
 from sealscope.recordings.recording import Recording, remembered
 
@@ -37,31 +37,22 @@ class Inspection:
 
     `part`: its longest uniformly sampled stretch with no chamber pressure and no command missing, gaps bridged where
     they can be (`recordings.gaps`); `findings` on the whole; `distrust`: why the chamber pressures cannot be trusted,
-    None where they can; `share` of the whole that the stretch is; `doubt`: why the pressures alone, without a balance
-    of volumes, do not look like those of a hydraulic machine, None where they do; `unreadable`: why not even a balance
-    can take them.
+    None where they can; `share` of the whole that the stretch is.
     """
 
     part: Recording
     findings: tuple[Finding, ...]
     distrust: str | None
     share: float
-    doubt: str | None = None
-    unreadable: str | None = None
 
     @property
-    def untrusted(self) -> str | None:
+    def defect(self) -> str | None:
         """Why the recording cannot stand for a leak-free machine; None where it can."""
         if lack := lack_of_chambers(self.part):
             return lack
         if len(self.part) < SHORTEST:
             return f"needs {SHORTEST} samples or more without a gap, got {len(self.part)}"
-        return self.distrust or self.unreadable
-
-    @property
-    def defect(self) -> str | None:
-        """Why nothing can be stated of its pressures alone; None where it can."""
-        return self.untrusted or self.doubt
+        return self.distrust
 
     @cached_property
     def digest(self) -> bytes:
@@ -105,13 +96,9 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
             findings.append(Finding("part_analysed", "warning", None, left_out, float(part.t[0]), text))
     spoiled = next((own for own in findings if own.channel in chambers and _spoils(own, len(part))), None)
     distrust = None if spoiled is None else f"the pressures cannot be trusted: {spoiled.text}"
-    doubt = None
-    if distrust is None and len(part) >= SHORTEST and does_not_move(part) is None and (reason := no_machine(part)):
-        doubt = f"this is no recording of a hydraulic machine: {reason}"
-    unreadable = no_readings(part) if distrust is None and len(part) >= SHORTEST else None
-    if unreadable is not None:
-        unreadable = f"this is no recording of a hydraulic machine: {unreadable}"
-    return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1), doubt, unreadable)
+    if distrust is None and len(part) >= SHORTEST and (reason := no_readings(part)):
+        distrust = f"this is no recording of a hydraulic machine: {reason}"
+    return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1))
 
 
 def _spoils(finding: Finding, samples: int) -> bool:
@@ -164,8 +151,8 @@ def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
 
 def _refusal(judged: Inspection, own: Inspection) -> tuple[Severity, str | None]:
     """Return why a baseline recording cannot be compared, None where it can, and how much that matters."""
-    if (untrusted := own.untrusted) is not None:
-        return "warning", untrusted
+    if own.defect is not None:
+        return "warning", own.defect
     if own.digest == judged.digest:
         return "warning", "the same samples as the recording itself"
     chambers = chambers_of(judged.part)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.onset import Information
+from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array, Recording
 
@@ -20,8 +21,8 @@ from sealscope.recordings.recording import Array, Recording
 BLOCKS = 40
 #: Differences by which noise is told from motion and ringing: the response goes with this power of the frequency.
 ORDER = 6
-#: Frequencies of the mains [Hz].
-MAINS = (50.0, 60.0)
+#: Frequencies of the mains [Hz], and pieces of a block whose power is averaged.
+MAINS, PIECES = (50.0, 60.0), 4
 #: What commands the motion, and what moves, in the order of preference.
 COMMANDS, MOTIONS = ("x_d", "u", "omega", "theta"), ("x", "theta", "omega", "u")
 
@@ -67,12 +68,12 @@ def _hum(hertz: float) -> Of:
     def hum(blocks: dict[str, Array], rate: float) -> Array | None:
         if not {"p_A", "p_B"} <= blocks.keys() or not hertz < 0.45 * rate:
             return None
-        values = blocks["p_A"] + blocks["p_B"]
-        length = values.shape[1]
+        length = blocks["p_A"].shape[1] // PIECES
+        values = (blocks["p_A"] + blocks["p_B"])[:, : PIECES * length].reshape(-1, PIECES, length)
         window = np.hanning(length) * np.exp(-2j * np.pi * hertz / rate * np.arange(length))
-        power = np.abs((values - values.mean(axis=1, keepdims=True)) @ window) ** 2
+        power = np.abs((values - values.mean(axis=2, keepdims=True)) @ window) ** 2
         with np.errstate(divide="ignore"):
-            return np.asarray(np.log(power))
+            return np.asarray(np.log(power.mean(axis=1)))
 
     return hum
 
@@ -116,9 +117,9 @@ def features(recording: Recording, wanted: Sequence[Feature] = FEATURES) -> list
         missing = recording.bridged[: BLOCKS * length].reshape(BLOCKS, length)
         blocks = {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
     time = recording.t[0] + (np.arange(BLOCKS) + 0.5) * length / recording.rate
-    shown = []
+    wander, shown = priors()["features"]["wander"].value, []
     for feature in wanted:
         values = feature.of(blocks, recording.rate)
         if values is not None and np.count_nonzero(np.isfinite(values)) == BLOCKS and np.ptp(values) > 0.0:
-            shown.append((feature, Information(time, np.eye(BLOCKS), values)))
+            shown.append((feature, Information(time, np.eye(BLOCKS), values, slope=wander, walk=wander)))
     return shown
