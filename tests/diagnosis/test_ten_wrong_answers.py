@@ -2,24 +2,19 @@
 
 A machine of the volume balance leaks from 60 s on. Its log in each dialect must give the same leak and onset as its own
 channels. The parts are tested where they live: dialects in `tests/recordings`, the size of the machine in
-`test_assumed_machine.py`, a leak from the first sample in `test_passage.py`, fusion in `test_fusion.py`.
+`test_assumed_machine.py`, a leak from the first sample in `test_passage.py`.
 """
 
 from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from sealscope.diagnosis.verdict.fusion import fuse
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.recordings import Recording, read
 from sealscope.reporting.messages import diagnosis_text, short_text
 
@@ -163,13 +158,3 @@ def test_9_no_leak_stood_beside_a_score_far_over_its_threshold() -> None:
     assert "external leak" in found.as_dict()["summary"]
     for line in diagnosis_text(found).splitlines():
         assert not ("no leak" in line and "over the threshold" in line)
-
-
-def test_10_fusion_lent_a_figure_that_another_detector_had_reason_to_refuse() -> None:
-    refusing = Evidence("leak", "its geometry is another", 9.0, 3.0, refuses=frozenset({"leak_lpm"}))
-    lending = Evidence("leak", "it leaks", 9.0, 3.0, leak_lpm=0.0086, leak_interval_lpm=(0.0061, 0.0111))
-    fused = fuse([replace(refusing, detector="volume balance"), replace(lending, detector="pressure response")])
-    assert fused.leak_lpm is None
-    recording = machine(1, duration=1.0)
-    shown = Diagnosis.of(fused, recording, assumed_rig("thesis", recording)[1], file="f", false_alarm_probability=0.01)
-    assert "L/min" not in short_text(shown)

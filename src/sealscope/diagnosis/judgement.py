@@ -58,10 +58,12 @@ def judged(
     if other is not None and (by_change or (verdict != "leak" and cause is None)):
         verdict, cause = "cannot tell" if verdict == "leak" else verdict, other.cause
         reasons.append(other.text)
+    if judge.share < 1.0:
+        reasons.append(f"this rests on {100.0 * judge.share:.3g} % of the recording")
     if verdict == "no leak":
         doubts = [] if refusal is None else [refusal]
         if judge.share < WHOLE:
-            doubts.append(f"this rests on {judge.share:.0%} of the recording, {WHOLE:.0%} are needed")
+            doubts.append(f"and the rest may hide a leak ({WHOLE:.0%} are needed)")
         reasons += doubts
         verdict = "cannot tell" if doubts else verdict
     others = [own for own in ranked if own is not judge]

@@ -62,7 +62,7 @@ class _WideRows(NamedTuple):
     whole: NDArray[np.bool_]
 
 
-class Circulation(NamedTuple):
+class CycleBalance(NamedTuple):
     """A balance without a position, or without flow, over a recording.
 
     `lost`: tests of a step of the external leak of either side by the accumulator's own balance, by the term's name.
@@ -74,7 +74,7 @@ class Circulation(NamedTuple):
     lost: Mapping[str, StepTest]
 
 
-def circulations(recording: Recording, rig: Rig) -> list[Circulation]:
+def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     """Return the balances over cycles and over holds of a recording.
 
     With a position and nothing that gives a flow, over holds by shut valves.
@@ -95,16 +95,16 @@ def circulations(recording: Recording, rig: Rig) -> list[Circulation]:
     area = max(rig.cylinder.A_A, rig.cylinder.A_B)
     counts = known & (signals.step("u") == 0.0) if shut else known
     still = _held(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
-    begin, made, long = float(recording.t[0]), list[Circulation](), recording.duration / STORED
+    begin, made, long = float(recording.t[0]), list[CycleBalance](), recording.duration / STORED
     if shut:
         blocks = _blocks(signals, equation, rig, HELD, known & still, begin)
-        return [] if blocks is None else [Circulation(blocks, equation, Columns(equation), {})]
+        return [] if blocks is None else [CycleBalance(blocks, equation, Columns(equation), {})]
     cycle = _cycle(np.where(known, speed, 0.0), recording.rate)
     for half, counts in ((cycle, known), (HELD, known & still)):
         blocks = None if half is None else _blocks(signals, equation, rig, half, counts, begin)
         if blocks is not None:
             lost = _lost(signals, rig, long if cycle is None else cycle * np.ceil(long / cycle), known, begin)
-            made.append(Circulation(blocks, equation, Columns(equation), lost))
+            made.append(CycleBalance(blocks, equation, Columns(equation), lost))
     return made
 
 

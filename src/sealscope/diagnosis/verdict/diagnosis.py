@@ -117,7 +117,7 @@ class Diagnosis(Evidence):
     >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
     ('piston or pump leak', '86 mm/min')
     >>> [evidence.detector for evidence in diagnosis.parts if evidence.verdict == "cannot tell"]
-    ['pressure response']
+    ['rms change']
     >>> [round(end, 1) for end in diagnosis.as_dict()["onset_interval_s"]]
     [27.9, 31.4]
     """
