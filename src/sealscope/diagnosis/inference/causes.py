@@ -78,12 +78,15 @@ def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Block
     return replace(blocks, gram=gram)
 
 
-def probabilities(tested: Sequence[StepHypothesis], other: OtherStep | None = None) -> dict[Cause, float]:
+def probabilities(
+    tested: Sequence[StepHypothesis], other: OtherStep | None = None, share: float = 0.0
+) -> dict[Cause, float]:
     """Return the probability of each cause, given that one of them is present, the most probable first.
 
     A cause is as likely as its best term; what stepped at the same time in what a leak does not move (`other`) speaks
-    for its cause, and another duty may change any coefficient with it. Logarithms of likelihoods are believed to within
-    a share of the largest.
+    for its cause, and another duty may change any coefficient with it. A leak of a large `share` of the pump's flow
+    slows the piston, and friction changes with its speed: it speaks the less for friction. Logarithms of likelihoods
+    are believed to within a share of the largest.
     """
     if not tested:
         return {}
@@ -92,7 +95,8 @@ def probabilities(tested: Sequence[StepHypothesis], other: OtherStep | None = No
         scores[each.cause] = max(scores.get(each.cause, -np.inf), each.score)
     if other is not None and abs(tested[0].test.onset().value - other.onset) <= other.doubt + _doubt(tested[0].test):
         own = max(scores.values()) if other.cause == "changed duty" else max(scores.get(other.cause, 0.0), 0.0)
-        scores[other.cause] = own + other.score
+        slowed = min(max(share, 0.0) / priors()["worth"]["share"].value, 1.0)
+        scores[other.cause] = own + other.score * (1.0 - slowed if other.cause == "friction change" else 1.0)
     most = max(scores.values())
     temper = 2.0 * (1.0 + beliefs["model"].value * max(most, 0.0))
     weights = {

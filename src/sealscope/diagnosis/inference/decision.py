@@ -204,8 +204,9 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Block
     questions = _questions(balance, against, probability)
     answered = next((own for own in questions if own.chance < own.probability), None)
     causes: dict[Cause, float] = {}
-    if answered is not None and answered.name == WITHIN:
-        causes = probabilities(balance.hypotheses, balance.other)
+    if answered is not None and answered.name == WITHIN and test is not None:
+        flow, pump = test.fitted[0] * balance.mean(0), balance.mean(2)
+        causes = probabilities(balance.hypotheses, balance.other, flow / pump if pump > 0.0 else 0.0)
         answered = answered if is_leak(causes) else None
     if answered is None:
         judging = questions[0]
