@@ -93,7 +93,7 @@ def probabilities(
     beliefs, scores = priors()["causes"], dict[Cause, float]()
     for each in tested:
         scores[each.cause] = max(scores.get(each.cause, -np.inf), each.score)
-    if other is not None and abs(tested[0].test.onset().value - other.onset) <= other.doubt + _doubt(tested[0].test):
+    if other is not None and _coincides(tested[0].test, other):
         own = max(scores.values()) if other.cause == "changed duty" else max(scores.get(other.cause, 0.0), 0.0)
         slowed = min(max(share, 0.0) / priors()["worth"]["share"].value, 1.0)
         scores[other.cause] = own + other.score * (1.0 - slowed if other.cause == "friction change" else 1.0)
@@ -108,15 +108,18 @@ def probabilities(
     return {cause: weight / total for cause, weight in sorted(weights.items(), key=lambda item: -item[1])}
 
 
-def _doubt(test: StepTest) -> float:
+def _coincides(test: StepTest, other: OtherStep) -> bool:
     onset = test.onset()
-    return onset.high - onset.low
+    return abs(onset.value - other.onset) <= other.doubt + onset.high - onset.low
 
 
 def stepped(tested: Sequence[StepHypothesis], chance: float, other: OtherStep | None = None) -> Cause | None:
-    """Return the most probable cause where a step of its term is as rare as `chance` among so many; else None."""
-    named = next(iter(probabilities(tested, other)), None)
-    if other is not None and named == other.cause:
-        return named
+    """Return what stepped beside a leak: the cause that names itself (`other`), else the most probable one.
+
+    That where a step of its term is as rare as `chance` among so many; None where nothing is.
+    """
+    if tested and other is not None and _coincides(tested[0].test, other):
+        return other.cause
+    named = next(iter(probabilities(tested)), None)
     best = max((own.test for own in tested if own.cause == named), key=lambda test: test.score, default=None)
     return named if best is not None and best.chance * len(tested) < chance else None
