@@ -46,10 +46,10 @@ def within(stroke: Recording, baseline: list[Recording]) -> str:
 
 @pytest.mark.parametrize("every", [6, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_defective_against_healthy(healthy: list[Recording], defective: list[Recording], every: int) -> None:
-    """One specimen with a defect, recorded on another day, cannot be told from a healthy one, and is not called so."""
+    """One specimen with a defect, recorded on another day: a change of the ringing is stated, or its bound, no L/min."""
     for stroke in defective[::every]:
         found = diagnose(stroke, healthy)
-        assert found.verdict != "no leak"
+        assert found.verdict == "leak" or "(95 %" in found.reason
         assert f"against {len(healthy)} comparable leak-free" in found.reason
         assert found.leak_lpm is None  # counts allow no L/min
         json.dumps(found.as_dict(), allow_nan=False)
