@@ -46,7 +46,7 @@ def within(stroke: Recording, baseline: list[Recording]) -> str:
 
 @pytest.mark.parametrize("every", [6, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_defective_against_healthy(healthy: list[Recording], defective: list[Recording], every: int) -> None:
-    """One specimen with a defect, recorded on another day: a change of the ringing is stated, or its bound, no L/min."""
+    """One specimen with a defect, recorded on another day: a change of the ringing or its bound is stated, no L/min."""
     for stroke in defective[::every]:
         found = diagnose(stroke, healthy)
         assert found.verdict == "leak" or "(95 %" in found.reason

@@ -54,7 +54,7 @@ def judged(
     if judge is None:
         return replace(_nobody(ranked), detector="", parts=tuple(ranked), usable=True)
     verdict, cause, reasons = judge.verdict, judge.cause, [judge.reason]
-    by_change = judge.detector == LEAST_SPECIFIC
+    by_change = judge.detector == LEAST_SPECIFIC and judge.onset_s is not None
     if other is not None and (by_change or (verdict != "leak" and cause is None)):
         verdict, cause = "cannot tell" if verdict == "leak" else verdict, other.cause
         reasons.append(other.text)

@@ -16,8 +16,8 @@ from sealscope.diagnosis.inference.other_steps.levels import level_tests
 from sealscope.diagnosis.verdict.evidence import RAREST, Cause
 from sealscope.recordings.recording import Recording, remembered
 
-#: Fewest samples: a noise in each block.
-FEWEST_SAMPLES = BLOCKS * (ORDER + 2)
+#: Fewest samples, a noise in each block, and least length of a block [s]: within a stroke all of them move.
+FEWEST_SAMPLES, SHORTEST = BLOCKS * (ORDER + 2), 0.5
 
 
 class OtherStep(NamedTuple):
@@ -37,7 +37,7 @@ def other_step(recording: Recording) -> OtherStep | None:
 
 @np.errstate(all="ignore")
 def _other_step(recording: Recording) -> OtherStep | None:
-    if len(recording) < FEWEST_SAMPLES:
+    if len(recording) < max(FEWEST_SAMPLES, BLOCKS * SHORTEST * recording.rate):
         return None
     try:
         return _duty(recording) or _feature(recording) or _level(recording)
