@@ -170,36 +170,30 @@ def diagnose(
     recording : Recording
         The recording to judge.
     baseline : Recording or sequence of Recording, optional
-        Leak-free recordings of the same machine. Those that cannot be compared (other chambers or units,
-        a pressure that does not move, copies) are left out, and a finding of the diagnosis says so. By default the
-        recording's own beginning is the baseline, and the onset is looked for.
+        Leak-free recordings of the same machine; what cannot be compared is left out, and a finding says so. Without
+        any a leak that begins within the recording is looked for.
     false_alarm_probability : float, optional
         Probability of `leak` on a leak-free recording, 1e-4 to 0.2.
     rig : Rig, str or path-like, optional
-        What the detectors may assume of the machine: a Rig, the name of a packaged rig or the path of a TOML file. By
-        default the thesis's: stated for a recording that was simulated with it, else a mere assumption. Then L/min is
-        stated only where displacement over area, measured, is that of this rig.
+        What may be assumed of the machine: a Rig, the name of a packaged one or the path of a TOML file; by default
+        the thesis's, stated for a recording that was simulated with it, else a mere assumption.
     limit : str, optional
         Leak from which the machine is to be repaired, as a flow (``"5 mL/min"``) or as the speed at which the piston
         would creep (``"8 mm/min"``, the default).
     quick : bool, optional
-        Run the detectors one after the other, the most specific first, and stop at the one that judges. The verdict and
-        the judge's figures are the same, in a fraction of the time; what less specific detectors would lend it, or name
-        as another cause, is missing.
+        Stop at the detector that judges: the same verdict and figures in a fraction of the time.
     file : str or path-like, optional
         Name of the recording in the diagnosis; by default that of the file it was read from.
 
     Returns
     -------
     Diagnosis
-        Verdict (`leak`, `no leak`, or `cannot tell` where the data do not allow one), onset, L/min with intervals, the
-        score and threshold behind it, the evidence of each detector, and findings on the data.
+        Verdict, onset and L/min with intervals, score and threshold, evidence of each detector, findings on the data.
 
     Raises
     ------
     InputError
-        The false-alarm probability is outside 1e-4 to 0.2, `recording` or `baseline` is no Recording, `rig` cannot be
-        read, or `limit` is neither a flow nor a speed.
+        An argument breaks one of these rules, or `rig` cannot be read.
 
     Examples
     --------

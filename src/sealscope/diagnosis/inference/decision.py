@@ -343,6 +343,31 @@ def bound_of(balance: RecordedBalance, against: Rise | None) -> float:
     return max(max(bounds, default=np.inf), 0.0)
 
 
+def asked(evidence: Evidence, questions: Sequence[Question], judging: Question, what: str) -> Evidence:
+    """Return the evidence with the figures of the question that judges, and where there are several with all of them.
+
+    `what`: what the questions are about.
+    """
+    parts = tuple(
+        Evidence(
+            "leak" if evidence.verdict == "leak" and own is judging else "no leak",
+            f"{what} {own.name}",
+            own.score,
+            own.threshold,
+            detector=own.name,
+            chance=max(own.chance, RAREST),
+        )
+        for own in questions
+    )
+    return replace(
+        evidence,
+        score=judging.score,
+        threshold=judging.threshold,
+        chance=max(judging.chance, RAREST),
+        parts=parts if len(parts) > 1 else (),
+    )
+
+
 def _with_figures(
     balance: RecordedBalance,
     evidence: Evidence,
@@ -352,25 +377,10 @@ def _with_figures(
 ) -> Evidence:
     """Return the evidence with scores, thresholds, course, total, bound and the reason in words."""
     size = balance.size
-    parts = tuple(
-        Evidence(
-            "leak" if evidence.verdict == "leak" and own is judging else "no leak",
-            f"leakage {own.name}",
-            own.score,
-            own.threshold,
-            detector=own.name,
-            chance=max(own.chance, RAREST),
-        )
-        for own in questions
-    )
     bound = bound_of(balance, against)
     stated = size.stated and evidence.verdict != "leak" and np.isfinite(bound)
     evidence = replace(
-        evidence,
-        score=judging.score,
-        threshold=judging.threshold,
-        chance=max(judging.chance, RAREST),
-        parts=parts if len(parts) > 1 else (),
+        asked(evidence, questions, judging, "leakage"),
         passage=_passage(balance, balance.level, None if evidence.verdict == "leak" else _findable(balance, questions)),
         ratio=None if size.ratio is None else size.ratio.value,
         ratio_interval=None if size.ratio is None else (size.ratio.low, size.ratio.high),

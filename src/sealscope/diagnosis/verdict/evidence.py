@@ -48,9 +48,6 @@ class LeakCourse:
     whole: bool = False
 
 
-#: The smallest leak worth finding, as a share of the pump's mean flow. Assumed: makers state volumetric efficiencies of
-#: 95 to 98 %; what is below the least loss of these is no reason to act.
-LEAK_WORTH_FINDING = 0.02
 #: The detector that judges where no other can: it sees that something changed, and states no size.
 LEAST_SPECIFIC = "rms change"
 
@@ -150,11 +147,6 @@ class Evidence:
         also where L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
         Displacement over area as measured, over the assumed one, and its 95 % interval, where the detector measures it.
-    weighed : frozenset of str
-        Causes against which the detector has weighed the leak itself; what else stepped cannot be one of these.
-    unruly : bool
-        Whether the detector abstains because the machine's parameters wander more than those of a healthy one may: then
-        the details' RMS wander, too, and a change of it says less.
     bound_lpm : float, optional
         95 % upper bound of a leak [L/min] where none is reported; None where the channels do not allow one.
     """
@@ -179,8 +171,6 @@ class Evidence:
     relative: RelativeLeak | None = None
     ratio: float | None = None
     ratio_interval: tuple[float, float] | None = None
-    weighed: frozenset[Cause] = frozenset()
-    unruly: bool = False
     bound_lpm: float | None = None
 
     @property

@@ -17,7 +17,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.causes import StepHypothesis, probabilities
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
-from sealscope.diagnosis.inference.decision import AGAINST, SECOND, WITHIN, Question, is_leak
+from sealscope.diagnosis.inference.decision import AGAINST, SECOND, WITHIN, Question, asked, is_leak
 from sealscope.diagnosis.inference.onset import StepTest, course, step_test
 from sealscope.diagnosis.inference.pressures import response, ring_down
 from sealscope.diagnosis.inference.pressures.evidence import PressureEvidence, priors, states_flow, unusable
@@ -210,17 +210,6 @@ def _with_figures(
     """Return the evidence with scores, thresholds, the bound and the reason in words."""
     pressure = float(own.evidence.pressure.mean())
     flow = own.evidence.laws[1] * bound * (1.0 + _95 * own.evidence.scale) * pressure
-    parts = tuple(
-        Evidence(
-            "leak" if evidence.verdict == "leak" and asked is judging else "no leak",
-            f"conductance {asked.name}",
-            asked.score,
-            asked.threshold,
-            detector=asked.name,
-            chance=max(asked.chance, RAREST),
-        )
-        for asked in questions
-    )
     stated = own.stated and evidence.verdict != "leak"
     limit = (
         f"{flow / LITRE_PER_MINUTE:.2g} L/min" if own.stated else f"{100.0 * flow / own.flow:.2g} % of the pump's flow"
@@ -240,15 +229,10 @@ def _with_figures(
     if evidence.verdict != "leak" and evidence.cause is not None:
         reason += f"; what stepped is rather {evidence.cause}"
     return replace(
-        evidence,
+        asked(evidence, questions, judging, "conductance"),
         reason=reason,
-        score=judging.score,
-        threshold=judging.threshold,
-        chance=max(judging.chance, RAREST),
-        parts=parts if len(parts) > 1 else (),
         bound_lpm=flow / LITRE_PER_MINUTE if stated else None,
         passage=_passage(own, questions, pressure) if evidence.verdict != "leak" else None,
-        weighed=frozenset(CAUSES.values()),
     )
 
 
