@@ -59,9 +59,16 @@ def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[C
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
         best = step_test(own, signs)
         if best is not None:
-            score = best.score - (cost if name in (LEAK, ORIFICE) else 0.0)  # the zero that it needs
+            # the zero that it needs, or what is believed of its size
+            score = best.score - (cost if name in (LEAK, ORIFICE) else _unlikely(best) if name == SCALE else 0.0)
             stepped.append(StepHypothesis(name, cause, best, score))
     return tuple(sorted(stepped, key=lambda own: -own.score))
+
+
+def _unlikely(scale: StepTest) -> float:
+    """Return minus twice the logarithm of what is believed of a step of the scale, over that of the likeliest one."""
+    size, spread = (priors()["scale"][name].value for name in ("size", "spread"))
+    return float(np.log(max(abs(scale.fitted[0]), np.finfo(float).tiny) / size) / spread) ** 2
 
 
 def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Blocks:
