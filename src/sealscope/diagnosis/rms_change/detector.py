@@ -21,6 +21,7 @@ from sealscope.diagnosis.rms_change.ringing import information, priors, rises
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.hydraulics import lack_of_chambers
+from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import shortest
@@ -135,12 +136,22 @@ def against(recording: Recording, baseline: Sequence[Recording], probability: fl
     if not alike:
         return Evidence("cannot tell", f"no baseline recording has the same chambers at {recording.rate:g} Hz")
     known = [whole(own) for own in alike]
-    stated, weights = rises(*whole(recording), np.stack([own for own, _ in known]), np.stack([own for _, own in known]))
+    apart = _apart(recording, alike)
+    levels, duties = (np.stack([own[k] for own in known]) for k in (0, 1))
+    stated, weights = rises(*whole(recording), levels, duties, bool(apart))
     names = [f"{quantity} of {chamber}" for chamber in chambers_of(recording) for quantity in QUANTITIES]
     share = probability / (2 * len(JUDGED) * len(chambers_of(recording)))
     changes = [_of_rise(name, own, w, share) for name, own, w in zip(names, stated, weights, strict=True)]
     count = f"{len(alike)} comparable leak-free recording{'s' if len(alike) > 1 else ''}"
+    count += {True: " of another session", False: "", None: ", maybe of another session or machine"}[apart]
     return _evidence(changes, 1.0, f"against {count}", None)
+
+
+def _apart(recording: Recording, baseline: Sequence[Recording]) -> bool | None:
+    """Whether a recording is of another session than all of the baseline's; None where no times tell."""
+    start, pause = start_seconds(recording), priors()["recordings"]["pause"].value
+    others = [other for own in baseline if (other := start_seconds(own)) is not None]
+    return None if start is None or not others else all(abs(start - other) > pause for other in others)
 
 
 def _of_rise(name: str, rise: Rise, weight: float, share: float) -> _Change:

@@ -69,12 +69,15 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     return stated, weight.mean(axis=0)
 
 
-def rises(log_rms: Array, duty: Array, known: Array, known_duty: Array) -> tuple[list[Rise], Array]:
+def rises(
+    log_rms: Array, duty: Array, known: Array, known_duty: Array, apart: bool = False
+) -> tuple[list[Rise], Array]:
     """Return the rise g of each quantity of a recording beyond n leak-free ones of the machine, duty taken out, and w.
 
     `log_rms` (5 per chamber,), `duty` (4,); `known` (n, 5 per chamber), `known_duty` (n, 4). The quantities of healthy
     recordings are normal about a mean and what the duty explains (Gelman et al., Bayesian Data Analysis, 3rd ed.,
-    section 14.8); the rise is Student's, as in `inference.scatter`.
+    section 14.8); the rise is Student's, as in `inference.scatter`. `apart`: the recording is of another
+    session than all of these, whose own deviation no scatter within a session shows.
     """
     belief, n = priors()["recordings"], len(known)
     freedom = belief["freedom"].value + n - 1
@@ -90,5 +93,6 @@ def rises(log_rms: Array, duty: Array, known: Array, known_duty: Array) -> tuple
         fitted = inverse @ design.T @ others
         squares = np.sum((others - design @ fitted) ** 2) + fitted @ penalty @ fitted
         variance = (belief["freedom"].value * scatter**2 + squares) / freedom * (1.0 + inverse[0, 0])
+        variance += (w * belief["session"].value) ** 2 if apart else 0.0
         stated.append(Rise(float(own - fitted[0]) / w, float(np.sqrt(variance)) / w, freedom))
     return stated, weight
