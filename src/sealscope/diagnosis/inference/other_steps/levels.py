@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.onset import Information, two_sided
+from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array, Recording
 
@@ -68,7 +69,7 @@ def directions(recording: Recording) -> Array | None:
     """Return the direction of motion at each sample, 1, -1 or 0; None where no channel shows it."""
     for name in _POSITIONS:
         if name in recording:
-            half = max(1, round(0.025 * recording.rate))
+            half = max(1, round(HALF_DIFFERENCE * recording.rate))
             padded = np.pad(recording[name], half, mode="edge")
             return np.asarray(np.sign(padded[2 * half :] - padded[: -2 * half]))
     return next((np.sign(recording[name]) for name in _SPEEDS if name in recording), None)
