@@ -10,11 +10,13 @@ import pytest
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.diagnosis.verdict.machine import assumed_rig, unstated
 from sealscope.diagnosis.verdict.severity import RepairLimit, severity
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording
+from sealscope.reporting.charts import course_charts
 from sealscope.reporting.messages import how_bad, how_much, next_steps, rests_on, short_text
 from sealscope.simulation.simulate import simulate
 
@@ -149,6 +151,14 @@ def test_levels_by_the_interval(interval: tuple[float, float], level: str, step_
     assert found.severity.pump_share[0] == pytest.approx(sum(interval) / 2 / 1000.0 / (60 * 4.9e-6))
     assert any(step_ in text for text in next_steps(found))
     assert "8 mm/min of creep, the default" in str(how_bad(found))
+
+
+def test_the_repair_limit_is_drawn_in_the_unit_of_the_leak() -> None:
+    """8 mm/min of a piston of 633 mm^2 are 5.06 mL/min; a limit as a flow needs no area."""
+    course = LeakCourse(np.array([1.0, 2.0]), np.array([0.0, 0.006]), np.array([0.0, 0.0055]), np.array([0.0, 0.0065]))
+    for limit, level in ((None, 8e-3 * 633e-6 * 1e3), ("20 mL/min", 0.02)):
+        chart, *_ = course_charts(replace(leak(0.006, 0.0055, 0.0065, limit=RepairLimit.of(limit)), course=course))
+        assert chart.level == pytest.approx(level)
 
 
 def test_a_limit_as_a_flow() -> None:

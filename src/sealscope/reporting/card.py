@@ -26,7 +26,7 @@ def render_card(
     """Return the card as HTML of `WIDTH` x `HEIGHT` pixels: machine, date, verdict, L/min, its curve."""
     particulars = particulars_of(recording, rig)
     name = Path(diagnosis.file).name
-    chart = next(iter(charts.course_charts(diagnosis.course, height=_CURVE_HEIGHT)), None)
+    chart = next(iter(charts.course_charts(diagnosis, height=_CURVE_HEIGHT)), None)
     still = None
     span = (float(recording.t[0]), float(recording.t[-1]))
     if chart is not None and diagnosis.course is not None:

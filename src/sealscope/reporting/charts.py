@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
@@ -93,6 +92,13 @@ class Chart:
     height: int = 150
     band: bool = False
     limits: tuple[float, float] | None = None
+    level: float | None = None
+
+    @property
+    def level_text(self) -> str:
+        """What the level is, in the key of the chart; it says so where the level lies above the frame."""
+        above = self.level is not None and self.limits is not None and self.level > self.limits[1]
+        return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if above else "")
 
     @property
     def cut(self) -> bool:
@@ -177,15 +183,40 @@ def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart
 COURSE = "course"
 
 
-def course_charts(course: LeakCourse | None, *, height: int = 190) -> list[Chart]:
-    """Return the chart of the leak over the recording with its interval, where a detector follows it."""
+#: The repair limit is drawn inside the frame up to this many times what else is shown.
+_LEVEL_SHOWN = 4.0
+
+
+def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
+    """Return the chart of the leak over the recording with its interval and the repair limit, where it is known."""
+    course = diagnosis.course
     if course is None or not np.isfinite(course.lpm).any():
         return []
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high))
     lines = (ChartLine("leak", "a", course.lpm), ChartLine("low", "d1", low), ChartLine("high", "d1", high))
-    limits = _limits(course.lpm, low, high)
+    bottom, top = _limits(course.lpm, low, high)
+    level = repair_level(diagnosis)
+    if level is not None and top < level < _LEVEL_SHOWN * top:
+        top = 1.06 * level
     title = "Passed by pump and piston together" if course.whole else "Leak past the piston"
-    return [Chart(COURSE, COURSE, title, "L/min", lines, COURSE, height, band=True, limits=limits)]
+    return [Chart(COURSE, COURSE, title, "L/min", lines, COURSE, height, True, (bottom, top), level)]
+
+
+def repair_level(diagnosis: Diagnosis) -> float | None:
+    """Return the repair limit on the axis of the leak's course [L/min]; None where it cannot be stated as a flow.
+
+    A limit counts from the healthy level: the median of the course before the onset, where the course is the total.
+    """
+    course, limit, machine = diagnosis.course, diagnosis.limit, diagnosis.machine
+    if course is None or (limit.kind == "creep" and (machine is None or not machine.area_stated)):
+        return None
+    flow = limit.value if limit.kind == "flow" else limit.value * machine.area  # type: ignore[union-attr]
+    level = flow / LITRE_PER_MINUTE
+    if not course.whole:
+        return level
+    onset = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else np.inf
+    before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
+    return level + float(np.median(before)) if before.size else None
 
 
 def _limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
@@ -265,6 +296,7 @@ def draw(
                 "height": chart.height,
                 "band": chart.band,
                 "limits": chart.limits,
+                "level": chart.level,
                 "series": [
                     {"label": line.label, "style": line.style}
                     | coded(base.reduce(line.values) if sampled else line.values)
@@ -334,6 +366,7 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
     return {
         "paths": paths,
         "band": band,
+        "level": None if chart.level is None or chart.level > high else height * (high - chart.level) / (high - low),
         "width": width,
         "height": height,
         "x_ticks": [(float(across(np.asarray(v))), f"{v:g}") for v in ticks(start, stop, 8)],

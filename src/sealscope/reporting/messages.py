@@ -160,25 +160,38 @@ def _between_shares(low: float, high: float) -> str:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Return the leak in mL/min, beside the pump's flow, and against the repair limit; None where none is sized."""
+    """Return the leak against the repair limit, else beside the pump's flow; None where neither is known."""
     own = diagnosis.severity
     if own is None:
         return None
-    parts = []
-    if own.mL_per_min is not None:
-        parts.append(f"{number(own.mL_per_min[0], 2)} mL/min")
-    if own.pump_share is not None and diagnosis.leak_lpm is not None:
-        parts.append(_of_the_pump(own.pump_share[0]))
-    if own.creep_mm_per_min is not None:
-        parts.append(f"as much as a piston that creeps by {number(own.creep_mm_per_min[0], 2)} mm/min")
     if own.level is not None and own.of_limit is not None:
         by = "" if diagnosis.limit.stated else ", the default"
-        parts.append(
-            f"{_LEVELS[own.level]}{_between_shares(*own.of_limit[1:])} the repair limit ({diagnosis.limit}{by})"
-        )
-    elif diagnosis.limit.stated:
-        parts.append(f"not held against the limit of {diagnosis.limit}, for that needs the machine's area (--area)")
-    return "; ".join(parts)
+        against = _between_shares(*own.of_limit[1:])
+        return f"{_LEVELS[own.level]}{against} the repair limit ({diagnosis.limit}{by})"
+    share = _pump_share(diagnosis)
+    if diagnosis.limit.stated:
+        return f"not compared with the limit of {diagnosis.limit}, which needs the machine's area (--area)"
+    return share
+
+
+def other_sizes(diagnosis: Diagnosis) -> str | None:
+    """Return the other sizes of the leak: beside the pump's flow, and as a creep; None where none is known."""
+    own = diagnosis.severity
+    if own is None:
+        return None
+    creep = own.creep_mm_per_min
+    parts = [
+        None if own.mL_per_min is None else f"{number(own.mL_per_min[0], 2)} mL/min",
+        _pump_share(diagnosis),
+        None if creep is None else f"as much as a piston that creeps by {number(creep[0], 2)} mm/min",
+    ]
+    return "; ".join(part for part in parts if part) or None
+
+
+def _pump_share(diagnosis: Diagnosis) -> str | None:
+    own = diagnosis.severity
+    known = own is not None and own.pump_share is not None and diagnosis.leak_lpm is not None
+    return _of_the_pump(own.pump_share[0]) if known else None  # type: ignore[union-attr, index]
 
 
 def passes(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
@@ -384,6 +397,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
         ("since", since(diagnosis)),
         ("how much", _how_much_by_what(diagnosis)),
         ("how bad", how_bad(diagnosis)),
+        ("which is", other_sizes(diagnosis)),
         ("passes", passes(diagnosis)),
         ("cause", cause(diagnosis)),
         ("how sure", how_sure(diagnosis)),

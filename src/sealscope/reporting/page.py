@@ -145,7 +145,7 @@ def render_page(
     details = [features.chamber_details(recording, name) for name in CHAMBERS]
     chambers = [chamber for chamber, _ in details if chamber is not None]
     shown = [
-        *charts.course_charts(diagnosis.course),
+        *charts.course_charts(diagnosis),
         *charts.rms_charts(chambers, pressure_unit),
         *charts.channel_charts(recording, pressure_unit),
         *charts.detail_charts(chambers, pressure_unit),

@@ -23,7 +23,7 @@
   const plots = [];
   let linking = false;
 
-  function marksOver(u, color) {
+  function marksOver(u, color, level) {
     const ctx = u.ctx, {left, top, width, height} = u.bbox, px = devicePixelRatio || 1;
     const at = (t) => Math.round(u.valToPos(t, "x", true));
     ctx.save();
@@ -39,6 +39,16 @@
       ctx.lineTo(at(t), top + height);
       ctx.stroke();
     };
+    if (level != null) {
+      const y = Math.round(u.valToPos(level, "y", true));
+      ctx.strokeStyle = color("--leak");
+      ctx.lineWidth = 1.5 * px;
+      ctx.setLineDash([10 * px, 4 * px]);
+      ctx.beginPath();
+      ctx.moveTo(left, y);
+      ctx.lineTo(left + width, y);
+      ctx.stroke();
+    }
     const onset = data.onset;
     if (onset.low != null) {
       ctx.fillStyle = color("--band");
@@ -88,7 +98,7 @@
         bands: c.band ? [{series: [2, 1], fill: color("--fill-a")}] : [],
         legend: {show: false},
         cursor: {sync: {key: "t", scales: ["x", null]}, drag: {x: true, y: false}},
-        hooks: {draw: [(u) => marksOver(u, color)], setCursor: [(u) => readOut(u, c, series, box)], setScale: [(u, key) => {if (key === "x" && u.status) link(u, u.scales.x.min, u.scales.x.max);}]},
+        hooks: {draw: [(u) => marksOver(u, color, c.level)], setCursor: [(u) => readOut(u, c, series, box)], setScale: [(u, key) => {if (key === "x" && u.status) link(u, u.scales.x.min, u.scales.x.max);}]},
       }, [stretched(c.axis, axes[c.axis], first, last)].concat(series.map((s) => stretched(c.axis, values(s), null, null))), box);
       box.classList.add("live");
       plot.drawnHeight = c.height;
