@@ -8,7 +8,8 @@ share nothing with the package: oil with air, volumes that move, Coulomb frictio
 differs by 10 %, friction by 15 %, load by 10 % and the zeros of both pressures by 0.3 bar. A log is a CSV with columns
 `time_s`, `stroke_mm`, `motor_rpm`, `p_bottom_bar`, `p_rod_bar` of 12 bits, read with `map="auto"`; areas and
 displacement are stated, nothing else. Every machine has seven healthy days, each judged against the other six, and days
-on which a share of the pump's mean flow (5 %) leaks past the piston from the first sample. Prints a line a load.
+on which a share of the pump's mean flow (5 %) leaks past the piston from the first sample. Prints a
+line a load, last the leaks and the false alarms of the plain regression of `plain_regression.py`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from plain_regression import regression
 from scipy.integrate import solve_ivp
 
 import sealscope as ss
@@ -151,11 +153,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--share", type=float, default=0.05, help="the leak over the pump's mean flow")
     asked = parser.parse_args()
-    print("load       leaks: leak, no leak, cannot tell, intervals hold | healthy: leak, no leak, cannot tell")
+    print("load       leaks: leak, no leak, cannot tell, intervals hold | healthy: leak, no leak, cannot tell | plain")
     for load in LOADS:
         rng = np.random.default_rng([asked.seed, LOADS.index(load)])
         verdicts: dict[str, list[str]] = {"healthy": [], "leak": []}
-        held = stated = 0
+        held = stated = plain_leaks = plain_false = 0
         for _ in range(asked.machines):
             machine = press(load, rng)
             with tempfile.TemporaryDirectory() as name:
@@ -170,11 +172,13 @@ def main() -> None:
                 for k, recording in enumerate(healthy):
                     others = healthy[:k] + healthy[k + 1 :]
                     verdicts["healthy"].append(ss.diagnose(recording, baseline=others, rig=str(rig)).verdict)
+                    plain_false += regression(recording, others, per_rev)
                 for k in range(LEAKING):
                     day, flow = leaking(another_day(machine, rng), asked.share, rng)
                     recording = ss.read(log(folder, f"leak{k}", simulate(day, rng)), map="auto")
                     answer = ss.diagnose(recording, baseline=healthy[:6], rig=str(rig))
                     verdicts["leak"].append(answer.verdict)
+                    plain_leaks += regression(recording, healthy[:6], per_rev)
                     if answer.leak_interval_lpm is not None and answer.verdict == "leak":
                         stated += 1
                         held += answer.leak_interval_lpm[0] <= flow <= answer.leak_interval_lpm[1]
@@ -182,9 +186,10 @@ def main() -> None:
             kind: [answers.count(verdict) for verdict in ("leak", "no leak", "cannot tell")]
             for kind, answers in verdicts.items()
         }
+        plain = f"{plain_leaks}, {plain_false}"
         print(
             f"{load:10} {counts['leak'][0]:6} {counts['leak'][1]:8} {counts['leak'][2]:12} {held:10} of {stated:2}  |"
-            f" {counts['healthy'][0]:12} {counts['healthy'][1]:8} {counts['healthy'][2]:12}"
+            f" {counts['healthy'][0]:12} {counts['healthy'][1]:8} {counts['healthy'][2]:12}  | {plain}"
         )
 
 

@@ -6,9 +6,7 @@ FILE: the logs of the public repository ivliev123/Electro-Hydraulic-Actuator (se
 by yourself: it has no licence, and none of it is part of this project. A leak of so many L/min, at the run's mean
 pressure difference, is put into the judged run: for the same motion the motor turns faster by G (p_A - p_B) over the
 displacement. The verdict knows the areas and the displacement that the builder states, the other runs, no onset and no
-size. `--plain`: beside it a plain regression of the pump's volume on motion either way, both pressures, time and the
-integral of p_A - p_B over windows of 0.5 s with motion, the
-speed through a median filter of 9 samples, judged by the scatter between the others (1 %).
+size. `--plain`: beside it the plain regression of `plain_regression.py`.
 """
 
 from __future__ import annotations
@@ -17,8 +15,7 @@ import argparse
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
-from scipy.signal import medfilt
+from plain_regression import regression
 
 import sealscope as ss
 from sealscope.parameters import load_rig
@@ -40,40 +37,6 @@ def leaking(recording: ss.Recording, lpm: float) -> ss.Recording:
     turned = 1.6e-6 / (2.0 * np.pi)
     omega = recording["omega"] + lpm * LPM / np.mean(np.abs(dp)) * dp / turned
     return replace(recording, channels={**recording.channels, "omega": omega})
-
-
-def windows(recording: ss.Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return regressors and pump volumes of windows of 0.5 s in which the piston moves."""
-    size, dt = int(0.5 * recording.rate), 1.0 / recording.rate
-    dp, dx = recording["p_A"] - recording["p_B"], np.diff(recording["x"], prepend=recording["x"][0])
-    volume = 1.6e-6 / (2.0 * np.pi) * medfilt(recording["omega"], 9) * dt  # without glitches of single samples
-    rows, left = [], []
-    for first in range(0, len(recording) - size, size):
-        part = slice(first, first + size)
-        moved = dx[part]
-        if np.ptp(recording["x"][part]) < 1e-3:
-            continue
-        ends = [recording[name][part.stop - 1] - recording[name][first] for name in ("p_A", "p_B")]
-        rows.append([moved[moved > 0].sum(), moved[moved < 0].sum(), *ends, size * dt, dp[part].sum() * dt])
-        left.append(volume[part].sum())
-    return np.array(rows), np.array(left)
-
-
-def regression(judged: ss.Recording, others: list[ss.Recording]) -> bool:
-    """Return whether the plain regression, fitted to the other runs together, calls the judged run a leak."""
-    parts = [windows(own) for own in (judged, *others)]
-
-    def rise(k: int, reference: list[int]) -> float:
-        x, y = (np.concatenate([parts[j][side] for j in reference]) for side in (0, 1))
-        size = np.sqrt((x**2).mean(axis=0))
-        left = parts[k][1] - parts[k][0] @ (np.linalg.lstsq(x / size, y, rcond=None)[0] / size)
-        own = parts[k][0][:, -2:] / size[-2:]
-        return float(np.linalg.lstsq(own, left, rcond=None)[0][-1])
-
-    healthy = list(range(1, len(parts)))
-    apart = np.array([rise(k, [j for j in healthy if j != k]) for k in healthy])
-    t = rise(0, healthy) / np.sqrt(np.mean(apart**2))
-    return bool(t > stats.t.ppf(0.99, len(apart)))
 
 
 def main() -> None:
@@ -98,7 +61,7 @@ def main() -> None:
             others = [own for j, own in enumerate(runs) if j != k]
             judged = leaking(run, lpm) if lpm else run
             verdicts.append(ss.diagnose(judged, others, rig=rig, quick=True))
-            plain += regression(judged, others) if options.plain else 0
+            plain += regression(judged, others, 1.6e-6) if options.plain else 0
         found = [own for own in verdicts if own.verdict == "leak"]
         sizes = [own.leak_lpm for own in found if own.leak_lpm is not None]
         hold = sum(
