@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sealscope import datasets
+    from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
+    from sealscope.diagnosis.commissioned.machine_file import load_machine, write_machine
     from sealscope.diagnosis.diagnose import diagnose
     from sealscope.diagnosis.inference.live.stream import SequentialBalance
     from sealscope.diagnosis.trend.trend import Trend, trend
@@ -34,12 +36,15 @@ _HOMES = {
     "Experiment": "simulation.experiment",
     "Recording": "recordings.recording",
     "Rig": "parameters",
+    "CommissionedMachine": "diagnosis.commissioned.machine",
     "RmsStream": "signals.windows",
     "SequentialBalance": "diagnosis.inference.live.stream",
     "Trend": "diagnosis.trend.trend",
     "Watch": "monitor.stream.watch",
+    "commission": "diagnosis.commissioned.machine",
     "diagnose": "diagnosis.diagnose",
     "inspect": "recordings",
+    "load_machine": "diagnosis.commissioned.machine_file",
     "load_rig": "parameters",
     "prove": "simulation.simulate",
     "read": "recordings",
@@ -53,10 +58,12 @@ _HOMES = {
     "write": "recordings",
     "write_fmu": "fmu.build",
     "write_sensor_fmu": "fmu.build",
+    "write_machine": "diagnosis.commissioned.machine_file",
     "write_page": "reporting",
 }
 
 __all__ = [
+    "CommissionedMachine",
     "DetailStream",
     "Diagnosis",
     "Experiment",
@@ -67,9 +74,11 @@ __all__ = [
     "Trend",
     "Watch",
     "__version__",
+    "commission",
     "datasets",
     "diagnose",
     "inspect",
+    "load_machine",
     "load_rig",
     "prove",
     "read",
@@ -82,6 +91,7 @@ __all__ = [
     "watch",
     "write",
     "write_fmu",
+    "write_machine",
     "write_page",
     "write_sensor_fmu",
 ]

@@ -78,15 +78,3 @@ def test_margins_of_a_loop_are_printed(call):
     assert [float(row[0]) for row in rows] == [0.0, 0.01, 0.02, 0.05]
     assert all(float(row[1]) > 6.0 and float(row[2]) > 45.0 for row in rows)
     assert "controller must be one of pi" in call("rigs", "margins", "--controller", "pid").refused()
-
-
-def test_identify_prints_intervals_and_writes_a_rig(call, tmp_path):
-    run, rig = tmp_path / "run.csv", tmp_path / "mine.toml"
-    words = ("--rig", "thesis-closed-loop", "--command", "position 60 mm sin(0.9t)", "--duration", "15")
-    assert call("simulate", "-o", run, *words).status == 0
-    done = call("identify", run, "--rig", "thesis-closed-loop", "-o", rig)
-    assert (done.status, done.err) == (0, "")
-    assert "cylinder.A_A" in done.out
-    assert "not told:" in done.out
-    assert pytest.approx(633e-6, rel=1e-3) == load_rig(rig).cylinder.A_A
-    assert "must be of a machine like single-rod-eha" in call("identify", run, "--rig", "single-rod-eha").refused()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy.stats import binom, kstest
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
-from sealscope.diagnosis.inference.scatter import Rise, rise
+from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term, priors
 
 PRESSURE, FLOW = 1e5, 1e-5
@@ -55,7 +57,13 @@ def risen(random: np.random.Generator, count: int, scatter: float, leak: float =
     """The rise of a recording beyond `count` healthy ones, in a fleet whose leakage scatters."""
     level = 20.0 * BELIEVED
     healthy = [recording(random, level + scatter * random.normal(), **kind) for _ in range(count)]
-    return rise(recording(random, level + scatter * random.normal() + leak, **kind), healthy, (COLUMNS,))
+    return beyond(recording(random, level + scatter * random.normal() + leak, **kind), healthy)
+
+
+def beyond(judged: Blocks, healthy: Sequence[Blocks]) -> Rise:
+    """The rise of a recording beyond healthy ones."""
+    sums = [Taught.of(own, (COLUMNS,)).sums for own in healthy]
+    return rise(Taught.of(judged, (COLUMNS,)), sums, (COLUMNS,))
 
 
 def believed_scatter(random: np.random.Generator) -> float:
@@ -116,7 +124,7 @@ def test_a_zero_of_the_flow_or_of_a_sensor_is_no_rise() -> None:
     for shift in (-5.0 * PRESSURE, 2.0 * PRESSURE):
         random = np.random.default_rng(2)
         healthy = [recording(random, 20.0 * BELIEVED) for _ in range(4)]
-        made = rise(recording(random, 20.0 * BELIEVED, shift=shift), healthy, (COLUMNS,))
+        made = beyond(recording(random, 20.0 * BELIEVED, shift=shift), healthy)
         assert abs(made.value) < 0.1 * BELIEVED
 
 

@@ -101,6 +101,14 @@ JoinOption = Annotated[
 BaselineOption = Annotated[
     list[Path] | None, typer.Option("--baseline", metavar="FILE...", help="Leak-free recordings of the same machine.")
 ]
+MachineOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--machine",
+        metavar="FILE",
+        help="The machine's file, by `sealscope commission`: map, rig, limit and healthy recordings are its.",
+    ),
+]
 FalseAlarmOption = Annotated[
     float, typer.Option("--false-alarm", help="Probability of `leak` on a leak-free recording.")
 ]
@@ -163,6 +171,17 @@ def assumed_rig(name: str | None, area: Sequence[str] | None = None, displacemen
     if not stated:
         return rig
     return (rig or unstated()).with_overrides(stated, source="set by the call (--area, --displacement)")
+
+
+def refuse_beside_machine(*options: object) -> None:
+    """Raise InputError where what a machine's file states is stated by the call, too.
+
+    `options`: those of --baseline, --map, --rate, --rig, --area, --displacement and --limit.
+    """
+    names = ("--baseline", "--map", "--rate", "--rig", "--area", "--displacement", "--limit")
+    for name, value in zip(names, options, strict=True):
+        if value:
+            raise InputError(f"{name} must not stand beside --machine, whose file states it")
 
 
 def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:

@@ -28,6 +28,7 @@ from sealscope.cli.options import (
     FalseAlarmOption,
     JoinOption,
     LimitOption,
+    MachineOption,
     MapOption,
     RateOption,
     assumed_rig,
@@ -35,11 +36,13 @@ from sealscope.cli.options import (
     channel_map_of,
     check_folder,
     complain,
+    refuse_beside_machine,
     say,
 )
 from sealscope.errors import InputError, UnreadableFile
 
 if TYPE_CHECKING:
+    from sealscope.diagnosis.commissioned.machine import CommissionedMachine
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
@@ -137,13 +140,17 @@ def _check_standard_input(files: Iterable[Path]) -> bool:
     return count == 1
 
 
-def _read_all(files: Sequence[Path], reading: _Reading) -> Iterator[tuple[Path, Recording | None]]:
+def _read_all(
+    files: Sequence[Path], reading: _Reading | CommissionedMachine
+) -> Iterator[tuple[Path, Recording | None]]:
     """Yield each file and its recording; None, with one line on standard error, where it cannot be read."""
     for file in files:
         yield file, attempt(file, partial(reading.read, file))
 
 
-def _read_parts(files: Sequence[Path], reading: _Reading, join_them: bool) -> Iterator[tuple[Path, Recording | None]]:
+def _read_parts(
+    files: Sequence[Path], reading: _Reading | CommissionedMachine, join_them: bool
+) -> Iterator[tuple[Path, Recording | None]]:
     """Yield what `_read_all` does; or the first file and the recording of all files joined, None where one is bad."""
     if not join_them:
         yield from _read_all(files, reading)
@@ -165,12 +172,19 @@ def _diagnoses(
     rig: Rig | None,
     limit: str | None = None,
     quick: bool = False,
+    machine: Path | None = None,
 ) -> Iterator[tuple[Recording, Diagnosis] | None]:
-    """Yield recording and diagnosis of each file, None for one that cannot be read; no file is its own baseline."""
+    """Yield recording and diagnosis of each file, None for one that cannot be read; no file is its own baseline.
+
+    `machine`: file of a commissioned machine, in place of baseline, map, rate, rig and limit.
+    """
     from sealscope.diagnosis.diagnose import check_probability, diagnose
     from sealscope.diagnosis.verdict.severity import RepairLimit
 
     check_probability(false_alarm)
+    if machine is not None:
+        yield from _by_machine(files, join_them, machine, false_alarm, quick)
+        return
     RepairLimit.of(limit)
     reading = _Reading.of(maps, rate, rig)
     for file in files if baseline else ():
@@ -204,11 +218,30 @@ def _diagnoses(
         yield None if diagnosis is None else (recording, diagnosis)
 
 
+def _by_machine(
+    files: Sequence[Path], join_them: bool, machine: Path, false_alarm: float, quick: bool
+) -> Iterator[tuple[Recording, Diagnosis] | None]:
+    """Yield recording and diagnosis of each file against a commissioned machine, None for one that cannot be read."""
+    from sealscope.diagnosis.commissioned.machine_file import load_machine
+
+    known = load_machine(machine)
+    for file, recording in _read_parts(files, known, join_them):
+        if recording is None:
+            yield None
+            continue
+        work = partial(known.diagnose, recording, false_alarm_probability=false_alarm, quick=quick)
+        diagnosis = attempt(file, work)
+        yield None if diagnosis is None else (recording, replace(diagnosis, file=str(file)))
+
+
 def diagnose(
     context: typer.Context,
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="Recordings, of any format; `-` is standard input."),
+        typer.Argument(
+            metavar="FILE...",
+            help="Recordings, of any format; `-` is standard input. With --machine also folders: a line a recording.",
+        ),
     ],
     baseline: BaselineOption = None,
     output: Annotated[TextFormat, typer.Option("--format", help="Text, or one JSON object a line.")] = TextFormat.text,
@@ -220,6 +253,7 @@ def diagnose(
     area: AreaOption = None,
     displacement: DisplacementOption = None,
     limit: LimitOption = None,
+    machine: MachineOption = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Stop at the first method that has a verdict, the most specific first.")
     ] = False,
@@ -242,6 +276,13 @@ def diagnose(
     whole = bool(context.find_root().params.get("verbose"))
     form = "jsonl" if output is TextFormat.jsonl else "line" if quiet else "whole" if whole else "short"
     complete, failed = True, False
+    if machine is not None:
+        refuse_beside_machine(baseline, maps, rate, rig, area, displacement, limit)
+        if any(path.is_dir() for path in files):
+            from sealscope.diagnosis.commissioned.machine import recordings_in
+
+            files = recordings_in(files)
+            form = form if form == "jsonl" else "table"
     task = partial(
         _verdicts,
         form=form,
@@ -253,11 +294,12 @@ def diagnose(
         rig=assumed_rig(rig, area, displacement),
         limit=limit,
         quick=quick,
+        machine=machine,
     )
     jobs = min(cores(), len(files))
     piped = _check_standard_input([*files, *(baseline or ())])
     # what a baseline costs is spent once, and standard input is this process's
-    if join or piped or baseline or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:
+    if join or piped or baseline or machine or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:
         said: Iterator[tuple[str, Sequence[SaidOfFile | None]]] = (("", [verdict]) for verdict in task(files))
     else:
         said = (
@@ -303,12 +345,13 @@ class SaidOfFile(NamedTuple):
 
 
 def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[SaidOfFile | None]:
-    """Yield each file's verdict and what is printed of it in a `form`: jsonl, whole, short or line.
+    """Yield each file's verdict and what is printed of it in a `form`: jsonl, whole, short, line or table.
 
     None for a file that cannot be read; `options` of `_diagnoses`.
     """
     from sealscope.recordings.joining import start_seconds
     from sealscope.reporting import diagnosis_text, short_text
+    from sealscope.reporting.messages import table_line
 
     for result in _diagnoses(files, **options):
         if result is None:
@@ -318,7 +361,7 @@ def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[Said
         if form == "jsonl":
             text = json.dumps(diagnosis.as_dict(), allow_nan=False)
         else:
-            text = diagnosis_text(diagnosis) if form == "whole" else short_text(diagnosis)
+            text = {"whole": diagnosis_text, "table": table_line}.get(form, short_text)(diagnosis)
         text = text.partition("\n")[0] if form == "line" else text
         level = None if diagnosis.severity is None else diagnosis.severity.level
         yield SaidOfFile(diagnosis.verdict, level, text, start_seconds(result[0]))
@@ -352,12 +395,15 @@ def report(
     area: AreaOption = None,
     displacement: DisplacementOption = None,
     limit: LimitOption = None,
+    machine: MachineOption = None,
 ) -> None:
     """Diagnose each file and write a self-contained page of it; a folder gets an index, the most severe first."""
     from sealscope.reporting import write_index, write_page
     from sealscope.reporting.template import check_page
     from sealscope.storage.folders import make_folder
 
+    if machine is not None:
+        refuse_beside_machine(baseline, maps, rate, rig, area, displacement, limit)
     several = (len(files) > 1 and not join) or output.is_dir()
     read_too = {path.resolve() for path in (*files, *(baseline or ()))}
     pages: dict[Path, Path] = {}
@@ -377,7 +423,7 @@ def report(
     complete = True
     written: list[tuple[Path, Diagnosis]] = []
     assumed = assumed_rig(rig, area, displacement)
-    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, assumed, limit):
+    for result in _diagnoses(files, join, baseline or [], maps, rate, false_alarm, assumed, limit, machine=machine):
         if result is None:
             complete = False
             continue

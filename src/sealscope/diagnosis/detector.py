@@ -25,6 +25,9 @@ class Detector(Protocol):
     (what was missing is bridged, and marked in `Recording.bridged`); any other channel may be absent or hold NaN. A
     class attribute `reads` may name the channels that it looks at where no baseline is given: then a campaign that
     shows a record through several sets of channels runs it once for all that agree in these.
+
+    A method `learn(recording)` may return what a healthy recording teaches, as plain values, or None; a detector that
+    has one is also given what was written down of recordings (`learnt.Learnt`), and reads both by `learnt.lessons_of`.
     """
 
     name: str
@@ -33,7 +36,7 @@ class Detector(Protocol):
         """Return None when the recording has what the detector needs, else the reason why not, in one line."""
         ...
 
-    def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
+    def examine(self, recording: Recording, baseline: Sequence[Any], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`.
 
         `baseline`: leak-free recordings of the same machine, at any duty, no two of them copies; where

@@ -15,6 +15,7 @@ from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inspection import comparable, inspected
 from sealscope.diagnosis.judgement import ORDER, judged, judging, rank
+from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
@@ -51,7 +52,7 @@ class Examination:
     def __init__(
         self,
         recording: Recording,
-        baseline: Sequence[Recording] = (),
+        baseline: Sequence[Healthy] = (),
         *,
         false_alarm_probability: float,
         rig: Rig | str | os.PathLike[str] = "thesis",
@@ -70,7 +71,11 @@ class Examination:
         wanted = set(channels)
         view = Examination(
             self.recording.only(name for name in self.recording.channels if name in wanted),
-            [own.only(name for name in own.channels if name in wanted) for own in self.baseline],
+            [
+                own.only(name for name in own.channels if name in wanted)
+                for own in self.baseline
+                if isinstance(own, Recording)
+            ],
             false_alarm_probability=self.false_alarm_probability,
             rig=self.rig,
             distrust=self.distrust,
@@ -118,7 +123,7 @@ class Examination:
             reason = does_not_move(self.recording)
         baseline = self.baseline
         if reason is None and baseline:
-            reasons = [unusable(detector, own) for own in baseline]
+            reasons = [_unusable(detector, own) for own in baseline]
             baseline = tuple(own for own, why in zip(baseline, reasons, strict=True) if why is None)
             if not baseline:
                 reason = f"no baseline recording can be used: {reasons[0]}"
@@ -148,11 +153,17 @@ class Examination:
         return judged(evidences, None if self.distrust else other_step(self.recording), self.refusal)
 
 
+def _unusable(detector: Detector, healthy: Healthy) -> str | None:
+    if isinstance(healthy, Recording):
+        return unusable(detector, healthy)
+    return None if detector.name in healthy.lessons else "it has taught this method nothing"
+
+
 @checked_call
 @np.errstate(all="ignore")  # what overflows is a finding, not a warning
 def diagnose(
     recording: Recording,
-    baseline: Recording | Sequence[Recording] = (),
+    baseline: Recording | Sequence[Healthy] = (),
     *,
     false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
     rig: Rig | str | os.PathLike[str] | None = None,
@@ -231,7 +242,7 @@ def diagnose(
     )
 
 
-def _sequence(baseline: Sequence[Recording]) -> list[Recording]:
+def _sequence(baseline: Sequence[Healthy]) -> list[Healthy]:
     if isinstance(baseline, str | os.PathLike):
         _check_recording("baseline", baseline)
     try:
@@ -241,7 +252,8 @@ def _sequence(baseline: Sequence[Recording]) -> list[Recording]:
             f"baseline must be a Recording or a sequence of Recordings, got {type(baseline).__name__}"
         ) from None
     for k, recording in enumerate(recordings):
-        _check_recording(f"baseline[{k}]", recording)
+        if not isinstance(recording, Learnt):
+            _check_recording(f"baseline[{k}]", recording)
     return recordings
 
 

@@ -7,13 +7,15 @@ samples of another recording, are left out for all detectors alike.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
+from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.gaps import MOST_BRIDGED, bridge
@@ -55,9 +57,9 @@ class Inspection:
         return self.distrust
 
     @cached_property
-    def digest(self) -> bytes:
+    def digest(self) -> str:
         """Hash of the chamber pressures: equal for copies of a recording."""
-        return sha256(b"".join(self.part[name].tobytes() for name in chambers_of(self.part))).digest()
+        return sha256(b"".join(self.part[name].tobytes() for name in chambers_of(self.part))).hexdigest()
 
 
 def inspected(recording: Recording, channels: Iterable[str] | None = None) -> Inspection:
@@ -114,22 +116,22 @@ class Baselines:
     where some are, or where none was given.
     """
 
-    parts: tuple[Recording, ...]
+    parts: tuple[Healthy, ...]
     findings: tuple[Finding, ...]
     refusal: str | None
 
 
-def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
+def comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
     Left out are baselines that cannot be trusted, that lack a chamber of the recording or state it in another unit, the
     recording itself, and all but one copy (that with the most channels) of the same recording. What differs in speed,
     load and temperature is for the detectors to describe.
     """
-    inspections = [inspected(recording) for recording in baseline]
-    chosen: dict[bytes, int] = {}
+    inspections = [_Healthy.of(recording) for recording in baseline]
+    chosen: dict[str, int] = {}
     left_out: dict[tuple[Severity, str], list[int]] = {}
-    for k in sorted(range(len(baseline)), key=lambda k: -len(baseline[k].channels)):
+    for k in sorted(range(len(baseline)), key=lambda k: -len(inspections[k].units)):
         own = inspections[k]
         severity, reason = _refusal(judged, own)
         if reason is None and own.digest in chosen:
@@ -139,7 +141,7 @@ def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
         else:
             left_out.setdefault((severity, reason), []).append(k)
     findings = tuple(
-        Finding("baseline_left_out", severity, None, len(numbers), None, _text(baseline, numbers, reason))
+        Finding("baseline_left_out", severity, None, len(numbers), None, _text(inspections, numbers, reason))
         for (severity, reason), numbers in left_out.items()
     )
     refusal = None
@@ -149,20 +151,35 @@ def comparable(judged: Inspection, baseline: Sequence[Recording]) -> Baselines:
     return Baselines(tuple(inspections[k].part for k in sorted(chosen.values())), findings, refusal)
 
 
-def _refusal(judged: Inspection, own: Inspection) -> tuple[Severity, str | None]:
+class _Healthy(NamedTuple):
+    """A healthy recording to compare with: itself, or what it taught; why it cannot be used, None where it can."""
+
+    part: Healthy
+    units: Mapping[str, str]
+    digest: str
+    defect: str | None
+    file: str | None
+
+    @classmethod
+    def of(cls, healthy: Healthy) -> _Healthy:
+        if isinstance(healthy, Learnt):
+            return cls(healthy, healthy.units, healthy.digest, None, healthy.file)
+        own, file = inspected(healthy), healthy.provenance.get("file")
+        return cls(own.part, own.part.units, own.digest, own.defect, None if file is None else str(file))
+
+
+def _refusal(judged: Inspection, own: _Healthy) -> tuple[Severity, str | None]:
     """Return why a baseline recording cannot be compared, None where it can, and how much that matters."""
     if own.defect is not None:
         return "warning", own.defect
     if own.digest == judged.digest:
         return "warning", "the same samples as the recording itself"
-    chambers = chambers_of(judged.part)
-    units = [(name, recording.units.get(name)) for recording in (judged.part, own.part) for name in chambers]
-    alike = units[: len(chambers)] == units[len(chambers) :]
+    alike = all(own.units.get(name) == judged.part.units[name] for name in chambers_of(judged.part))
     return "note", None if alike else "other channels or units"
 
 
-def _text(baseline: Sequence[Recording], numbers: Sequence[int], reason: str) -> str:
-    names = [str(baseline[k].provenance.get("file", f"number {k + 1}")) for k in sorted(numbers)]
+def _text(baseline: Sequence[_Healthy], numbers: Sequence[int], reason: str) -> str:
+    names = [baseline[k].file or f"number {k + 1}" for k in sorted(numbers)]
     listed = ", ".join(names[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
     verb = "is" if len(names) == 1 else "are"
     return f"{len(names)} of {len(baseline)} baseline recordings {verb} left out: {reason} ({listed})"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import floor, isfinite, isnan, log10
-from textwrap import fill
+from pathlib import PurePath
+from textwrap import fill, shorten
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS
@@ -424,3 +425,25 @@ def _row(label: str, text: str, width: int) -> str:
     return fill(
         _printable(text), width, initial_indent=f"  {label:<10}", subsequent_indent=" " * 12, break_on_hyphens=False
     )
+
+
+#: Width of a line of a table in a terminal.
+WIDTH = 80
+
+
+def table_line(diagnosis: Diagnosis) -> str:
+    """Return a diagnosis as a line of a table: file, date, verdict, L/min, and where it is no `no leak` what to do."""
+    if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
+        low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
+        flow = f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
+    elif diagnosis.verdict != "leak" and diagnosis.bound_lpm is not None:
+        flow = f"none above {number(diagnosis.bound_lpm, 2)} L/min"
+    else:
+        flow = "L/min not stated"
+    file = PurePath(diagnosis.file).name
+    file = file if len(file) <= 28 else f"{file[:13]}..{file[-13:]}"
+    line = f"{file:<28}  {(diagnosis.start or '')[:16]:<16}  {diagnosis.verdict:<11}  {flow}"
+    if diagnosis.verdict == "no leak":
+        return line
+    action = diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
+    return f"{line}\n    {shorten(action, WIDTH - 4)}"

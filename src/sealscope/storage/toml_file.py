@@ -18,22 +18,22 @@ _MOST_DOTS = 30
 _NO_KEY = re.compile(r"[^\w.\"'\s-]+|\n")
 
 
-def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
+def read_toml(path: Path, what: str, place: str, largest: int = LARGEST) -> dict[str, Any]:
     """Return the tables of the TOML file `path`; `what` it is ("a rig file") and its `place` stand in the errors.
 
-    Raises InputError where it cannot be read, is larger than `LARGEST`, is not UTF-8 or not TOML, or holds a whole
+    Raises InputError where it cannot be read, has more than `largest` bytes, is not UTF-8 or not TOML, or holds a whole
     number beyond 2^53, which doubles do not hold, or a key of more than 30 dots.
     """
     try:
         with open_regular(path, what) as file:
-            data = file.read(LARGEST + 1)
+            data = file.read(largest + 1)
     except InputError:
         raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{what} must be readable, got: {reason} ({place})") from None
-    if len(data) > LARGEST:
-        raise InputError(f"{what} must be at most {LARGEST} bytes, got more ({place})")
+    if len(data) > largest:
+        raise InputError(f"{what} must be at most {largest} bytes, got more ({place})")
     try:
         text = data.decode("utf-8-sig")
         if any(part.count(".") > _MOST_DOTS for part in _NO_KEY.split(text)):

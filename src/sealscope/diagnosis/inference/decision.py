@@ -23,7 +23,7 @@ from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, pro
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
-from sealscope.diagnosis.inference.scatter import Rise, rise
+from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
 from sealscope.diagnosis.inference.terms import ORIFICE, PUMP, Equation, priors
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
@@ -195,10 +195,13 @@ def _area(balance: RecordedBalance, motion: list[int]) -> Interval:
     return Interval(abs(value), abs(value) - half, abs(value) + half)
 
 
-def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Blocks] = ()) -> Evidence:
-    """Return the evidence of a balance at a false-alarm probability, against healthy recordings where there are any."""
+def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Array] = ()) -> Evidence:
+    """Return the evidence of a balance at a false-alarm probability, against healthy recordings where there are any.
+
+    `baseline`: the sums that each of them has taught (`scatter.Taught`).
+    """
     test = balance.test
-    against = rise(balance.blocks, baseline, balance.columns) if baseline else None
+    against = rise(Taught.of(balance.blocks, balance.columns), baseline, balance.columns) if baseline else None
     if test is None and against is None:
         return Evidence("cannot tell", "p_A and p_B hardly differ, or too few samples are whole: no leak would show")
     questions = _questions(balance, against, probability)

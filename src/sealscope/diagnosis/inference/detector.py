@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
-from sealscope.diagnosis.inference.blocks import Blocks
+from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.causes import StepHypothesis
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
 from sealscope.diagnosis.inference.onset import StepTest
+from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
 from sealscope.diagnosis.inference.terms import LOCKED, circulation, equations, locked, priors
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.inference.without_position import circulations
+from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
@@ -117,16 +119,35 @@ class VolumeBalance:
         blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
         return None if blocks is None else RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording)
 
-    def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
+    def learn(self, recording: Recording) -> Lesson | None:
+        """Return what a healthy recording teaches (`scatter.Taught`), by the terms of its balance.
+
+        `scale` makes flows by the rig's displacement the machine's, 0 where its size is not stated.
+        """
+        own = self.balance(recording)
+        if own is None:
+            return None
+        scale = own.size.scale if own.size.stated else 0.0
+        return {"terms": list(own.columns[0].names), "scale": scale, **Taught.of(own.blocks, own.columns)._asdict()}
+
+    def rises(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> list[Rise]:
+        """Return how far each of several healthy recordings of the same channels is above the others."""
+        balances = equations(self.rig, channels)
+        columns = [Columns(equation) for equation in balances]
+        sums = [np.asarray(lesson["sums"], dtype=float) for lesson in lessons]
+        return [
+            rise(Taught(own, lesson["flow"], lesson["pressure"]), sums[:k] + sums[k + 1 :], columns)
+            for k, (own, lesson) in enumerate(zip(sums, lessons, strict=True))
+        ]
+
+    def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a step of the leakage, and of its rise against the baseline."""
         own = self.balance(recording)
         if own is None:
             return Evidence("cannot tell", _NO_BALANCE["x" in recording].format(recording.duration), usable=False)
-        healthy: list[Blocks] = []
-        for other in baseline:
-            compared = self.balance(other)
-            if compared is not None and compared.columns[0].names == own.columns[0].names:
-                healthy.append(compared.blocks)
+        names = list(own.columns[0].names)
+        lessons = [lesson for lesson in lessons_of(self, baseline) if lesson["terms"] == names]
+        healthy = [np.asarray(lesson["sums"], dtype=float) for lesson in lessons]
         evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
         if isinstance(own, RecordedCirculation):
             return evidence

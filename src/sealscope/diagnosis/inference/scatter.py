@@ -55,15 +55,35 @@ class Rise(NamedTuple):
         return self.value - half, self.value + half
 
 
-def rise(judged: Blocks, baseline: Sequence[Blocks], columns: Sequence[Columns]) -> Rise:
-    """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine."""
-    sums = [_about_own(total(own, columns), columns) for own in baseline]
-    everything = np.sum(sums, axis=0)
-    value = _rise(_about_own(total(judged, columns), columns), everything, columns)
-    weights = np.maximum(judged.rows, 1e-9)
-    flow, pressure = (float(np.average(of, weights=weights)) for of in (judged.means[:, 2], judged.driving()))
-    believed = priors()["scatter"]["leak"].value * flow / pressure if pressure > 0.0 else 0.0
-    apart = [_rise(own, everything - own, columns) for own in sums] if len(sums) > 1 else [0.0]
+class Taught(NamedTuple):
+    """What a healthy recording teaches of its machine.
+
+    `sums` (E, m, m) of its rows, the zero of its flow set aside; `flow` of the pump and `pressure`, mean sizes
+    [m^3/s], [Pa].
+    """
+
+    sums: Array
+    flow: float
+    pressure: float
+
+    @classmethod
+    def of(cls, blocks: Blocks, columns: Sequence[Columns]) -> Taught:
+        """Return that of a recording's blocks."""
+        weights = np.maximum(blocks.rows, 1e-9)
+        flow, pressure = (float(np.average(of, weights=weights)) for of in (blocks.means[:, 2], blocks.driving()))
+        return cls(_about_own(total(blocks, columns), columns), flow, pressure)
+
+
+def rise(judged: Taught, baseline: Sequence[Array], columns: Sequence[Columns]) -> Rise:
+    """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine.
+
+    `baseline`: the sums of each of them.
+    """
+    everything = np.sum(baseline, axis=0)
+    value = _rise(judged.sums, everything, columns)
+    share = priors()["scatter"]["leak"].value
+    believed = share * judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
+    apart = [_rise(own, everything - own, columns) for own in baseline] if len(baseline) > 1 else [0.0]
     return student(value, apart, believed)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.onset import Interval, step_test
 from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, RmsBlocks, cut, whole
 from sealscope.diagnosis.rms_change.ringing import information, priors, rises
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
@@ -78,7 +79,18 @@ class RmsChange:
                 return f"{chamber} is constant"
         return None
 
-    def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
+    def learn(self, recording: Recording) -> Lesson:
+        """Return what a healthy recording teaches: its log RMS and duty, whose they are, and when."""
+        levels, duty = whole(recording)
+        return {
+            "chambers": list(chambers_of(recording)),
+            "rate": recording.rate,
+            "start_s": start_seconds(recording),
+            "levels": levels,
+            "duty": duty,
+        }
+
+    def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`, within it or against the baseline."""
         evidence = _examine(recording, baseline, false_alarm_probability)
         if evidence.verdict != "no leak" or recording.rate >= RINGING_RATE:
@@ -87,7 +99,7 @@ class RmsChange:
         return replace(evidence, verdict="cannot tell", reason=f"{seen}; {evidence.reason}")
 
 
-def _examine(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
+def _examine(recording: Recording, baseline: Sequence[Healthy], probability: float) -> Evidence:
     """Return the evidence on a recording, by what its details show."""
     if recording.rate < SLOWEST_RATE:
         reason = f"needs {SLOWEST_RATE:g} Hz or more to see the ringing that a leak damps, got {recording.rate:g} Hz"
@@ -129,15 +141,14 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
     return _evidence(changes, blocks.share, "within the recording", onset)
 
 
-def against(recording: Recording, baseline: Sequence[Recording], probability: float) -> Evidence:
+def against(recording: Recording, baseline: Sequence[Healthy], probability: float) -> Evidence:
     """Return the evidence of a rise or fall against leak-free recordings of the machine."""
-    alike = [own for own in baseline if chambers_of(own) == chambers_of(recording)]
-    alike = [own for own in alike if abs(own.rate / recording.rate - 1.0) < 1e-3]
+    alike = [own for own in lessons_of(RmsChange(), baseline) if own["chambers"] == list(chambers_of(recording))]
+    alike = [own for own in alike if abs(own["rate"] / recording.rate - 1.0) < 1e-3]
     if not alike:
         return Evidence("cannot tell", f"no baseline recording has the same chambers at {recording.rate:g} Hz")
-    known = [whole(own) for own in alike]
     apart = _apart(recording, alike)
-    levels, duties = (np.stack([own[k] for own in known]) for k in (0, 1))
+    levels, duties = (np.stack([np.asarray(own[name], dtype=float) for own in alike]) for name in ("levels", "duty"))
     stated, weights = rises(*whole(recording), levels, duties, bool(apart))
     names = [f"{quantity} of {chamber}" for chamber in chambers_of(recording) for quantity in QUANTITIES]
     share = probability / (2 * len(JUDGED) * len(chambers_of(recording)))
@@ -147,10 +158,10 @@ def against(recording: Recording, baseline: Sequence[Recording], probability: fl
     return _evidence(changes, 1.0, f"against {count}", None)
 
 
-def _apart(recording: Recording, baseline: Sequence[Recording]) -> bool | None:
+def _apart(recording: Recording, baseline: Sequence[Lesson]) -> bool | None:
     """Whether a recording is of another session than all of the baseline's; None where no times tell."""
     start, pause = start_seconds(recording), priors()["recordings"]["pause"].value
-    others = [other for own in baseline if (other := start_seconds(own)) is not None]
+    others = [other for own in baseline if (other := own.get("start_s")) is not None]
     return None if start is None or not others else all(abs(start - other) > pause for other in others)
 
 

@@ -56,7 +56,7 @@ class LeakReading:
     temperature: float | None
     scale: float | None
     machine: AssumedMachine | None
-    digest: bytes
+    digest: str
     problem: str = ""
 
 

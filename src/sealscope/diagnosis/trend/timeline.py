@@ -66,7 +66,7 @@ def timeline(readings: Sequence[LeakReading]) -> Timeline:
     findings = _clock(ordered)
     left_out: list[tuple[LeakReading, str]] = []
     kept: list[LeakReading] = []
-    seen: dict[bytes, str] = {}
+    seen: dict[str, str] = {}
     for reading in ordered:
         if reading.basis is None:
             left_out.append((reading, reading.problem))

@@ -23,6 +23,7 @@ from sealscope.diagnosis.inference.pressures import response, ring_down
 from sealscope.diagnosis.inference.pressures.evidence import PressureEvidence, priors, states_flow, unusable
 from sealscope.diagnosis.inference.scatter import Rise, student
 from sealscope.diagnosis.inference.terms import priors as terms_priors
+from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.verdict.evidence import LEAKS, NO_RIG, RAREST, Cause, Evidence, LeakCourse, Passage
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
@@ -62,6 +63,11 @@ class PressureReading:
             return None
         speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
         return PressureReading(evidence, own, speed * rig.pump.q_b / (2.0 * np.pi), states_flow(rig))
+
+    @property
+    def by(self) -> str:
+        """The provider."""
+        return "ring" if self.response is None else "response"
 
     @cached_property
     def test(self) -> StepTest | None:
@@ -112,20 +118,25 @@ class PressureResponse:
         """Return what a usable recording says of the conductance; None where it says nothing."""
         return PressureReading.of(recording, self.rig)
 
-    def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
+    def learn(self, recording: Recording) -> Lesson | None:
+        """Return what a healthy recording teaches: the level of the conductance, and by which provider."""
+        own = None if unusable(recording, self.rig) else self.reading(recording)
+        return None if own is None else {"by": own.by, "level": own.level[0]}
+
+    def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a step of the conductance, and of its rise against the baseline."""
         own = self.reading(recording)
         if own is None:
             return Evidence("cannot tell", "no response to the command that a pump-driven piston would give")
-        readings = [self.reading(other) for other in baseline if unusable(other, self.rig) is None]
-        evidence = judge(own, false_alarm_probability, [other for other in readings if other is not None])
+        levels = [lesson["level"] for lesson in lessons_of(self, baseline) if lesson["by"] == own.by]
+        evidence = judge(own, false_alarm_probability, levels)
         whole = 1.0 if recording.bridged is None else float(np.mean(~recording.bridged))
         return replace(evidence, share=whole)
 
 
-def judge(own: PressureReading, probability: float, baseline: Sequence[PressureReading] = ()) -> Evidence:
-    """Return the evidence of a reading at a false-alarm probability, against healthy recordings where there are any."""
-    test, against = own.test, _rise(own, baseline) if baseline else None
+def judge(own: PressureReading, probability: float, levels: Sequence[float] = ()) -> Evidence:
+    """Return the evidence of a reading at a false-alarm probability, against the levels of healthy recordings."""
+    test, against = own.test, _rise(own, levels) if levels else None
     if test is None and against is None:
         return Evidence("cannot tell", "too little moves: no leak would show")
     questions = _questions(test, against, probability)
@@ -164,11 +175,8 @@ def _questions(test: StepTest | None, against: Rise | None, probability: float) 
     return questions
 
 
-def _rise(own: PressureReading, baseline: Sequence[PressureReading]) -> Rise | None:
-    """Return how far the level of g is above that of healthy recordings by the same provider."""
-    levels = [other.level[0] for other in baseline if (other.response is None) == (own.response is None)]
-    if not levels:
-        return None
+def _rise(own: PressureReading, levels: Sequence[float]) -> Rise:
+    """Return how far the level of g is above those of healthy recordings by the same provider."""
     total, count = sum(levels), len(levels)
     apart = [level - (total - level) / (count - 1) for level in levels] if count > 1 else [0.0]
     return student(own.level[0] - total / count, apart, priors("response")["G_level"].width)

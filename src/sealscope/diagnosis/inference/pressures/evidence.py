@@ -136,6 +136,8 @@ def block_edges(recording: Recording) -> NDArray[np.int64]:
 
 def mains_lines(total: Array, rate: float) -> Array:
     """Return the frequencies (m,) [Hz] of the mains' lines, from p_A + p_B (n,), where the ring cancels."""
+    if not total.size:
+        return np.array([])
     spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), 4 * total.size))
     frequency = np.fft.rfftfreq(4 * total.size, 1.0 / rate)
     known = priors("mains")

@@ -1,0 +1,84 @@
+"""The command `commission`."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sealscope.cli.options import (
+    AreaOption,
+    AssumeOption,
+    DisplacementOption,
+    LimitOption,
+    MapOption,
+    RateOption,
+    assumed_rig,
+    channel_map_of,
+    check_folder,
+    say,
+)
+from sealscope.errors import InputError
+
+
+def commission(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Healthy recordings of the machine, or a folder of them.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The machine's file to write (.toml).")],
+    rig: AssumeOption = None,
+    area: AreaOption = None,
+    displacement: DisplacementOption = None,
+    maps: MapOption = None,
+    rate: RateOption = None,
+    limit: LimitOption = None,
+    add: Annotated[
+        bool,
+        typer.Option(
+            "--add", help="Add recordings that are confirmed healthy to the machine's file; the old one is kept (.bak)."
+        ),
+    ] = False,
+    since: Annotated[
+        str | None,
+        typer.Option("--since", metavar="DATE", help="With --add: forget recordings before DATE, as after a repair."),
+    ] = None,
+) -> None:
+    """Learn a machine from healthy recordings, once: its terms, sensors, scatter, and the smallest leak it will show.
+
+    `diagnose`, `trend`, `report` and `monitor` take the file by --machine.
+    """
+    from sealscope.diagnosis.commissioned.machine import checksum_of, recordings_in
+    from sealscope.diagnosis.commissioned.machine import commission as commissioned
+    from sealscope.diagnosis.commissioned.machine_file import load_machine, write_machine
+
+    if output.suffix.lower() != ".toml":
+        raise InputError(f"a machine's file must end in .toml, got {output}")
+    if since is not None and not add:
+        raise InputError("--since must stand with --add, for a machine that is known")
+    check_folder(output)
+    if add:
+        machine = load_machine(output)
+        for path in recordings_in(files):
+            machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
+        if since is not None:
+            machine = machine.since(_date(since))
+        backup = output.with_suffix(".toml.bak")
+        backup.write_bytes(output.read_bytes())
+    else:
+        if output.exists():
+            raise InputError(f"a machine's file must be new, got {output}, which exists; --add adds recordings to it")
+        columns = channel_map_of(maps)
+        assumed = assumed_rig(rig, area, displacement)
+        machine = commissioned(files, rig=assumed, map=columns or None, rate=rate, limit=limit, name=output.stem)
+    write_machine(machine, output)
+    say(f"{output}:\n{machine}")
+
+
+def _date(text: str) -> float:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"--since must be a date such as 2026-11-25, got {text!r}") from None
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()

@@ -1,0 +1,1 @@
+"""A machine commissioned once: what its healthy recordings taught, written down and used everywhere."""

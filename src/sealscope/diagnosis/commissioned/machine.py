@@ -1,0 +1,285 @@
+"""A commissioned machine: its rig, how its logs are read, and what its healthy recordings have taught."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.inspection import inspected
+from sealscope.diagnosis.learnt import Learnt, Lesson
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.errors import InputError, SealscopeError, UnreadableFile
+from sealscope.parameters import Rig
+from sealscope.recordings import read
+from sealscope.recordings.formats.columns import ChannelMap, counted
+from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from sealscope.diagnosis.commissioned.summary import Summary
+
+#: Suffixes of files in a folder that are no recordings: Sealscope's own pages and settings, and notes.
+NO_RECORDINGS = frozenset({".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"})
+
+
+@dataclass(frozen=True)
+class CommissionedMachine:
+    """A commissioned machine.
+
+    Parameters
+    ----------
+    name : str
+        Name of the machine.
+    healthy : tuple of Learnt
+        What each healthy recording has taught, in the order of their dates.
+    rig : Rig, optional
+        What is stated of the machine; None: nothing.
+    channel_map : mapping of str to str, or "auto", optional
+        Channel to column of its logs.
+    rate : float, optional
+        Sampling rate [Hz] of logs without a time column.
+    limit : str, optional
+        Leak from which it is to be repaired, such as "5 mL/min".
+    about : mapping of str to mapping, optional
+        Of each healthy recording, by its digest, what people read: checksum of the file, pressure, oil, noise.
+    left_out : tuple of str, optional
+        Recordings that could not be used, each with the reason.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> ss.CommissionedMachine("actuator 7", ())
+    <CommissionedMachine actuator 7: 0 healthy recordings>
+    """
+
+    name: str
+    healthy: tuple[Learnt, ...]
+    rig: Rig | None = None
+    channel_map: ChannelMap = field(default_factory=dict)
+    rate: float | None = None
+    limit: str | None = None
+    about: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+
+    @cached_property
+    def summary(self) -> Summary:
+        """What the healthy recordings say of the machine, of its sensors and of the smallest leak."""
+        from sealscope.diagnosis.commissioned.summary import summarised
+
+        return summarised(self.healthy, self.rig, self.about, self.left_out)
+
+    def read(self, path: str | os.PathLike[str]) -> Recording:
+        """Read a log of the machine by its map; a recording of Sealscope's own is read as it is."""
+        if not self.channel_map:
+            return read(path, rate=self.rate)
+        try:
+            return read(path, map=self.channel_map, rate=self.rate)
+        except UnreadableFile as unmapped:
+            try:
+                return read(path, rate=self.rate)
+            except UnreadableFile:
+                raise unmapped from None
+
+    def diagnose(
+        self,
+        recording: Recording | str | os.PathLike[str],
+        *,
+        false_alarm_probability: float = 0.01,
+        quick: bool = False,
+    ) -> Diagnosis:
+        """Say whether oil bypasses the piston in a recording, or in the file of one, against the healthy ones.
+
+        Arguments, result and errors as for `sealscope.diagnose`; rig, baseline and limit are the machine's.
+        """
+        own = recording if isinstance(recording, Recording) else self.read(recording)
+        return diagnose(
+            own,
+            self.healthy,
+            false_alarm_probability=false_alarm_probability,
+            rig=self.rig,
+            limit=self.limit,
+            quick=quick,
+            file=None if isinstance(recording, Recording) else recording,
+        )
+
+    def diagnose_all(self, paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Diagnosis]:
+        """Return the diagnoses of several files, or of those of a folder, in the order of their dates.
+
+        Raises UnreadableFile for a file that cannot be read.
+        """
+        recordings = [(path, self.read(path)) for path in recordings_in(paths)]
+        recordings.sort(key=lambda own: (start_seconds(own[1]) or 0.0, str(own[0])))
+        return [replace(self.diagnose(recording), file=os.fspath(path)) for path, recording in recordings]
+
+    def with_healthy(self, recording: Recording, *, file: str = "recording", checksum: str = "") -> CommissionedMachine:
+        """Return the machine with one more healthy recording.
+
+        Raises InputError where it is judged leaking, or is known already, or cannot be trusted.
+        """
+        digest = inspected(recording).digest
+        known = next((own for own in self.healthy if own.digest == digest), None)
+        if known is not None:
+            raise InputError(f"a healthy recording must be new, got the samples of {known.file} ({file})")
+        if self.healthy and (found := self.diagnose(recording)).verdict == "leak":
+            raise InputError(f"a healthy recording must not leak, got one that does: {found.reason} ({file})")
+        learnt, about = learn(recording, self.known_rig(recording), file, checksum)
+        healthy = sorted((*self.healthy, learnt), key=lambda own: (own.start_s or 0.0, own.file))
+        return replace(self, healthy=tuple(healthy), about={**self.about, digest: about})
+
+    def since(self, start_s: float) -> CommissionedMachine:
+        """Return the machine without the recordings of before a repair, `start_s` [s since 1970].
+
+        Raises InputError where none is left.
+        """
+        left = tuple(own for own in self.healthy if own.start_s is not None and own.start_s >= start_s)
+        if not left:
+            raise InputError(f"a machine must keep a healthy recording, got none of {start_s:g} s since 1970 or later")
+        return replace(self, healthy=left, about={own.digest: self.about.get(own.digest, {}) for own in left})
+
+    def known_rig(self, recording: Recording) -> Rig:
+        """Return the rig that detectors assume."""
+        from sealscope.diagnosis.verdict.machine import assumed_rig
+
+        return assumed_rig(self.rig, recording)[0]
+
+    def __repr__(self) -> str:
+        return f"<CommissionedMachine {self.name}: {counted(len(self.healthy), 'healthy recording')}>"
+
+    def __str__(self) -> str:
+        return self.summary.text(self.healthy, self.rig, self.about)
+
+
+def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
+    """Return the files of recordings that a path, several, or a folder name; InputError where there is none."""
+    named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    files: list[Path] = []
+    for path in map(Path, named):
+        if path.is_dir():
+            inside = sorted(own for own in path.iterdir() if own.is_file() and not own.name.startswith("."))
+            files += [own for own in inside if own.suffix.lower() not in NO_RECORDINGS]
+        else:
+            files.append(path)
+    if not files:
+        raise InputError(f"a folder of recordings must hold one, got none ({', '.join(map(str, named)) or 'no path'})")
+    return files
+
+
+def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> tuple[Learnt, dict[str, Any]]:
+    """Return what a healthy recording teaches every built-in detector, and what people read of it.
+
+    Raises InputError where it cannot be trusted, or teaches nothing.
+    """
+    import numpy as np
+    from threadpoolctl import threadpool_limits
+
+    from sealscope.diagnosis.commissioned.summary import about_recording
+    from sealscope.diagnosis.detector import failure, unusable
+    from sealscope.diagnosis.registry import detectors
+
+    inspection = inspected(recording)
+    part = inspection.part
+    if inspection.defect is not None:
+        raise InputError(f"a healthy recording must be whole, got one that is not: {inspection.defect} ({file})")
+    lessons: dict[str, Lesson] = {}
+    with np.errstate(all="ignore"), threadpool_limits(limits=1):
+        for name, factory in detectors().items():
+            try:
+                detector = factory(rig)
+                if hasattr(detector, "learn") and unusable(detector, part) is None:
+                    lesson = detector.learn(part)
+                    lessons |= {} if lesson is None else {name: lesson}
+            except Exception as error:  # as in a diagnosis, a method that fails is left out
+                failure(name, getattr(factory, "distribution", None), error)
+    if not lessons:
+        raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
+    units = {name: part.units[name] for name in part.channels}
+    about = {"sha256": checksum, **about_recording(recording, inspection)}
+    start = start_seconds(recording)
+    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons), about
+
+
+def commission(
+    paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str],
+    *,
+    rig: Rig | str | os.PathLike[str] | None = None,
+    map: ChannelMap | None = None,
+    rate: float | None = None,
+    limit: str | None = None,
+    name: str = "machine",
+) -> CommissionedMachine:
+    """Commission a machine on its healthy recordings: learn once what every later diagnosis compares with.
+
+    Parameters
+    ----------
+    paths : path-like, or several
+        A folder of healthy recordings, or their files.
+    rig : Rig, str or path-like, optional
+        What is stated of the machine, as for `sealscope.diagnose`.
+    map : mapping of str to str, or "auto", optional
+        Channel to column of the logs, as for `sealscope.read`; by default that of the rig's file.
+    rate : float, optional
+        Sampling rate [Hz] of logs without a time column.
+    limit : str, optional
+        Leak from which the machine is to be repaired, such as ``"5 mL/min"``.
+    name : str, optional
+        Name of the machine.
+
+    Returns
+    -------
+    CommissionedMachine
+        Its `diagnose` judges other recordings; `sealscope.write_machine` keeps it.
+
+    Raises
+    ------
+    InputError, UnreadableFile
+        A recording cannot be read or trusted, two hold the same samples, or an argument breaks a rule.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as healthy:
+    ...     for seed in (1, 2, 3):
+    ...         ss.write(ss.simulate(duration="20 s", seed=seed), Path(healthy, f"run{seed}.nc"))
+    ...     machine = ss.commission(healthy)
+    >>> machine.diagnose(ss.simulate(duration="20 s", leak="0.02 L/min", seed=4)).verdict
+    'leak'
+    """
+    from sealscope.diagnosis.verdict.severity import RepairLimit
+    from sealscope.parameters import load_rig
+
+    RepairLimit.of(limit)
+    known = None if rig is None else load_rig(rig)
+    channel_map = map if map is not None else {} if known is None else known.channel_map
+    machine = CommissionedMachine(name, (), known, channel_map, rate, limit)
+    problems: list[str] = []
+    for path in recordings_in(paths):
+        try:
+            recording = machine.read(path)
+            learnt, about = learn(recording, machine.known_rig(recording), path.name, checksum_of(path))
+        except SealscopeError as error:
+            problems.append(str(error))
+            continue
+        twin = next((own for own in machine.healthy if own.digest == learnt.digest), None)
+        if twin is not None:
+            problems.append(f"{path}: the same samples as {twin.file}")
+            continue
+        machine = replace(machine, healthy=(*machine.healthy, learnt), about={**machine.about, learnt.digest: about})
+    if not machine.healthy:
+        raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
+    ordered = sorted(machine.healthy, key=lambda own: (own.start_s or 0.0, own.file))
+    return replace(machine, healthy=tuple(ordered), left_out=tuple(problems))
+
+
+def checksum_of(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a file in hexadecimal digits."""
+    from hashlib import file_digest
+
+    with Path(path).open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,289 @@
+"""What healthy recordings say of a machine: terms, sensors, scatter, the smallest leak, and what looks wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from textwrap import fill
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.blocks import Columns, solve
+from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.inference.terms import ATMOSPHERE, equations
+from sealscope.diagnosis.inspection import Inspection
+from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
+from sealscope.recordings.recording import Array, Recording
+from sealscope.units import LITRE_PER_MINUTE
+
+if TYPE_CHECKING:
+    from sealscope.diagnosis.learnt import Learnt
+    from sealscope.parameters import Rig
+
+#: Probability with which the smallest leak is found, and of a false alarm for which it is stated.
+POWER, FALSE_ALARM = 0.9, 0.01
+#: Numbers of recordings that are tried for half of the smallest leak.
+_MORE = (3, 5, 7, 10, 15, 20, 30, 50)
+_BALANCE = VolumeBalance.name
+#: Columns of a terminal.
+WIDTH = 80
+#: Of each healthy recording, by its digest, what people read.
+About = Mapping[str, Mapping[str, Any]]
+
+
+class TermEstimate(NamedTuple):
+    """A coefficient of the balance: estimate, its standard deviation, its scatter between recordings, unit."""
+
+    value: float
+    deviation: float
+    scatter: float | None
+    unit: str
+
+
+class Smallest(NamedTuple):
+    """The smallest leak that the next recording shows.
+
+    `lpm` [L/min], None where the machine's size is not stated, and `share` of the pump's flow; `halved_by`: healthy
+    recordings after which it is half as large, None where none of a reasonable number does.
+    """
+
+    lpm: float | None
+    share: float
+    halved_by: int | None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What is stated of a machine by its healthy recordings.
+
+    `terms` by name; `noise` of each channel in its unit; `smallest` leak, None where no balance states one; `problems`:
+    what looks wrong, a line each.
+    """
+
+    terms: Mapping[str, TermEstimate]
+    noise: Mapping[str, float]
+    smallest: Smallest | None
+    problems: list[str] = field(default_factory=list)
+
+    def text(self, healthy: Sequence[Learnt], rig: Rig | None, about: About) -> str:
+        """Return it in some ten lines."""
+        dates = sorted(own.start_s for own in healthy if own.start_s is not None)
+        seconds = sum(own.seconds for own in healthy)
+        known = [{**about.get(own.digest, {}), **_flow(own)} for own in healthy]
+        rows = [
+            ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all" + (f", {_span(dates)}" if dates else "")),
+            ("channels", ", ".join(f"{name} [{unit}]" for name, unit in healthy[0].units.items())),
+            (
+                "machine",
+                "size not stated: --rig, --area or --displacement states L/min"
+                if rig is None
+                else f"{rig.title or rig.name}",
+            ),
+            (
+                "duty",
+                _ranges(
+                    known, (("flow_lpm", "L/min"), ("pressure_bar", "bar between the chambers"), ("oil_degC", "deg C"))
+                ),
+            ),
+            ("noise", ", ".join(f"{name} {value:.2g} {unit}" for name, value, unit in _shown(self.noise, healthy[0]))),
+        ]
+        if self.smallest is not None:
+            rows.append(("smallest leak", _smallest_text(self.smallest)))
+            rows.append(("half of that", _half_text(self.smallest, len(healthy))))
+        rows += [("check", problem) for problem in self.problems]
+        indent = " " * 16
+        return "\n".join(
+            fill(f"  {name:<14}{text}", WIDTH, subsequent_indent=indent, break_on_hyphens=False)
+            for name, text in rows
+            if text
+        )
+
+
+def _flow(healthy: Learnt) -> dict[str, float]:
+    """Return the pump's mean flow in a healthy recording [L/min], as far as the machine's size is stated."""
+    lesson = healthy.lessons.get(_BALANCE, {})
+    flow = lesson.get("flow", 0.0) * lesson.get("scale", 0.0)
+    return {"flow_lpm": flow / LITRE_PER_MINUTE} if flow > 0.0 else {}
+
+
+def about_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
+    """Return what people read of a healthy recording, and what looks wrong with it."""
+    part, about = inspection.part, dict[str, Any]()
+    if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
+        about["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / 1e5)
+    if "T_oil" in recording and np.any(known := np.isfinite(recording["T_oil"])):
+        about["oil_degC"] = _rounded(float(recording["T_oil"][known].mean()) - 273.15)
+    elif (stated := stated_oil_temperature(recording.provenance)) is not None:
+        about["oil_degC"] = _rounded(stated)
+    about["noise"] = {name: noise for name in part.channels if (noise := _noise(part[name])) > 0.0}
+    about["wrong"] = [
+        *(own.text for own in inspection.findings if own.severity != "note"),
+        *(text for name in ("p_A", "p_B") if name in part and (text := _below_vacuum(part, name))),
+        *(text for name in ("omega", "u") if name in part and (text := _glitches(part, name))),
+    ]
+    return about
+
+
+def summarised(healthy: Sequence[Learnt], rig: Rig | None, about: About, left_out: Sequence[str] = ()) -> Summary:
+    """Return the summary of a machine's healthy recordings; `left_out`: those that could not be used, and why."""
+    known = [about.get(own.digest, {}) for own in healthy]
+    problems = list(left_out)
+    problems += _collected([(own.file, about.get("wrong", ())) for own, about in zip(healthy, known, strict=True)])
+    noises = [about.get("noise", {}) for about in known]
+    names = dict.fromkeys(name for own in noises for name in own)
+    noise = {name: float(np.median([own[name] for own in noises if name in own])) for name in names}
+    taught = [own for own in healthy if _BALANCE in own.lessons]
+    if not taught:
+        return Summary({}, noise, None, problems)
+    alike = [own for own in taught if own.lessons[_BALANCE]["terms"] == taught[0].lessons[_BALANCE]["terms"]]
+    for own in (own for own in taught if own not in alike):
+        problems.append(f"{own.file} has other channels than {taught[0].file}")
+    rig = rig or unstated()
+    lessons = [own.lessons[_BALANCE] for own in alike]
+    channels = frozenset(alike[0].units)
+    if not equations(rig, channels):
+        return Summary({}, noise, None, problems)
+    columns = Columns(equations(rig, channels)[0])
+    terms = _terms([np.asarray(lesson["sums"], dtype=float)[0] for lesson in lessons], columns, rig, channels)
+    smallest = None
+    if len(alike) > 1:
+        rises = VolumeBalance(rig).rises(lessons, channels)
+        problems += _unlike(alike, rises)
+        smallest = _smallest(rises, lessons)
+    return Summary(terms, noise, smallest, problems)
+
+
+def _terms(sums: Sequence[Array], columns: Columns, rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
+    """Return the estimates of the terms from all recordings together, and how each scatters between them."""
+    chosen = list(columns.nuisance)
+    units = {term.name: term.unit for term in equations(rig, channels)[0].terms}
+
+    def fitted(own: Array) -> Array:
+        return solve(own[np.ix_(chosen, chosen)], own[chosen, columns.left])
+
+    together, apart = np.sum(sums, axis=0), np.array([fitted(own) for own in sums])
+    values = fitted(together)
+    variance = np.diag(solve(together[np.ix_(chosen, chosen)], np.eye(len(chosen))))
+    scatter = apart.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(chosen)
+    return {
+        columns.names[k]: TermEstimate(
+            float(values[i]),
+            float(np.sqrt(max(variance[i], 0.0))),
+            scatter[i],
+            units[columns.names[k]],
+        )
+        for i, k in enumerate(chosen)
+    }
+
+
+def _unlike(healthy: Sequence[Learnt], rises: Sequence[Rise]) -> list[str]:
+    """Return the recordings that are not like the others, as one in a hundred of healthy ones."""
+    if len(rises) <= 2:
+        return []
+    return [
+        f"{own.file} is not like the others: its leakage differs from theirs by {abs(rise.score):.2g} deviations"
+        for own, rise in zip(healthy, rises, strict=True)
+        if 2.0 * min(rise.chance, 1.0 - rise.chance) < FALSE_ALARM
+    ]
+
+
+def _smallest(rises: Sequence[Rise], lessons: Sequence[Mapping[str, Any]]) -> Smallest | None:
+    """Return the smallest leak that the next recording shows, of the duties of the healthy ones.
+
+    A rise is found where it passes the threshold of Student's t; half is reached where the count of recordings takes
+    the threshold, the deviation of their mean, and nothing of their scatter, there.
+    """
+    from scipy.special import ndtri
+
+    count, freedom = len(rises), rises[0].freedom  # against count - 1 others
+    between = float(np.median([own.deviation for own in rises])) / np.sqrt(1.0 + 1.0 / (count - 1))
+
+    def findable(recordings: int) -> float:
+        law = Rise(0.0, 1.0, freedom + recordings - (count - 1))
+        return float((law.threshold(FALSE_ALARM) + ndtri(POWER)) * between * np.sqrt(1.0 + 1.0 / recordings))
+
+    pressure, flow = (float(np.median([own[name] for own in lessons])) for name in ("pressure", "flow"))
+    scale, own = float(np.median([lesson["scale"] for lesson in lessons])), findable(count)
+    halved = next((more for more in _MORE if more > count and findable(more) <= 0.5 * own), None)
+    share = own * pressure / flow if flow > 0.0 else float("nan")
+    return Smallest(own * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None, share, halved)
+
+
+def _smallest_text(smallest: Smallest) -> str:
+    share = f"{100.0 * smallest.share:.2g} % of the pump's flow"
+    size = share if smallest.lpm is None else f"{smallest.lpm:.2g} L/min, {share}"
+    return f"the next recording shows {size} ({POWER:.0%} of the time)"
+
+
+def _half_text(smallest: Smallest, count: int) -> str:
+    if smallest.halved_by is not None:
+        return f"{smallest.halved_by} healthy recordings instead of {count}"
+    return "twice the pressure difference at the same flow; more recordings alone do not"
+
+
+def _collected(found: Sequence[tuple[str, Sequence[str]]]) -> list[str]:
+    """Return what is wrong, each kind of it once, with the file or the number of files."""
+    files: dict[str, list[tuple[str, str]]] = {}
+    for file, texts in found:
+        for text in texts:
+            files.setdefault(text.partition(":")[0], []).append((text, file))
+    return [
+        f"{max(own)[0]} ({own[0][1] if len(own) == 1 else f'in {len(own)} of {len(found)}'})" for own in files.values()
+    ]
+
+
+def _noise(values: Array) -> float:
+    """Return the standard deviation of white noise by the second differences, without what is far off."""
+    second = np.diff(values[np.isfinite(values)], 2)
+    return _rounded(float(np.median(np.abs(second))) / 0.6745 / np.sqrt(6.0)) if second.size else 0.0
+
+
+def _below_vacuum(part: Recording, name: str) -> str:
+    if part.units[name] != "Pa" or not (least := float(np.quantile(part[name], 0.01))) < -ATMOSPHERE:
+        return ""
+    off = (-ATMOSPHERE - least) / 1e5
+    return f"{name} reads below vacuum: its zero is at least {off:.1g} bar too low"
+
+
+def _glitches(part: Recording, name: str) -> str:
+    """Return how many samples jump away and back by far more than all others."""
+    values = part[name]
+    if len(values) < 3:
+        return ""
+    middle = np.median([values[:-2], values[1:-1], values[2:]], axis=0)
+    away = np.abs(values[1:-1] - middle)
+    span = float(np.subtract(*np.quantile(values, (0.99, 0.01))))
+    jumped = int(np.count_nonzero(away > span)) if span > 0.0 else 0
+    return f"{name} has glitches: single samples jump beyond its whole range, and are weighted down" if jumped else ""
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def _span(dates: Sequence[float]) -> str:
+    first, last = (datetime.fromtimestamp(at, UTC).date().isoformat() for at in (dates[0], dates[-1]))
+    return first if first == last else f"{first} to {last}"
+
+
+def _ranges(known: Sequence[Mapping[str, Any]], rows: Sequence[tuple[str, str]]) -> str:
+    texts = []
+    for name, unit in rows:
+        values = [own[name] for own in known if name in own]
+        if values:
+            low, high = min(values), max(values)
+            texts.append(f"{low:.3g} {unit}" if f"{low:.3g}" == f"{high:.3g}" else f"{low:.3g} to {high:.3g} {unit}")
+    return ", ".join(texts)
+
+
+def _shown(noise: Mapping[str, float], healthy: Learnt) -> list[tuple[str, float, str]]:
+    usual = {"Pa": ("bar", 1e5), "m": ("mm", 1e-3)}
+    shown = []
+    for name, value in noise.items():
+        unit, size = usual.get(healthy.units.get(name, ""), (healthy.units.get(name, ""), 1.0))
+        shown.append((name, value / size, unit))
+    return shown

@@ -1,0 +1,57 @@
+"""What a healthy recording teaches the detectors, in place of its samples: so a machine is commissioned once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from sealscope.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from sealscope.diagnosis.detector import Detector
+
+#: What a detector has learnt of a healthy recording, as plain values; the detector alone reads it.
+Lesson = Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """What a healthy recording has taught.
+
+    Parameters
+    ----------
+    file : str
+        Name of its file.
+    digest : str
+        Hash of its chamber pressures in hexadecimal digits, by which copies are known.
+    units : mapping of str to str
+        Units by channel.
+    rate, seconds : float
+        Sampling rate [Hz], and length [s].
+    start_s : float or None
+        When its first sample was taken [s since 1970].
+    lessons : mapping of str to Lesson
+        By the names of the detectors that could use the recording.
+    """
+
+    file: str
+    digest: str
+    units: Mapping[str, str]
+    rate: float
+    seconds: float
+    start_s: float | None
+    lessons: Mapping[str, Lesson]
+
+
+#: A healthy recording, or what it taught.
+Healthy = Recording | Learnt
+
+
+def lessons_of(detector: Detector, baseline: Sequence[Healthy]) -> list[Lesson]:
+    """Return what a detector has learnt of each healthy recording, from its samples or from what was written down."""
+    known = (
+        own.lessons.get(detector.name) if isinstance(own, Learnt) else detector.learn(own)  # type: ignore[attr-defined]
+        for own in baseline
+    )
+    return [lesson for lesson in known if lesson is not None]

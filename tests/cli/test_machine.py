@@ -1,0 +1,53 @@
+"""`sealscope commission`, and a folder judged by `--machine`."""
+
+from __future__ import annotations
+
+import pytest
+
+import sealscope as ss
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("healthy")
+    for seed in range(1, 4):
+        ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=seed), folder / f"run{seed}.nc")
+    return folder
+
+
+def test_a_folder_is_judged_a_line_a_recording(call, healthy, tmp_path):
+    file, suspect = tmp_path / "actuator7.toml", tmp_path / "suspect"
+    suspect.mkdir()
+    done = call("commission", healthy, "-o", file, "--rig", "thesis", "--limit", "3 mL/min")
+    assert (done.status, done.err) == (0, "")
+    assert "smallest leak" in done.out
+    assert max(map(len, done.out.splitlines()[1:])) <= 80
+    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=8), suspect / "good.nc")
+    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=9, leak="0.05 L/min"), suspect / "bad.nc")
+    (suspect / "page.html").write_text("Sealscope's own")
+    done = call("diagnose", suspect, "--machine", file, "--fail-on", "leak")
+    assert done.status == 3
+    lines = [line for line in done.out.splitlines() if not line.startswith(" ")]
+    assert [line.split()[0] for line in lines] == ["bad.nc", "good.nc"]
+    assert " leak " in lines[0]
+    assert "L/min (" in lines[0]
+    assert "none above" in lines[1]
+    assert max(map(len, done.out.splitlines())) <= 100
+
+
+def test_a_recording_is_added_and_the_old_file_kept(call, healthy, tmp_path):
+    file, new = tmp_path / "m.toml", tmp_path / "new.nc"
+    call("commission", healthy, "-o", file)
+    before = file.read_bytes()
+    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=5), new)
+    assert "4 healthy" in call("commission", new, "-o", file, "--add").out
+    assert (tmp_path / "m.toml.bak").read_bytes() == before
+    assert "must be new" in call("commission", new, "-o", file, "--add").refused()
+    assert "which exists" in call("commission", new, "-o", file).refused()
+
+
+def test_what_the_machine_states_is_not_stated_twice(call, healthy, tmp_path):
+    file = tmp_path / "m.toml"
+    call("commission", healthy, "-o", file)
+    refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rig", "thesis").refused()
+    assert "--rig must not stand beside --machine" in refused

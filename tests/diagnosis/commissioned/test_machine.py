@@ -1,0 +1,137 @@
+"""A machine commissioned once judges as the healthy recordings themselves would."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sealscope as ss
+from sealscope.errors import InputError
+
+
+def figures(diagnosis: ss.Diagnosis) -> tuple:
+    return diagnosis.verdict, diagnosis.score, diagnosis.leak_lpm, diagnosis.bound_lpm, diagnosis.cause
+
+
+@settings(max_examples=4, deadline=None)
+@given(
+    leak=st.sampled_from(["none", "0.002 L/min", "0.02 L/min", "0.05 L/min from 10 s"]),
+    channels=st.sampled_from([None, ("u", "p_A", "p_B")]),
+    seed=st.integers(10, 99),
+)
+def test_the_file_judges_as_the_recordings_do(folder, file, by_pressures, leak, channels, seed):
+    """All methods, with every digit, whichever channels the judged recording has."""
+    recording = ss.simulate(command="3 sin(4t)", duration="20 s", leak=leak, seed=seed)
+    healthy = [ss.read(path) for path in sorted(folder.iterdir())]
+    machine = ss.load_machine(file)
+    if channels is not None:
+        recording, healthy = recording.only(channels), [own.only(channels) for own in healthy]
+        machine = ss.load_machine(by_pressures)
+    by_file, by_recordings = machine.diagnose(recording), ss.diagnose(recording, healthy, rig="thesis")
+    assert figures(by_file) == figures(by_recordings)
+    assert [figures_of(part) for part in by_file.parts] == [figures_of(part) for part in by_recordings.parts]
+
+
+def figures_of(part) -> tuple:
+    return part.detector, part.verdict, part.score, part.threshold
+
+
+def test_the_predicted_smallest_leak_is_what_is_found(machine):
+    """Leaks of 1.3 times the size are found, of a third of it hardly ever."""
+    smallest = machine.summary.smallest.lpm
+    found = {
+        share: [
+            machine.diagnose(
+                ss.simulate(command="3 sin(4t)", duration="20 s", leak=f"{share * smallest:.6g} L/min", seed=seed),
+                quick=True,
+            ).verdict
+            == "leak"
+            for seed in range(50, 56)
+        ]
+        for share in (0.2, 1.4)
+    }
+    assert sum(found[1.4]) >= 5
+    assert sum(found[0.2]) <= 1
+
+
+def test_what_is_learnt_is_the_machine(machine):
+    summary = machine.summary
+    leak = next(term for name, term in summary.terms.items() if name.startswith("motion"))
+    assert leak.unit == "m^2"
+    assert leak.value == pytest.approx(633e-6, rel=0.02)
+    assert summary.noise["p_A"] == pytest.approx(1.25 * 6894.76, rel=0.2)
+    assert summary.problems == []
+    assert str(machine).count("\n") < 15
+
+
+def test_a_recording_that_is_not_like_the_others_is_named(folder, tmp_path):
+    leaking = tmp_path / "bad.nc"
+    ss.write(ss.simulate(command="3 sin(4t)", duration="20 s", leak="0.1 L/min", seed=9), leaking)
+    machine = ss.commission([*sorted(folder.iterdir()), leaking], rig="thesis")
+    assert any("bad.nc is not like the others" in problem for problem in machine.summary.problems)
+
+
+def test_a_zero_below_vacuum_and_glitches_are_named(folder, tmp_path):
+    recording = ss.read(folder / "run1.nc")
+    omega = recording["omega"].copy()
+    omega[::500] += 3e4
+    wrong = ss.Recording(
+        recording.t,
+        {**recording.channels, "p_B": recording["p_B"] - 8e5, "omega": omega},
+        dict(recording.units),
+        recording.rate,
+    )
+    ss.write(wrong, tmp_path / "wrong.nc")
+    problems = " ".join(ss.commission(tmp_path / "wrong.nc", rig="thesis").summary.problems)
+    assert "p_B reads below vacuum" in problems
+    assert "omega has glitches" in problems
+
+
+def test_a_recording_is_added_once_and_never_a_leaking_one(machine, folder):
+    new = ss.simulate(command="3 sin(4t)", duration="20 s", seed=30)
+    assert len(machine.with_healthy(new).healthy) == 5
+    with pytest.raises(InputError, match="must be new"):
+        machine.with_healthy(ss.read(folder / "run1.nc"))
+    with pytest.raises(InputError, match="must not leak"):
+        machine.with_healthy(ss.simulate(command="3 sin(4t)", duration="20 s", leak="0.1 L/min", seed=31))
+
+
+def test_the_map_of_raw_counts_goes_with_the_machine(folder, tmp_path):
+    """A log of another program, in counts of its converter, is read by the machine's file alone."""
+    recording = ss.read(folder / "run1.nc")
+    rows = np.column_stack([recording.t, recording["p_A"] / 1e5 / 0.0625 + 10, recording["p_B"] / 1e5, recording["u"]])
+    log = tmp_path / "log.csv"
+    np.savetxt(log, rows, delimiter=",", header="time,ch2,p_rod_bar,volts", comments="", fmt="%.12g")
+    columns = {"t": "time s", "p_A": "ch2*0.0625-0.625 bar", "p_B": "p_rod_bar", "u": "volts V"}
+    machine = ss.commission(log, rig="thesis", map=columns)
+    ss.write_machine(machine, tmp_path / "counts.toml")
+    again = ss.load_machine(tmp_path / "counts.toml").read(log)
+    np.testing.assert_allclose(again["p_A"], recording["p_A"], rtol=1e-9, atol=1.0)
+
+
+HOSTILE = {
+    "format = 1": ("format = 7", "machine.format must be 1, got 7"),
+    'name = "actuator7"': ("name = 7", "name must be a text, got 7"),
+    "seconds = 20": ("seconds = nan\nlater = 20", "seconds must be a finite number, got nan"),
+    'digest = "': ('digest = 3 # "', "digest must be a text, got 3"),
+    "\npressure = ": ("\npressure = inf # ", "pressure must be a finite number"),
+    "sums = [[[": ("sums = [[[[", "must be TOML"),
+    'terms = ["': ('terms = ["x", "', "sums must be of the shape"),
+    "levels = [": ('levels = ["a", ', "levels must hold numbers"),
+}
+
+
+@pytest.mark.parametrize("part", HOSTILE)
+def test_a_hostile_file_is_refused_in_one_line(file, tmp_path, part):
+    wrong, rule = HOSTILE[part]
+    text = file.read_text()
+    assert part in text
+    path = tmp_path / "hostile.toml"
+    path.write_text(text.replace(part, wrong, 1))
+    with pytest.raises(InputError) as caught:
+        ss.load_machine(path)
+    assert rule in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "hostile.toml" in str(caught.value)
