@@ -139,10 +139,27 @@ def type_reference() -> str:
     return "\n".join(lines)
 
 
+def parameters() -> str:
+    """Return the reference of a rig's parameters, from their declarations; the transducers have the same ones."""
+    lines = ["# Parameters", "", "`sealscope parameters RIG` prints their values, each with its source.", ""]
+    lines += ["`sensors.p_1`, `sensors.p_2` and `sensors.p_B` have the parameters of `sensors.p_A`.", ""]
+    part = ""
+    for row in sealscope.load_rig("thesis").table():
+        head, _, symbol = row.name.rpartition(".")
+        if head in ("sensors.p_1", "sensors.p_2", "sensors.p_B"):
+            continue
+        if head != part:
+            lines += ["", f"## {head}", "", "| name | unit | meaning |", "| --- | --- | --- |"]
+        part = head
+        lines.append(f"| `{symbol}` | {row.unit} | {row.meaning} |")
+    return "\n".join(lines) + "\n"
+
+
 def _write(_app: object) -> None:
     _GENERATED.mkdir(exist_ok=True)
-    for name, text in (("cli.md", command_line()), ("api.md", public_names()), ("types.md", type_reference())):
-        (_GENERATED / name).write_text(text, encoding="utf-8")
+    pages = {"cli": command_line(), "api": public_names(), "types": type_reference(), "parameters": parameters()}
+    for name, text in pages.items():
+        (_GENERATED / f"{name}.md").write_text(text, encoding="utf-8")
 
 
 def setup(app: object) -> None:

@@ -134,7 +134,7 @@ def test_prose_wraps_at_120_columns() -> None:
     assert long == []
 
 
-#: Most lines of a decision record: a page. Longer tables stand in `docs/notes` and `docs/results.md`.
+#: Most lines of a decision record: a page. Longer tables stand in `docs/results.md`.
 PAGE = 60
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("0*.md"))
 

@@ -145,8 +145,6 @@ def test_another_source_is_another_fingerprint(install: Install) -> None:
 
 def test_the_guide_shows_the_example_as_it_stands() -> None:
     guide = (EXAMPLE.parents[1] / "detectors.md").read_text(encoding="utf-8")
-    source = (EXAMPLE / "ringing_energy.py").read_text(encoding="utf-8")
-    assert source[source.index("class RingingEnergy") :].rstrip() in guide
     project = (EXAMPLE / "pyproject.toml").read_text(encoding="utf-8")
     assert all(line in project for line in guide.split("```toml\n")[1].split("```")[0].splitlines())
     plan = (EXAMPLE / "judge.toml").read_text(encoding="utf-8")
