@@ -112,22 +112,22 @@ def recording_of(run: SimulatedRun, test: ShownTest) -> Recording:
 
 def figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw one of Figs. 5.1 to 5.89, by the item's test, view, chamber and stretch of time."""
-    test = TESTS[str(item.input("test"))]
+    test = TESTS[str(item.inputs["test"])]
     run = context.run(spec_of(test))
     view = FigureView(run, recording_of(run, test), test, (_number(item, "from_s"), _number(item, "to_s")))
-    chamber = str(item.input("chamber"))
+    chamber = str(item.inputs["chamber"])
     draw: dict[str, Callable[[], tuple[tuple[Panel, ...], tuple[Number, ...]]]] = {
         "input": view.inputs,
         "leak": view.leak,
         "details": lambda: view.details(chamber),
         "rms": lambda: view.windowed_rms(chamber),
     }
-    panels, numbers = draw[str(item.input("view"))]()
+    panels, numbers = draw[str(item.inputs["view"])]()
     return (Figure(item.id, item.title, panels, numbers, resolved=run.resolved, notes=view.notes()),)
 
 
 def _number(item: Item, name: str) -> float:
-    return float(item.input(name))  # type: ignore[arg-type]
+    return float(item.inputs[name])
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,7 +364,7 @@ def _item(test: ShownTest, number: int, view: View, chamber: str, closeup: bool)
         "figure",
         f"Test {test.section}, {test.command}, {test.level} leak: {content}, {when}",
         figure,
-        (("test", test.section), ("view", view), ("chamber", chamber), ("from_s", start), ("to_s", stop)),
+        {"test": test.section, "view": view, "chamber": chamber, "from_s": start, "to_s": stop},
     )
 
 

@@ -227,6 +227,7 @@ ITEMS: tuple[Item, ...] = (
         "table",
         "Success rates of Table 5.1, counted anew, with intervals and false alarms",
         table,
+        uses_sheet=True,
         needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
     ),
 )

@@ -141,7 +141,7 @@ def appendix(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the change of a detail's RMS against the mean leak: measured, simulated, simulated without a leak."""
-    chamber, name, direction = (str(item.input(key)) for key in ("chamber", "detail", "way"))
+    chamber, name, direction = (str(item.inputs[key]) for key in ("chamber", "detail", "way"))
     table, sheet = simulated_sheet(context, "appendix-c-leak")
     leak = np.array([row.mean_leak_lpm for row in APPENDIX_C])
     sources: list[tuple[DataSheet | None, str, Role]] = [
@@ -177,7 +177,15 @@ ITEMS: tuple[Item, ...] = (
     Item("appendix-c-leak", 5, "case", "The 41 tests of Appendix C simulated with their leak", leak_table),
     Item("appendix-c-no-leak", 5, "case", "The same 41 tests simulated with no leak", no_leak_table),
     Item("appendix-c-drift", 5, "case", "The same 41 tests simulated with no leak on a rig that drifts", drift_table),
-    Item("appendix-c", 5, "table", "Appendix C, simulated beside measured", appendix, needs=("appendix-c-leak",)),
+    Item(
+        "appendix-c",
+        5,
+        "table",
+        "Appendix C, simulated beside measured",
+        appendix,
+        needs=("appendix-c-leak",),
+        uses_sheet=True,
+    ),
     *(
         Item(
             figure,
@@ -185,7 +193,8 @@ ITEMS: tuple[Item, ...] = (
             "figure",
             f"Change of the RMS of {name} of {chamber} against the mean leak",
             difference_figure,
-            inputs=(("chamber", chamber), ("detail", name), ("way", direction)),
+            inputs={"chamber": chamber, "detail": name, "way": direction},
+            uses_sheet=True,
             needs=("appendix-c-leak", "appendix-c-no-leak"),
         )
         for figure, chamber, name, direction in DIFFERENCES

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from sealscope.thesis.chapters.chapter4.cases import (
 )
 from sealscope.thesis.chapters.chapter4.friction import friction_models, stribeck_curve
 from sealscope.thesis.engine.context import Context, SimulatedRun
-from sealscope.thesis.engine.items import Input, Item
+from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable, thinned
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -62,12 +63,12 @@ _CLAIMS: dict[str, tuple[str, ...]] = {
 
 def reading_of(item: Item) -> Reading:
     """Return the reading of the equations that an item asks for."""
-    return Reading(**{field.name: item.input(field.name) for field in fields(Reading)})  # type: ignore[arg-type]
+    return Reading(**{field.name: item.inputs[field.name] for field in fields(Reading)})
 
 
 def _case_of(context: Context, item: Item) -> tuple[SolverPair, str]:
     """Run the case of Table 4.2 or 4.3 that an item shows; return it with the notes on it."""
-    case, reading = CASES[str(item.input("case"))], reading_of(item)
+    case, reading = CASES[str(item.inputs["case"])], reading_of(item)
     pair = run_pair(context, case.command, case.closed_pct, reading)
     return pair, _notes(pair, reading if case.closed_pct is not None else None)
 
@@ -144,7 +145,7 @@ def over_time(context: Context, item: Item) -> tuple[Figure, ...]:
     from sealscope.simulation.commands import parse_command
 
     pair, notes = _case_of(context, item)
-    command = CASES[str(item.input("case"))].command
+    command = CASES[str(item.inputs["case"])].command
     panels, numbers = [], []
     for letter, name in zip(_LETTERS, _quantities(item), strict=False):
         if name == "u":
@@ -163,7 +164,7 @@ def over_time(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _quantities(item: Item) -> list[str]:
-    return [str(name) for name in item.input("quantities")]  # type: ignore[union-attr]
+    return [str(name) for name in item.inputs["quantities"]]
 
 
 def across_orifice(context: Context, item: Item) -> tuple[Figure, ...]:
@@ -214,7 +215,7 @@ def _swept(
 
 def openings(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw one pressure at 25, 50 and 75 % closed with both solvers, and its range against the closing."""
-    name, command, reading = str(item.input("quantity")), str(item.input("command")), reading_of(item)
+    name, command, reading = str(item.inputs["quantity"]), str(item.inputs["command"]), reading_of(item)
     pairs = {closed: run_pair(context, command, closed, reading) for closed in CLOSINGS}
     solvers: tuple[Solver, ...] = ("converged", "literal")
     panels = []
@@ -277,26 +278,26 @@ def measured_only(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     return (ThesisTable(item.id, item.title, ("figure", "what it shows", "simulated", "why"), rows, (), None, notes),)
 
 
-Inputs = tuple[tuple[str, Input], ...]
+Inputs = dict[str, Any]
 
 
 def _reading_inputs(reading: Reading) -> Inputs:
-    return tuple((field.name, getattr(reading, field.name)) for field in fields(Reading))
+    return {field.name: getattr(reading, field.name) for field in fields(Reading)}
 
 
 def _figure_item(number: int, title: str, case: str, quantities: tuple[str, ...]) -> Item:
-    inputs: Inputs = (("case", case), ("quantities", quantities), *_reading_inputs(OURS))
+    inputs: Inputs = {"case": case, "quantities": quantities, **_reading_inputs(OURS)}
     make = across_orifice if number in (13, 14) else over_time
     return Item(f"fig-4.{number}", 4, "figure", f"{title}: {CASES[case].title}", make, inputs)
 
 
 def _with_printed(item: Item) -> tuple[Item, Item]:
     """Return a figure, and the same under the reading that takes the equations as printed and 3.75 mm of 5 mm open."""
-    inputs = {**dict(item.inputs), **dict(_reading_inputs(AS_PRINTED))}
+    inputs = {**item.inputs, **_reading_inputs(AS_PRINTED)}
     title = f"{item.title}, equations as printed, 3.75 mm of 5 mm open"
     if "%" not in item.title:
         title = f"{item.title}, equations as printed, closed by diameter of 5 mm"
-    return item, Item(f"{item.id}-printed", 4, "figure", title, item.make, tuple(inputs.items()))
+    return item, Item(f"{item.id}-printed", 4, "figure", title, item.make, inputs)
 
 
 def _items() -> list[Item]:
@@ -306,7 +307,7 @@ def _items() -> list[Item]:
     ]
     for case in CASES.values():
         title = f"Case {case.name[:3]} {case.name[-1]}): {case.title}"
-        inputs: Inputs = (("case", case.name), *_reading_inputs(OURS))
+        inputs: Inputs = {"case": case.name, **_reading_inputs(OURS)}
         items.append(Item(f"table-{case.name}", 4, "case", title, case_table, inputs))
     for first, name in zip((4, 6, 8), ("4.2-a", "4.2-b", "4.2-c"), strict=True):
         items.append(_figure_item(first, "Command, motor speed and displacement", name, ("u", "omega", "x")))
@@ -320,7 +321,7 @@ def _items() -> list[Item]:
             items += _with_printed(_figure_item(14, "p_2 and p_B", "4.3-a", ("p_2", "p_B")))
     places = ("pump inlet", "pump outlet", "chamber A", "chamber B")
     for number, (name, place) in enumerate(zip(PRESSURES, places, strict=True), start=33):
-        inputs = (("quantity", name), ("command", COMMAND), *_reading_inputs(OURS))
+        inputs = {"quantity": name, "command": COMMAND, **_reading_inputs(OURS)}
         title = f"{name} ({place}) over the openings, {COMMAND}"
         items += _with_printed(Item(f"fig-4.{number}", 4, "figure", title, openings, inputs))
     return [
