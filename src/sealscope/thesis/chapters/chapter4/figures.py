@@ -196,10 +196,7 @@ def _both_ends(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureCurve,
 
 
 def _swept(
-    name: str,
-    pairs: Mapping[float, SolverPair],
-    measure: Callable[[SimulatedRun], float],
-    solvers: Sequence[Solver],
+    name: str, pairs: Mapping[float, SolverPair], measure: Callable[[SimulatedRun], float], solvers: Sequence[Solver]
 ) -> tuple[tuple[FigureCurve, ...], list[Number]]:
     """Draw a measure [Pa] over what was varied, in MPa, with its numbers; `name` has a place for what was varied."""
     curves, numbers = [], []
