@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import itertools
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -71,9 +70,9 @@ def experiment_values(condition: Condition) -> dict[str, str | float]:
 
 
 def _conditions() -> Iterator[Condition]:
-    with files(__package__).joinpath("appendix_c.csv").open(encoding="utf-8", newline="") as file:
-        for number, (command, closed_pct, leak, level) in enumerate(itertools.islice(csv.reader(file), 1, None), 1):
-            yield Condition(number, command, float(closed_pct), float(leak), level)
+    _, *lines = files(__package__).joinpath("appendix_c.csv").read_text(encoding="utf-8").splitlines()
+    for number, (command, closed_pct, leak, level) in enumerate(csv.reader(lines), 1):
+        yield Condition(number, command, float(closed_pct), float(leak), level)
 
 
 #: The tests of Appendix C of "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation

@@ -15,7 +15,7 @@ import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.thesis.engine.products import ThesisTable
+from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
@@ -221,7 +221,7 @@ _COLUMNS = (
 
 def table_of(tests: list[SimulatedTest], item: str, title: str, notes: str = "") -> ThesisTable:
     """Tabulate the tests; `sheet_of` reads the table back. It is resolved when every run that was proved is."""
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for test in tests:
         of, rms = test.condition, (test.rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
         rows.append((of.number, of.command, of.closed_pct, test.happened, test.mean_leak_lpm, *test.range_MPa, *rms))
