@@ -95,6 +95,11 @@ class DataSheet:
 
     rms: Mapping[str, Mapping[str, Array]]
 
+    @property
+    def tests(self) -> int:
+        """The number of tests."""
+        return len(self.rms["p_A"]["d3"])
+
     def log_change(self, chamber: str, quantity: str) -> Array:
         """Return log(RMS with leak / RMS without) of each test, (tests,)."""
         pairs = self.rms[chamber][quantity]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -54,19 +54,17 @@ def falls_up_to(F_C: float) -> float:
 def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with Table 4.1's numbers."""
     f = thesis_rig().friction
+    F, peak, v_th = f.F_pr, f.F_pr * f.K_brk, f.v_th
     v = np.linspace(-0.1, 0.1, 801)
-    peak = f.F_pr * f.K_brk
-    step = np.array([-0.1, 0.0, 0.0, 0.1])
-    coulomb = np.array([-f.F_pr, -f.F_pr, f.F_pr, f.F_pr])
-    static_v = np.array([-0.1, 0.0, 0.0, 0.0, 0.0, 0.1])
-    static = np.array([-f.F_pr, -f.F_pr, -peak, peak, f.F_pr, f.F_pr])
-    slip_v = np.array([-0.1, -f.v_th, f.v_th, 0.1])
-    slip = np.array([-f.F_pr, -peak, peak, f.F_pr])
-    panels = (
-        Panel(*_AXES, (FigureCurve(step, coulomb, "F_C sign(v)", "reference"),), "(a) Coulomb"),
-        Panel(*_AXES, (FigureCurve(static_v, static, "F_C K_brk at rest", "reference"),), "(b) Static"),
-        Panel(*_AXES, (FigureCurve(slip_v, slip, "linear below v_th", "reference"),), "(c) Stick-slip"),
-        Panel(*_AXES, (FigureCurve(v, stribeck(v, f.F_pr), "eqs. 4.21, 4.22", "reference"),), "(d) Stribeck"),
+    sketches: dict[str, tuple[str, Any, Any]] = {
+        "(a) Coulomb": ("F_C sign(v)", [-0.1, 0.0, 0.0, 0.1], [-F, -F, F, F]),
+        "(b) Static": ("F_C K_brk at rest", [-0.1, 0.0, 0.0, 0.0, 0.0, 0.1], [-F, -F, -peak, peak, F, F]),
+        "(c) Stick-slip": ("linear below v_th", [-0.1, -v_th, v_th, 0.1], [-F, -peak, peak, F]),
+        "(d) Stribeck": ("eqs. 4.21, 4.22", v, stribeck(v, F)),
+    }
+    panels = tuple(
+        Panel(*_AXES, (FigureCurve(np.array(x), np.array(y), label, "reference"),), title)
+        for title, (label, x, y) in sketches.items()
     )
     numbers = (
         Number("Coulomb force without pressure", f.F_pr, "N"),
