@@ -35,7 +35,7 @@ from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import parse_fault, parse_leak
-from sealscope.thesis.engine.folder import ResultsFolder
+from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 from sealscope.units import parse_quantity, parse_unit
 
@@ -310,10 +310,9 @@ def _products() -> tuple[Any, ...]:
 def kept(folder: Path) -> Use:
     """What a reproduction keeps: products and notes, changed in their bytes or in their structure."""
     results = ResultsFolder(folder / "results")
-    results.keep("fig-1", False, {"key": "k"}, _products())
+    results.keep("fig-1", "k", _products(), ("figures/a.svg",))
     path = next((folder / "results" / "kept" / "items").glob("*.npz"))
     whole = path.read_bytes()
-    note = folder / "results" / "kept" / "drawn" / "fig-1.json"
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files}
 
@@ -328,17 +327,13 @@ def kept(folder: Path) -> Use:
             changed[name] = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
             with path.open("wb") as file:
                 np.savez(file, **changed)
-        tree = {"key": "k", "files": ["figures/a.svg"]}
-        change_tree(tree, draw)
-        note.write_text(json.dumps(tree))
 
         def work() -> object:
-            results.drawn("fig-1")
-            results.record("fig-1", False)
-            return results.products("fig-1", False)
+            results.files("fig-1", "k")
+            return results.products("fig-1", "k")
 
         assert taken(work)  # a damaged file is one that is not there
-        return results.products("fig-1", False) is not None
+        return results.products("fig-1", "k") is not None
 
     return use
 

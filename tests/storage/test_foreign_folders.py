@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterator
@@ -18,7 +17,7 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.storage.atomic import atomic_write, remove_temporaries
 from sealscope.storage.opening import open_inner, open_regular
 from sealscope.thesis.engine.build import reproduce
-from sealscope.thesis.engine.folder import ResultsFolder
+from sealscope.thesis.engine.kept import ResultsFolder
 
 PLAN = """
 [campaign]
@@ -79,7 +78,7 @@ def test_a_pipe_in_a_folder_is_not_waited_for(name: str, plan: SimulatedPlan, tm
         run(plan, tmp_path / "campaign", jobs=1)
 
 
-@pytest.mark.parametrize("name", ["kept", "kept/items", "kept/drawn", "kept/runs", "kept/failed", "kept/lock"])
+@pytest.mark.parametrize("name", ["kept", "kept/items", "kept/runs", "kept/failed", "kept/lock"])
 def test_a_reproduction_follows_no_link(name: str, outside: Path, tmp_path: Path) -> None:
     path = tmp_path / "thesis" / name
     path.parent.mkdir(parents=True)
@@ -98,25 +97,14 @@ def test_products_go_into_no_linked_folder(name: str, outside: Path, tmp_path: P
         publish(None, (), tmp_path / "thesis")  # type: ignore[arg-type]  # the folders are first
 
 
-def test_a_note_of_drawn_files_removes_nothing_elsewhere(outside: Path, tmp_path: Path) -> None:
-    kept = ResultsFolder(tmp_path / "thesis")
-    (tmp_path / "thesis" / "linked").symlink_to(outside)
-    names = ["../outside/diary.txt", str(outside / "diary.txt"), "linked/diary.txt", "tables/old.csv"]
-    (tmp_path / "thesis" / "tables").mkdir()
-    (tmp_path / "thesis" / "tables" / "old.csv").touch()
-    (tmp_path / "thesis" / "kept" / "drawn" / "tab-1.json").write_text(json.dumps({"key": "k", "files": names}))
-    kept.keep_drawn("tab-1", "new", ())
-    assert not (tmp_path / "thesis" / "tables" / "old.csv").exists()
-
-
 def test_a_kept_file_or_failure_is_no_link(outside: Path, tmp_path: Path) -> None:
     kept = ResultsFolder(tmp_path / "thesis")
-    for place in ("failed/tab-1.txt", "items/tab-1.npz", "drawn/tab-1.json"):
+    for place in ("failed/tab-1.txt", "items/tab-1.npz"):
         (tmp_path / "thesis" / "kept" / place).symlink_to(outside / "diary.txt")
     kept.keep_failure("tab-1", "trace")
-    kept.keep_drawn("tab-1", "key", ())
-    kept.keep("tab-2", True, {}, ())
-    assert kept.products("tab-1", False) is None
+    kept.keep("tab-2", "key", ())
+    assert kept.products("tab-1", "key") is None
+    assert kept.files("tab-1", "key") is None
     assert (tmp_path / "thesis" / "kept" / "failed" / "tab-1.txt").read_text() == "trace"
 
 

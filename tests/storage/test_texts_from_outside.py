@@ -17,7 +17,7 @@ from sealscope.recordings import split_map_option
 from sealscope.simulation.commands import Chirp, check_command, parse_command
 from sealscope.simulation.faults import FrictionChange, parse_fault, parse_leak
 from sealscope.storage.opening import names_a_file
-from sealscope.thesis.engine.folder import ResultsFolder
+from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.units import parse_quantity
 
 PLAN = '[campaign]\nname = "a"\nduration = "6 s"\ndetectors = ["rms change"]\n[[records]]\ncount = 1\n'
@@ -71,10 +71,10 @@ def test_what_no_path_can_be_is_no_file(name: str) -> None:
         load_rig(name)
 
 
-def test_a_note_of_drawn_files_with_such_a_name(tmp_path: Path) -> None:
+def test_a_kept_note_of_drawn_files_with_such_a_name(tmp_path: Path) -> None:
     kept = ResultsFolder(tmp_path)
-    (tmp_path / "kept" / "drawn" / "fig-1.json").write_text('{"key": "k", "files": ["' + "x" * 500 + '"]}')
-    assert kept.drawn("fig-1")[0] == ""
+    kept.keep("fig-1", "k", (), ("x" * 500,))
+    assert kept.files("fig-1", "k") is None
 
 
 def test_a_row_without_its_time_is_no_row(tmp_path: Path) -> None:

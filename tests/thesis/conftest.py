@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.thesis.engine import sources
 from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES
 
 CHAPTER = """
@@ -19,9 +18,6 @@ from pathlib import Path
 from sealscope.thesis.engine.context import RunSpec
 from sealscope.thesis.engine.products import Claim, FigureCurve, Figure, Panel, ThesisTable
 
-FACTOR = 1
-
-
 def _note(item):
     with open(os.environ["FAKE_LOG"], "a") as log:
         log.write(item.id + "\\n")
@@ -29,12 +25,12 @@ def _note(item):
 
 def table(context, item):
     _note(item)
-    return (ThesisTable(item.id, item.title, ("a", "b [Pa]"), ((1 * FACTOR, 2.5), ("x", None))),)
+    return (ThesisTable(item.id, item.title, ("a", "b [Pa]"), ((1, 2.5), ("x", None))),)
 
 
 def doubled(context, item):
     _note(item)
-    found = context.product("t-1")
+    found = context.product(item.needs[0])
     return (ThesisTable(item.id, item.title, ("a",), ((2 * found[0].rows[0][0],),)),)
 
 
@@ -93,31 +89,10 @@ def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("FAKE_LOG", str(tmp_path / "log"))
     monkeypatch.delenv("SEALSCOPE_SHEET", raising=False)
     monkeypatch.chdir(tmp_path)
-    _forget()
-    return package / "chapter.py"
-
-
-def _forget() -> None:
-    """Let this process see edited sources, as a new call would."""
     for name in [name for name in sys.modules if name.split(".")[0] == "fakes"]:
         del sys.modules[name]
     importlib.invalidate_caches()
-    sources.sources_key.cache_clear()
-    sources._imported.cache_clear()
-    sources._file.cache_clear()
-
-
-@pytest.fixture
-def edit(fakes: Path) -> Callable[[str, str], None]:
-    """Edit the chapter's source, as somebody would between two calls."""
-
-    def edited(old: str, new: str) -> None:
-        text = fakes.read_text()
-        assert old in text
-        fakes.write_text(text.replace(old, new))
-        _forget()
-
-    return edited
+    return package / "chapter.py"
 
 
 def _write_sheet(folder: Path, shift: float = 0.0) -> Path:

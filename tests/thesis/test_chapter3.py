@@ -15,9 +15,8 @@ from sealscope.thesis.chapters.chapter3 import (
     wavelet_spectrum,
 )
 from sealscope.thesis.claims import chapter3 as chapter3_claims
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
 from sealscope.thesis.engine.products import Claim, Figure, verdict_of
-from sealscope.thesis.engine.runs import experiment_of, simulated_run
 
 
 class Kept:
@@ -31,7 +30,7 @@ class Kept:
 
     def run(self, spec: RunSpec) -> SimulatedRun:
         if spec not in self.runs:
-            self.runs[spec] = simulated_run(spec, experiment_of(spec))
+            self.runs[spec] = simulated_run(spec.experiment(), spec.prove)
         return self.runs[spec]
 
     def product(self, item: str) -> tuple[Figure | Claim, ...]:

@@ -32,10 +32,9 @@ from sealscope.thesis.chapters.chapter4.cases import (
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold
 from sealscope.thesis.claims import chapter4 as chapter4_claims
 from sealscope.thesis.claims.chapter4 import ringing, sine_fit
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun
-from sealscope.thesis.engine.items import Item, check
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
+from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, ThesisTable
-from sealscope.thesis.engine.runs import experiment_of, simulated_run
 
 
 class Kept:
@@ -49,7 +48,7 @@ class Kept:
 
     def run(self, spec: RunSpec) -> SimulatedRun:
         if spec not in self.runs:
-            self.runs[spec] = simulated_run(spec, experiment_of(spec))
+            self.runs[spec] = simulated_run(spec.experiment(), spec.prove)
         return self.runs[spec]
 
     def product(self, item: str) -> tuple[Figure | ThesisTable | Claim, ...]:
@@ -90,15 +89,14 @@ def test_cases_are_those_of_tables_4_2_and_4_3() -> None:
 
 
 def test_every_simulated_figure_and_case_has_an_item() -> None:
-    check(ALL.values())
     measured = {15, 16, 37, 38, 39, 40}
     figures = {f"fig-4.{n}" for n in range(2, 41) if n not in measured}
     assert figures <= ALL.keys()
     assert not {f"fig-4.{n}" for n in measured} & ALL.keys()
     assert {f"table-{name}" for name in CASES} <= ALL.keys()
     assert all(item.chapter == 4 for item in ALL.values())
-    assert ALL["fig-4.26"].input("case") == "4.3-f"
-    assert ALL["fig-4.17"].input("quantities") == ("p_1", "p_2")
+    assert ALL["fig-4.26"].inputs["case"] == "4.3-f"
+    assert ALL["fig-4.17"].inputs["quantities"] == ("p_1", "p_2")
 
 
 def test_measured_only_figures_are_listed(kept: Kept) -> None:
@@ -110,7 +108,7 @@ def test_measured_only_figures_are_listed(kept: Kept) -> None:
 
 @pytest.mark.parametrize("reading", READINGS, ids=lambda one: one.title)
 def test_a_reading_sets_what_it_says(reading: Reading) -> None:
-    rig = experiment_of(spec("5 sin(2t)", 25.0, reading)).rig
+    rig = spec("5 sin(2t)", 25.0, reading).experiment().rig
     free = 0.92 * math.pi / 4.0 * (reading.d_line_mm * 1e-3) ** 2 * math.sqrt(2.0 / 847.0)
     tight = free * (0.75 if reading.closed_means == "area" else 0.5625)
     expected = (free, tight, tight, free) if reading.metering == "literal" else (free, tight, free, tight)
@@ -156,7 +154,7 @@ def test_with_orifices_it_is_not_and_the_figure_says_so(kept: Kept) -> None:
 
 def test_the_converged_drop_is_the_orifice_s(kept: Kept) -> None:
     run = of_case(kept, "4.3-i").converged
-    c = throttle_coefficients(experiment_of(spec("7 sin(4t)", 75.0)).rig)
+    c = throttle_coefficients(spec("7 sin(4t)", 75.0).experiment().rig)
     drop, flow = steady_output(run, "p_1") - steady_output(run, "p_A"), steady_output(run, "Q_A")
     assert drop.min() == pytest.approx(-((flow.min() / c[1]) ** 2), rel=1e-3)
     assert drop.max() == pytest.approx((flow.max() / c[0]) ** 2, rel=1e-3)
@@ -215,7 +213,7 @@ def test_a_figure_follows_the_reading_of_its_item(kept: Kept) -> None:
     assert usual[key] < 0 < printed[key]
     narrow = replace(
         ALL["fig-4.14"],
-        inputs=tuple({**dict(ALL["fig-4.14"].inputs), "d_line_mm": 5.0, "closed_means": "diameter"}.items()),
+        inputs={**ALL["fig-4.14"].inputs, "d_line_mm": 5.0, "closed_means": "diameter"},
     )
     assert chapter4.reading_of(narrow) == Reading(d_line_mm=5.0, closed_means="diameter")
     assert abs(numbers(make(kept, narrow)[0])[key]) > 3.0 * abs(usual[key])

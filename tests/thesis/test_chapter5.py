@@ -99,12 +99,12 @@ def test_each_number_shows_what_the_thesis_s_caption_says() -> None:
         if caption.startswith("Close-up"):
             start, stop = map(int, re.search(r"from (\d+)th to (\d+)th", caption).groups())  # type: ignore[union-attr]
             views[number] = (*views[source][:2], True)
-            assert (item(number).input("from_s"), item(number).input("to_s")) == (start, stop)
+            assert (item(number).inputs["from_s"], item(number).inputs["to_s"]) == (start, stop)
         elif caption.startswith("Experimental input"):
             views[number] = ("input", "", False)
         elif "level of internal leakage" in caption:
             views[number] = ("leak", "", False)
-            assert caption.split()[0].lower() == TESTS[str(item(number).input("test"))].level
+            assert caption.split()[0].lower() == TESTS[str(item(number).inputs["test"])].level
         elif caption.startswith("Four-level detail"):
             chamber = f"p_{re.search(r'of P_([AB])', caption)[1]}"  # type: ignore[index]
             views[number] = ("details", chamber, False)
@@ -115,8 +115,8 @@ def test_each_number_shows_what_the_thesis_s_caption_says() -> None:
     assert sorted(views) == list(range(1, 90))
     for number, (view, chamber, closeup) in views.items():
         one = item(number)
-        assert (one.input("view"), one.input("chamber")) == (view, chamber), one.id
-        assert (one.input("from_s") != 0.0) == closeup, one.id
+        assert (one.inputs["view"], one.inputs["chamber"]) == (view, chamber), one.id
+        assert (one.inputs["from_s"] != 0.0) == closeup, one.id
 
 
 def test_the_row_of_a_test_is_the_one_nearest_to_the_level_s_nominal_leak() -> None:

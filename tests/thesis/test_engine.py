@@ -1,29 +1,29 @@
-"""The engine of the reproduction: the list of items, what is kept between calls, when it is out of date, and calls that
-are broken off, fail or lose a process."""
+"""The loop of the reproduction: the list of items, what is kept between calls, when it is out of date, and calls
+that are broken off, fail or lose a process."""
 
 from __future__ import annotations
 
 import importlib
 import os
-import pkgutil
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import sealscope.thesis
 from sealscope.errors import InputError
-from sealscope.thesis.engine import serialization, sources
+from sealscope.thesis.engine import build
 from sealscope.thesis.engine.build import Reproduction, reproduce
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun
-from sealscope.thesis.engine.folder import ResultsFolder
-from sealscope.thesis.engine.items import MODULES, Item, check, collect, select_items, with_needed
+from sealscope.thesis.engine.context import RunSpec, simulated_run
+from sealscope.thesis.engine.items import Item, collect, select_items, with_needed
+from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 from sealscope.thesis.sheet import MISSING
 
@@ -42,8 +42,8 @@ def bare(name: str, *needs: str, chapter: int = 4) -> Item:
     return Item(name, chapter, "table", f"Item {name}", nothing, needs=needs)
 
 
-def item(name: str, make: str, *needs: str, needs_sheet: bool = False) -> Item:
-    return Item(name, 4, "table", f"Item {name}", maker(make), needs=needs, needs_sheet=needs_sheet)
+def item(name: str, make: str, *needs: str, **sheet: bool) -> Item:
+    return Item(name, 4, "table", f"Item {name}", maker(make), needs=needs, **sheet)
 
 
 def worked(tmp_path: Path) -> list[str]:
@@ -76,33 +76,18 @@ def test_an_unknown_id_names_the_closest() -> None:
         select_items((bare("fig-5.1"), bare("t-1")), ["fig-5.9"])
 
 
-@pytest.mark.parametrize(
-    ("items", "words"),
-    [
-        ((bare("t-1"), bare("t-1")), "t-1 twice"),
-        ((bare("t-1", "t-2"),), "t-2 (t-1)"),
-        ((bare("t-1", "t-2"), bare("t-2", "t-1")), "t-1 -> t-2 -> t-1"),
-        ((bare("T 1"),), "'T 1'"),
-    ],
-)
-def test_a_list_that_contradicts_itself_is_refused(items: tuple[Item, ...], words: str) -> None:
-    with pytest.raises(ValueError, match="must") as error:
-        check(items)
-    assert words in str(error.value)
+def test_ids_are_unique_file_names_and_what_is_needed_exists_without_a_circle() -> None:
+    items = collect()
+    assert len({of.id for of in items}) == len(items)
+    assert all(re.fullmatch(r"[a-z0-9]+([-.][a-z0-9]+)*", of.id) for of in items)
+    order = list(TopologicalSorter({of.id: of.needs for of in items}).static_order())
+    assert set(order) == {of.id for of in items}
+    assert {of.chapter for of in items} == {3, 4, 5, 6}
 
 
 def test_what_is_needed_comes_first() -> None:
     items = (bare("t-1", "t-3"), bare("t-2"), bare("t-3", "t-2"))
     assert [one.id for one in with_needed(items, items[:1])] == ["t-2", "t-3", "t-1"]
-
-
-def test_every_module_that_lists_items_is_collected() -> None:
-    offering = set()
-    for module in pkgutil.walk_packages(sealscope.thesis.__path__, "sealscope.thesis."):
-        if hasattr(importlib.import_module(module.name), "ITEMS"):
-            offering.add(module.name.removeprefix("sealscope.thesis."))
-    assert offering == set(MODULES)
-    assert {3, 4, 5, 6} == {one.chapter for one in collect()}
 
 
 # kept results
@@ -120,40 +105,37 @@ def test_a_second_call_makes_nothing(fakes: Path, tmp_path: Path) -> None:
     assert table.rows == ((2,),)
 
 
-def test_an_edited_source_makes_its_items_and_those_that_need_them_anew(
-    fakes: Path, edit: Callable[[str, str], None]
-) -> None:
-    other = fakes.with_name("other.py")
-    other.write_text(fakes.read_text())
-
-    def items() -> tuple[Item, ...]:
-        other_item = Item("t-3", 5, "table", "", maker("table", "fakes.other"))
-        return item("t-1", "table"), item("t-2", "doubled", "t-1"), other_item
-
-    reproduce(["all"], "out", items=items(), jobs=1)
-    edit("FACTOR = 1", "FACTOR = 10")
-    again = reproduce(["all"], "out", items=items(), jobs=1)
-    assert states(again) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
-    (table,) = again.products(again.statuses[1])
-    assert isinstance(table, ThesisTable)
-    assert table.rows == ((20,),)
+def test_other_sources_make_everything_anew(fakes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    items = (item("t-1", "table"), item("t-2", "doubled", "t-1"))
+    reproduce(["all"], "out", items=items, jobs=1)
+    monkeypatch.setattr(build, "sources_key", lambda: "of an edited package")
+    assert states(reproduce(["t-1"], "out", items=items, jobs=1)) == {"t-1": "made", "t-2": "not made"}
 
 
 def test_changed_inputs_and_quick_make_anew(fakes: Path, tmp_path: Path) -> None:
     one = item("t-1", "table")
     reproduce(["all"], "out", items=(one,), jobs=1)
-    changed = Item(**{**one.__dict__, "inputs": (("rate", 500.0),)})
+    changed = Item(**{**one.__dict__, "inputs": {"rate": 500.0}})
     assert states(reproduce(["all"], "out", items=(changed,), jobs=1)) == {"t-1": "made"}
     assert states(reproduce(["all"], "out", items=(changed,), jobs=1, quick=True)) == {"t-1": "made"}
     assert states(reproduce(["all"], "out", items=(changed,), jobs=1, quick=True)) == {"t-1": "kept"}
 
 
-def test_a_damaged_kept_file_is_made_anew(fakes: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["kept/items/t-1.npz", "drawn.txt"])
+def test_a_damaged_or_lost_file_is_made_anew(name: str, fakes: Path, tmp_path: Path) -> None:
+    def publish(of: Item, products: object, folder: Path) -> tuple[str, ...]:
+        (folder / "drawn.txt").write_text(of.id)
+        return ("drawn.txt",)
+
     items = (item("t-1", "table"),)
-    reproduce(["all"], "out", items=items, jobs=1)
-    (tmp_path / "out" / "kept" / "drawn" / "t-1.json").unlink()
-    (tmp_path / "out" / "kept" / "items" / "t-1.npz").write_bytes(b"PK broken")
-    assert states(reproduce(["all"], "out", items=items, jobs=1)) == {"t-1": "made"}
+    reproduce(["all"], "out", items=items, jobs=1, publish=publish)
+    assert states(reproduce(["all"], "out", items=items, jobs=1, publish=publish)) == {"t-1": "kept"}
+    if name == "drawn.txt":
+        (tmp_path / "out" / name).unlink()
+    else:
+        (tmp_path / "out" / name).write_bytes(b"PK broken")
+    assert states(reproduce(["all"], "out", items=items, jobs=1, publish=publish)) == {"t-1": "made"}
+    assert (tmp_path / "out" / "drawn.txt").read_text() == "t-1"
 
 
 def test_only_the_asked_items_and_their_needs_are_made(fakes: Path, tmp_path: Path) -> None:
@@ -184,9 +166,10 @@ def test_products_and_runs_survive_the_file(tmp_path: Path) -> None:
     figure = Figure("fig-1", "One", (panel,), numbers, ("claim-1",), False, "note")
     claim = Claim("claim-1", "section 1", "It is.", "so", "so", "holds", "why")
     table = ThesisTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.5), True)))
-    serialization.save(tmp_path / "one.npz", (figure, claim, table))
-    again = serialization.load(tmp_path / "one.npz")
-    assert again is not None
+    kept = ResultsFolder(tmp_path)
+    kept.keep("one", "key", (figure, claim, table))
+    again: Any = kept.products("one", "key")
+    assert kept.products("one", "other key") is None
     assert again[1] == claim
     assert (again[2].id, again[2].rows) == ("t-1", ((1, 2.5), ("x", None), (0.5, True)))
     panel = again[0].panels[0]
@@ -197,26 +180,21 @@ def test_products_and_runs_survive_the_file(tmp_path: Path) -> None:
     assert again[0].resolved is False
 
 
-def test_what_cannot_be_kept_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match="must hold texts, numbers and arrays, got object"):
-        serialization.save(tmp_path / "one.npz", (object(),))
-    with pytest.raises(TypeError, match="must hold numbers"):
-        serialization.save(tmp_path / "one.npz", (np.array([object()]),))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_sources_of_a_module_are_those_it_imports() -> None:
-    found = {path.name for path in sources.reached_files("sealscope.thesis.engine.runs")}
-    assert {"runs.py", "simulate.py", "experiment.py", "restrictors.py", "thesis.toml", "context.py"} <= found
-    assert not {"chapter5.py", "page.py", "verdict.py"} & found
-    reached = {path.name for path in sources.reached_files("sealscope.thesis.engine.items")}
-    assert reached == {"calls.py", "errors.py", "items.py"}
+@pytest.mark.parametrize("odd", [object(), np.array([object()])])
+def test_what_cannot_be_kept_is_refused_and_leaves_no_file(odd: Any, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="must hold texts, numbers and arrays"):
+        ResultsFolder(tmp_path).keep("one", "key", (odd,))
+    assert list((tmp_path / "kept" / "items").iterdir()) == []
 
 
 def test_without_the_sheet_items_that_need_it_are_left_out(
     fakes: Path, tmp_path: Path, write_sheet: Callable[..., Path]
 ) -> None:
-    items = (item("t-1", "measured", needs_sheet=True), item("t-2", "perhaps_measured"), item("t-3", "table"))
+    items = (
+        item("t-1", "measured", needs_sheet=True),
+        item("t-2", "perhaps_measured", uses_sheet=True),
+        item("t-3", "table"),
+    )
     without = reproduce(["all"], "out", items=items, jobs=1)
     assert states(without) == {"t-1": "left out", "t-2": "made", "t-3": "made"}
     assert without.statuses[0].reason == MISSING
@@ -234,15 +212,16 @@ def test_without_the_sheet_items_that_need_it_are_left_out(
 def test_equal_runs_are_simulated_once_and_kept_exactly(
     fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sealscope.thesis.engine import runs
-
     calls = []
-    real = runs.simulated_run
-    monkeypatch.setattr(runs, "simulated_run", lambda *given: calls.append(given) or real(*given))
-    first = reproduce(["fig-4.1"], "out", items=(item("fig-4.1", "simulated"), item("fig-4.2", "simulated")), jobs=1)
-    second = reproduce(["all"], "out", items=(item("fig-4.1", "simulated"), item("fig-4.2", "simulated")), jobs=1)
+    monkeypatch.setattr(build, "simulated_run", lambda *given: calls.append(given) or simulated_run(*given))
+    items = tuple(item(f"fig-4.{k}", make) for k, make in enumerate(("simulated", "interrupted", "simulated")))
+    with pytest.raises(KeyboardInterrupt):
+        reproduce(["all"], "out", items=items, jobs=1)
+    (tmp_path / "log.go").touch()
+    second = reproduce(["all"], "out", items=items, jobs=1)
     assert len(calls) == 1
-    (fresh,), (loaded,) = first.products(first.statuses[0]), second.products(second.statuses[1])
+    assert not (tmp_path / "out" / "kept" / "runs").exists()
+    (fresh,), (loaded,) = (second.products(second.statuses[k]) for k in (0, 2))
     assert isinstance(fresh, Figure)
     assert isinstance(loaded, Figure)
     np.testing.assert_array_equal(fresh.panels[0].curves[0].y, loaded.panels[0].curves[0].y)
@@ -250,13 +229,10 @@ def test_equal_runs_are_simulated_once_and_kept_exactly(
 
 
 def test_a_run_survives_the_file(tmp_path: Path) -> None:
-    from sealscope.thesis.engine.runs import experiment_of, simulated_run
-
-    spec = RunSpec("3 sin(4t)", 2.0)
-    run = simulated_run(spec, experiment_of(spec))
-    serialization.save(tmp_path / "run.npz", run)
-    again = serialization.load(tmp_path / "run.npz")
-    assert isinstance(again, SimulatedRun)
+    run = simulated_run(RunSpec("3 sin(4t)", 2.0).experiment(), prove=False)
+    kept = ResultsFolder(tmp_path)
+    kept.run("key", lambda: run)
+    again = kept.run("key", lambda: pytest.fail("simulated again"))
     assert run.recording is not None
     assert again.recording is not None
     assert dict(again.recording.provenance) == dict(run.recording.provenance)
@@ -295,18 +271,17 @@ def test_a_killed_call_is_taken_up_where_it_stopped(fakes: Path, tmp_path: Path,
         [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": paths}, cwd=tmp_path, stderr=subprocess.DEVNULL
     )
     end = time.monotonic() + 60
-    while len(list((tmp_path / "out" / "kept" / "drawn").glob("*.json"))) < 3 and time.monotonic() < end:
+    while len(list((tmp_path / "out" / "kept" / "items").glob("*.npz"))) < 3 and time.monotonic() < end:
         assert call.poll() is None
         time.sleep(0.02)
     call.send_signal(how)
     call.wait(20)
     time.sleep(1.0)  # workers of a killed parent end with it
-    finished = {path.stem for path in (tmp_path / "out" / "kept" / "drawn").glob("*.json")}
+    finished = {path.stem for path in (tmp_path / "out" / "kept" / "items").glob("*.npz")}
     assert 3 <= len(finished) < 8
     again = reproduce(["all"], "out", items=tuple(item(name, "slow") for name in names), jobs=2)
     assert {name for name, state in states(again).items() if state == "kept"} == finished
-    # "drawn": killed between the product and the note on its drawing
-    assert {name for name, state in states(again).items() if state in ("made", "drawn")} == set(names) - finished
+    assert {name for name, state in states(again).items() if state == "made"} == set(names) - finished
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

@@ -76,7 +76,6 @@ def _summarise(reproduction: Reproduction, page: Path) -> None:
         complain(f"{status.item.id} failed: {status.reason}")
     counts = {
         "made": len(reproduction.among("made")),
-        "drawn anew": len(reproduction.among("drawn")),
         "kept from before": len(reproduction.among("kept")),
         "failed": len(reproduction.among("failed")),
     }

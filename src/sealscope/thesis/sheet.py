@@ -9,17 +9,16 @@ import csv
 import hashlib
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.recording import Array
 
-Level = Literal["extra-small", "small", "medium", "large"]
 #: Columns of the sheet: RMS of the details of a chamber's pressure and of the product of the third and the fourth.
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Units of the columns. The sheet names none; it is taken to be in psi.
@@ -49,7 +48,7 @@ class Condition:
     command: str
     closed_pct: float
     mean_leak_lpm: float
-    level: Level
+    level: str
 
     @property
     def group(self) -> tuple[str, float]:
@@ -70,51 +69,15 @@ def experiment_values(condition: Condition) -> dict[str, str | float]:
     return values
 
 
+def _conditions() -> Iterator[Condition]:
+    _, *lines = files(__package__).joinpath("appendix_c.csv").read_text(encoding="utf-8").splitlines()
+    for number, (command, closed_pct, leak, level) in enumerate(csv.reader(lines), 1):
+        yield Condition(number, command, float(closed_pct), float(leak), level)
+
+
 #: The tests of Appendix C of "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation
 #: Systems", in its order.
-APPENDIX_C: tuple[Condition, ...] = (
-    Condition(1, "8 sin(t)", 50.0, 0.0042, "extra-small"),
-    Condition(2, "8 sin(t)", 25.0, 0.0047, "extra-small"),
-    Condition(3, "8 sin(t)", 25.0, 0.0048, "extra-small"),
-    Condition(4, "8 sin(t)", 50.0, 0.0048, "extra-small"),
-    Condition(5, "7 sin(4t)", 75.0, 0.0051, "extra-small"),
-    Condition(6, "7 sin(4t)", 75.0, 0.0055, "extra-small"),
-    Condition(7, "5 sin(2t)", 75.0, 0.0057, "extra-small"),
-    Condition(8, "5 sin(2t)", 75.0, 0.0062, "extra-small"),
-    Condition(9, "5 sin(2t)", 50.0, 0.0067, "extra-small"),
-    Condition(10, "5 sin(2t)", 50.0, 0.0071, "extra-small"),
-    Condition(11, "3 sin(4t)", 75.0, 0.0071, "extra-small"),
-    Condition(12, "3 sin(4t)", 75.0, 0.0073, "extra-small"),
-    Condition(13, "8 sin(t)", 0.0, 0.0074, "small"),
-    Condition(14, "7 sin(4t)", 50.0, 0.0077, "extra-small"),
-    Condition(15, "7 sin(4t)", 50.0, 0.0078, "extra-small"),
-    Condition(16, "7 sin(4t)", 25.0, 0.0081, "extra-small"),
-    Condition(17, "7 sin(4t)", 25.0, 0.0084, "extra-small"),
-    Condition(18, "5 sin(2t)", 25.0, 0.0085, "extra-small"),
-    Condition(19, "5 sin(2t)", 25.0, 0.0087, "extra-small"),
-    Condition(20, "7 sin(4t)", 0.0, 0.0092, "extra-small"),
-    Condition(21, "8 sin(t)", 0.0, 0.0095, "medium"),
-    Condition(22, "8 sin(t)", 0.0, 0.0096, "small"),
-    Condition(23, "5 sin(2t)", 0.0, 0.0097, "extra-small"),
-    Condition(24, "8 sin(t)", 0.0, 0.0103, "large"),
-    Condition(25, "7 sin(4t)", 0.0, 0.0108, "small"),
-    Condition(26, "3 sin(4t)", 50.0, 0.0112, "extra-small"),
-    Condition(27, "3 sin(4t)", 50.0, 0.0113, "extra-small"),
-    Condition(28, "5 sin(2t)", 0.0, 0.012, "small"),
-    Condition(29, "3 sin(4t)", 25.0, 0.0132, "extra-small"),
-    Condition(30, "3 sin(4t)", 25.0, 0.0135, "extra-small"),
-    Condition(31, "5 sin(2t)", 0.0, 0.0139, "large"),
-    Condition(32, "3 sin(4t)", 0.0, 0.014, "extra-small"),
-    Condition(33, "7 sin(4t)", 0.0, 0.0144, "medium"),
-    Condition(34, "7 sin(4t)", 0.0, 0.0145, "large"),
-    Condition(35, "3 sin(4t)", 0.0, 0.0152, "small"),
-    Condition(36, "7 sin(4t)", 0.0, 0.0156, "medium"),
-    Condition(37, "3 sin(4t)", 0.0, 0.0159, "medium"),
-    Condition(38, "3 sin(4t)", 0.0, 0.016, "medium"),
-    Condition(39, "3 sin(4t)", 0.0, 0.0163, "large"),
-    Condition(40, "5 sin(2t)", 0.0, 0.0163, "medium"),
-    Condition(41, "5 sin(2t)", 0.0, 0.0185, "medium"),
-)
+APPENDIX_C: tuple[Condition, ...] = tuple(_conditions())
 
 
 def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, float], ...]:
@@ -131,6 +94,11 @@ class DataSheet:
     """
 
     rms: Mapping[str, Mapping[str, Array]]
+
+    @property
+    def tests(self) -> int:
+        """The number of tests."""
+        return len(self.rms["p_A"]["d3"])
 
     def log_change(self, chamber: str, quantity: str) -> Array:
         """Return log(RMS with leak / RMS without) of each test, (tests,)."""
@@ -202,8 +170,11 @@ def _positive(row: dict[str, str], column: str, number: int, path: Path) -> floa
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
     leak, amplitude, omega = (_positive(row, column, condition.number, path) for column in _CONDITION[:3])
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"
-    given = (command, _number(row["orifice_closed_pct"]), leak, (row["leakage_level"] or "").strip())
-    expected = (condition.command, condition.closed_pct, condition.mean_leak_lpm, condition.level)
-    if given != expected:
-        wanted, got = ("{!r}, {:g} % closed, {:g} L/min, {}".format(*test) for test in (expected, given))
+    closed, level = _number(row["orifice_closed_pct"]), (row["leakage_level"] or "").strip()
+    given = Condition(condition.number, command, closed, leak, level)
+    if given != condition:
+        wanted, got = (
+            f"{of.command!r}, {of.closed_pct:g} % closed, {of.mean_leak_lpm:g} L/min, {of.level}"
+            for of in (condition, given)
+        )
         raise InputError(f"row {condition.number} must be the test {wanted}, got {got} ({path})")

@@ -7,7 +7,7 @@ import numpy as np
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context, RunSpec
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Figure, FigureCurve, Image, Number, Panel, Role, thinned
+from sealscope.thesis.engine.products import Figure, FigureCurve, Image, Number, Panel, Role
 
 #: Sampling rate [Hz] of the signals of this chapter; the thesis gives none.
 RATE = 1000.0
@@ -158,10 +158,8 @@ def db8(context: Context, item: Item) -> tuple[Figure, ...]:
     step = float(t[1] - t[0])
     frequency = wavelet_centre()[1]
     panels = (
-        Panel(
-            "t [samples]", "psi(t) [1]", (FigureCurve(*thinned(t, psi), "psi(t)", "reference"),), "(a) Mother wavelet"
-        ),
-        Panel("t [samples]", "phi(t) [1]", (FigureCurve(*thinned(t, phi), "phi(t)", "other"),), "(b) Scaling function"),
+        Panel("t [samples]", "psi(t) [1]", (FigureCurve(t, psi, "psi(t)", "reference"),), "(a) Mother wavelet"),
+        Panel("t [samples]", "phi(t) [1]", (FigureCurve(t, phi, "phi(t)", "other"),), "(b) Scaling function"),
     )
     numbers = (
         Number("integral of psi", float(psi.sum() * step)),
@@ -254,9 +252,7 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
     wanted = np.geomspace(12.0, 0.45 * rate, 64)
     recorded, clean = run.recording["p_A"] * 1e-6, run.outputs["p_A"] * 1e-6
     leak = ((_ONSET, "leak"),)
-    panels = [
-        Panel("t [s]", "p_A [MPa]", (FigureCurve(*thinned(t, recorded), "p_A, recorded", "A"),), "(a) Record", leak)
-    ]
+    panels = [Panel("t [s]", "p_A [MPa]", (FigureCurve(t, recorded, "p_A, recorded", "A"),), "(a) Record", leak)]
     for letter, p_A, name in (("b", recorded, "as recorded"), ("c", clean, "without the instruments' noise")):
         rows = continuous_transform(p_A, rate, scales_for(wanted))
         middles, power = _running_rms(t, rows, round(_BLOCK * rate))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +15,17 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.thesis.chapters.appendix_c.simulation import SETTLING, detail_rms, detail_series, pressure_range
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, thinned
-from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, Level, experiment_values
+from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, experiment_values
 from sealscope.units import LITRE_PER_MINUTE
 
-View = Literal["input", "leak", "details", "rms"]
 Mask = NDArray[np.bool_]
-Span = tuple[float, float]
+Drawn = tuple[list[Panel], list[Number]]
 _RPM = 2.0 * math.pi / 60.0
 _WINDOWED = ("d3", "d4", "d3d4")
 _WHEN = ("without leak", "with leak")
+#: Nominal leak of each level [L/min], section 5.1.
+NOMINAL_LPM: dict[str, float] = {"large": 0.0150, "medium": 0.0100, "small": 0.0075, "extra-small": 0.0042}
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,15 @@ class ShownTest:
 
     section: str
     command: str
-    level: Level
+    level: str
     first: int
     inputs: int = 0
     half: float = 90.0
 
     @property
-    def closeup(self) -> Span:
-        """The thesis's close-up [s]: ten seconds to both sides of the onset."""
-        return self.half - 10.0, self.half + 10.0
+    def parts(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The settled part without and the part with the leak [s]."""
+        return (SETTLING, self.half), (self.half, 2 * self.half)
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
@@ -67,9 +67,6 @@ class ShownTest:
         """Angular frequency [rad/s] of the command, such as 4 for `3 sin(4t)`."""
         return float(self.command.split("(")[1].rstrip(")").removesuffix("t").strip() or 1.0)
 
-
-#: Nominal leak of each level [L/min], section 5.1.
-NOMINAL_LPM: dict[Level, float] = {"large": 0.0150, "medium": 0.0100, "small": 0.0075, "extra-small": 0.0042}
 
 #: The ten tests by section.
 TESTS: dict[str, ShownTest] = {
@@ -92,15 +89,9 @@ TESTS: dict[str, ShownTest] = {
 def spec_of(test: ShownTest) -> RunSpec:
     """Return the run of a test: its command and throttles on the identified rig, its mean leak from half time."""
     condition = test.condition
-    return RunSpec(
-        command=condition.command,
-        duration=2 * test.half,
-        leaks=(f"{condition.mean_leak_lpm:g} L/min from {test.half:g} s",),
-        rig=BENCH_RIG,
-        values=tuple(experiment_values(condition).items()),
-        seed=condition.number,
-        prove=True,
-    )
+    leak = f"{condition.mean_leak_lpm:g} L/min from {test.half:g} s"
+    values = tuple(experiment_values(condition).items())
+    return RunSpec(condition.command, 2 * test.half, (leak,), BENCH_RIG, values, condition.number, prove=True)
 
 
 def recording_of(run: SimulatedRun, test: ShownTest) -> Recording:
@@ -112,22 +103,18 @@ def recording_of(run: SimulatedRun, test: ShownTest) -> Recording:
 
 def figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw one of Figs. 5.1 to 5.89, by the item's test, view, chamber and stretch of time."""
-    test = TESTS[str(item.input("test"))]
+    test, chamber = TESTS[item.inputs["test"]], item.inputs["chamber"]
     run = context.run(spec_of(test))
-    view = FigureView(run, recording_of(run, test), test, (_number(item, "from_s"), _number(item, "to_s")))
-    chamber = str(item.input("chamber"))
-    draw: dict[str, Callable[[], tuple[tuple[Panel, ...], tuple[Number, ...]]]] = {
+    view = FigureView(run, recording_of(run, test), test, (item.inputs["from_s"], item.inputs["to_s"]))
+    draw: dict[str, Callable[[], Drawn]] = {
         "input": view.inputs,
         "leak": view.leak,
         "details": lambda: view.details(chamber),
         "rms": lambda: view.windowed_rms(chamber),
     }
-    panels, numbers = draw[str(item.input("view"))]()
-    return (Figure(item.id, item.title, panels, numbers, resolved=run.resolved, notes=view.notes()),)
-
-
-def _number(item: Item, name: str) -> float:
-    return float(item.input(name))  # type: ignore[arg-type]
+    panels, numbers = draw[item.inputs["view"]]()
+    notes = view.notes()
+    return (Figure(item.id, item.title, tuple(panels), tuple(numbers), resolved=run.resolved, notes=notes),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,68 +124,63 @@ class FigureView:
     run: SimulatedRun
     recording: Recording
     test: ShownTest
-    span: Span
+    span: tuple[float, float]
 
     def notes(self) -> str:
         """Return which row of Appendix C was simulated, and how it was chosen."""
-        condition = self.test.condition
-        others = ", ".join(str(row.number) for row in self.test.candidates if row is not condition)
+        row = self.test.condition
+        others = ", ".join(str(of.number) for of in self.test.candidates if of is not row)
         chosen = (
-            f"; the thesis does not say which row of Appendix C this is: of rows {condition.number}, {others} the one "
-            "with the mean leak nearest to the level's nominal one is taken"
-            if others
-            else ""
+            f"; the thesis does not say which row of Appendix C this is: of rows {row.number}, {others} the one with "
+            "the mean leak nearest to the level's nominal one is taken"
         )
         return (
-            f"Simulated on rig {BENCH_RIG}: row {condition.number} of Appendix C, throttles {condition.closed_pct:g} % "
-            f"closed, mean leak {self.run.mean_leak_lpm:.4f} L/min from {self.test.half:g} s{chosen}."
+            f"Simulated on rig {BENCH_RIG}: row {row.number} of Appendix C, throttles {row.closed_pct:g} % closed, "
+            f"mean leak {self.run.mean_leak_lpm:.4f} L/min from {self.test.half:g} s{chosen if others else ''}."
         )
 
     def _panel(self, label: str, *curves: FigureCurve) -> Panel:
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)
 
-    def _curve(self, y: Array, label: str, role: str, span: Span | None = None, t: Array | None = None) -> FigureCurve:
+    def _curve(self, y: Array, label: str, role: Role, t: Array | None = None, low: float = 0.0) -> FigureCurve:
         t = self.recording.t if t is None else t
-        start, stop = span or self.span
-        part = (t >= start) & (t <= stop)
-        return FigureCurve(*thinned(t[part], y[part]), label, role)  # type: ignore[arg-type]
+        part = (t >= max(low, self.span[0])) & (t <= self.span[1])
+        return FigureCurve(t[part], y[part], label, role)
 
     def _split(self, y: Array, t: Array | None = None) -> list[FigureCurve]:
         """Split a series into two curves, without and with the leak."""
-        (start, stop), half = self.span, self.test.half
-        parts = (((start, min(stop, half)), "no leak"), ((max(start, half), stop), "leak"))
-        return [self._curve(y, role, role, part, t) for part, role in parts if part[1] > part[0]]
+        half, (start, stop) = self.test.half, self.span
+        before = replace(self, span=(start, min(stop, half)))._curve(y, "no leak", "no leak", t)
+        return [before, self._curve(y, "leak", "leak", t, low=half)]
 
     def _halves(self) -> tuple[tuple[Mask, str], ...]:
         """Which samples belong to the part without and to the part with the leak, the start left out."""
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _WHEN[0]), (t >= half, _WHEN[1])
 
-    def inputs(self) -> tuple[tuple[Panel, ...], tuple[Number, ...]]:
+    def inputs(self) -> Drawn:
         """Draw command, motor speed and displacement."""
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
-        panels = (
+        panels = [
             self._panel("u [V]", self._curve(recording["u"], "command", "command")),
             self._panel("motor speed [rpm]", self._curve(rpm, "speed", "other")),
             self._panel("x [mm]", self._curve(x, "displacement", "other")),
-        )
+        ]
         numbers = []
         for part, when in self._halves():
-            numbers += [
-                Number(f"RMS of speed {when}", float(np.sqrt(np.mean(rpm[part] ** 2))), "rpm"),
-                Number(f"drift of x {when}", mean_slope(recording.t[part], x[part], self.test.omega), "mm/s"),
-            ]
-        return panels, tuple(numbers)
+            speed = float(np.sqrt(np.mean(rpm[part] ** 2)))
+            drift = mean_slope(recording.t[part], x[part], self.test.omega)
+            numbers += [Number(f"RMS of speed {when}", speed, "rpm"), Number(f"drift of x {when}", drift, "mm/s")]
+        return panels, numbers
 
-    def leak(self) -> tuple[tuple[Panel, ...], tuple[Number, ...]]:
+    def leak(self) -> Drawn:
         """Draw leak flow and chamber pressures."""
         recording = self.recording
-        flow = recording["q_leak"] / LITRE_PER_MINUTE
-        panels = (
-            self._panel("leak [L/min]", self._curve(flow, "flow meter, A to B positive", "leak")),
-            *(self._panel(f"{c} [MPa]", self._curve(recording[c] / 1e6, c, c.removeprefix("p_"))) for c in CHAMBERS),
-        )
+        flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
+        roles: dict[str, Role] = {"p_A": "A", "p_B": "B"}
+        panels = [self._panel("leak [L/min]", flow)]
+        panels += [self._panel(f"{c} [MPa]", self._curve(recording[c] / 1e6, c, roles[c])) for c in CHAMBERS]
         numbers = [
             Number("mean leak while open (true)", self.run.mean_leak_lpm, "L/min"),
             Number("mean leak of the thesis's sheet", self.test.condition.mean_leak_lpm, "L/min"),
@@ -207,39 +189,32 @@ class FigureView:
             for chamber in CHAMBERS:
                 low, high = np.percentile(recording[chamber][part], [5.0, 95.0]) / 1e6
                 numbers.append(Number(f"5 to 95 % range of {chamber} {when}", float(high - low), "MPa"))
-        return panels, tuple(numbers)
+        return panels, numbers
 
-    def details(self, chamber: str) -> tuple[tuple[Panel, ...], tuple[Number, ...]]:
+    def details(self, chamber: str) -> Drawn:
         """Draw d1 to d4 and d3d4 of a chamber's pressure."""
-        panels = tuple(
-            self._panel(f"{name} [{UNITS[name]}]", *self._split(values))
-            for name, values in detail_series(self.recording, chamber).items()
-        )
+        series = detail_series(self.recording, chamber)
+        panels = [self._panel(f"{name} [{UNITS[name]}]", *self._split(values)) for name, values in series.items()]
         return panels, self._changes(chamber, QUANTITIES)
 
-    def windowed_rms(self, chamber: str) -> tuple[tuple[Panel, ...], tuple[Number, ...]]:
+    def windowed_rms(self, chamber: str) -> Drawn:
         """Draw the windowed RMS of d3, d4 and d3d4 of a chamber's pressure, and the RMS of each part."""
         t, curves = windowed(self.recording, chamber)
-        half = self.test.half
-        parts = np.array([SETTLING, half, half, 2 * half])
+        rms = detail_rms(self.recording, self.test.parts)[chamber]
         panels = []
         for name, values in curves.items():
-            before, after = half_rms(self.recording, self.test)[chamber][name]
-            levels = FigureCurve(parts, np.array([before, before, after, after]), "RMS of each part", "reference")
+            levels = FigureCurve(np.ravel(self.test.parts), np.repeat(rms[name], 2), "RMS of each part", "reference")
             panels.append(self._panel(f"RMS of {name} [{UNITS[name]}]", *self._split(values, t), levels))
-        return tuple(panels), self._changes(chamber, _WINDOWED)
+        return panels, self._changes(chamber, _WINDOWED)
 
-    def _changes(self, chamber: str, names: tuple[str, ...]) -> tuple[Number, ...]:
-        rms = half_rms(self.recording, self.test)[chamber]
+    def _changes(self, chamber: str, names: tuple[str, ...]) -> list[Number]:
         numbers = []
-        for name in names:
-            before, after = rms[name]
-            numbers += [
-                Number(f"RMS of {name} without leak", before, UNITS[name]),
-                Number(f"RMS of {name} with leak", after, UNITS[name]),
-                Number(f"change of {name}", 100.0 * (after - before) / before, "%"),
-            ]
-        return tuple(numbers)
+        for name, (before, after) in detail_rms(self.recording, self.test.parts)[chamber].items():
+            if name in names:
+                rms = zip(_WHEN, (before, after), strict=True)
+                numbers += [Number(f"RMS of {name} {when}", value, UNITS[name]) for when, value in rms]
+                numbers.append(Number(f"change of {name}", 100.0 * (after - before) / before, "%"))
+        return numbers
 
 
 def mean_slope(t: Array, y: Array, omega: float) -> float:
@@ -247,11 +222,6 @@ def mean_slope(t: Array, y: Array, omega: float) -> float:
     t_0 = t - t.mean()
     basis = np.column_stack([np.ones_like(t), t_0, np.sin(omega * t), np.cos(omega * t)])
     return float(np.linalg.lstsq(basis, y, rcond=None)[0][1])
-
-
-def half_rms(recording: Recording, test: ShownTest) -> dict[str, dict[str, tuple[float, ...]]]:
-    """Return the RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers without and with the leak, as in Appendix C."""
-    return detail_rms(recording, ((SETTLING, test.half), (test.half, 2 * test.half)))
 
 
 def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
@@ -300,13 +270,6 @@ def best_step(t: Array, y: Array, least: int = 5) -> float:
     return float((t[k - 1] + t[k]) / 2.0)
 
 
-def _whole_cycles(t: Array, start: float, stop: float, omega: float) -> Mask:
-    """Return the samples of the last whole periods of the command before `stop`, none before `start` [s]."""
-    period = 2.0 * np.pi / omega
-    cycles = np.floor((stop - start) / period)
-    return np.asarray((t >= stop - cycles * period) & (t < stop))
-
-
 def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownMeasures:
     """Measure one of the ten tests, or the same run with its leak left out."""
     from sealscope.signals.windows import rms
@@ -314,10 +277,12 @@ def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownM
     spec = spec_of(test)
     run = context.run(spec if leak else replace(spec, leaks=(), prove=False))
     recording = recording_of(run, test)
-    t, x, omega, half = recording.t, run.outputs["x"], test.omega, test.half
-    parts = [_whole_cycles(t, *ends, omega) for ends in ((SETTLING, half), (half, 2 * half))]
+    t, period = recording.t, 2.0 * np.pi / test.omega
+    # the last whole periods of the command in each half
+    starts = [stop - np.floor((stop - start) / period) * period for start, stop in test.parts]
+    parts = [(t >= start) & (t < stop) for start, (_, stop) in zip(starts, test.parts, strict=True)]
 
-    def pair(values: Array, of: Callable[[Array], float]) -> tuple[float, float]:
+    def pair(values: Array, of: Callable[[Array], float] = rms) -> tuple[float, float]:
         return of(values[parts[0]]), of(values[parts[1]])
 
     steps = {}
@@ -325,19 +290,20 @@ def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownM
         centres, curves = windowed(recording, chamber)
         settled = centres >= SETTLING
         steps[chamber] = best_step(centres[settled], curves["d3"][settled])
+    before, after = (mean_slope(t[part], run.outputs["x"][part], test.omega) * 1e3 for part in parts)
     return ShownMeasures(
         test=test,
-        rms=half_rms(recording, test),
-        speed=pair(run.outputs["omega"], rms),
-        drift=(mean_slope(t[parts[0]], x[parts[0]], omega) * 1e3, mean_slope(t[parts[1]], x[parts[1]], omega) * 1e3),
-        velocity=pair(run.outputs["v"] * 1e3, rms),
+        rms=detail_rms(recording, test.parts),
+        speed=pair(run.outputs["omega"]),
+        drift=(before, after),
+        velocity=pair(run.outputs["v"] * 1e3),
         range_MPa={chamber: pair(run.outputs[chamber] / 1e6, pressure_range) for chamber in CHAMBERS},
         step_s=steps,
         onset_s=test.half,
     )
 
 
-_CONTENT: dict[View, str] = {
+_CONTENT = {
     "input": "command, motor speed and piston displacement",
     "leak": "leak flow and chamber pressures",
     "details": "wavelet details d1 to d4 and d3d4",
@@ -345,30 +311,21 @@ _CONTENT: dict[View, str] = {
 }
 
 
-def _views(test: ShownTest) -> list[tuple[View, str, bool]]:
-    """View, chamber and whether a close-up, in the order of the test's figures."""
-    views: list[tuple[View, str, bool]] = [("input", "", closeup) for closeup in (False, True)[: test.inputs]]
-    views += [("leak", "", False), ("leak", "", True)]
+def _items(test: ShownTest) -> list[Item]:
+    """Return the figures of a test in their order: view, chamber, whole or close-up (ten seconds about the onset)."""
+    views = [*[("input", "", False), ("input", "", True)][: test.inputs], ("leak", "", False), ("leak", "", True)]
     for chamber in CHAMBERS:
         views += [("details", chamber, False), ("details", chamber, True), ("rms", chamber, False)]
-    return views
-
-
-def _item(test: ShownTest, number: int, view: View, chamber: str, closeup: bool) -> Item:
-    start, stop = test.closeup if closeup else (0.0, 2 * test.half)
-    when = f"close-up {start:g} to {stop:g} s" if closeup else f"{stop:g} s"
-    content = _CONTENT[view] + (f" of {chamber}" if chamber else "")
-    return Item(
-        f"fig-5.{number}",
-        5,
-        "figure",
-        f"Test {test.section}, {test.command}, {test.level} leak: {content}, {when}",
-        figure,
-        (("test", test.section), ("view", view), ("chamber", chamber), ("from_s", start), ("to_s", stop)),
-    )
+    items = []
+    for number, (view, chamber, closeup) in enumerate(views, test.first):
+        start, stop = (test.half - 10.0, test.half + 10.0) if closeup else (0.0, 2 * test.half)
+        when = f"close-up {start:g} to {stop:g} s" if closeup else f"{stop:g} s"
+        content = _CONTENT[view] + (f" of {chamber}" if chamber else "")
+        title = f"Test {test.section}, {test.command}, {test.level} leak: {content}, {when}"
+        inputs = {"test": test.section, "view": view, "chamber": chamber, "from_s": start, "to_s": stop}
+        items.append(Item(f"fig-5.{number}", 5, "figure", title, figure, inputs))
+    return items
 
 
 #: Figs. 5.1 to 5.89 in their order.
-ITEMS: tuple[Item, ...] = tuple(
-    _item(test, test.first + k, *view) for test in TESTS.values() for k, view in enumerate(_views(test))
-)
+ITEMS: tuple[Item, ...] = tuple(item for test in TESTS.values() for item in _items(test))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -34,43 +35,29 @@ AMPLITUDE, OMEGA = 0.04, 0.5 * math.pi
 STIFF_AT, STIFF_FORCE = 0.5, 500.0
 SMALL_AT, SMALL_SPEED = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0), 8e-3
 CONTROLLERS = ("pi", "flatness", "fault-tolerant", "fault-tolerant-flatness", "ideal")
-_ROLES: dict[str, Role] = {
-    "pi": "simulated",
-    "flatness": "25 %",
-    "fault-tolerant": "leak",
-    "fault-tolerant-flatness": "75 %",
-    "ideal": "reference",
-}
-COLUMNS = (
-    "controller",
-    "leak [L/min]",
-    "rms error [mm]",
-    "bandwidth [Hz]",
-    "energy a cycle [J]",
-    "stiffness at 0.5 Hz [N/mm]",
-    "made good [L/min]",
-)
+#: Columns of the tables, and what the numbers in them are.
+_ERROR, _STIFF, _FLOW = "rms error [mm]", "stiffness at 0.5 Hz [N/mm]", "made good [L/min]"
+COLUMNS = ("controller", "leak [L/min]", _ERROR, "bandwidth [Hz]", "energy a cycle [J]", _STIFF, _FLOW)
 OUTSIDE_COLUMNS = (
-    "rod seal",
-    "controller",
-    "leak [L/min]",
-    "rms error [mm]",
-    "stiffness at 0.5 Hz [N/mm]",
-    "made good [L/min]",
+    *("rod seal", "controller", "leak [L/min]", _ERROR, _STIFF, _FLOW),
     "lower pressure, fifth cycle less third [kPa]",
 )
 VALVE_COLUMNS = (
-    "source",
-    "controller",
-    "leak [L/min]",
-    "rms error [mm]",
-    "bandwidth [Hz]",
-    "stiffness at 0.5 Hz [N/mm]",
-    "electrical energy a cycle [J]",
-    "hydraulic energy a cycle [J]",
-    "efficiency against a damper [%]",
-    "efficiency from what the cylinder takes [%]",
+    *("source", "controller", "leak [L/min]", _ERROR, "bandwidth [Hz]", _STIFF),
+    *("electrical energy a cycle [J]", "hydraulic energy a cycle [J]"),
+    *("efficiency against a damper [%]", "efficiency from what the cylinder takes [%]"),
 )
+_ROLES: dict[tuple[str, ...], Role] = dict(
+    zip(((name,) for name in CONTROLLERS), ("simulated", "25 %", "leak", "75 %", "reference"), strict=True)
+)
+_VALVE_ROLES: dict[tuple[str, ...], Role] = {
+    ("pump", "pi"): "simulated",
+    ("pump", "flatness"): "25 %",
+    ("valve", "pi"): "leak",
+    ("valve", "flatness"): "75 %",
+}
+CYCLE = 2.0 * math.pi / OMEGA
+DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
 
 def conductance(lpm: float, rig: Rig) -> float:
@@ -131,24 +118,15 @@ def on_duty(
     name: str, lpm: float, load: str = "0 N", rig: str = RIG, values: Mapping[str, float | str] | None = None
 ) -> tuple[Trajectory, Array]:
     """Return a run of five cycles of the duty, and which of its samples are of the last two."""
-    cycle = 2.0 * math.pi / OMEGA
-    command = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
-    run = followed(command, 5.0 * cycle, controller_of(name, _rig(rig), lpm), lpm, load, rig, values)
-    return run, np.asarray((run.t >= 3.0 * cycle) & (run.t < 5.0 * cycle))
+    run = followed(DUTY, 5.0 * CYCLE, controller_of(name, _rig(rig), lpm), lpm, load, rig, values)
+    return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
 
 
-def tracking(name: str, lpm: float, load: str = "0 N", rig: str = RIG) -> tuple[float, float, float]:
+def tracking(run: Trajectory, late: Array) -> tuple[float, float, float]:
     """Return the rms error [mm], the electrical energy of a cycle [J] and the flow made good [L/min] on the duty."""
-    run, late = on_duty(name, lpm, load, rig)
-    error, flow = _error_and_flow(run, late)
-    return error, float(np.mean(run["V"][late] * run["i"][late])) * 2.0 * math.pi / OMEGA, flow
-
-
-def _error_and_flow(run: Trajectory, late: Array) -> tuple[float, float]:
-    """Return the rms error [mm] and the flow made good [L/min] of a run of the duty."""
     error = AMPLITUDE * np.sin(OMEGA * run.t[late]) - run["x"][late]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[late])) * 6e4
-    return 1e3 * float(np.sqrt(np.mean(error**2))), flow
+    return 1e3 * float(np.sqrt(np.mean(error**2))), float(np.mean(run["V"][late] * run["i"][late])) * CYCLE, flow
 
 
 def drawn(run: Trajectory) -> Array:
@@ -163,9 +141,8 @@ def energies(name: str, lpm: float, rig: str) -> tuple[float, float, float]:
     and over the hydraulic energy that the cylinder takes: what a supply without losses would give to the valve at its
     pressure, or the pump to its ports.
     """
-    cycle = 2.0 * math.pi / OMEGA
     run, late = on_duty(name, lpm, rig=rig)
-    given = float(np.mean((run["Q_1"] * (run["p_1"] - run["p_2"]))[late])) * cycle
+    given = float(np.mean((run["Q_1"] * (run["p_1"] - run["p_2"]))[late])) * CYCLE
     damped, late = on_duty(name, lpm, rig=rig, values={"F_l": 0.0, "d_load": DAMPER})
     dp = damped["p_1"] - damped["p_2"]
     taken = (drawn(damped) if _rig(rig).valve.spool == "present" else damped["Q_1"]) * dp
@@ -203,83 +180,79 @@ def bandwidth(name: str, lpm: float, rig: str = RIG) -> float:
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
     """Tabulate and draw error, bandwidth, energy and stiffness of each controller against the size of the leak."""
-    leaks = (0.0, 0.5) if context.quick else LEAKS
     rows: list[tuple[Cell, ...]] = []
     for name in CONTROLLERS:
-        for lpm in leaks:
-            error, energy, flow = tracking(name, lpm)
+        for lpm in _leaks(context):
+            error, energy, flow = tracking(*on_duty(name, lpm))
             rows.append((name, lpm, error, bandwidth(name, lpm), energy, stiffness(name, lpm), flow))
     notes = (
         f"{RIG}, friction +20 % and bulk modulus -20 % against what the controllers assume, {LOAD:g} N, leak sized at "
-        f"it; {1e3 * AMPLITUDE:g} mm at {OMEGA / (2 * math.pi):g} Hz. `ideal` knows the leak, nobody else does."
+        f"it; {1e3 * AMPLITUDE:g} mm at {1 / CYCLE:g} Hz. `ideal` knows the leak, nobody else does."
     )
-    panels = []
-    for column, label in ((2, "rms error [mm]"), (5, "stiffness at 0.5 Hz [N/mm]")):
-        curves = []
-        for name in CONTROLLERS:
-            own = [row for row in rows if row[0] == name]
-            x, y = (np.array([float(row[k] or 0.0) for row in own]) for k in (1, column))
-            curves.append(FigureCurve(np.maximum(x, 0.001), y, name, _ROLES[name]))
-        panels.append(Panel("leak [L/min], none drawn at 0.001", label, tuple(curves), log_x=True))
     table = ThesisTable(item.id, item.title, COLUMNS, tuple(rows), notes=notes)
-    return table, Figure(f"{item.id}-figure", "Error and stiffness against the leak", tuple(panels), notes=notes)
+    return table, _against_the_leak(table, "Error and stiffness against the leak", _ROLES, (_ERROR, _STIFF))
+
+
+def _leaks(context: Context) -> tuple[float, ...]:
+    return (0.0, 0.5) if context.quick else LEAKS
+
+
+def _against_the_leak(
+    table: ThesisTable, title: str, roles: Mapping[tuple[str, ...], Role], columns: Sequence[str], log_y: bool = False
+) -> Figure:
+    """Draw columns of a table over the leak, a curve for each of the names in its first columns."""
+    panels = []
+    for column in columns:
+        curves = []
+        for names, role in roles.items():
+            own = [row for row in table.rows if row[: len(names)] == names]
+            places = len(names), table.columns.index(column)
+            x, y = (np.array([float(row[k] or 0.0) for row in own]) for k in places)
+            curves.append(FigureCurve(np.maximum(x, 0.001), y, ", ".join(names), role))
+        panels.append(Panel("leak [L/min], none drawn at 0.001", column, tuple(curves), log_x=True, log_y=log_y))
+    return Figure(f"{table.id}-figure", title, tuple(panels), notes=table.notes)
 
 
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate where the piston's middle goes with a leak, in the open loop and in two closed ones."""
     rows: list[tuple[Cell, ...]] = []
-    cycle, u = 2.0 * math.pi / OMEGA, 7.3
-    still = 0.0
-    for lpm in (0.0, 0.5) if context.quick else LEAKS:
-        opened = followed(f"{u} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * cycle, None, lpm, "0 N")
-        middle = [float(np.mean(opened["x"][_cycle_of(opened.t, k)])) for k in (1, 2)]
-        drift = 60e3 * (middle[1] - middle[0]) / cycle
-        still = drift if lpm == 0.0 else still
-        size = 1e3 * abs(amplitude_at(opened.t[opened.t >= cycle], opened["x"][opened.t >= cycle], OMEGA / (2 * np.pi)))
-        closed = []
-        for name in ("pi", "fault-tolerant"):
-            run = followed(
-                f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)",
-                4.0 * cycle,
-                controller_of(name, _rig(), lpm),
-                lpm,
-                "0 N",
-            )
-            ends = [float(np.mean(run["x"][_cycle_of(run.t, k)])) for k in (2, 3)]
-            closed.append(60e3 * (ends[1] - ends[0]) / cycle)
-        rows.append((lpm, size, drift, drift - still, *closed))
+    u, still = 7.3, 0.0
+
+    def drift(run: Trajectory, first: int) -> float:
+        """Return by how much the middle of a cycle moves to the next [mm/min]."""
+        middle = [float(np.mean(run["x"][_cycle_of(run.t, k)])) for k in (first, first + 1)]
+        return 60e3 * (middle[1] - middle[0]) / CYCLE
+
+    for lpm in _leaks(context):
+        opened = followed(f"{u} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * CYCLE, None, lpm, "0 N")
+        still = drift(opened, 1) if lpm == 0.0 else still
+        late = opened.t >= CYCLE
+        size = 1e3 * abs(amplitude_at(opened.t[late], opened["x"][late], 1 / CYCLE))
+        loops = (controller_of(name, _rig(), lpm) for name in ("pi", "fault-tolerant"))
+        closed = [drift(followed(DUTY, 4.0 * CYCLE, loop, lpm, "0 N"), 2) for loop in loops]
+        rows.append((lpm, size, drift(opened, 1), drift(opened, 1) - still, *closed))
     heads = (
-        "leak [L/min]",
-        "open: amplitude [mm]",
-        "open: drift [mm/min]",
-        "open: drift by the leak [mm/min]",
-        "pi: drift [mm/min]",
-        "fault-tolerant: drift [mm/min]",
+        *("leak [L/min]", "open: amplitude [mm]", "open: drift [mm/min]", "open: drift by the leak [mm/min]"),
+        *("pi: drift [mm/min]", "fault-tolerant: drift [mm/min]"),
     )
     notes = f"{RIG} under {LOAD:g} N, friction and stiffness off by 20 %. At 0.25 Hz; open: {u:g} V, closed: 40 mm."
     return (ThesisTable(item.id, item.title, heads, tuple(rows), notes=notes),)
 
 
 def _cycle_of(t: Array, k: int) -> Array:
-    cycle = 2.0 * math.pi / OMEGA
-    return np.asarray((t >= k * cycle) & (t < (k + 1) * cycle))
+    return np.asarray((t >= k * CYCLE) & (t < (k + 1) * CYCLE))
 
 
 def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the error on the duty against the load, without a leak and with the middle one."""
-    rows: list[tuple[Cell, ...]] = []
-    for force in (0.0, 2000.0) if context.quick else (0.0, 500.0, 1000.0, 2000.0):
-        beside = f"{force - LOAD!r} N"
-        row: list[Cell] = [force]
-        for name in ("pi", "flatness", "fault-tolerant"):
-            for lpm in (0.0, 0.05):
-                error, energy, _ = tracking(name, lpm, beside)
-                row += [error, energy]
-        rows.append(tuple(row))
+    cases = [(name, lpm) for name in ("pi", "flatness", "fault-tolerant") for lpm in (0.0, 0.05)]
     heads = ["load [N]"]
-    for name in ("pi", "flatness", "fault-tolerant"):
-        for lpm in (0.0, 0.05):
-            heads += [f"{name}, {lpm:g} L/min: rms error [mm]", f"{name}, {lpm:g} L/min: energy a cycle [J]"]
+    for name, lpm in cases:
+        heads += [f"{name}, {lpm:g} L/min: {what}" for what in (_ERROR, "energy a cycle [J]")]
+    rows = []
+    for force in (0.0, 2000.0) if context.quick else (0.0, 500.0, 1000.0, 2000.0):
+        pairs = (tracking(*on_duty(name, lpm, f"{force - LOAD!r} N"))[:2] for name, lpm in cases)
+        rows.append((force, *itertools.chain.from_iterable(pairs)))
     notes = "The leak is a conductance: 0.05 L/min under 2 kN, in proportion less under a smaller load."
     return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=notes),)
 
@@ -288,16 +261,15 @@ def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness where oil leaves the circuit past a rod seal of either side."""
     sound, late = on_duty("pi", 0.0)
     pressure = {side: float(np.mean(sound[f"p_{side}"][late])) for side in ("A", "B")}
+    names, leaks = (CONTROLLERS[:1], (0.5,)) if context.quick else (CONTROLLERS[:4], LEAKS[1:])
     rows: list[tuple[Cell, ...]] = []
-    for side, p in pressure.items():
-        for name in CONTROLLERS[:1] if context.quick else CONTROLLERS[:4]:
-            for lpm in (0.5,) if context.quick else LEAKS[1:]:
-                values = {f"G_ext_{side}": lpm / 6e4 / p}
-                run, late = on_duty(name, 0.0, values=values)
-                lower = np.minimum(run["p_A"], run["p_B"])
-                fallen = [1e-3 * float(np.mean(lower[_cycle_of(run.t, k)])) for k in (2, 4)]
-                error, flow = _error_and_flow(run, late)
-                rows.append((side, name, lpm, error, stiffness(name, 0.0, values=values), flow, fallen[1] - fallen[0]))
+    for side, name, lpm in itertools.product(pressure, names, leaks):
+        values = {f"G_ext_{side}": lpm / 6e4 / pressure[side]}
+        run, late = on_duty(name, 0.0, values=values)
+        lower = np.minimum(run["p_A"], run["p_B"])
+        third, fifth = (1e-3 * float(np.mean(lower[_cycle_of(run.t, k)])) for k in (2, 4))
+        error, _, flow = tracking(run, late)
+        rows.append((side, name, lpm, error, stiffness(name, 0.0, values=values), flow, fifth - third))
     notes = (
         f"{RIG} under {LOAD:g} N, which side A carries ({1e-6 * pressure['A']:.2g} MPa on average, B "
         f"{1e-6 * pressure['B']:.2g}); the leak has its size at that pressure. Friction and stiffness off by 20 %."
@@ -307,39 +279,22 @@ def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
     """Tabulate and draw tracking, stiffness and energy of the pump-controlled and the valve-controlled rig."""
-    leaks = (0.0, 0.5) if context.quick else LEAKS
+    rigs = {"pump": RIG, "valve": VALVE_RIG}
     rows: list[tuple[Cell, ...]] = []
-    for source, rig in (("pump", RIG), ("valve", VALVE_RIG)):
-        for name in VALVE_CONTROLLERS:
-            for lpm in leaks:
-                error, energy, _ = tracking(name, lpm, rig=rig)
-                given, efficiency, taken = energies(name, lpm, rig)
-                loop = bandwidth(name, lpm, rig), stiffness(name, lpm, rig)
-                rows.append((source, name, lpm, error, *loop, energy, given, 100 * efficiency, 100 * taken))
+    for (source, rig), name, lpm in itertools.product(rigs.items(), VALVE_CONTROLLERS, _leaks(context)):
+        error, energy, _ = tracking(*on_duty(name, lpm, rig=rig))
+        given, efficiency, taken = energies(name, lpm, rig)
+        loop = bandwidth(name, lpm, rig), stiffness(name, lpm, rig)
+        rows.append((source, name, lpm, error, *loop, energy, given, 100 * efficiency, 100 * taken))
     notes = (
         f"{RIG} and {VALVE_RIG}: one cylinder, oil, motor and pump, one controller with the same gains, friction and "
-        f"stiffness off by 20 %; {1e3 * AMPLITUDE:g} mm at {OMEGA / (2 * math.pi):g} Hz under {LOAD:g} N, efficiencies "
-        f"against a damper of {DAMPER:g} N s/m instead. The valve's supply turns at a constant speed; the last column "
-        "leaves its losses, motor and pump out. A pump takes energy back on the way down where the load drives it."
+        f"stiffness off by 20 %; {1e3 * AMPLITUDE:g} mm at {1 / CYCLE:g} Hz under {LOAD:g} N, efficiencies against a "
+        f"damper of {DAMPER:g} N s/m instead. The valve's supply turns at a constant speed; the last column leaves its "
+        "losses, motor and pump out. A pump takes energy back on the way down where the load drives it."
     )
-    roles: dict[tuple[str, str], Role] = {
-        ("pump", "pi"): "simulated",
-        ("pump", "flatness"): "25 %",
-        ("valve", "pi"): "leak",
-        ("valve", "flatness"): "75 %",
-    }
-    panels = []
-    for column in (6, 5):
-        curves = []
-        for (source, name), role in roles.items():
-            own = [row for row in rows if row[:2] == (source, name)]
-            x, y = (np.array([float(row[k] or 0.0) for row in own]) for k in (2, column))
-            curves.append(FigureCurve(np.maximum(x, 0.001), y, f"{source}, {name}", role))
-        panels.append(
-            Panel("leak [L/min], none drawn at 0.001", VALVE_COLUMNS[column], tuple(curves), log_x=True, log_y=True)
-        )
     table = ThesisTable(item.id, item.title, VALVE_COLUMNS, tuple(rows), notes=notes)
-    return table, Figure(f"{item.id}-figure", "Energy and stiffness, pump and valve", tuple(panels), notes=notes)
+    shown = ("electrical energy a cycle [J]", _STIFF)
+    return table, _against_the_leak(table, "Energy and stiffness, pump and valve", _VALVE_ROLES, shown, log_y=True)
 
 
 ITEMS: tuple[Item, ...] = (

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from sealscope.thesis.claims.judged import judged
+from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Claim, ThesisTable, verdict_of
+from sealscope.thesis.engine.products import Claim
 
-if TYPE_CHECKING:
-    from sealscope.thesis.engine.context import Context
-
-_ABSENT = "no closed loop in the sheet"
 #: Tracking and stiffness count as restored within this share of those without a leak.
 RESTORED = 0.1
 #: A drift [mm/min] that nobody would call one: a tenth of a millimetre.
 STILL = 0.1
-#: Two machines are told apart where one has this many times what the other has.
+#: Two machines, or controllers, are told apart where one has this many times what the other has.
 APART = 1.5
 
 
-def _table(context: Context, item: str) -> ThesisTable:
-    return next(product for product in context.product(item) if isinstance(product, ThesisTable))
-
-
-def _value(cell: object) -> float:
-    assert isinstance(cell, int | float)
-    return float(cell)
+def _rows(context: Context, item: str, names: int) -> dict[tuple[str, ...], dict[float, list[float]]]:
+    """Return the numbers of a table by its first `names` columns and by the leak [L/min] in the next."""
+    by: dict[tuple[str, ...], dict[float, list[float]]] = {}
+    for row in first_table(context, item).rows:
+        leak, *numbers = (float(cell) for cell in row[names:] if isinstance(cell, int | float))
+        by.setdefault(tuple(map(str, row[:names])), {})[leak] = numbers
+    return by
 
 
 def claims(context: Context, item: Item) -> tuple[Claim, ...]:
@@ -34,102 +30,44 @@ def claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _disturbance(context: Context) -> Claim:
-    rows = _table(context, "sec-6.2-open-loop").rows
-    by_leak = [(_value(row[0]), *(_value(cell) for cell in row[3:5])) for row in rows if _value(row[0]) > 0]
-    text = "; ".join(f"{lpm:g} L/min: {opened:.1f} open, {closed:.2f} closed" for lpm, opened, closed in by_leak)
-    return Claim(
-        "claim-6.2.1",
-        "section 6.2",
-        "A loop closed over the piston's displacement makes good what disturbs it from outside.",
-        _ABSENT,
-        f"drift by the leak under 2 kN [mm/min]: {text}",
-        verdict_of([abs(closed) < STILL for _, _, closed in by_leak]),
-        "Holds of a controller with an integral. What a leak moves in the open loop, the closed one hides in its "
-        "command.",
-    )
+    rows = {lpm: row[2:4] for lpm, row in _rows(context, "sec-6.2-open-loop", 0)[()].items() if lpm > 0}
+    texts = [f"{lpm:g} L/min: {opened:.1f} open, {closed:.2f} closed" for lpm, (opened, closed) in rows.items()]
+    return judged("6.2.1", [abs(closed) < STILL for _, closed in rows.values()], drifts="; ".join(texts))
 
 
 def _tolerance(context: Context) -> Claim:
-    rows = _table(context, "sec-6.2-controllers").rows
-    by = {(str(row[0]), _value(row[1])): [_value(cell) for cell in row[1:]] for row in rows}
-    leaks = sorted({lpm for _, lpm in by if lpm > 0})
-    healthy = by["pi", 0.0]
-    tests: list[bool] = []
-    texts: list[str] = []
-    for lpm in leaks:
-        fixed, tolerant = by["pi", lpm], by["fault-tolerant", lpm]
-        tests += [tolerant[1] <= (1 + RESTORED) * healthy[1], tolerant[4] >= (1 - RESTORED) * healthy[4]]
-        texts.append(
-            f"{lpm:g} L/min: {fixed[1]:.3f} and {tolerant[1]:.3f} mm, {fixed[4]:.0f} and {tolerant[4]:.0f} N/mm"
-        )
-    unharmed = by["fault-tolerant", 0.0][1] == healthy[1] and by["fault-tolerant", 0.0][5] == 0.0
-    return Claim(
-        "claim-6.2.2",
-        "section 6.2",
-        "With a leak across the piston, a fault-tolerant controller makes the closed loop more effective.",
-        _ABSENT,
-        f"rms error and stiffness, fixed and tolerant: {'; '.join(texts)}; without a leak {healthy[1]:.3f} mm, "
-        f"{healthy[4]:.0f} N/mm, and the tolerant one is the fixed one" + ("" if unharmed else " NOT"),
-        verdict_of([*tests, unharmed]),
-        "Holds where tracking and stiffness are within 10 % of those without a leak, and nothing is lost without one. "
-        "Internal leaks only: oil that leaves the circuit was not studied here.",
-    )
+    rows = _rows(context, "sec-6.2-controllers", 1)
+    fixed, tolerant = rows[("pi",)], rows[("fault-tolerant",)]
+    error, _, _, stiffness, _ = fixed[0.0]
+    tests, texts = [], []
+    for lpm in sorted(lpm for lpm in fixed if lpm > 0):
+        a, b = fixed[lpm], tolerant[lpm]
+        tests += [b[0] <= (1 + RESTORED) * error, b[3] >= (1 - RESTORED) * stiffness]
+        texts.append(f"{lpm:g} L/min: {a[0]:.3f} and {b[0]:.3f} mm, {a[3]:.0f} and {b[3]:.0f} N/mm")
+    unharmed = tolerant[0.0][0] == error and tolerant[0.0][4] == 0.0
+    unless = "" if unharmed else " NOT"
+    return judged("6.2.2", [*tests, unharmed], pairs="; ".join(texts), error=error, stiffness=stiffness, unless=unless)
 
 
 def _load(context: Context) -> Claim:
-    rows = _table(context, "sec-6.2-load").rows
-    spread = []
-    for column, name in ((1, "pi"), (5, "flatness"), (9, "fault-tolerant")):
-        errors = [_value(row[column]) for row in rows]
-        spread.append((name, min(errors), max(errors)))
-    least, most = (max(pair) for pair in ([s[1] for s in spread], [s[2] for s in spread]))
-    text = "; ".join(f"{name} {low:.3f} to {high:.3f} mm" for name, low, high in spread)
-    differs = max(s[2] for s in spread) > 1.5 * min(s[2] for s in spread)
-    return Claim(
-        "claim-6.2.3",
-        "section 6.2",
-        "A force on the cylinder tells controllers of the piston's displacement apart.",
-        _ABSENT,
-        f"rms error over loads of 0 to 2 kN, no leak: {text}",
-        verdict_of([differs]),
-        f"Told apart where the worst errors differ by half or more. All are within 1 % of 40 mm: {most < 0.4} "
-        f"(least {least:.3f} mm).",
-    )
+    rows = _rows(context, "sec-6.2-load", 0)[()].values()
+    spread = {}
+    for column, name in ((0, "pi"), (4, "flatness"), (8, "fault-tolerant")):
+        errors = [row[column] for row in rows]
+        spread[name] = min(errors), max(errors)
+    least, worst = max(low for low, _ in spread.values()), [high for _, high in spread.values()]
+    text = "; ".join(f"{name} {low:.3f} to {high:.3f} mm" for name, (low, high) in spread.items())
+    return judged("6.2.3", [max(worst) > APART * min(worst)], spread=text, near=max(worst) < 0.4, least=least)
 
 
 def _valves(context: Context) -> Claim:
-    rows = _table(context, "sec-6.2-valve").rows
-    by = {(str(row[0]), str(row[1]), _value(row[2])): [_value(cell) for cell in row[3:]] for row in rows}
-    largest = max(lpm for *_, lpm in by)
-    pump, valve = by["pump", "pi", 0.0], by["valve", "pi", 0.0]
-    worn = [by[source, "pi", largest] for source in ("pump", "valve")]
-
-    def apart(column: int) -> bool:
-        return max(pump[column], valve[column]) > APART * min(pump[column], valve[column])
-
-    return Claim(
-        "claim-6.2.4",
-        "section 6.2",
-        "A comparison of valve-controlled and pump-controlled machines would be informative.",
-        _ABSENT,
-        f"pump and valve without a leak: efficiency {pump[5]:.0f} and {valve[5]:.1f} % (from what the cylinder takes "
-        f"{pump[6]:.0f} and {valve[6]:.0f} %), rms error {pump[0]:.3f} and {valve[0]:.3f} mm, stiffness {pump[2]:.0f} "
-        f"and {valve[2]:.0f} N/mm; with {largest:g} L/min {worn[0][0]:.3f} and {worn[1][0]:.3f} mm, {worn[0][2]:.0f} "
-        f"and {worn[1][2]:.0f} N/mm",
-        verdict_of([apart(5), apart(0)]),
-        "Informative where both efficiency and tracking differ by half or more. The supply turns at a constant speed; "
-        "one that gives what is drawn at its pressure has the second efficiency. The smallest leak that each lets be "
-        "found is not part of this study.",
-    )
+    rows = _rows(context, "sec-6.2-valve", 2)
+    pump, valve = rows["pump", "pi"], rows["valve", "pi"]
+    largest = max(pump)
+    tests = [max(ends) > APART * min(ends) for ends in ((pump[0.0][k], valve[0.0][k]) for k in (5, 0))]
+    worn = pump[largest], valve[largest]
+    return judged("6.2.4", tests, pump=pump[0.0], valve=valve[0.0], largest=largest, worn=worn)
 
 
-ITEMS: tuple[Item, ...] = (
-    Item(
-        "chapter-6-claims",
-        6,
-        "claims",
-        "What section 6.2 expects",
-        claims,
-        needs=("sec-6.2-open-loop", "sec-6.2-controllers", "sec-6.2-load", "sec-6.2-valve"),
-    ),
-)
+_NEEDS = tuple(f"sec-6.2-{name}" for name in ("open-loop", "controllers", "load", "valve"))
+ITEMS: tuple[Item, ...] = (Item("chapter-6-claims", 6, "claims", "What section 6.2 expects", claims, needs=_NEEDS),)

@@ -55,6 +55,7 @@ ITEMS: tuple[Item, ...] = (
         "claims",
         "What the abstract and chapters 1, 5 and 6 claim",
         detection,
+        uses_sheet=True,
         needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
     ),
     Item(
@@ -63,6 +64,7 @@ ITEMS: tuple[Item, ...] = (
         "table",
         "Every claim of the thesis and its verdict",
         table,
+        uses_sheet=True,
         needs=("chapter-3-claims", "chapter-4-claims", "detection-claims", "chapter-6-claims"),
     ),
 )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,16 +13,14 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.chapters.appendix_c.success_rates import DIRECTION, Rule, column_tests
 from sealscope.thesis.chapters.appendix_c.tables import simulated_sheet
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures, measure_test
+from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.context import Context
-from sealscope.thesis.engine.products import Claim, ThesisTable, verdict_of
+from sealscope.thesis.engine.products import Claim, ThesisTable
 from sealscope.thesis.sheet import DataSheet
 
 NO_SHEET = "the thesis's data sheet was not given"
-NOT_ON_SHEET = "not on the sheet"
 #: The details that chapter 5 calls sensitive.
 SENSITIVE = ("d3", "d4", "d3d4")
-#: A test on a sheet, measured or simulated: its result in words, and which of the claim's parts hold.
-SheetTest = Callable[[DataSheet], tuple[str, Sequence[bool]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +50,34 @@ def gather(context: Context) -> ClaimEvidence:
     return ClaimEvidence(context.sheet, leak, still, drift, table, shown, control)
 
 
-def on_sheet(
-    evidence: ClaimEvidence, id: str, where: str, claim: str, test: SheetTest, why: str | Callable[[DataSheet], str]
-) -> Claim:
-    """Judge a claim by the measured sheet; the same test on the simulated sheet stands beside it."""
-    simulation, _ = test(evidence.leak)
-    result, parts = (NO_SHEET, ()) if evidence.measured is None else test(evidence.measured)
-    reason = why if isinstance(why, str) else why(evidence.measured or evidence.leak)
-    return Claim(id, where, claim, result, simulation, verdict_of(parts), reason)
+#: A finding on a sheet, measured or simulated: its words, and which of the claim's parts hold.
+Finding = tuple[str, Sequence[bool]]
+#: Finds in a sheet what a claim says of it.
+SheetTest = Callable[[DataSheet], Iterable[Finding]]
 
 
-def by_simulation(id: str, where: str, claim: str, simulation: str, parts: Sequence[bool | None], why: str) -> Claim:
-    """Judge a claim that the sheet is silent on."""
-    return Claim(id, where, claim, NOT_ON_SHEET, simulation, verdict_of(parts), why)
+@dataclass(frozen=True)
+class SheetClaim:
+    """How a claim is judged by a sheet.
+
+    `test` gives the findings, written after `head` with `joint` between them; `values` of the other texts of the claim.
+    """
+
+    test: SheetTest
+    head: str = ""
+    joint: str = "; "
+    values: Callable[[ClaimEvidence, DataSheet], Mapping[str, Any]] = lambda evidence, sheet: {}
+
+    def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
+        """Judge by the measured sheet; the same test on the simulated sheet stands beside it."""
+
+        def found(sheet: DataSheet) -> tuple[str, list[bool]]:
+            texts, parts = zip(*self.test(sheet), strict=True)
+            return self.head + self.joint.join(texts), [part for of in parts for part in of]
+
+        result, parts = (NO_SHEET, []) if evidence.measured is None else found(evidence.measured)
+        values = self.values(evidence, evidence.measured or evidence.leak)
+        return judged(id, parts, kind, sheet=result, simulation=found(evidence.leak)[0], **values)
 
 
 def fired(sheet: DataSheet, rule: Rule) -> str:

@@ -6,39 +6,38 @@ import hashlib
 import json
 import os
 import traceback
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import astuple, dataclass, replace
-from functools import lru_cache
-from graphlib import TopologicalSorter
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
+import sealscope
 from sealscope.campaigns.execution.workers import Workers, process_count
 from sealscope.errors import InputError, SealscopeError
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun
-from sealscope.thesis.engine.folder import ResultsFolder
-from sealscope.thesis.engine.items import Item, check, collect, select_items, with_needed
+from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun, simulated_run
+from sealscope.thesis.engine.items import Item, collect, select_items, with_needed
+from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable, thinned
-from sealscope.thesis.engine.sources import sources_key
 from sealscope.thesis.sheet import MISSING, DataSheet, find_sheet, read_sheet
 
 #: Draws an item's products into a folder and returns its files, relative to the folder.
 Publish = Callable[[Item, tuple[Product | Claim, ...], Path], tuple[str, ...]]
 #: Called with how many items have ended, of how many, and which are in work.
 Progress = Callable[[int, int, Sequence[str]], None]
-LEFT_OUT = "left out"
-State = Literal["made", "drawn", "kept", "left out", "failed", "not made"]
-_DRAWING = ("matplotlib", "pillow", "jinja2")
-_RUNS = "sealscope.thesis.engine.runs"
+State = Literal["made", "kept", "left out", "failed", "not made"]
+#: Libraries that results and drawings rest on, beside the sources of this package.
+_LIBRARIES = ("numpy", "scipy", "numba", "PyWavelets", "matplotlib")
 
 
 @dataclass(frozen=True)
 class ItemStatus:
     """The state of an item in a results folder.
 
-    `state`: made now, only drawn anew, kept from an earlier call, left out or failed (`reason` says why), or not made
-    (not chosen, or made by other sources); `files`: what was drawn of it, relative to the folder.
+    `state`: made now, kept from an earlier call, left out or failed (`reason` says why), or not made (not chosen, or
+    made by other sources); `files`: what was drawn of it, relative to the folder.
     """
 
     item: Item
@@ -49,7 +48,7 @@ class ItemStatus:
     @property
     def available(self) -> bool:
         """Whether its products can be shown."""
-        return self.state in ("made", "drawn", "kept")
+        return self.state in ("made", "kept")
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,7 @@ class Reproduction:
 
     def products(self, status: ItemStatus) -> tuple[Product | Claim, ...]:
         """Read the products of an item from the folder; () where there are none."""
-        folder = ResultsFolder(self.job.folder)
-        return (folder.products(status.item.id, self.job.quick) or ()) if status.available else ()
+        return (Builder(self.job).products(status.item.id) or ()) if status.available else ()
 
 
 def reproduce(
@@ -102,59 +100,44 @@ def reproduce(
     if jobs is not None and jobs < 1:
         raise InputError(f"jobs must be >= 1, got {jobs}")
     every = tuple(items) if items is not None else collect()
-    check(every)
     chosen = with_needed(every, select_items(every, patterns))
-    job = Job(Path(folder), every, quick, find_sheet(sheet), publish)
-    builder = Builder(job)
+    builder = Builder(Job(Path(folder), every, quick, find_sheet(sheet), publish))
     with builder.folder.locked():
-        known = {item.id: builder.status(item) for item in chosen}
-        stale: dict[str, list[str]] = {}
-        for item in chosen:  # needs come before what needs them
-            needs = [needed for needed in item.needs if needed in stale]
-            if known[item.id].state == "not made" or (known[item.id].state == "kept" and needs):
-                stale[item.id] = needs
-        ended = 0
+        known = {item.id: builder.status(item) for item in every}
+        waiting = [item for item in chosen if known[item.id].state == "not made"]
+        total, ended = len(waiting), 0
 
         def report(in_work: Sequence[str]) -> None:
             if progress is not None:
-                progress(ended, len(stale), in_work)
+                progress(ended, total, in_work)
 
-        count = min(process_count(jobs), len(stale))
-        built = _in_turn(builder, stale, report) if count <= 1 else _side_by_side(job, stale, count, report)
-        with closing(built):
+        with closing(_built(builder, waiting, min(process_count(jobs), total), report)) as built:
             for status in built:
                 known[status.item.id] = status
                 ended += 1
         report(())
-        return Reproduction(job, tuple(known.get(item.id) or builder.status(item) for item in every))
+    return Reproduction(builder.job, tuple(known.values()))
 
 
-Report = Callable[[Sequence[str]], None]
-
-
-def _in_turn(builder: Builder, needs: Mapping[str, Sequence[str]], report: Report) -> Generator[ItemStatus, None, None]:
-    for name in needs:
-        report([name])
-        yield builder(name)
-
-
-def _side_by_side(
-    job: Job, needs: Mapping[str, Sequence[str]], jobs: int, report: Report
+def _built(
+    builder: Builder, waiting: list[Item], jobs: int, report: Callable[[Sequence[str]], None]
 ) -> Generator[ItemStatus, None, None]:
-    """Build the items in processes, each as soon as its needs have ended."""
-    items = {item.id: item for item in job.items}
-    sorter = TopologicalSorter(needs)
-    sorter.prepare()
-    ready: list[str] = []
-    with Workers(jobs, Builder(job)) as workers:
-        while sorter.is_active():
-            ready += sorter.get_ready()
-            while ready and workers.free:
-                workers.begin(ready.pop(0))
+    """Build the items in this process or in several, each as soon as its needs have ended."""
+    if jobs <= 1:
+        for item in waiting:
+            report([item.id])
+            yield builder(item.id)
+        return
+    with Workers(jobs, builder) as workers:
+        while waiting or workers.items:
+            unfinished = {item.id for item in waiting}.union(workers.items)
+            for item in [item for item in waiting if unfinished.isdisjoint(item.needs)]:
+                if workers.free:
+                    waiting.remove(item)
+                    workers.begin(item.id)
             report(workers.items)
             for name, status in workers.ended():
-                yield status or ItemStatus(items[name], "failed", "the process that made it died")
-                sorter.done(name)
+                yield status or ItemStatus(builder.items[name], "failed", "the process that made it died")
 
 
 class Builder:
@@ -165,7 +148,7 @@ class Builder:
         self.folder = ResultsFolder(job.folder)
         self.items = {item.id: item for item in job.items}
         self.sheet: DataSheet | None = None
-        self.sheet_key = "none"
+        self.sheet_key = ""
         if job.sheet is not None:
             self.sheet, self.sheet_key = read_sheet(job.sheet)
         self.run = lru_cache(maxsize=2)(self._run)
@@ -174,120 +157,55 @@ class Builder:
         return Builder, (self.job,)
 
     def __call__(self, name: str) -> ItemStatus:
-        """Make an item, or only draw it where its kept product is valid; the status holds the reason of a failure."""
+        """Make and draw an item; the status holds the reason of a failure."""
         item, job = self.items[name], self.job
         try:
-            status = self.status(item)
-            if status.state == "kept":
-                return status
-            products = self.folder.products(name, job.quick) if self._stamp(name) else None
-            state: State = "made" if products is None else "drawn"
-            if products is None:
-                products = self._make(item)
+            products = self.products(name) or tuple(map(_thinned, item.make(self._context(item), item)))
             files = () if job.publish is None else job.publish(item, products, job.folder)
-            self.folder.keep_drawn(name, self._drawing(self._stamp(name)), files)
+            self.folder.keep(name, self._key(item), products, files)
         except Exception as error:
             self.folder.keep_failure(name, traceback.format_exc())
             text = str(error) if isinstance(error, SealscopeError) else f"{type(error).__name__}: {error}"
             return ItemStatus(item, "failed", (text.strip() or type(error).__name__).splitlines()[0])
-        return ItemStatus(item, state, files=files)
+        return ItemStatus(item, "made", files=files)
 
     def status(self, item: Item) -> ItemStatus:
         """Return the status of an item in the folder: kept, left out or not made."""
         if item.needs_sheet and self.sheet is None:
             return ItemStatus(item, "left out", MISSING)
-        stamp = self._stamp(item.id)
-        drawn, files = self.folder.drawn(item.id)
-        if stamp and drawn == self._drawing(stamp):
-            return ItemStatus(item, "kept", files=files)
-        return ItemStatus(item, "not made")
+        files = self.folder.files(item.id, self._key(item))
+        return ItemStatus(item, "not made") if files is None else ItemStatus(item, "kept", files=files)
 
-    def _stamp(self, name: str) -> str:
-        """Digest of what the kept product of an item rests on, where that is as it was; else an empty text.
-
-        A record holds the `key` of the item; the hash of the `sheet` and the key of the `runs`, None where the maker
-        did not look at them; and the stamps of other items' products that it `asked` for.
-        """
-        item = self.items.get(name)
-        if item is None:
-            return ""
-        if item.needs_sheet and self.sheet is None:
-            return LEFT_OUT
-        record = self.folder.record(name, self.job.quick)
-        valid = (
-            record is not None
-            and record.get("key") == self._key(item)
-            and record["sheet"] in (None, self.sheet_key)
-            and record["runs"] in (None, sources_key(_RUNS))
-            and all(self._stamp(other) == stamp for other, stamp in record["asked"].items())
-        )
-        return _digest(record)[:24] if valid else ""
+    def products(self, name: str) -> tuple[Product | Claim, ...] | None:
+        """Return the products of an item that the folder holds; None where it has none of these sources."""
+        return self.folder.products(name, self._key(self.items[name]))
 
     def _key(self, item: Item) -> str:
-        """Digest of what an item's products rest on beside the sheet, the runs and other items."""
-        return _digest([astuple(item), self.job.quick, sources_key(item.make.__module__)])
+        """Digest of what an item's products and drawings rest on."""
+        sheet = self.sheet_key if item.needs_sheet or item.uses_sheet else ""
+        needs = [self._key(self.items[needed]) for needed in item.needs]
+        draw = self.job.publish is not None
+        own = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
+        return _digest([own, needs, sheet, draw, self.job.quick, sources_key()])
 
-    def _drawing(self, stamp: str) -> str:
-        """Key of the drawing of a product: the product and all that draws it."""
-        publish = self.job.publish
-        return stamp if publish is None else f"{stamp} {sources_key(publish.__module__, _DRAWING)}"
+    def _context(self, item: Item) -> Context:
+        def product(name: str) -> tuple[Product | Claim, ...]:
+            if name not in item.needs:
+                raise InputError(f"{item.id} must name {name} among its needs to ask for its products")
+            if self.status(self.items[name]).state == "left out":
+                return ()
+            products = self.products(name)
+            if products is None:
+                raise InputError(f"needs {name}, which failed")
+            return products
 
-    def _make(self, item: Item) -> tuple[Product | Claim, ...]:
-        for needed in item.needs:
-            if not self._stamp(needed):
-                raise InputError(f"needs {needed}, which failed")
-        context = BuildContext(self, item)
-        products = tuple(map(_thinned, item.make(context, item)))
-        record = {
-            "key": self._key(item),
-            "sheet": self.sheet_key if context.saw_sheet else None,
-            "runs": sources_key(_RUNS) if context.ran else None,
-            "asked": context.product_stamps,
-        }
-        self.folder.keep(item.id, self.job.quick, record, products)
-        return products
+        sheet = self.sheet if item.needs_sheet or item.uses_sheet else None
+        return Context(self.job.quick, sheet, self.run, product)
 
     def _run(self, spec: RunSpec) -> SimulatedRun:
-        from sealscope.thesis.engine import runs
-
-        experiment = runs.experiment_of(spec)
-        key = _digest([experiment.key(), spec.prove, sources_key(_RUNS)])
-        return self.folder.run(key[:32], lambda: runs.simulated_run(spec, experiment))
-
-
-class BuildContext:
-    """The Context of one item's maker; notes what it used, for the item's record."""
-
-    def __init__(self, builder: Builder, item: Item) -> None:
-        self._builder, self._item = builder, item
-        self.quick = builder.job.quick
-        self.saw_sheet = item.needs_sheet
-        self.ran = False
-        self.product_stamps: dict[str, str] = {}
-
-    @property
-    def sheet(self) -> DataSheet | None:
-        """The measured sheet, None where it was not given."""
-        self.saw_sheet = True
-        return self._builder.sheet
-
-    def run(self, spec: RunSpec) -> SimulatedRun:
-        """Return the run of `spec`: from memory, from the folder, or simulated now."""
-        self.ran = True
-        return self._builder.run(spec)
-
-    def product(self, item: str) -> tuple[Product | Claim, ...]:
-        """Return the products of an item among the maker's `needs`; () where it is left out for want of the sheet."""
-        if item not in self._item.needs:
-            raise InputError(f"{self._item.id} must name {item} among its needs to ask for its products")
-        builder = self._builder
-        self.product_stamps[item] = stamp = builder._stamp(item)
-        if stamp == LEFT_OUT:
-            return ()
-        products = builder.folder.products(item, builder.job.quick) if stamp else None
-        if products is None:
-            raise InputError(f"needs {item}, which failed")
-        return products
+        experiment = spec.experiment()
+        key = _digest([experiment.key(), spec.prove, sources_key()])
+        return self.folder.run(key, lambda: simulated_run(experiment, spec.prove))
 
 
 def _thinned(product: Product | Claim) -> Product | Claim:
@@ -304,7 +222,17 @@ def _thinned(product: Product | Claim) -> Product | Claim:
     return replace(product, panels=tuple(panels))
 
 
+@cache
+def sources_key() -> str:
+    """Digest of the sources of this package and the versions of the libraries under it: what every result rests on."""
+    package = Path(sealscope.__file__).parent
+    kinds = (".py", ".toml", ".csv", ".j2", ".css", ".js")
+    files = {str(path.relative_to(package)): path for path in package.rglob("*") if path.suffix in kinds}
+    sources = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in sorted(files.items())}
+    versions = {of.name.lower(): of.version for of in metadata.distributions()}
+    return _digest([sources, [versions.get(name.lower()) for name in _LIBRARIES]])
+
+
 def _digest(value: Any) -> str:
-    """SHA-256 of plain values; a function stands for its name."""
-    text = json.dumps(value, default=lambda of: f"{of.__module__}:{of.__qualname__}")
-    return hashlib.sha256(text.encode()).hexdigest()
+    """SHA-256 of plain values."""
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:32]

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from sealscope.errors import SimulationFailed
 from sealscope.recordings.recording import Array, Recording
-from sealscope.thesis.engine.products import Claim, Product
+from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import DataSheet
+
+if TYPE_CHECKING:
+    from sealscope.simulation.experiment import Experiment
 
 
 @dataclass(frozen=True)
 class RunSpec:
-    """A simulated run as text and numbers; equal specs are run once and kept on disk.
+    """A simulated run as text and numbers; equal specs are run once.
 
     `values`: parameters by name, as text with unit or SI number; `leaks` as `simulation.faults.parse_leak` reads
     them; `prove`: do the halving test too (its outcome is in `SimulatedRun.resolved`; an unresolved run is kept and
@@ -30,6 +36,23 @@ class RunSpec:
     method: Literal["auto", "rk4", "imex"] = "auto"
     step: float | None = None
     prove: bool = False
+
+    def experiment(self) -> Experiment:
+        """Make the experiment of this spec; raise InputError for one that cannot be."""
+        from sealscope.simulation.experiment import Experiment
+
+        return Experiment.of(
+            rig=self.rig,
+            command=self.command,
+            leak=self.leaks,
+            set=dict(self.values),
+            duration=self.duration,
+            seed=self.seed,
+            x_0=self.x_0,
+            method=self.method,
+            step=self.step,
+            allow_unresolved=True,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,20 +73,34 @@ class SimulatedRun:
     diverged: str = ""
 
 
-class Context(Protocol):
-    """Handed to every maker."""
+def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
+    """Simulate an experiment, with its halving test where it is asked for."""
+    from sealscope.simulation.simulate import simulate_with_truth
+
+    try:
+        simulated = simulate_with_truth(experiment, prove=prove)
+    except SimulationFailed as error:
+        return SimulatedRun(None, np.empty(0), {}, 0.0, False if prove else None, diverged=str(error))
+    truth, proof = simulated.truth, simulated.proof
+    moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
+    resolved = None if proof is None else proof.resolved
+    return SimulatedRun(simulated.recording, truth.t, truth.outputs, truth.mean_leak_lpm, resolved, moved)
+
+
+@dataclass(frozen=True)
+class Context:
+    """Handed to every maker.
+
+    `sheet`: the measured sheet, None where it was not given or the item does not use it; `run` gives the run of a spec,
+    simulated now or earlier; `product` the products of an item among the maker's `needs`, () where it is left out.
+    """
 
     quick: bool
+    sheet: DataSheet | None
+    run: Callable[[RunSpec], SimulatedRun]
+    product: Callable[[str], tuple[Product | Claim, ...]]
 
-    @property
-    def sheet(self) -> DataSheet | None:
-        """The measured sheet, None where it was not given."""
-        ...
 
-    def run(self, spec: RunSpec) -> SimulatedRun:
-        """Return the run of `spec`, simulated now or earlier."""
-        ...
-
-    def product(self, item: str) -> tuple[Product | Claim, ...]:
-        """Return the products of another item, made now or earlier."""
-        ...
+def first_table(context: Context, item: str) -> ThesisTable:
+    """Return the first table among the products of an item."""
+    return next(product for product in context.product(item) if isinstance(product, ThesisTable))

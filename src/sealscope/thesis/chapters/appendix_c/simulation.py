@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,6 +42,8 @@ FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT = (0.04, 0.08), (0.03, 0.03), (0.04, 0.0
 _SIZING = 30.0
 _NO_LEAK_SEED, _DRIFT_SEED = 1000, 2000
 _DRAWS, _QUICK_DRAWS = 2, 1
+#: RMS without and with what happened at half time, by chamber and quantity.
+Pairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
 
 @dataclass(frozen=True)
@@ -53,16 +56,12 @@ class RigDrift:
 
     def values(self, rig: Rig) -> dict[str, float]:
         """Return the drifted parameters by name, SI."""
-        friction, sensors = rig.friction, rig.sensors
-        return {
-            "friction.F_pr": friction.F_pr * self.friction,
-            "friction.F_cfr": friction.F_cfr * self.friction,
-            "friction.F_v": friction.F_v * self.friction,
-            "fluid.K_oil": rig.fluid.K_oil * self.bulk,
-            "sensors.common_noise": sensors.common_noise * self.noise,
-            "sensors.p_A.noise": sensors.p_A.noise * self.noise,
-            "sensors.p_B.noise": sensors.p_B.noise * self.noise,
+        factors = {
+            **dict.fromkeys(("friction.F_pr", "friction.F_cfr", "friction.F_v"), self.friction),
+            "fluid.K_oil": self.bulk,
+            **dict.fromkeys(("sensors.common_noise", "sensors.p_A.noise", "sensors.p_B.noise"), self.noise),
         }
+        return {name: float(rig[name]) * factor for name, factor in factors.items()}
 
 
 def draw_rig_drift(number: int, draw: int = 0) -> RigDrift:
@@ -78,9 +77,9 @@ class SimulatedTest:
     """One simulated test: RMS without and with what happened at half time, and what the run was."""
 
     condition: Condition
-    rms: Mapping[str, Mapping[str, tuple[float, ...]]]
+    rms: Pairs
     mean_leak_lpm: float
-    range_MPa: tuple[float, float]
+    range_MPa: tuple[float, ...]
     resolved: bool | None = None
     happened: str = ""
 
@@ -117,24 +116,17 @@ def pressure_range(values: Array) -> float:
     return float(np.ptp(np.percentile(values, [5.0, 95.0])))
 
 
-def _range_MPa(t: Array, outputs: Mapping[str, Array] | Trajectory, stop: float) -> tuple[float, float]:
+def _range_MPa(t: Array, outputs: Mapping[str, Array] | Trajectory, stop: float) -> tuple[float, ...]:
     """Range of both chambers' true pressures [MPa] from the settled start to `stop` [s]."""
     part = (t >= SETTLING) & (t < stop)
-    range_A, range_B = (pressure_range(outputs[chamber][part]) / 1e6 for chamber in CHAMBERS)
-    return range_A, range_B
+    return tuple(pressure_range(outputs[chamber][part]) / 1e6 for chamber in CHAMBERS)
 
 
-def _experiment(condition: Condition, duration: float, leak: str | None = None, **others: Any) -> Experiment:
+def _experiment(condition: Condition, duration: float, leak: str | None = None, seed: int = 0) -> Experiment:
     from sealscope.simulation.experiment import Experiment
 
-    return Experiment.of(
-        rig=BENCH_RIG,
-        command=condition.command,
-        set=experiment_values(condition),
-        leak=leak,
-        duration=duration,
-        **others,
-    )
+    values = experiment_values(condition)
+    return Experiment.of(rig=BENCH_RIG, command=condition.command, set=values, leak=leak, duration=duration, seed=seed)
 
 
 def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
@@ -144,6 +136,13 @@ def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
 
     volts = experiment.commanded.volts(experiment.sample_times())
     return record(experiment.rig, path, volts, oversampling(experiment), experiment.seed)
+
+
+def _still(group: tuple[str, float], duration: float) -> Trajectory:
+    """Simulate an operating condition without a leak."""
+    from sealscope.simulation.integrate import trajectory
+
+    return trajectory(_experiment(Condition(0, *group, 0.0, ""), duration), ())
 
 
 def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
@@ -174,15 +173,11 @@ def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
 
 def without_leak(quick: bool = False) -> Iterator[SimulatedTest]:
     """Simulate the same tests with no leak: nothing happens at half time; the noise alone differs."""
-    from sealscope.simulation.integrate import trajectory
-
+    still = cache(_still)  # for this call alone: a path is large
     half = QUICK_HALF if quick else HALF
-    paths: dict[tuple[str, float], Trajectory] = {}
     for condition in APPENDIX_C:
         experiment = _experiment(condition, 2 * half, seed=_NO_LEAK_SEED + condition.number)
-        if condition.group not in paths:
-            paths[condition.group] = trajectory(experiment, ())
-        path = paths[condition.group]
+        path = still(condition.group, 2 * half)
         rms = detail_rms(_recorded(experiment, path), ((SETTLING, half), (half, 2 * half)))
         yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, half), None, "nothing")
 
@@ -195,24 +190,20 @@ def with_drift(quick: bool = False) -> Iterator[SimulatedTest]:
     """
     from sealscope.simulation.integrate import trajectory
 
-    half = QUICK_HALF if quick else HALF
-    paths: dict[tuple[str, float], Trajectory] = {}
+    still = cache(_still)
+    length = SETTLING + (QUICK_HALF if quick else HALF)
+    part = ((SETTLING, length),)
     for draw in range(_QUICK_DRAWS if quick else _DRAWS):
         for condition in APPENDIX_C:
-            seed = _DRIFT_SEED + 100 * draw + condition.number
-            first = _experiment(condition, SETTLING + half, seed=seed)
-            if condition.group not in paths:
-                paths[condition.group] = trajectory(first, ())
-            path = paths[condition.group]
-            drift = draw_rig_drift(condition.number, draw)
+            first = _experiment(condition, length, seed=_DRIFT_SEED + 100 * draw + condition.number)
+            path, drift = still(condition.group, length), draw_rig_drift(condition.number, draw)
             rig = first.rig.with_overrides(drift.values(first.rig), source="drifted")
-            second = replace(first, rig=rig, seed=seed + 50_000)
-            part = ((SETTLING, SETTLING + half),)
+            second = replace(first, rig=rig, seed=first.seed + 50_000)
             before = detail_rms(_recorded(first, path), part)
             after = detail_rms(_recorded(second, trajectory(second, ())), part)
-            rms = {c: {name: (before[c][name][0], after[c][name][0]) for name in QUANTITIES} for c in CHAMBERS}
+            rms = {c: {name: (*before[c][name], *after[c][name]) for name in QUANTITIES} for c in CHAMBERS}
             happened = f"friction x {drift.friction:.3f}, K x {drift.bulk:.3f}, noise x {drift.noise:.3f}"
-            yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, SETTLING + half), None, happened)
+            yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, length), None, happened)
 
 
 #: Chamber, quantity, half and head of the RMS columns.
@@ -223,33 +214,19 @@ _RMS_COLUMNS = [
     for k, when in enumerate(("no leak", "leak"))
 ]
 _COLUMNS = (
-    "test",
-    "input",
-    "closed [%]",
-    "at half time",
-    "mean leak [L/min]",
-    "p_A range [MPa]",
-    "p_B range [MPa]",
+    *("test", "input", "closed [%]", "at half time", "mean leak [L/min]", "p_A range [MPa]", "p_B range [MPa]"),
     *(head for *_, head in _RMS_COLUMNS),
 )
 
 
 def table_of(tests: list[SimulatedTest], item: str, title: str, notes: str = "") -> ThesisTable:
     """Tabulate the tests; `sheet_of` reads the table back. It is resolved when every run that was proved is."""
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (
-            test.condition.number,
-            test.condition.command,
-            test.condition.closed_pct,
-            test.happened,
-            test.mean_leak_lpm,
-            *test.range_MPa,
-            *(test.rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS),
-        )
-        for test in tests
-    )
+    rows: list[tuple[Cell, ...]] = []
+    for test in tests:
+        of, rms = test.condition, (test.rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
+        rows.append((of.number, of.command, of.closed_pct, test.happened, test.mean_leak_lpm, *test.range_MPa, *rms))
     outcomes = [test.resolved for test in tests if test.resolved is not None]
-    return ThesisTable(item, title, _COLUMNS, rows, resolved=all(outcomes) if outcomes else None, notes=notes)
+    return ThesisTable(item, title, _COLUMNS, tuple(rows), resolved=all(outcomes) if outcomes else None, notes=notes)
 
 
 def column(table: ThesisTable, head: str) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,23 +44,22 @@ class Rule:
         return np.asarray(np.all(moved, axis=0))
 
 
+def _rule(chamber: str, detail: str, printed: str = "") -> Rule:
+    return Rule(f"P_{chamber} {detail} {'down' if chamber == 'A' else 'up'}", ((f"p_{chamber}", detail),), printed)
+
+
 #: The six cells of Table 5.1 and the cumulative one.
 CLAIMED: tuple[Rule, ...] = (
-    Rule("P_A d3 down", (("p_A", "d3"),), "100"),
-    Rule("P_A d4 down", (("p_A", "d4"),), "64 (65 in the text)"),
-    Rule("P_A d3d4 down", (("p_A", "d3d4"),), "85"),
-    Rule("P_B d3 up", (("p_B", "d3"),), "48"),
-    Rule("P_B d4 up", (("p_B", "d4"),), "76"),
-    Rule("P_B d3d4 up", (("p_B", "d3d4"),), "76"),
+    _rule("A", "d3", "100"),
+    _rule("A", "d4", "64 (65 in the text)"),
+    _rule("A", "d3d4", "85"),
+    _rule("B", "d3", "48"),
+    _rule("B", "d4", "76"),
+    _rule("B", "d3d4", "76"),
     Rule("both d3d4", (("p_A", "d3d4"), ("p_B", "d3d4")), "65"),
 )
 #: The columns of Appendix C that Table 5.1 leaves out.
-UNCLAIMED: tuple[Rule, ...] = (
-    Rule("P_A d1 down", (("p_A", "d1"),)),
-    Rule("P_A d2 down", (("p_A", "d2"),)),
-    Rule("P_B d1 up", (("p_B", "d1"),)),
-    Rule("P_B d2 up", (("p_B", "d2"),)),
-)
+UNCLAIMED: tuple[Rule, ...] = tuple(_rule(chamber, detail) for chamber in "AB" for detail in ("d1", "d2"))
 
 
 def _counted(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
@@ -77,32 +76,23 @@ def counts(measured: DataSheet | None, leak: DataSheet, still: DataSheet, drift:
 
     The last rows are the rules that always and never fire.
     """
-
-    def row(name: str, printed: str, fires: list[Fires | None]) -> tuple[Cell, ...]:
-        with_leak, with_drift = fires[1], fires[3]
-        assert with_leak is not None and with_drift is not None
-        gain = 100.0 * float(with_leak.mean() - with_drift.mean())
-        return (name, printed or None, *(cell for of in fires for cell in _counted(of)), gain)
-
     sheets = (measured, leak, still, drift)
-    rows = [
-        row(rule.name, rule.printed, [None if sheet is None else rule.fires(sheet) for sheet in sheets])
-        for rule in (*CLAIMED, *UNCLAIMED)
-    ]
-    for name, value in (("always fires", True), ("never fires", False)):
-        sizes = [None if sheet is None else sheet.rms["p_A"]["d3"].shape[0] for sheet in sheets]
-        rows.append(row(name, "", [None if n is None else np.full(n, value) for n in sizes]))
+    rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
+        **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
+        "always fires": ("", lambda sheet: np.full(sheet.tests, True)),
+        "never fires": ("", lambda sheet: np.full(sheet.tests, False)),
+    }
+    rows: list[tuple[Cell, ...]] = []
+    for name, (printed, fires) in rules.items():
+        cells = [cell for sheet in sheets for cell in _counted(None if sheet is None else fires(sheet))]
+        rows.append((name, printed or None, *cells, 100.0 * float(fires(leak).mean() - fires(drift).mean())))
     return rows
 
 
+_SOURCES = ("sheet", "simulated leak", "simulated, no leak", "simulated, drift only")
 RATES = (
-    "rule",
-    "printed [%]",
-    *(
-        f"{of}: {what}"
-        for of in ("sheet", "simulated leak", "simulated, no leak", "simulated, drift only")
-        for what in ("fires", *_COUNTED)
-    ),
+    *("rule", "printed [%]"),
+    *(f"{of}: {what}" for of in _SOURCES for what in ("fires", *_COUNTED)),
     "simulated leak less drift [points]",
 )
 
@@ -125,15 +115,8 @@ def column_tests(sheet: DataSheet) -> list[tuple[Cell, ...]]:
 
 
 COLUMNS = (
-    "source",
-    "chamber",
-    "detail",
-    "down",
-    "up",
-    "geometric mean change [%]",
-    "sign test p",
-    "p, Holm over ten columns",
-    "moves (p < 0.05)",
+    *("source", "chamber", "detail", "down", "up", "geometric mean change [%]"),
+    *("sign test p", "p, Holm over ten columns", "moves (p < 0.05)"),
 )
 
 
@@ -174,10 +157,8 @@ def thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) ->
 
 THRESHOLDS = (
     "rule",
-    "sheet: threshold from d1's scatter [%]",
-    *(f"sheet: {what}" for what in ("finds", *_COUNTED)),
-    "simulated: threshold from drift only [%]",
-    *(f"simulated leak: {what}" for what in ("finds", *_COUNTED)),
+    *("sheet: threshold from d1's scatter [%]", *(f"sheet: {what}" for what in ("finds", *_COUNTED))),
+    *("simulated: threshold from drift only [%]", *(f"simulated leak: {what}" for what in ("finds", *_COUNTED))),
 )
 
 
@@ -186,38 +167,32 @@ def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     leak_runs, leak = simulated_sheet(context, "appendix-c-leak")
     _, still = simulated_sheet(context, "appendix-c-no-leak")
     _, drift = simulated_sheet(context, "appendix-c-drift")
-    measured = context.sheet
+    measured, resolved = context.sheet, leak_runs.resolved
+    sheets = dict(zip(_SOURCES, (measured, leak, still, drift), strict=True))
+    tests = tuple((name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet))
     none = "" if measured else " No measured sheet was given."
-    success = ThesisTable(
-        item.id,
-        item.title,
-        RATES,
-        tuple(counts(measured, leak, still, drift)),
-        resolved=leak_runs.resolved,
-        notes="A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
+    notes = (
+        "A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
         f"(Clopper-Pearson) and take the tests as independent, which repeats of one condition are not.{none} The bench "
         f"had no leak-free test, so its own false-alarm rate is unknown. {leak_runs.notes}",
+        "Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the leak "
+        "always came second.",
+        "On the sheet the threshold is 1.645 times the scatter of d1's changes about zero in the same chamber: they "
+        "are the only leak-free ones; in simulation it is the 95 % point of the drift-only tests.",
     )
-    sheets = {"sheet": measured, "simulated leak": leak, "simulated, no leak": still, "simulated, drift only": drift}
-    columns = ThesisTable(
-        f"{item.id}-columns",
-        "Sign tests of every column of Appendix C",
-        COLUMNS,
-        tuple((name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet)),
-        resolved=leak_runs.resolved,
-        notes="Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the "
-        "leak always came second.",
+    set_for = f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms"
+    return tuple(
+        ThesisTable(f"{item.id}{tail}", title, heads, tuple(rows), resolved=resolved, notes=note)
+        for (tail, title, heads, rows), note in zip(
+            (
+                ("", item.title, RATES, counts(measured, leak, still, drift)),
+                ("-columns", "Sign tests of every column of Appendix C", COLUMNS, tests),
+                ("-thresholds", set_for, THRESHOLDS, thresholds(measured, leak, drift)),
+            ),
+            notes,
+            strict=True,
+        )
     )
-    limits = ThesisTable(
-        f"{item.id}-thresholds",
-        f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms",
-        THRESHOLDS,
-        tuple(thresholds(measured, leak, drift)),
-        resolved=leak_runs.resolved,
-        notes="On the sheet the threshold is 1.645 times the scatter of d1's changes about zero in the same chamber: "
-        "they are the only leak-free ones; in simulation it is the 95 % point of the drift-only tests.",
-    )
-    return success, columns, limits
 
 
 ITEMS: tuple[Item, ...] = (
@@ -227,6 +202,7 @@ ITEMS: tuple[Item, ...] = (
         "table",
         "Success rates of Table 5.1, counted anew, with intervals and false alarms",
         table,
+        uses_sheet=True,
         needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
     ),
 )

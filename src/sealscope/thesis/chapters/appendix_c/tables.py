@@ -7,39 +7,19 @@ import numpy as np
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.thesis.chapters.appendix_c.simulation import (
-    BULK_DRIFT,
-    FRICTION_DRIFT,
-    NOISE_DRIFT,
-    sheet_of,
-    table_of,
-    with_drift,
-    with_leak,
-    without_leak,
-)
-from sealscope.thesis.engine.context import Context
+from sealscope.thesis.chapters.appendix_c import simulation
+from sealscope.thesis.chapters.appendix_c.simulation import sheet_of, table_of
+from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, DataSheet
 
 #: Figs. 5.90 to 5.95: chamber, quantity, and the direction it is said to move when a leak opens.
-DIFFERENCES: tuple[tuple[str, str, str, str], ...] = (
-    ("fig-5.90", "p_A", "d3", "down"),
-    ("fig-5.91", "p_A", "d4", "down"),
-    ("fig-5.92", "p_A", "d3d4", "down"),
-    ("fig-5.93", "p_B", "d3", "up"),
-    ("fig-5.94", "p_B", "d4", "up"),
-    ("fig-5.95", "p_B", "d3d4", "up"),
-)
+DIFFERENCES = tuple((c, name, way) for c, way in (("p_A", "down"), ("p_B", "up")) for name in ("d3", "d4", "d3d4"))
 AGREEMENT = (
-    "chamber",
-    "detail",
-    "mean change with leak, simulated [%]",
-    "mean change with leak, measured [%]",
-    "leak-free RMS, simulated / measured",
-    "scatter of that ratio [factor]",
-    "tests with the same sign of change [of 41]",
-    "correlation of the changes",
+    *("chamber", "detail", "mean change with leak, simulated [%]", "mean change with leak, measured [%]"),
+    *("leak-free RMS, simulated / measured", "scatter of that ratio [factor]"),
+    *("tests with the same sign of change [of 41]", "correlation of the changes"),
 )
 
 
@@ -54,29 +34,30 @@ def leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
     )
     notes = f"{_where(context)} Laminar leak of the test's own mean. {proof}"
-    return (table_of(list(with_leak(context.quick)), item.id, item.title, notes),)
+    return (table_of(list(simulation.with_leak(context.quick)), item.id, item.title, notes),)
 
 
 def no_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the 41 tests with nothing happening at half time."""
     notes = f'{_where(context)} Nothing leaks: "leak" heads the second half.'
-    return (table_of(list(without_leak(context.quick)), item.id, item.title, notes),)
+    return (table_of(list(simulation.without_leak(context.quick)), item.id, item.title, notes),)
 
 
 def drift_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the 41 tests without a leak on a rig that drifts between the halves."""
-    bounds = [f"{100 * low:g} to {100 * high:g} %" for low, high in (FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT)]
+    drifts = (simulation.FRICTION_DRIFT, simulation.BULK_DRIFT, simulation.NOISE_DRIFT)
+    bounds = [f"{100 * low:g} to {100 * high:g} %" for low, high in drifts]
     notes = (
         f'{_where(context)} Nothing leaks: "leak" heads the second half, from a rig with friction moved {bounds[0]}, '
         f"bulk modulus {bounds[1]}, noise {bounds[2]}, up or down at random. The sizes are assumed: the scatter "
         "of d1 on the thesis's own sheet is 4 %, the others were not measured."
     )
-    return (table_of(list(with_drift(context.quick)), item.id, item.title, notes),)
+    return (table_of(list(simulation.with_drift(context.quick)), item.id, item.title, notes),)
 
 
 def simulated_sheet(context: Context, item: str) -> tuple[ThesisTable, DataSheet]:
     """Return the table of `appendix-c-leak`, `-no-leak` or `-drift`, and the sheet in it."""
-    table = next(product for product in context.product(item) if isinstance(product, ThesisTable))
+    table = first_table(context, item)
     return table, sheet_of(table)
 
 
@@ -112,18 +93,13 @@ def agreement(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, 
             change = sheet.log_change(chamber, name)
             row: list[Cell] = [chamber, name, float(100 * np.expm1(change.mean()))]
             if measured is None:
-                row += [None] * 5
-            else:
-                real = measured.log_change(chamber, name)
-                ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
-                row += [
-                    float(100 * np.expm1(real.mean())),
-                    float(np.exp(ratio.mean())),
-                    float(np.exp(ratio.std(ddof=1))),
-                    int(np.sum(np.sign(change) == np.sign(real))),
-                    float(np.corrcoef(change, real)[0, 1]),
-                ]
-            rows.append(tuple(row))
+                rows.append((*row, *[None] * 5))
+                continue
+            real = measured.log_change(chamber, name)
+            ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
+            same, correlation = int(np.sum(np.sign(change) == np.sign(real))), np.corrcoef(change, real)[0, 1]
+            numbers = (100 * np.expm1(real.mean()), np.exp(ratio.mean()), np.exp(ratio.std(ddof=1)))
+            rows.append((*row, *map(float, numbers), same, float(correlation)))
     return rows
 
 
@@ -141,23 +117,21 @@ def appendix(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the change of a detail's RMS against the mean leak: measured, simulated, simulated without a leak."""
-    chamber, name, direction = (str(item.input(key)) for key in ("chamber", "detail", "way"))
+    chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     table, sheet = simulated_sheet(context, "appendix-c-leak")
     leak = np.array([row.mean_leak_lpm for row in APPENDIX_C])
-    sources: list[tuple[DataSheet | None, str, Role]] = [
+    sources: tuple[tuple[DataSheet | None, str, Role], ...] = (
         (context.sheet, "measured (sheet)", "measured"),
         (sheet, "simulated", "simulated"),
         (simulated_sheet(context, "appendix-c-no-leak")[1], "simulated, nothing leaks", "no leak"),
-    ]
-    numbers: list[Number] = []
-    absolute, relative = [], []
+    )
+    numbers, absolute, relative = [], [], []
     for source, label, role in sources:
         if source is None:
             continue
-        pairs = source.rms[chamber][name]
+        pairs, change = source.rms[chamber][name], source.log_change(chamber, name)
         absolute.append(FigureCurve(leak, pairs[:, 1] - pairs[:, 0], label, role, "points"))
         relative.append(FigureCurve(leak, _difference(pairs), label, role, "points"))
-        change = source.log_change(chamber, name)
         k = int(np.sum(change < 0 if direction == "down" else change > 0))
         low, high = clopper_pearson(k, change.size)
         numbers += [
@@ -166,10 +140,9 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
             Number(f"{label}: correlation of the change with the leak", float(np.corrcoef(change, leak)[0, 1])),
         ]
     zero = FigureCurve(np.array([leak.min(), leak.max()]), np.zeros(2), "no change", "reference")
-    panels = (
-        Panel("mean leak [L/min]", f"RMS with - without leak, {name} [{UNITS[name]}]", (*absolute, zero)),
-        Panel("mean leak [L/min]", f"change of the RMS of {name} [%]", (*relative, zero)),
-    )
+    heads = (f"RMS with - without leak, {name} [{UNITS[name]}]", f"change of the RMS of {name} [%]")
+    drawn = zip(heads, (absolute, relative), strict=True)
+    panels = tuple(Panel("mean leak [L/min]", head, (*curves, zero)) for head, curves in drawn)
     return (Figure(item.id, item.title, panels, tuple(numbers), resolved=table.resolved, notes=table.notes),)
 
 
@@ -177,17 +150,26 @@ ITEMS: tuple[Item, ...] = (
     Item("appendix-c-leak", 5, "case", "The 41 tests of Appendix C simulated with their leak", leak_table),
     Item("appendix-c-no-leak", 5, "case", "The same 41 tests simulated with no leak", no_leak_table),
     Item("appendix-c-drift", 5, "case", "The same 41 tests simulated with no leak on a rig that drifts", drift_table),
-    Item("appendix-c", 5, "table", "Appendix C, simulated beside measured", appendix, needs=("appendix-c-leak",)),
+    Item(
+        "appendix-c",
+        5,
+        "table",
+        "Appendix C, simulated beside measured",
+        appendix,
+        uses_sheet=True,
+        needs=("appendix-c-leak",),
+    ),
     *(
         Item(
-            figure,
+            f"fig-5.{number}",
             5,
             "figure",
             f"Change of the RMS of {name} of {chamber} against the mean leak",
             difference_figure,
-            inputs=(("chamber", chamber), ("detail", name), ("way", direction)),
+            {"chamber": chamber, "detail": name, "way": direction},
+            uses_sheet=True,
             needs=("appendix-c-leak", "appendix-c-no-leak"),
         )
-        for figure, chamber, name, direction in DIFFERENCES
+        for number, (chamber, name, direction) in enumerate(DIFFERENCES, 90)
     ),
 )

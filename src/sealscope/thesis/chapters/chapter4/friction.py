@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 _AXES = ("v [m/s]", "F_f [N]")
 
 
-def _rig() -> Rig:
+def thesis_rig() -> Rig:
+    """Return the rig of the thesis."""
     from sealscope.parameters import load_rig
 
     return load_rig("thesis")
@@ -28,14 +29,14 @@ def stribeck(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
     """Return the rig's friction [N] at `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs. (4.21), (4.22)."""
     from sealscope.physics.friction import stribeck_friction
 
-    f = _rig().friction
+    f = thesis_rig().friction
     plain = getattr(stribeck_friction, "py_func", stribeck_friction)
     return np.array([plain(float(value), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for value in v])
 
 
 def jumps_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
     """Return friction [N] at and just above v_th for both bracketings of eq. (4.22), "continuous" and "literal"."""
-    v_th = _rig().friction.v_th
+    v_th = thesis_rig().friction.v_th
     sides = np.array([v_th, math.nextafter(v_th, 1.0)])
     jumps = {}
     for name, literal_bracket in (("continuous", False), ("literal", True)):
@@ -46,26 +47,24 @@ def jumps_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
 
 def falls_up_to(F_C: float) -> float:
     """Return the velocity [m/s] up to which friction falls with it: where F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
-    f = _rig().friction
+    f = thesis_rig().friction
     return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
 
 
 def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with Table 4.1's numbers."""
-    f = _rig().friction
+    f = thesis_rig().friction
+    F, peak, v_th = f.F_pr, f.F_pr * f.K_brk, f.v_th
     v = np.linspace(-0.1, 0.1, 801)
-    peak = f.F_pr * f.K_brk
-    step = np.array([-0.1, 0.0, 0.0, 0.1])
-    coulomb = np.array([-f.F_pr, -f.F_pr, f.F_pr, f.F_pr])
-    static_v = np.array([-0.1, 0.0, 0.0, 0.0, 0.0, 0.1])
-    static = np.array([-f.F_pr, -f.F_pr, -peak, peak, f.F_pr, f.F_pr])
-    slip_v = np.array([-0.1, -f.v_th, f.v_th, 0.1])
-    slip = np.array([-f.F_pr, -peak, peak, f.F_pr])
-    panels = (
-        Panel(*_AXES, (FigureCurve(step, coulomb, "F_C sign(v)", "reference"),), "(a) Coulomb"),
-        Panel(*_AXES, (FigureCurve(static_v, static, "F_C K_brk at rest", "reference"),), "(b) Static"),
-        Panel(*_AXES, (FigureCurve(slip_v, slip, "linear below v_th", "reference"),), "(c) Stick-slip"),
-        Panel(*_AXES, (FigureCurve(v, stribeck(v, f.F_pr), "eqs. 4.21, 4.22", "reference"),), "(d) Stribeck"),
+    sketches: dict[str, tuple[str, Any, Any]] = {
+        "(a) Coulomb": ("F_C sign(v)", [-0.1, 0.0, 0.0, 0.1], [-F, -F, F, F]),
+        "(b) Static": ("F_C K_brk at rest", [-0.1, 0.0, 0.0, 0.0, 0.0, 0.1], [-F, -F, -peak, peak, F, F]),
+        "(c) Stick-slip": ("linear below v_th", [-0.1, -v_th, v_th, 0.1], [-F, -peak, peak, F]),
+        "(d) Stribeck": ("eqs. 4.21, 4.22", v, stribeck(v, F)),
+    }
+    panels = tuple(
+        Panel(*_AXES, (FigureCurve(np.array(x), np.array(y), label, "reference"),), title)
+        for title, (label, x, y) in sketches.items()
     )
     numbers = (
         Number("Coulomb force without pressure", f.F_pr, "N"),
@@ -78,7 +77,7 @@ def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
 
 def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 4.3: friction against velocity, near rest under both bracketings, and its slope."""
-    rig = _rig()
+    rig = thesis_rig()
     f = rig.friction
     charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
     v = np.linspace(-0.2, 0.2, 1601)
