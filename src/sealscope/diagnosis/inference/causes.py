@@ -7,7 +7,7 @@ terms, all equally likely beforehand; hypotheses that the channels cannot tell a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
-from sealscope.diagnosis.inference.terms import LEAK, ORIFICE, Equation, priors
+from sealscope.diagnosis.inference.terms import LEAK, MADE_UP, ORIFICE, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: Blocks that causes are weighed with: a step is dated by the leak's own test.
@@ -42,8 +42,13 @@ class StepHypothesis(NamedTuple):
     score: float
 
 
-def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns]) -> tuple[StepHypothesis, ...]:
-    """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak."""
+def hypotheses(
+    blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns], lost: Mapping[str, StepTest]
+) -> tuple[StepHypothesis, ...]:
+    """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak.
+
+    Oil that leaves the circuit empties the accumulator as well, by as much (`lost`).
+    """
     coarse = blocks.merged(COARSE)
     tested = []
     for index, term in enumerate(balances[0].terms):
@@ -61,8 +66,16 @@ def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[C
         if best is not None:
             # the zero that it needs, or what is believed of its size
             score = best.score - (cost if name in (LEAK, ORIFICE) else _unlikely(best) if name == SCALE else 0.0)
-            stepped.append(StepHypothesis(name, cause, best, score))
+            stored = lost.get(name.removesuffix(MADE_UP)) if cause == "external leak" else None
+            stepped.append(StepHypothesis(name, cause, best, score + (0.0 if stored is None else _agree(best, stored))))
     return tuple(sorted(stepped, key=lambda own: -own.score))
+
+
+def _agree(test: StepTest, stored: StepTest) -> float:
+    """Return twice the logarithm of the likelihood of what the accumulator lost, beside that of none."""
+    at = int(np.abs(stored.onsets - test.onsets[test.best]).argmin())
+    lost, expected = np.array([stored.size[at], test.fitted[0]]) / stored.deviation[at]
+    return float(lost**2 - (lost - expected) ** 2)
 
 
 def _unlikely(scale: StepTest) -> float:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Blocks
-from sealscope.diagnosis.inference.causes import StepHypothesis
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
-from sealscope.diagnosis.inference.onset import StepTest
-from sealscope.diagnosis.inference.terms import LOCKED, circulation, equations, locked, priors
+from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked, priors
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.without_position import circulations
+from sealscope.diagnosis.inference.without_position import circulations, lost_oil
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
@@ -32,33 +29,6 @@ _NO_BALANCE = {
 }
 #: Fewest samples between neighbouring test functions.
 RESOLVED = 2
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedCirculation(RecordedBalance):
-    """A recorded balance without a position, with what the accumulator says of oil that leaves the circuit.
-
-    `lost`: tests of a step of the external leak of either side by the accumulator's own balance, by the term's name.
-    """
-
-    lost: Mapping[str, StepTest]
-
-    @cached_property
-    def hypotheses(self) -> tuple[StepHypothesis, ...]:
-        """Tests of all terms' coefficients; an external leak must empty the accumulator as well, by as much.
-
-        Twice the logarithm of the likelihood of what the accumulator lost, beside that of none, is added to its score.
-        """
-        tested = []
-        for own in super().hypotheses:
-            store = self.lost.get(own.name)
-            if store is not None:
-                at = int(np.abs(store.onsets - own.test.onsets[own.test.best]).argmin())
-                seen, expected = np.array([store.size[at], own.test.fitted[0]]) / store.deviation[at]
-                tested.append(own._replace(score=own.score + float(seen**2 - (seen - expected) ** 2)))
-            else:
-                tested.append(own)
-        return tuple(sorted(tested, key=lambda own: -own.score))
 
 
 def made_good(balance: RecordedBalance) -> bool:
@@ -109,13 +79,17 @@ class VolumeBalance:
         if not balances:
             made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), self.reads)
             recorded = [
-                RecordedCirculation(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
+                RecordedBalance(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
                 for own in made
             ]
             answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
             return min(answering, key=lambda own: bound_of(own, None), default=None)
         blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
-        return None if blocks is None else RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording)
+        if blocks is None:
+            return None
+        zero = float(blocks[0].zero[0])
+        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_oil(own, self.rig, zero), self.reads)
+        return RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording, lost)
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a step of the leakage, and of its rise against the baseline."""
@@ -128,6 +102,6 @@ class VolumeBalance:
             if compared is not None and compared.columns[0].names == own.columns[0].names:
                 healthy.append(compared.blocks)
         evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
-        if isinstance(own, RecordedCirculation):
+        if own.equations[0].name != CYLINDER and len(own.columns) == 1:
             return evidence
         return replace(evidence, share=float(rows.mean() / max(rows.max(), 1.0)))

@@ -64,10 +64,14 @@ class Signals:
         Sampling rate [Hz].
     zeros : mapping of str to float
         What is added to a gauge pressure to make it an absolute one [Pa], by the channel's name.
+    zero : float, optional
+        What p_A - p_B reads too much [Pa].
     """
 
-    def __init__(self, channels: Mapping[str, Array], rate: float, zeros: Mapping[str, float]) -> None:
-        self._channels, self.rate, self._zeros = channels, rate, zeros
+    def __init__(
+        self, channels: Mapping[str, Array], rate: float, zeros: Mapping[str, float], zero: float = 0.0
+    ) -> None:
+        self._channels, self.rate, self._zeros, self._zero = channels, rate, zeros, zero
         self._steps: dict[str, Array] = {}
         self._means: dict[str, Array] = {}
 
@@ -96,8 +100,8 @@ class Signals:
 
     @cached_property
     def pressure_difference(self) -> Array:
-        """p_A - p_B [Pa] in the middle of each interval."""
-        return self.mean("p_A") - self.mean("p_B")
+        """p_A - p_B [Pa] in the middle of each interval, about its zero."""
+        return self.mean("p_A") - self.mean("p_B") - self._zero
 
     @cached_property
     def port_difference(self) -> Array:
@@ -123,7 +127,7 @@ class Signals:
     @cached_property
     def carried_by_A(self) -> Array:
         """1 where p_A > p_B, else 0, at each sample."""
-        return (self._channels["p_A"] > self._channels["p_B"]).astype(float)
+        return (self._channels["p_A"] > self._channels["p_B"] + self._zero).astype(float)
 
     def moved(self, outward: bool, by_A: bool) -> Array:
         """Return the increments of x of one direction while one side carries the pressure [m]."""
@@ -233,7 +237,10 @@ LEAK, ORIFICE = "leak", "leak through an orifice"
 PUMP = "pump leak"
 #: What passes or is read whatever the pressures are; a zero of the pressures acts through it.
 BIAS = "bias"
-#: The balance of a load that shut valves hold, by name.
+#: What the name of a leak to the outside ends with where a check valve makes it up.
+MADE_UP = ", made up"
+#: The balance with a position of a pump-controlled cylinder, and that of a load that shut valves hold, by name.
+CYLINDER = "cylinder"
 LOCKED = "locked"
 #: What remains of a speed loop's state at the first sample, which nothing recorded tells.
 START = "start"
@@ -343,7 +350,7 @@ def _made_up(side: str) -> Term:
         return np.asarray((carries if side == "A" else 1.0 - carries) * s.mean(name) * s.dt)
 
     return Term(
-        f"external leak {side}, made up",
+        f"external leak {side}{MADE_UP}",
         f"[{name} the larger] {name} dt",
         "m^3/(s Pa)",
         lost,
@@ -480,10 +487,10 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     by_command = channels.isdisjoint(_SOURCES)
     # an angle has no zero of a speed: what is lost whatever the pressures are is lost to the outside
     terms = [
-        term._replace(cause="external leak") if term.name == BIAS and "theta" in channels else term
+        term._replace(cause="external leak", drift="outside") if term.name == BIAS and "theta" in channels else term
         for term in ((_START, *_CYLINDER) if by_command else _CYLINDER)
     ]
-    balance = Equation("cylinder", left, tuple(terms), drive=SpeedLoop.of(rig) if by_command else None)
+    balance = Equation(CYLINDER, left, tuple(terms), drive=SpeedLoop.of(rig) if by_command else None)
     return (_with_channels(balance, channels | {START}),)
 
 
@@ -524,12 +531,15 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
 def of_store(rig: Rig) -> Equation:
     """Return the balance of the oil in the accumulator that makes up what leaves the circuit.
 
-    Its gas expands, -V dp/(n p), as oil is lost, and as it warms; the lower of the chambers' pressures is its own.
+    Its gas expands, -V dp/(n p) at its charge, as oil is lost, as the rod leaves, and as it warms; the pressure of the
+    side that does not carry is its own.
     """
+    makeup = rig.makeup
+    compliance = makeup.V_gas / (makeup.n_gas * (rig.fluid.p_charge + ATMOSPHERE))
 
     def expanded(s: Signals) -> Array:
-        lower = np.minimum(s.absolute["p_A"], s.absolute["p_B"])
-        return np.asarray(-rig.makeup.V_gas / rig.makeup.n_gas * _steps(np.log(lower)))
+        gas = -compliance * _steps(np.where(s.carried_by_A > 0.0, s["p_B"], s["p_A"]))
+        return np.asarray(gas - (rig.cylinder.A_A - rig.cylinder.A_B) * s.step("x") if "x" in s else gas)
 
     warmed = _BIAS._replace(cause="external leak")
     return Equation("accumulator", expanded, (warmed, _lost_outside("A"), _lost_outside("B"), *_LEAKS))

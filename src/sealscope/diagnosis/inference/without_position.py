@@ -28,6 +28,7 @@ from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, witho
 from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting, information
 from sealscope.diagnosis.inference.onset import FEWEST, StepTest, step_test
 from sealscope.diagnosis.inference.terms import (
+    BIAS,
     LEAK,
     LOCKED,
     ORIFICE,
@@ -95,28 +96,50 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     area = max(rig.cylinder.A_A, rig.cylinder.A_B)
     counts = known & (signals.step("u") == 0.0) if shut else known
     still = _held(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
-    begin, made, long = float(recording.t[0]), list[CycleBalance](), recording.duration / STORED
+    begin, made = float(recording.t[0]), list[CycleBalance]()
+    carries = rig.cylinder.single_rod
     if shut:
-        blocks = _blocks(signals, equation, rig, HELD, known & still, begin)
+        blocks = _blocks(signals, equation, HELD, known & still, begin, carries)
         return [] if blocks is None else [CycleBalance(blocks, equation, Columns(equation), {})]
     cycle = _cycle(np.where(known, speed, 0.0), recording.rate)
     for half, counts in ((cycle, known), (HELD, known & still)):
-        blocks = None if half is None else _blocks(signals, equation, rig, half, counts, begin)
+        blocks = None if half is None else _blocks(signals, equation, half, counts, begin, carries)
         if blocks is not None:
-            lost = _lost(signals, rig, long if cycle is None else cycle * np.ceil(long / cycle), known, begin)
+            lost = _lost(signals, rig, recording.duration, cycle, known, begin)
             made.append(CycleBalance(blocks, equation, Columns(equation), lost))
     return made
 
 
-def _lost(signals: Signals, rig: Rig, half: float, counts: NDArray[np.bool_], begin: float) -> dict[str, StepTest]:
+def lost_oil(recording: Recording, rig: Rig, zero: float) -> dict[str, StepTest]:
+    """Return the tests of what leaves a circuit by the accumulator's balance, beside a balance with a position.
+
+    `zero`: what p_A - p_B reads too much [Pa].
+    """
+    names = {"x", "p_A", "p_B"}
+    if rig.makeup.check_valves == "absent" or not names <= set(recording.channels):
+        return {}
+    samples = {name: without_rails(name, recording[name]) for name in names}
+    signals = Signals(samples, recording.rate, {}, zero)
+    moved = signals.step("x")
+    known = np.isfinite(moved + signals.pressure_difference)
+    if recording.bridged is not None:
+        known &= ~(recording.bridged[1:] | recording.bridged[:-1])
+    cycle = _cycle(np.where(known, moved, 0.0) * recording.rate, recording.rate) if known.any() else None
+    return _lost(signals, rig, recording.duration, cycle, known, float(recording.t[0]))
+
+
+def _lost(
+    signals: Signals, rig: Rig, seconds: float, cycle: float | None, counts: NDArray[np.bool_], begin: float
+) -> dict[str, StepTest]:
     """Return the tests of what leaves the circuit by the accumulator's balance, empty where there is none."""
     if rig.makeup.check_valves == "absent":
         return {}
-    store = of_store(rig)
-    columns, blocks = Columns(store), _blocks(signals, store, rig, half, counts, begin)
+    store, long = of_store(rig), seconds / STORED
+    half = long if cycle is None else cycle * float(np.ceil(long / cycle))
+    columns, blocks = Columns(store), _blocks(signals, store, half, counts, begin)
     if blocks is None:
         return {}
-    names = [name for name in columns.names if name.startswith("external")]
+    names = [name for name in columns.names if name == BIAS or name.startswith("external")]
     tests = {name: step_test(information(blocks, [columns], columns.names.index(name))) for name in names}
     return {name: test for name, test in tests.items() if test is not None}
 
@@ -163,14 +186,22 @@ def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
 
 
 def _blocks(
-    signals: Signals, equation: Equation, rig: Rig, half: float, counts: NDArray[np.bool_], begin: float
+    signals: Signals,
+    equation: Equation,
+    half: float,
+    counts: NDArray[np.bool_],
+    begin: float,
+    carries: bool = False,
 ) -> Blocks | None:
-    """Return the blocks of test functions of a half-width [s]; None for fewer than `FEWEST`."""
+    """Return the blocks of test functions of a half-width [s]; None for fewer than `FEWEST`.
+
+    `carries`: rows count where one side carries throughout.
+    """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
     increments = [*(term.increments(signals) for term in equation.terms), left]
     rows = _rows(increments, counts, half, rate)
     _less_the_zero(rows.values, [term.name for term in equation.terms])
-    if rig.cylinder.single_rod:
+    if carries:
         side = _rows([signals.carried_by_A[1:] / rate], counts, half, rate).values[:, 0]
         one_side = np.minimum(side, 1.0 - side) < priors()["held"]["elsewhere"].value
         rows = rows._replace(whole=rows.whole & one_side)
