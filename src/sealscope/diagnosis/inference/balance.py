@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 LONGEST, SHORTEST, WANTED = 3.0, 0.5, 20
 #: Turns by which the terms are taken about a zero of p_A - p_B, and how near to it they are, as a share of what is
 #: believed of one: a root is not linear in it, nor is which side carries.
-TURNS, NEAR = 2, 2.0
+TURNS, NEAR = 2, 3.0
 #: Samples whose increments are computed at once: they stay in the processor's cache.
 AT_ONCE = 8192
 
@@ -263,10 +263,16 @@ def _zero(pressure: Array) -> float:
     return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
 
 
-def without_rails(name: str, values: Array) -> Array:
-    """Return the samples, NaN where a pressure is cut off at an end of its sensor's range."""
-    rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
-    return np.where(np.isin(values, rails), np.nan, values) if rails else values
+def whole_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
+    """Return the samples of channels, NaN where bridged or where a pressure is cut off at an end of its range."""
+    samples = {}
+    for name in recording.channels:
+        if name not in names:
+            continue
+        values = recording[name] if recording.bridged is None else np.where(recording.bridged, np.nan, recording[name])
+        rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
+        samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
+    return samples
 
 
 def shortest(rate: float) -> int:
@@ -283,10 +289,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
         return None
     needed = {"x", "p_A", "p_B", *(name for balance in balances for term in balance.terms for name in term.needs)}
     needed |= {next(name for name in ("theta", "omega", "q_pump", "u") if name in names)}
-    samples = {name: recording[name] for name in names if name in needed}
-    if recording.bridged is not None:
-        samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
-    samples = {name: without_rails(name, values) for name, values in samples.items()}
+    samples = whole_samples(recording, needed)
     seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
     zero = 0.0
     for _ in range(TURNS):

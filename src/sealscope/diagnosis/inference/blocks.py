@@ -419,6 +419,19 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
     return 0.5 * (precision + precision.T) / fit.fitted.variance, vector / fit.fitted.variance, middle
 
 
+def mean_of(blocks: Blocks, columns: Columns, shares: Mapping[int, float]) -> tuple[float, float]:
+    """Return a mean of coefficients, by their columns' `shares`, and its deviation; the leak is free in each block."""
+    others = [k for k in columns.nuisance if k != columns.leak]
+    normal, fitted, _ = _fit(blocks.gram[:, 0], blocks, columns, columns.leak, others)
+    weights = np.zeros((len(others) + 1, len(fitted.coefficients) // (len(others) + 1)))
+    for column, share in shares.items():
+        weights[others.index(column), 0] = share
+    energy = np.maximum(normal.energy, np.finfo(float).tiny)
+    matrix = normal.cross - (normal.along / energy[:, None]).T @ normal.along + np.diag(fitted.precision)
+    variance = float(weights.ravel() @ solve(matrix, weights.ravel())) * fitted.variance
+    return float(weights.ravel() @ fitted.coefficients), float(np.sqrt(max(variance, 0.0)))
+
+
 def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
     """Return a recording's sums (E, m, m), over the rows' variance."""
     sums = []

@@ -11,9 +11,10 @@ import numpy as np
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Blocks
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
+from sealscope.diagnosis.inference.store import lost_beside
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked, priors
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.without_position import circulations, lost_oil
+from sealscope.diagnosis.inference.without_position import circulations
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
@@ -88,7 +89,7 @@ class VolumeBalance:
         if blocks is None:
             return None
         zero = float(blocks[0].zero[0])
-        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_oil(own, self.rig, zero), self.reads)
+        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), self.reads)
         return RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording, lost)
 
     def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:

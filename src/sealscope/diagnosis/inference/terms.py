@@ -528,23 +528,6 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     return Equation(LOCKED, gives_way, (*_STORED, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
 
 
-def of_store(rig: Rig) -> Equation:
-    """Return the balance of the oil in the accumulator that makes up what leaves the circuit.
-
-    Its gas expands, -V dp/(n p) at its charge, as oil is lost, as the rod leaves, and as it warms; the pressure of the
-    side that does not carry is its own.
-    """
-    makeup = rig.makeup
-    compliance = makeup.V_gas / (makeup.n_gas * (rig.fluid.p_charge + ATMOSPHERE))
-
-    def expanded(s: Signals) -> Array:
-        gas = -compliance * _steps(np.where(s.carried_by_A > 0.0, s["p_B"], s["p_A"]))
-        return np.asarray(gas - (rig.cylinder.A_A - rig.cylinder.A_B) * s.step("x") if "x" in s else gas)
-
-    warmed = _BIAS._replace(cause="external leak")
-    return Equation("accumulator", expanded, (warmed, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
-
-
 #: Channels that give what the pump delivers, the first recorded one is taken.
 _SOURCES = ("theta", "omega", "q_pump")
 

@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, without_rails
-from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting, information
-from sealscope.diagnosis.inference.onset import FEWEST, StepTest, step_test
+from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, whole_samples
+from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.onset import FEWEST, StepTest
+from sealscope.diagnosis.inference.store import cycle_length, lost_oil
 from sealscope.diagnosis.inference.terms import (
-    BIAS,
     LEAK,
     LOCKED,
     ORIFICE,
@@ -37,10 +37,8 @@ from sealscope.diagnosis.inference.terms import (
     Signals,
     circulation,
     locked,
-    of_store,
     priors,
 )
-from sealscope.recordings.cycle import cycle_of, fundamental
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
@@ -49,8 +47,6 @@ if TYPE_CHECKING:
 #: Half-width of a test function while the piston is held, and the time it settles for before, as it moves slower than
 #: a share of its largest speed, averaged over a while [s].
 HELD, SETTLES, SLOW, AVERAGED = 0.25, 0.25, 0.1, 0.1
-#: Half-widths of the accumulator's test functions in a recording: a pressure's noise hides what leaves at once.
-STORED = 24
 _95 = 1.96
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_A", "p_B")
 
@@ -101,47 +97,13 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     if shut:
         blocks = _blocks(signals, equation, HELD, known & still, begin, carries)
         return [] if blocks is None else [CycleBalance(blocks, equation, Columns(equation), {})]
-    cycle = _cycle(np.where(known, speed, 0.0), recording.rate)
+    cycle = cycle_length(np.where(known, speed, 0.0), recording.rate)
     for half, counts in ((cycle, known), (HELD, known & still)):
         blocks = None if half is None else _blocks(signals, equation, half, counts, begin, carries)
         if blocks is not None:
-            lost = _lost(signals, rig, recording.duration, cycle, known, begin)
+            lost = lost_oil(signals, rig, cycle, begin)
             made.append(CycleBalance(blocks, equation, Columns(equation), lost))
     return made
-
-
-def lost_oil(recording: Recording, rig: Rig, zero: float) -> dict[str, StepTest]:
-    """Return the tests of what leaves a circuit by the accumulator's balance, beside a balance with a position.
-
-    `zero`: what p_A - p_B reads too much [Pa].
-    """
-    names = {"x", "p_A", "p_B"}
-    if rig.makeup.check_valves == "absent" or not names <= set(recording.channels):
-        return {}
-    samples = {name: without_rails(name, recording[name]) for name in names}
-    signals = Signals(samples, recording.rate, {}, zero)
-    moved = signals.step("x")
-    known = np.isfinite(moved + signals.pressure_difference)
-    if recording.bridged is not None:
-        known &= ~(recording.bridged[1:] | recording.bridged[:-1])
-    cycle = _cycle(np.where(known, moved, 0.0) * recording.rate, recording.rate) if known.any() else None
-    return _lost(signals, rig, recording.duration, cycle, known, float(recording.t[0]))
-
-
-def _lost(
-    signals: Signals, rig: Rig, seconds: float, cycle: float | None, counts: NDArray[np.bool_], begin: float
-) -> dict[str, StepTest]:
-    """Return the tests of what leaves the circuit by the accumulator's balance, empty where there is none."""
-    if rig.makeup.check_valves == "absent":
-        return {}
-    store, long = of_store(rig), seconds / STORED
-    half = long if cycle is None else cycle * float(np.ceil(long / cycle))
-    columns, blocks = Columns(store), _blocks(signals, store, half, counts, begin)
-    if blocks is None:
-        return {}
-    names = [name for name in columns.names if name == BIAS or name.startswith("external")]
-    tests = {name: step_test(information(blocks, [columns], columns.names.index(name))) for name in names}
-    return {name: test for name, test in tests.items() if test is not None}
 
 
 def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Array]:
@@ -149,7 +111,7 @@ def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Ar
 
     The thesis's drive takes 19 s to make good what the load costs it: what of that is left at first fades (`START`).
     """
-    samples = {name: without_rails(name, recording[name]) for name in _READ if name in recording.channels}
+    samples = whole_samples(recording, _READ)
     if equation.name != LOCKED:
         drive = Drive.of(rig)
         if "u" in samples and samples.keys().isdisjoint(("theta", "omega", "q_pump")):
@@ -158,21 +120,7 @@ def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Ar
             sense = -1.0 if float((u - u.mean()) @ (dp - dp.mean())) < 0.0 else 1.0
             samples["omega"] = drive.flow(u, sense * dp, recording.rate) / drive.displacement
         samples[START] = np.exp(-np.arange(len(recording)) / (recording.rate * drive.lag))
-    if recording.bridged is not None:
-        samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
     return samples
-
-
-def _cycle(speed: Array, rate: float) -> float | None:
-    """Return the duration of a stroke to and fro [s], or of the strongest line of the speed; None without one."""
-    cycle, seconds = cycle_of(speed, rate), speed.size / rate
-    if cycle is None:
-        spectrum = np.abs(np.fft.rfft((speed - speed.mean()) * np.hanning(speed.size)))
-        line = int(spectrum.argmax())
-        if line < FEWEST:
-            return None
-        cycle = seconds / line
-    return 1.0 / fundamental(speed, np.arange(speed.size) / rate, cycle)
 
 
 def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
