@@ -200,7 +200,7 @@ class Weighting:
 
 def solve(matrix: Array, right: Array) -> Array:
     """Return matrix^-1 right of a symmetric matrix >= 0; directions that nothing is known of are left at zero."""
-    size = np.sqrt(matrix.diagonal())
+    size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     size[~(size > 0.0)] = 1.0
     column = size[:, None]
     scaled = matrix / column / size

@@ -24,7 +24,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
-from sealscope.diagnosis.inference.terms import BIAS, LEAK, MADE_UP, ORIFICE, Equation, priors
+from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: Blocks that causes are weighed with: a step is dated by the leak's own test.
@@ -63,6 +63,8 @@ def hypotheses(
     for index, term in enumerate(balances[0].terms):
         if term.drift == "motion" and index in columns[0].motion and term.name.startswith("motion"):
             continue  # area and displacement change together, as a scale
+        if AIR in columns[0].names and term.cause == "air in the oil" and term.nuisance:
+            continue  # free air changes them together
         if lost and term.name == BIAS:
             continue  # an accumulator's pressure drives what leaves its circuit
         replaced = columns[0].leak if term.name == ORIFICE else None

@@ -41,8 +41,11 @@ def cycle_length(speed: Array, rate: float) -> float | None:
 
 
 def lost_beside(recording: Recording, rig: Rig, zero: float) -> dict[str, StepTest]:
-    """Return `lost_oil` of a recording with a position; `zero`: what p_A - p_B reads too much [Pa]."""
-    if rig.makeup.check_valves == "absent":
+    """Return `lost_oil` of a recording with a position; `zero`: what p_A - p_B reads too much [Pa].
+
+    Empty but for a single rod: behind the check valves of a double rod's circuit either side may keep its own pressure.
+    """
+    if rig.makeup.check_valves == "absent" or not rig.cylinder.single_rod:
         return {}
     samples = whole_samples(recording, ("x", "p_A", "p_B"))
     signals = Signals(samples, recording.rate, {}, zero)

@@ -233,6 +233,8 @@ class Equation(NamedTuple):
 
 #: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
 LEAK, ORIFICE = "leak", "leak through an orifice"
+#: Free air in both chambers at once; what single coefficients of its kind do it does.
+AIR = "free air"
 #: The pump's own leakage, by the pressures at its ports.
 PUMP = "pump leak"
 #: What passes or is read whatever the pressures are; a zero of the pressures acts through it.
@@ -322,6 +324,22 @@ def _of_side(side: str) -> tuple[Term, ...]:
             needs=(name,),
         ),
     )
+
+
+def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
+    """Return free air in both chambers at once, each by its volume; `share`: how far side A's balance counts."""
+    own = rig.cylinder
+    middle = {"A": own.V + own.V_hose_A, "B": own.V - own.V_rod + own.V_hose_B}
+    areas = {"A": own.A_A, "B": -own.A_B} if own.volumes == "position" else {"A": 0.0, "B": 0.0}
+
+    def released(s: Signals) -> Array:
+        by_A = share(s)
+        volumes = {side: np.maximum(middle[side] + areas[side] * s.mean("x"), 0.1 * middle[side]) for side in "AB"}
+        expands = {side: volumes[side] * _steps(1.0 / s.absolute[f"p_{side}"]) for side in "AB"}
+        return np.asarray(by_A * expands["A"] - (1.0 - by_A) * expands["B"])
+
+    formula = "V_A d(1/p_A) - V_B d(1/p_B)"
+    return Term(AIR, formula, "Pa", released, "air in the oil", nuisance=False, needs=("x", "p_A", "p_B"))
 
 
 def _lost_outside(side: str) -> Term:
@@ -467,7 +485,7 @@ def _chamber(side: str, rig: Rig) -> Equation:
     of a healthy piston tells them apart, and so friction that changes from a leak.
     """
     area = rig.cylinder.A_A if side == "A" else rig.cylinder.A_B
-    terms = (*_edges(side), *_of_side(side), _BIAS, *_LEAKS)
+    terms = (*_edges(side), *_of_side(side), _BIAS, _released(rig, lambda s: float(side == "A")), *_LEAKS)
     return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, "piston", takes=-1.0)
 
 
@@ -490,6 +508,8 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
         term._replace(cause="external leak", drift="outside") if term.name == BIAS and "theta" in channels else term
         for term in ((_START, *_CYLINDER) if by_command else _CYLINDER)
     ]
+    one_side = rig.cylinder.single_rod
+    terms.insert(-len(_LEAKS), _released(rig, lambda s: _middle(s.carried_by_A) if one_side else 0.5))
     balance = Equation(CYLINDER, left, tuple(terms), drive=SpeedLoop.of(rig) if by_command else None)
     return (_with_channels(balance, channels | {START}),)
 
