@@ -10,6 +10,8 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import diagnosis_text, passes
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 from .balance_machine import machine, step
 
@@ -103,3 +105,20 @@ def test_no_leak_only_where_one_worth_finding_would_have_shown() -> None:
     noisy = machine(4, p_noise=2.0e6, x_step=2.0e-3)
     evidence = VolumeBalance(rig(None)).examine(noisy, [], P)
     assert evidence.verdict == "cannot tell"
+
+
+@pytest.mark.parametrize(("command", "load"), [("5 sin(2t)", "0 N"), ("5 sin(2t)", "-3000 N"), ("3 sin(4t)", "2000 N")])
+def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load: str) -> None:
+    """An angle has no zero of the flow: what drifts over a cycle is what pump and piston pass together."""
+    own = load_rig("single-rod-eha")
+    experiment = Experiment.of(rig=own, command=command, load=load, duration=60, leak="0.1 L/min from 0 s", seed=3)
+    simulated = simulate_with_truth(experiment)
+    difference = simulated.truth.outputs["p_A"] - simulated.truth.outputs["p_B"]
+    true = own.pump.G_pump * float(np.abs(difference).mean()) * LPM + simulated.truth.mean_leak_lpm
+    diagnosis = diagnose(simulated.recording, rig=own, quick=True)
+    assert diagnosis.passage is not None
+    assert diagnosis.passage.lpm == pytest.approx(true, rel=0.05)
+    low, high = diagnosis.passage.interval_lpm or pytest.fail("no interval")
+    assert low <= true <= high
+    worn = true / LPM / float(np.abs(difference).mean()) > own.pump.G_healthy
+    assert diagnosis.verdict == ("leak" if worn else "no leak")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.balance import BlockStream, blocks_of
 from sealscope.diagnosis.inference.blocks import information, zero_of
 from sealscope.diagnosis.inference.onset import StepTest, step_test
@@ -14,9 +16,12 @@ from sealscope.diagnosis.inference.terms import SpeedLoop, equations, priors
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 
 RATE, DURATION, ONSET = 200.0, 60.0, 30.0
 LEAK = 5e-12
+LATE = "0.05 L/min from 60 s"
 NOISE = np.random.default_rng(43)
 
 
@@ -178,3 +183,17 @@ def test_a_stream_is_oriented_and_driven_as_the_recording_is(rig: Rig, leaking: 
 def test_nothing_is_balanced_without_a_source_of_flow(rig: Rig) -> None:
     assert equations(rig, frozenset({"x", "p_A", "p_B"})) == ()
     assert equations(load_rig("servo-valve"), frozenset({"x", "p_A", "p_B", "u"})) == ()
+
+
+@pytest.mark.parametrize("bar", [-6.0, -1.0, 6.0])
+def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(bar: float) -> None:
+    """Which side carries, and the root of an orifice's law, are taken about the zero."""
+    single = load_rig("single-rod-eha")
+    experiment = Experiment.of(rig=single, command="5 sin(2t)", duration=120, load="-3000 N", leak=LATE, seed=3)
+    own = simulate_with_truth(experiment).recording
+    shifted = replace(own, channels={**own.channels, "p_A": own["p_A"] + bar * 1e5})
+    diagnosis = diagnose(shifted, rig=single, quick=True)
+    assert diagnosis.verdict == "leak"
+    low, high = diagnosis.leak_interval_lpm or pytest.fail("no interval")
+    assert low <= 0.05 <= high
+    assert ("p_A - p_B reads" in diagnosis.reason) and (("too much" in diagnosis.reason) == (bar > 0.0))

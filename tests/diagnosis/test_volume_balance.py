@@ -139,7 +139,7 @@ def test_under_a_weight_that_is_held_a_leak_inside_is_none_to_the_outside() -> N
     drawn = draw("load", 100, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
     leaks = simulate_with_truth(drawn.experiment(seed=100, leak="0.0015 L/min from 60 s"))
     found = VolumeBalance(load_rig("thesis-closed-loop")).examine(leaks.recording, [], P)
-    assert (found.verdict, found.cause) == ("leak", "piston or pump leak"), found.reason
+    assert found.verdict == "leak" and found.cause in ("piston leak", "piston or pump leak"), found.reason
     assert found.leak_interval_lpm is not None
     assert found.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= found.leak_interval_lpm[1]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,6 +20,7 @@ from sealscope.diagnosis.inference.terms import (
     Equation,
     Signals,
     equations,
+    priors,
 )
 from sealscope.diagnosis.inference.weak_form import SPAN, STRIDE, rows, stride_samples
 from sealscope.diagnosis.inference.zero import about_zero
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 
 #: Longest and shortest block, and how many a recording has where it is long enough for these [s].
 LONGEST, SHORTEST, WANTED = 3.0, 0.5, 20
+#: Turns by which the terms are taken about a zero of p_A - p_B, and how near to it they are, as a share of what is
+#: believed of one: a root is not linear in it, nor is which side carries.
+TURNS, NEAR = 2, 3.0
 #: Samples whose increments are computed at once: they stay in the processor's cache.
 AT_ONCE = 8192
 
@@ -51,6 +55,8 @@ class BlockStream:
         Blocks at the beginning whose rows are weighted together; None: all that are pushed at first.
     start : float, optional
         Time of the first sample [s].
+    zero : float, optional
+        What p_A - p_B reads too much [Pa].
     """
 
     def __init__(
@@ -60,9 +66,10 @@ class BlockStream:
         seconds: float = LONGEST,
         support: int | None = SUPPORT,
         start: float = 0.0,
+        zero: float = 0.0,
     ) -> None:
         self.columns = tuple(Columns(balance) for balance in balances)
-        self._balances, self._rate = balances, rate
+        self._balances, self._rate, self._zero = balances, rate, zero
         self._stride = stride_samples(rate)
         self._strides = max(SPAN, round(seconds / STRIDE))
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
@@ -183,7 +190,7 @@ class BlockStream:
         start = self._begin + (index * self._strides + 0.5 * SPAN) * (self._stride / self._rate)
         last = start + (self._strides - 1) * self._stride / self._rate
         means, pressures = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("means", "pressures"))
-        zeros = np.zeros(end - first)
+        zeros = np.full(end - first, self._zero)
         return Blocks(start, last, gram, weights.astype(float), means, pressures, zeros)
 
     def _cut(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
@@ -194,7 +201,7 @@ class BlockStream:
         stop = end * length + (SPAN - 1) * self._stride + 1
         reach = stop + self._margin - self._first
         cut = {name: values[begin - self._first : reach] for name, values in samples.items()}
-        signals = Signals(cut, self._rate, self._zeros or {})
+        signals = Signals(cut, self._rate, self._zeros or {}, self._zero)
         inner = slice(start - begin, stop - 1 - begin)
         whole = np.ones((end - first) * self._strides, dtype=bool)
         cut_rows = []
@@ -203,7 +210,7 @@ class BlockStream:
             made = rows([column[inner] for column in columns], self._rate)
             whole &= made.whole
             cut_rows.append(made.values)
-        pressure = signals.pressure_difference[inner][: (end - first) * length].reshape(-1, length)
+        pressure = (signals.pressure_difference + self._zero)[inner][: (end - first) * length].reshape(-1, length)
         rate = self._balances[0].left(signals)[inner][: (end - first) * length].reshape(-1, length) * self._rate
         return _Cut(tuple(cut_rows), whole, _means(pressure, rate), self._pressures(pressure))
 
@@ -256,10 +263,16 @@ def _zero(pressure: Array) -> float:
     return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
 
 
-def without_rails(name: str, values: Array) -> Array:
-    """Return the samples, NaN where a pressure is cut off at an end of its sensor's range."""
-    rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
-    return np.where(np.isin(values, rails), np.nan, values) if rails else values
+def whole_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
+    """Return the samples of channels, NaN where bridged or where a pressure is cut off at an end of its range."""
+    samples = {}
+    for name in recording.channels:
+        if name not in names:
+            continue
+        values = recording[name] if recording.bridged is None else np.where(recording.bridged, np.nan, recording[name])
+        rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
+        samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
+    return samples
 
 
 def shortest(rate: float) -> int:
@@ -276,14 +289,19 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
         return None
     needed = {"x", "p_A", "p_B", *(name for balance in balances for term in balance.terms for name in term.needs)}
     needed |= {next(name for name in ("theta", "omega", "q_pump", "u") if name in names)}
-    samples = {name: recording[name] for name in names if name in needed}
-    if recording.bridged is not None:
-        samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
-    samples = {name: without_rails(name, values) for name, values in samples.items()}
+    samples = whole_samples(recording, needed)
     seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
-    stream = BlockStream(balances, recording.rate, seconds, support=None, start=float(recording.t[0]))
-    blocks = stream.push(samples, last=True)
-    return None if blocks is None else (about_zero(blocks, stream.columns).merged(), stream.columns)
+    zero = 0.0
+    for _ in range(TURNS):
+        stream = BlockStream(balances, recording.rate, seconds, None, float(recording.t[0]), zero)
+        blocks = stream.push(samples, last=True)
+        if blocks is None:
+            return None
+        blocks = about_zero(blocks, stream.columns)
+        zero, before = float(blocks.zero[0]), zero
+        if abs(zero - before) < NEAR * priors()["zero"]["pressure"].value:
+            break
+    return blocks.merged(), stream.columns
 
 
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")

@@ -37,6 +37,8 @@ MOST_BLOCKS = 240
 DRIFT_DEGREE = 2
 #: Parts of a block's distribution of pressure, and the time over which the pressure is averaged for it [s].
 PRESSURE_PARTS, SMOOTHED = 9, 0.025
+#: Beliefs of the coefficients that are free in each block while its rows are weighted.
+UNSTEADY = ("leak", "pump", "bias", "outside")
 _RIDGE = 1e-10  # of a matrix whose diagonal is 1
 _TURNS = 3
 _MOST, _TOLERANCE = 50, 1e-2  # turns to a fixed point at most, and the relative change that ends them
@@ -124,8 +126,14 @@ class Columns:
         self.drift = np.array([beliefs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
         differs = priors()["between"]
         self.between = np.array([differs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
+        levels = priors()["level"]
+        self.levels = np.array(
+            [levels[term.drift].value if term.drift in levels else np.inf for term in equation.terms]
+        )
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
-        self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in ("leak", "pump", "bias"))
+        self.support = tuple(
+            k for k in self.nuisance if equation.terms[k].drift not in ("leak", "pump", "bias", "outside")
+        )
         self.fast = tuple(k for k in self.nuisance if k not in self.support)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.driven = tuple(term.driven for term in equation.terms)
@@ -192,7 +200,7 @@ class Weighting:
 
 def solve(matrix: Array, right: Array) -> Array:
     """Return matrix^-1 right of a symmetric matrix >= 0; directions that nothing is known of are left at zero."""
-    size = np.sqrt(matrix.diagonal())
+    size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     size[~(size > 0.0)] = 1.0
     column = size[:, None]
     scaled = matrix / column / size
@@ -267,9 +275,11 @@ def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int)
 class _Belief(NamedTuple):
     """What is believed of the other coefficients.
 
-    `drift` (c,), standard deviations of each one's drifts; `zero`, that of the last one; `at`: what it is counted from.
+    Standard deviations of each one's `level` and of its `drift`, (c,); `zero`, that of the last one; `at`: what it is
+    counted from.
     """
 
+    level: Array
     drift: Array
     zero: float
     at: float = 0.0
@@ -298,6 +308,7 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
     for _ in range(_MOST):
         belief, mean = np.zeros((2, len(believed.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
+            belief[:, 0] = OVERLAP * variance / believed.level**2
             belief[:, 1:] = (OVERLAP * variance / believed.drift**2)[:, None]
         if believed.zero > 0.0:
             belief[-1, 0], mean[-1, 0] = OVERLAP * variance / believed.zero**2, -believed.at
@@ -331,7 +342,8 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     rows, degrees = max(float(blocks.rows.sum()), 1.0), powers.shape[1]
     total = gram.sum(axis=0)
     level = solve(total[np.ix_(others, others)], total[others, columns.left])
-    believed = _Belief(np.append(np.abs(level) * columns.drift[others] * minutes, 0.0), width)
+    size = np.append(np.minimum(np.abs(level), columns.levels[others]) * columns.drift[others] * minutes, 0.0)
+    believed = _Belief(np.append(columns.levels[others], np.inf), size, width)
     chosen, slope = [*others, gram.shape[1]], np.zeros(len(blocks))
     for turn in range(_TURNS + 1):
         normal = _normal(_about(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
@@ -405,6 +417,19 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
     precision = np.diag(np.concatenate([of_leak.energy, of_bias.energy])) - along @ solved[:, :-1]
     vector = np.concatenate([of_leak.lead, of_bias.lead]) - along @ solved[:, -1]
     return 0.5 * (precision + precision.T) / fit.fitted.variance, vector / fit.fitted.variance, middle
+
+
+def mean_of(blocks: Blocks, columns: Columns, shares: Mapping[int, float]) -> tuple[float, float]:
+    """Return a mean of coefficients, by their columns' `shares`, and its deviation; the leak is free in each block."""
+    others = [k for k in columns.nuisance if k != columns.leak]
+    normal, fitted, _ = _fit(blocks.gram[:, 0], blocks, columns, columns.leak, others)
+    weights = np.zeros((len(others) + 1, len(fitted.coefficients) // (len(others) + 1)))
+    for column, share in shares.items():
+        weights[others.index(column), 0] = share
+    energy = np.maximum(normal.energy, np.finfo(float).tiny)
+    matrix = normal.cross - (normal.along / energy[:, None]).T @ normal.along + np.diag(fitted.precision)
+    variance = float(weights.ravel() @ solve(matrix, weights.ravel())) * fitted.variance
+    return float(weights.ravel() @ fitted.coefficients), float(np.sqrt(max(variance, 0.0)))
 
 
 def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:

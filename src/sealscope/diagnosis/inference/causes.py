@@ -7,7 +7,7 @@ terms, all equally likely beforehand; hypotheses that the channels cannot tell a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
-from sealscope.diagnosis.inference.terms import LEAK, ORIFICE, Equation, priors
+from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: Blocks that causes are weighed with: a step is dated by the leak's own test.
@@ -34,21 +34,39 @@ SCALE = "scale"
 
 
 class StepHypothesis(NamedTuple):
-    """The coefficient of a term stepped: its `name`, the `cause`, the test, and its score less what it needs beside."""
+    """The coefficient of a term stepped: its `name`, the `cause`, the test, and what else speaks for it.
+
+    `beside`: twice the logarithm of what is believed of the zero or the size that it needs, and of the likelihood of
+    what the accumulator lost over that of none.
+    """
 
     name: str
     cause: Cause
     test: StepTest
-    score: float
+    beside: float = 0.0
+
+    @property
+    def score(self) -> float:
+        """Twice the logarithm of the likelihood ratio, with what else speaks for it."""
+        return self.test.score + self.beside
 
 
-def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns]) -> tuple[StepHypothesis, ...]:
-    """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak."""
+def hypotheses(
+    blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns], lost: Mapping[str, StepTest]
+) -> tuple[StepHypothesis, ...]:
+    """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak.
+
+    Oil that leaves the circuit empties the accumulator as well, by as much (`lost`).
+    """
     coarse = blocks.merged(COARSE)
     tested = []
     for index, term in enumerate(balances[0].terms):
         if term.drift == "motion" and index in columns[0].motion and term.name.startswith("motion"):
             continue  # area and displacement change together, as a scale
+        if AIR in columns[0].names and term.cause == "air in the oil" and term.nuisance:
+            continue  # free air changes them together
+        if lost and term.name == BIAS:
+            continue  # an accumulator's pressure drives what leaves its circuit
         replaced = columns[0].leak if term.name == ORIFICE else None
         tested.append((term.name, term.cause, information(coarse, columns, index, replaced)))
     orifice = columns[0].names.index(ORIFICE)
@@ -59,10 +77,19 @@ def hypotheses(blocks: Blocks, balances: Sequence[Equation], columns: Sequence[C
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
         best = step_test(own, signs)
         if best is not None:
-            # the zero that it needs, or what is believed of its size
-            score = best.score - (cost if name in (LEAK, ORIFICE) else _unlikely(best) if name == SCALE else 0.0)
-            stepped.append(StepHypothesis(name, cause, best, score))
+            stored = lost.get(name.removesuffix(MADE_UP)) if cause == "external leak" else None
+            beside = {LEAK: -cost, ORIFICE: -cost, SCALE: -_unlikely(best)}.get(name, 0.0)
+            stepped.append(
+                StepHypothesis(name, cause, best, beside + (0.0 if stored is None else _agree(best, stored)))
+            )
     return tuple(sorted(stepped, key=lambda own: -own.score))
+
+
+def _agree(test: StepTest, stored: StepTest) -> float:
+    """Return twice the logarithm of the likelihood of what the accumulator lost, beside that of none."""
+    at = int(np.abs(stored.onsets - test.onsets[test.best]).argmin())
+    lost, expected = np.array([stored.size[at], test.fitted[0]]) / stored.deviation[at]
+    return float(lost**2 - (lost - expected) ** 2)
 
 
 def _unlikely(scale: StepTest) -> float:
@@ -97,22 +124,22 @@ def probabilities(
     """
     if not tested:
         return {}
-    beliefs, scores = priors()["causes"], dict[Cause, float]()
-    for each in tested:
-        scores[each.cause] = max(scores.get(each.cause, -np.inf), each.score)
+    beliefs, scores, beside = priors()["causes"], dict[Cause, float](), dict[Cause, float]()
+    for each in reversed(tested):
+        scores[each.cause], beside[each.cause] = each.test.score, each.beside
     if other is not None and _coincides(tested[0].test, other):
         own = max(scores.values()) if other.cause == "changed duty" else max(scores.get(other.cause, 0.0), 0.0)
         slowed = min(max(share, 0.0) / priors()["worth"]["share"].value, 1.0)
         scores[other.cause] = own + other.score * (1.0 - slowed if other.cause == "friction change" else 1.0)
-    most = max(scores.values())
-    temper = 2.0 * (1.0 + beliefs["model"].value * max(most, 0.0))
-    weights = {
-        cause: beliefs["leak" if cause in (*LEAKS, "pump leak") else cause].value
-        * float(np.exp((score - most) / temper))
+    temper = 2.0 * (1.0 + beliefs["model"].value * max(*scores.values(), 0.0))
+    logs = {
+        cause: float(np.log(beliefs["leak" if cause in (*LEAKS, "pump leak") else cause].value))
+        + score / temper
+        + 0.5 * beside.get(cause, 0.0)
         for cause, score in scores.items()
     }
-    total = sum(weights.values())
-    return {cause: weight / total for cause, weight in sorted(weights.items(), key=lambda item: -item[1])}
+    total = float(np.logaddexp.reduce(list(logs.values())))
+    return {cause: float(np.exp(own - total)) for cause, own in sorted(logs.items(), key=lambda item: -item[1])}
 
 
 def _coincides(test: StepTest, other: OtherStep) -> bool:

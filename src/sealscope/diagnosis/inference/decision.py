@@ -11,14 +11,14 @@ pump is the most probable of all causes; `no leak` with the 95 % bound X where X
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, solve, total, zero_of
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
 from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, probabilities
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 #: Share of the false-alarm probability that a question has beside another: the change within the recording where there
 #: is a baseline, the level against the rig's file where there is none.
 SECOND = 0.25
-_95, _SURE = 1.96, 0.95
+_95, _ONE_SIDED, _SURE = 1.96, 1.645, 0.95
 
 
 class Size(NamedTuple):
@@ -65,13 +65,17 @@ class Size(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RecordedBalance:
-    """A recording's blocks with all that is asked of them."""
+    """A recording's blocks with all that is asked of them.
+
+    `lost`: tests of a step of what leaves the circuit by the accumulator's own balance, by the term's name.
+    """
 
     blocks: Blocks
     equations: tuple[Equation, ...]
     columns: tuple[Columns, ...]
     rig: Rig
     recording: Recording
+    lost: Mapping[str, StepTest] = field(default_factory=dict)
 
     @property
     def units(self) -> frozenset[tuple[str, str]]:
@@ -97,7 +101,7 @@ class RecordedBalance:
     @cached_property
     def hypotheses(self) -> tuple[StepHypothesis, ...]:
         """Tests of all terms' coefficients, the most likely first."""
-        return hypotheses(self.blocks, self.equations, self.columns)
+        return hypotheses(self.blocks, self.equations, self.columns, self.lost)
 
     @cached_property
     def other(self) -> OtherStep | None:
@@ -143,7 +147,8 @@ class RecordedBalance:
         column = self.columns[0]
         apart = column.names.index(PUMP) if PUMP in column.names else None
         both = information(self.blocks, self.columns, column.leak, apart)
-        return course(both, step_test(both), step=False)
+        test = step_test(both)
+        return course(both, test, step=test is not None and test.chance < RAREST)
 
     def course(self, step: bool) -> Course:
         """Return the leak's coefficient over the blocks."""
@@ -165,34 +170,38 @@ def _size(balance: RecordedBalance) -> Size:
         return Size(1.0, beliefs["area"].value, rig.states("cylinder.A_A", "cylinder.A_B") and pressures, None, None)
     motion = [k for k in column.motion if column.names[k].startswith("motion")]
     area = _area(balance, motion) if motion and ("x", "m") in balance.units else None
-    if area is None or not area.value > 0.0 or not with_unit:
+    if area is None or not area.measured > 0.0 or not with_unit:
         return Size(1.0, beliefs["displacement"].value, states_displacement and pressures, None, None)
-    assumed = 0.5 * (rig.cylinder.A_A + rig.cylinder.A_B)
-    ratio = Interval(assumed / area.value, *sorted(assumed / np.maximum([area.low, area.high], 1e-12)))
+    ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
     apart = abs(1.0 / ratio.value - 1.0)
     known = float(np.hypot(beliefs["displacement"].value, beliefs["area"].value))
     if states_displacement:
         disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and apart > _95 * known
         deviation = apart if disagrees else beliefs["displacement"].value
-        return Size(1.0, deviation, pressures, ratio, area.value, disagrees)
+        return Size(1.0, deviation, pressures, ratio, area.measured, disagrees)
     if rig.states("cylinder.A_A", "cylinder.A_B"):
-        return Size(ratio.value, beliefs["area"].value, pressures, ratio, area.value)
-    return Size(1.0, known, False, ratio, area.value)
+        return Size(ratio.value, beliefs["area"].value, pressures, ratio, area.measured)
+    return Size(1.0, known, False, ratio, area.measured)
 
 
-def _area(balance: RecordedBalance, motion: list[int]) -> Interval:
-    """Return the piston's area by the assumed displacement [m^2], the mean of both ways and sides that occur."""
-    column = balance.columns[0]
-    sums = total(balance.blocks, balance.columns)[0]
-    chosen = list(column.nuisance)
-    coefficients = solve(sums[np.ix_(chosen, chosen)], sums[chosen, column.left])
-    energy = np.array([sums[k, k] for k in motion])
-    weights = np.zeros(len(chosen))
-    weights[[chosen.index(k) for k in motion]] = energy / max(float(energy.sum()), np.finfo(float).tiny)
-    variance = float(weights @ solve(sums[np.ix_(chosen, chosen)], weights))
-    value = float(weights @ coefficients)
-    half = _95 * float(np.sqrt(max(variance, 0.0)))
-    return Interval(abs(value), abs(value) - half, abs(value) + half)
+class _Area(NamedTuple):
+    """The area of the side that carries [m^2]: `measured` by the assumed displacement, with its interval; `assumed`."""
+
+    measured: float
+    low: float
+    high: float
+    assumed: float
+
+
+def _area(balance: RecordedBalance, motion: list[int]) -> _Area:
+    """Return the area of the side that carries, the mean of both ways and sides in the proportion that they occur."""
+    column, cylinder = balance.columns[0], balance.rig.cylinder
+    energy = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]
+    shares = energy / max(float(energy.sum()), np.finfo(float).tiny)
+    value, deviation = mean_of(balance.blocks, column, dict(zip(motion, shares, strict=True)))
+    value, half = abs(value), _95 * deviation
+    stated = [cylinder.A_A if column.names[k].endswith("A carries") else cylinder.A_B for k in motion]
+    return _Area(value, value - half, value + half, float(shares @ stated))
 
 
 def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Array] = ()) -> Evidence:
@@ -251,7 +260,9 @@ def _questions(balance: RecordedBalance, against: Rise | None, probability: floa
 
     questions, test = [], balance.test
     healthy = balance.rig.pump.G_healthy
-    level = healthy > 0.0 and against is None and balance.size.stated and len(balance.columns) == 1
+    # a drive's droop with the load passes for a level of the leak
+    measured = len(balance.columns) == 1 and balance.equations[0].drive is None
+    level = healthy > 0.0 and against is None and balance.size.stated and measured
     second = SECOND * probability if test is not None and (against is not None or level) else 0.0
     if against is not None:
         share = probability - second
@@ -343,7 +354,8 @@ def bound_of(balance: RecordedBalance, against: Rise | None) -> float:
         bounds.append((against.value + against.threshold(0.05) * against.deviation) * balance.mean(0))
     elif balance.test is not None:
         bounds.append(balance.test.bound() * balance.mean(0))
-    return max(max(bounds, default=np.inf), 0.0)
+    size = float(np.hypot(balance.size.deviation, priors()["size"]["law"].value))
+    return max(max(bounds, default=np.inf), 0.0) * (1.0 + _ONE_SIDED * size)
 
 
 def asked(evidence: Evidence, questions: Sequence[Question], judging: Question, what: str) -> Evidence:
@@ -468,6 +480,8 @@ def _reason(balance: RecordedBalance, evidence: Evidence, bound: float, question
     size = balance.size
     if size.ratio is not None and size.disagrees:
         text += f"; displacement over area is {size.ratio.value:.3g} times the assumed one: flows lie between both"
+    if abs(balance.zero) > 2.0 * _95 * priors()["zero"]["pressure"].value:
+        text += f"; p_A - p_B reads {abs(balance.zero) / 1e5:.2g} bar too {'much' if balance.zero > 0.0 else 'little'}"
     if evidence.verdict != "leak" and evidence.cause is not None:
         text += f"; what stepped is rather {evidence.cause}"
     return text

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Columns
-from sealscope.diagnosis.inference.causes import StepHypothesis
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
-from sealscope.diagnosis.inference.onset import StepTest
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
-from sealscope.diagnosis.inference.terms import LOCKED, circulation, equations, locked, priors
+from sealscope.diagnosis.inference.store import lost_beside
+from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked, priors
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.inference.without_position import circulations
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
@@ -34,33 +32,6 @@ _NO_BALANCE = {
 }
 #: Fewest samples between neighbouring test functions.
 RESOLVED = 2
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedCirculation(RecordedBalance):
-    """A recorded balance without a position, with what the accumulator says of oil that leaves the circuit.
-
-    `lost`: tests of a step of the external leak of either side by the accumulator's own balance, by the term's name.
-    """
-
-    lost: Mapping[str, StepTest]
-
-    @cached_property
-    def hypotheses(self) -> tuple[StepHypothesis, ...]:
-        """Tests of all terms' coefficients; an external leak must empty the accumulator as well, by as much.
-
-        Twice the logarithm of the likelihood of what the accumulator lost, beside that of none, is added to its score.
-        """
-        tested = []
-        for own in super().hypotheses:
-            store = self.lost.get(own.name)
-            if store is not None:
-                at = int(np.abs(store.onsets - own.test.onsets[own.test.best]).argmin())
-                seen, expected = np.array([store.size[at], own.test.fitted[0]]) / store.deviation[at]
-                tested.append(own._replace(score=own.score + float(seen**2 - (seen - expected) ** 2)))
-            else:
-                tested.append(own)
-        return tuple(sorted(tested, key=lambda own: -own.score))
 
 
 def made_good(balance: RecordedBalance) -> bool:
@@ -111,13 +82,17 @@ class VolumeBalance:
         if not balances:
             made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), self.reads)
             recorded = [
-                RecordedCirculation(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
+                RecordedBalance(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
                 for own in made
             ]
             answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
             return min(answering, key=lambda own: bound_of(own, None), default=None)
         blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
-        return None if blocks is None else RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording)
+        if blocks is None:
+            return None
+        zero = float(blocks[0].zero[0])
+        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), self.reads)
+        return RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording, lost)
 
     def learn(self, recording: Recording) -> Lesson | None:
         """Return what a healthy recording teaches (`scatter.Taught`), by the terms of its balance.
@@ -149,6 +124,6 @@ class VolumeBalance:
         lessons = [lesson for lesson in lessons_of(self, baseline) if lesson["terms"] == names]
         healthy = [np.asarray(lesson["sums"], dtype=float) for lesson in lessons]
         evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
-        if isinstance(own, RecordedCirculation):
+        if own.equations[0].name != CYLINDER and len(own.columns) == 1:
             return evidence
         return replace(evidence, share=float(rows.mean() / max(rows.max(), 1.0)))

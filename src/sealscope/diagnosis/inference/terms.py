@@ -64,10 +64,14 @@ class Signals:
         Sampling rate [Hz].
     zeros : mapping of str to float
         What is added to a gauge pressure to make it an absolute one [Pa], by the channel's name.
+    zero : float, optional
+        What p_A - p_B reads too much [Pa].
     """
 
-    def __init__(self, channels: Mapping[str, Array], rate: float, zeros: Mapping[str, float]) -> None:
-        self._channels, self.rate, self._zeros = channels, rate, zeros
+    def __init__(
+        self, channels: Mapping[str, Array], rate: float, zeros: Mapping[str, float], zero: float = 0.0
+    ) -> None:
+        self._channels, self.rate, self._zeros, self._zero = channels, rate, zeros, zero
         self._steps: dict[str, Array] = {}
         self._means: dict[str, Array] = {}
 
@@ -96,8 +100,8 @@ class Signals:
 
     @cached_property
     def pressure_difference(self) -> Array:
-        """p_A - p_B [Pa] in the middle of each interval."""
-        return self.mean("p_A") - self.mean("p_B")
+        """p_A - p_B [Pa] in the middle of each interval, about its zero."""
+        return self.mean("p_A") - self.mean("p_B") - self._zero
 
     @cached_property
     def port_difference(self) -> Array:
@@ -123,7 +127,7 @@ class Signals:
     @cached_property
     def carried_by_A(self) -> Array:
         """1 where p_A > p_B, else 0, at each sample."""
-        return (self._channels["p_A"] > self._channels["p_B"]).astype(float)
+        return (self._channels["p_A"] > self._channels["p_B"] + self._zero).astype(float)
 
     def moved(self, outward: bool, by_A: bool) -> Array:
         """Return the increments of x of one direction while one side carries the pressure [m]."""
@@ -229,11 +233,16 @@ class Equation(NamedTuple):
 
 #: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
 LEAK, ORIFICE = "leak", "leak through an orifice"
+#: Free air in both chambers at once; what single coefficients of its kind do it does.
+AIR = "free air"
 #: The pump's own leakage, by the pressures at its ports.
 PUMP = "pump leak"
 #: What passes or is read whatever the pressures are; a zero of the pressures acts through it.
 BIAS = "bias"
-#: The balance of a load that shut valves hold, by name.
+#: What the name of a leak to the outside ends with where a check valve makes it up.
+MADE_UP = ", made up"
+#: The balance with a position of a pump-controlled cylinder, and that of a load that shut valves hold, by name.
+CYLINDER = "cylinder"
 LOCKED = "locked"
 #: What remains of a speed loop's state at the first sample, which nothing recorded tells.
 START = "start"
@@ -317,6 +326,22 @@ def _of_side(side: str) -> tuple[Term, ...]:
     )
 
 
+def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
+    """Return free air in both chambers at once, each by its volume; `share`: how far side A's balance counts."""
+    own = rig.cylinder
+    middle = {"A": own.V + own.V_hose_A, "B": own.V - own.V_rod + own.V_hose_B}
+    areas = {"A": own.A_A, "B": -own.A_B} if own.volumes == "position" else {"A": 0.0, "B": 0.0}
+
+    def released(s: Signals) -> Array:
+        by_A = share(s)
+        volumes = {side: np.maximum(middle[side] + areas[side] * s.mean("x"), 0.1 * middle[side]) for side in "AB"}
+        expands = {side: volumes[side] * _steps(1.0 / s.absolute[f"p_{side}"]) for side in "AB"}
+        return np.asarray(by_A * expands["A"] - (1.0 - by_A) * expands["B"])
+
+    formula = "V_A d(1/p_A) - V_B d(1/p_B)"
+    return Term(AIR, formula, "Pa", released, "air in the oil", nuisance=False, needs=("x", "p_A", "p_B"))
+
+
 def _lost_outside(side: str) -> Term:
     name = f"p_{side}"
     return Term(
@@ -343,7 +368,7 @@ def _made_up(side: str) -> Term:
         return np.asarray((carries if side == "A" else 1.0 - carries) * s.mean(name) * s.dt)
 
     return Term(
-        f"external leak {side}, made up",
+        f"external leak {side}{MADE_UP}",
         f"[{name} the larger] {name} dt",
         "m^3/(s Pa)",
         lost,
@@ -460,7 +485,7 @@ def _chamber(side: str, rig: Rig) -> Equation:
     of a healthy piston tells them apart, and so friction that changes from a leak.
     """
     area = rig.cylinder.A_A if side == "A" else rig.cylinder.A_B
-    terms = (*_edges(side), *_of_side(side), _BIAS, *_LEAKS)
+    terms = (*_edges(side), *_of_side(side), _BIAS, _released(rig, lambda s: float(side == "A")), *_LEAKS)
     return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, "piston", takes=-1.0)
 
 
@@ -480,10 +505,12 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     by_command = channels.isdisjoint(_SOURCES)
     # an angle has no zero of a speed: what is lost whatever the pressures are is lost to the outside
     terms = [
-        term._replace(cause="external leak") if term.name == BIAS and "theta" in channels else term
+        term._replace(cause="external leak", drift="outside") if term.name == BIAS and "theta" in channels else term
         for term in ((_START, *_CYLINDER) if by_command else _CYLINDER)
     ]
-    balance = Equation("cylinder", left, tuple(terms), drive=SpeedLoop.of(rig) if by_command else None)
+    one_side = rig.cylinder.single_rod
+    terms.insert(-len(_LEAKS), _released(rig, lambda s: _middle(s.carried_by_A) if one_side else 0.5))
+    balance = Equation(CYLINDER, left, tuple(terms), drive=SpeedLoop.of(rig) if by_command else None)
     return (_with_channels(balance, channels | {START}),)
 
 
@@ -519,20 +546,6 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         return -area * s.step("x")
 
     return Equation(LOCKED, gives_way, (*_STORED, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
-
-
-def of_store(rig: Rig) -> Equation:
-    """Return the balance of the oil in the accumulator that makes up what leaves the circuit.
-
-    Its gas expands, -V dp/(n p), as oil is lost, and as it warms; the lower of the chambers' pressures is its own.
-    """
-
-    def expanded(s: Signals) -> Array:
-        lower = np.minimum(s.absolute["p_A"], s.absolute["p_B"])
-        return np.asarray(-rig.makeup.V_gas / rig.makeup.n_gas * _steps(np.log(lower)))
-
-    warmed = _BIAS._replace(cause="external leak")
-    return Equation("accumulator", expanded, (warmed, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
 
 
 #: Channels that give what the pump delivers, the first recorded one is taken.

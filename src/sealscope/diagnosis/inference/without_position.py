@@ -24,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, without_rails
-from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting, information
-from sealscope.diagnosis.inference.onset import FEWEST, StepTest, step_test
+from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, whole_samples
+from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.onset import FEWEST, StepTest
+from sealscope.diagnosis.inference.store import cycle_length, lost_oil
 from sealscope.diagnosis.inference.terms import (
     LEAK,
     LOCKED,
@@ -36,10 +37,8 @@ from sealscope.diagnosis.inference.terms import (
     Signals,
     circulation,
     locked,
-    of_store,
     priors,
 )
-from sealscope.recordings.cycle import cycle_of, fundamental
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
@@ -48,8 +47,6 @@ if TYPE_CHECKING:
 #: Half-width of a test function while the piston is held, and the time it settles for before, as it moves slower than
 #: a share of its largest speed, averaged over a while [s].
 HELD, SETTLES, SLOW, AVERAGED = 0.25, 0.25, 0.1, 0.1
-#: Half-widths of the accumulator's test functions in a recording: a pressure's noise hides what leaves at once.
-STORED = 24
 _95 = 1.96
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_A", "p_B")
 
@@ -95,30 +92,18 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     area = max(rig.cylinder.A_A, rig.cylinder.A_B)
     counts = known & (signals.step("u") == 0.0) if shut else known
     still = _held(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
-    begin, made, long = float(recording.t[0]), list[CycleBalance](), recording.duration / STORED
+    begin, made = float(recording.t[0]), list[CycleBalance]()
+    carries = rig.cylinder.single_rod
     if shut:
-        blocks = _blocks(signals, equation, rig, HELD, known & still, begin)
+        blocks = _blocks(signals, equation, HELD, known & still, begin, carries)
         return [] if blocks is None else [CycleBalance(blocks, equation, Columns(equation), {})]
-    cycle = _cycle(np.where(known, speed, 0.0), recording.rate)
+    cycle = cycle_length(np.where(known, speed, 0.0), recording.rate)
     for half, counts in ((cycle, known), (HELD, known & still)):
-        blocks = None if half is None else _blocks(signals, equation, rig, half, counts, begin)
+        blocks = None if half is None else _blocks(signals, equation, half, counts, begin, carries)
         if blocks is not None:
-            lost = _lost(signals, rig, long if cycle is None else cycle * np.ceil(long / cycle), known, begin)
+            lost = lost_oil(signals, rig, cycle, begin)
             made.append(CycleBalance(blocks, equation, Columns(equation), lost))
     return made
-
-
-def _lost(signals: Signals, rig: Rig, half: float, counts: NDArray[np.bool_], begin: float) -> dict[str, StepTest]:
-    """Return the tests of what leaves the circuit by the accumulator's balance, empty where there is none."""
-    if rig.makeup.check_valves == "absent":
-        return {}
-    store = of_store(rig)
-    columns, blocks = Columns(store), _blocks(signals, store, rig, half, counts, begin)
-    if blocks is None:
-        return {}
-    names = [name for name in columns.names if name.startswith("external")]
-    tests = {name: step_test(information(blocks, [columns], columns.names.index(name))) for name in names}
-    return {name: test for name, test in tests.items() if test is not None}
 
 
 def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Array]:
@@ -126,7 +111,7 @@ def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Ar
 
     The thesis's drive takes 19 s to make good what the load costs it: what of that is left at first fades (`START`).
     """
-    samples = {name: without_rails(name, recording[name]) for name in _READ if name in recording.channels}
+    samples = whole_samples(recording, _READ)
     if equation.name != LOCKED:
         drive = Drive.of(rig)
         if "u" in samples and samples.keys().isdisjoint(("theta", "omega", "q_pump")):
@@ -135,21 +120,7 @@ def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Ar
             sense = -1.0 if float((u - u.mean()) @ (dp - dp.mean())) < 0.0 else 1.0
             samples["omega"] = drive.flow(u, sense * dp, recording.rate) / drive.displacement
         samples[START] = np.exp(-np.arange(len(recording)) / (recording.rate * drive.lag))
-    if recording.bridged is not None:
-        samples = {name: np.where(recording.bridged, np.nan, values) for name, values in samples.items()}
     return samples
-
-
-def _cycle(speed: Array, rate: float) -> float | None:
-    """Return the duration of a stroke to and fro [s], or of the strongest line of the speed; None without one."""
-    cycle, seconds = cycle_of(speed, rate), speed.size / rate
-    if cycle is None:
-        spectrum = np.abs(np.fft.rfft((speed - speed.mean()) * np.hanning(speed.size)))
-        line = int(spectrum.argmax())
-        if line < FEWEST:
-            return None
-        cycle = seconds / line
-    return 1.0 / fundamental(speed, np.arange(speed.size) / rate, cycle)
 
 
 def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
@@ -163,14 +134,22 @@ def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
 
 
 def _blocks(
-    signals: Signals, equation: Equation, rig: Rig, half: float, counts: NDArray[np.bool_], begin: float
+    signals: Signals,
+    equation: Equation,
+    half: float,
+    counts: NDArray[np.bool_],
+    begin: float,
+    carries: bool = False,
 ) -> Blocks | None:
-    """Return the blocks of test functions of a half-width [s]; None for fewer than `FEWEST`."""
+    """Return the blocks of test functions of a half-width [s]; None for fewer than `FEWEST`.
+
+    `carries`: rows count where one side carries throughout.
+    """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
     increments = [*(term.increments(signals) for term in equation.terms), left]
     rows = _rows(increments, counts, half, rate)
     _less_the_zero(rows.values, [term.name for term in equation.terms])
-    if rig.cylinder.single_rod:
+    if carries:
         side = _rows([signals.carried_by_A[1:] / rate], counts, half, rate).values[:, 0]
         one_side = np.minimum(side, 1.0 - side) < priors()["held"]["elsewhere"].value
         rows = rows._replace(whole=rows.whole & one_side)
