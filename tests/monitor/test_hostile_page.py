@@ -57,7 +57,7 @@ def page(service: Service) -> TestClient:
 def test_any_name_of_an_actuator_works_in_every_address(page: TestClient, name: str):
     of = f"?name={quote(name, safe='')}"
     life = page.get(f"/api/actuator{of}").json()
-    assert (life["name"], life["alarms"][0]["state"]) == (name, "unacknowledged")
+    assert (life["name"], life["alarms"][0]["state"]) == (name, "new")
     answer = page.post(f"/api/mark{of}", json={"mark": "acknowledged"}, headers=MARK)
     assert (answer.status_code, answer.json()["actuator"]) == (200, name)
     assert page.get(f"/api/actuator{of}").json()["events"][0]["event"] == "acknowledged"

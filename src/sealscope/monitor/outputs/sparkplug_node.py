@@ -44,6 +44,12 @@ _Table = dict[str, tuple[int, str | None, tuple[str, ...]]]
 _STATE: _Table = {
     "Status": (STRING, None, ("status",)),
     "Status Word": (UINT32, None, ("status_word",)),
+    "State": (STRING, None, ("state", "name")),
+    "State/Health": (UINT32, None, ("state", "health")),
+    "State/Severity": (UINT32, None, ("state", "severity")),
+    "State/Since": (DOUBLE, "s", ("state", "since_s")),
+    "State/Cause": (STRING, None, ("state", "cause")),
+    "State/Action": (STRING, None, ("state", "action")),
     "Leak": (DOUBLE, "L/min", ("leak_lpm",)),
     "Leak Low": (DOUBLE, "L/min", ("leak_interval_lpm", "0")),
     "Leak High": (DOUBLE, "L/min", ("leak_interval_lpm", "1")),
@@ -67,6 +73,7 @@ _ALARM: _Table = {
     "Alarm/Evidence": (STRING, None, ("evidence",)),
     "Alarm/Next Check": (STRING, None, ("next_check",)),
     "Alarm/Mark": (STRING, None, ("mark",)),
+    "Alarm/Reason": (STRING, None, ("reason",)),
     "Alarm/Shelved": (BOOLEAN, None, ("shelved",)),
 }
 #: ... in an event.

@@ -53,6 +53,9 @@ class BlockReceiver(Protocol):
     def count(self, reason: str) -> None:
         """Count something that was dropped."""
 
+    def states(self) -> dict[str, dict[str, Any]]:
+        """Return the state of NE 107 of each actuator as plain values."""
+
 
 def nothing() -> None:
     """Do nothing."""

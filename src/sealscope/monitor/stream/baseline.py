@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from sealscope.diagnosis.inference.terms import priors
-from sealscope.errors import InputError
-from sealscope.storage.plain_state import plain_fields
-from sealscope.storage.plain_values import as_type
+from sealscope.storage.plain_state import plain_fields, restored
 
-_T = TypeVar("_T")
 #: Logarithm by which pressure and flow of a duty may lie outside what was learned.
 _DUTY_MARGIN = 0.2
 #: ... and by which a leak may lower the pressure difference.
@@ -152,12 +149,4 @@ class BaselineLearning:
     def from_state(cls, state: Mapping[str, Any]) -> BaselineLearning:
         """Return what `state` was of; raises InputError where it does not fit."""
         known = {name: value for name, value in state.items() if value is not None}
-        return plain_dataclass(cls, known, "learning")
-
-
-def plain_dataclass(kind: type[_T], state: Any, name: str) -> _T:
-    """Return a part of a saved state as the dataclass `kind`; raises InputError where it does not fit."""
-    try:
-        return as_type(kind, state)
-    except ValueError as error:
-        raise InputError(f"saved state's {name} does not fit: {error}") from None
+        return restored(cls, known, "learning")

@@ -26,12 +26,12 @@ from sealscope.diagnosis.inference.live.balance import (
 from sealscope.diagnosis.inference.live.sequential import RECENT, StepDetector
 from sealscope.diagnosis.inference.terms import priors
 from sealscope.errors import InputError
-from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, plain_dataclass, within
+from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, within
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 from sealscope.monitor.stream.joining import SampleJoiner
 from sealscope.monitor.stream.pressures import PressureEstimator
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import array_of, part_of, plain_array, plain_fields
+from sealscope.storage.plain_state import array_of, part_of, plain_array, plain_fields, restored
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -454,8 +454,8 @@ class Watch:
         watch._pressures = None if pressures is None else PressureEstimator.from_state(watch._rig, pressures)
         watch._learning = BaselineLearning.from_state(part_of(state, "learning", Mapping))
         baseline, leak = (part_of(state, name, (Mapping, type(None))) for name in ("baseline", "leak"))
-        watch.baseline = None if baseline is None else plain_dataclass(WatchBaseline, baseline, "baseline")
-        watch.leak = None if leak is None else plain_dataclass(WatchedLeak, leak, "leak")
+        watch.baseline = None if baseline is None else restored(WatchBaseline, baseline, "baseline")
+        watch.leak = None if leak is None else restored(WatchedLeak, leak, "leak")
         watch._detector = StepDetector.from_state(part_of(state, "detector", Mapping))
         last, group = (array_of(part_of(state, name, Mapping), name) for name in ("last", "group"))
         if last.shape[1:] != (_COLUMNS,) or group.shape[1:] != (4,):
