@@ -21,14 +21,13 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
 from sealscope.errors import InputError
-from sealscope.monitor.outages import Outages
 from sealscope.monitor.page import site as site_module
 from sealscope.monitor.page.admission import Admission
 from sealscope.monitor.page.connections import limited_protocol, most_connections
 from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings, topic_part
-from sealscope.monitor.supervisor import Supervisor
+from sealscope.monitor.supervisor import Outages, Supervisor
 
 from .plant import served, settings_in, until
 from .test_outputs import LINES

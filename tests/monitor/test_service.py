@@ -277,6 +277,10 @@ def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
         of = "SELECT summary FROM summaries WHERE summaries.actuator = actuators.actuator"
         connection.exec_driver_sql(f"UPDATE actuators SET summary = ({of})")
         connection.exec_driver_sql("DELETE FROM summaries")
+        for table, column in (("alarms", "alarm"), ("events", "alarm"), ("actuators", "checkpoint")):
+            words = f"""UPDATE {table} SET {column} = REPLACE({column}, '"new"', '"unacknowledged"')"""
+            connection.exec_driver_sql(words)
+        connection.exec_driver_sql("UPDATE alarms SET state = 'unacknowledged'")
         connection.exec_driver_sql("UPDATE facts SET value = '1' WHERE name = 'schema'")
     before = service.actuators._actuators["press 1"].watch.baseline
     assert before is not None
@@ -293,6 +297,8 @@ def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
     assert "oil_celsius" in next(again.store.estimates())
     assert len(shown) == 2
     assert again.actuators.plain() == shown
+    assert [alarm["state"] for alarm in again.store.alarms(open_only=True)] == ["new"]
+    assert again.actuators.mark("press 1", "valid").state == "valid"
 
 
 def test_old_estimates_and_identities_are_forgotten(tmp_path, monkeypatch):

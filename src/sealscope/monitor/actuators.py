@@ -21,11 +21,11 @@ from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.memory.sharing import Share
 from sealscope.monitor.memory.store import KEPT_IDENTITIES, PENDING_BLOCKS, PENDING_BYTES, MonitorStore, StoredRows
-from sealscope.monitor.outages import Outages
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.monitor.stream.watch import STATE_VERSION, Watch, watch
+from sealscope.monitor.supervisor import Outages
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, plain_fields, restored
 

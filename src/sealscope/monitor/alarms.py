@@ -245,15 +245,15 @@ class AlarmJudge:
         if mark == "invalid" and not reason.strip():
             raise InputError(f"{alarm.id} must be invalid for a reason, got none: state it as the comment")
         last: AlarmState = "valid" if mark == "valid" else "acknowledged"
-        changes: dict[str, Any] = {
+        by_mark: dict[str, dict[str, Any]] = {
             "shelved": {"shelved_until_s": until},
             "invalid": {"state": "invalid", "mark": mark, "reason": reason},
             "repaired": {"state": "closed", "mark": mark},
             "valid": {"state": last if alarm.active else "closed", "mark": mark},
             "acknowledged": {"state": last if alarm.active else "closed"},
-        }[mark]
+        }
         self.above = self.error = self.below = 0
-        return self._kept(replace(alarm, updated_s=at, **changes))
+        return self._kept(replace(alarm, updated_s=at, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""

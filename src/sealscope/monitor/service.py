@@ -20,7 +20,6 @@ from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.sharing import Share
 from sealscope.monitor.memory.store import MonitorStore, away
-from sealscope.monitor.outages import DATABASE, WEBHOOK
 from sealscope.monitor.outputs.lines import EventLines
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
@@ -34,7 +33,7 @@ from sealscope.monitor.sources.source_block import (
     SourceBlock,
     bytes_of,
 )
-from sealscope.monitor.supervisor import Supervisor
+from sealscope.monitor.supervisor import DATABASE, WEBHOOK, Supervisor
 from sealscope.monitor.waiting import Waiting
 from sealscope.storage.folders import locked
 

@@ -255,7 +255,7 @@ class MonitorStore:
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Return what each actuator showed last."""
-        return {name: json.loads(summary) for name, summary in self._rows(select(tables.summaries))}
+        return {row.actuator: json.loads(row.summary) for row in self._rows(select(tables.summaries))}
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
         """Return alarms as plain values, the latest first."""

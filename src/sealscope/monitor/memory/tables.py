@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy import Column, Float, Index, Integer, LargeBinary, MetaData, String, Table, Text
 from sqlalchemy.types import TypeEngine
 
@@ -15,11 +17,11 @@ FIGURES = (
 )
 
 
-def _key(name: str, kind: TypeEngine[object]) -> Column[object]:
+def _key(name: str, kind: TypeEngine[Any]) -> Column[Any]:
     return Column(name, kind, primary_key=True, autoincrement=False)
 
 
-def _stated(name: str, kind: TypeEngine[object], *, index: bool = False) -> Column[object]:
+def _stated(name: str, kind: TypeEngine[Any], *, index: bool = False) -> Column[Any]:
     return Column(name, kind, nullable=False, index=index)
 
 

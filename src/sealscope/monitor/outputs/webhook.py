@@ -13,8 +13,8 @@ import httpx
 from sqlalchemy.exc import DBAPIError
 
 from sealscope.monitor.memory.store import MonitorStore
-from sealscope.monitor.outages import WEBHOOK, Outages
 from sealscope.monitor.outputs.lines import announced
+from sealscope.monitor.supervisor import WEBHOOK, Outages
 
 _log = logging.getLogger(__name__)
 logging.getLogger("httpx").setLevel(logging.WARNING)  # which tells each request

@@ -236,7 +236,7 @@ function showLife(life) {
   const alarm = life.alarms.find((each) => each.state !== "closed" && each.state !== "invalid");
   byId("alarm").hidden = !alarm;
   if (alarm) {
-    byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}${alarm.returned_s === null ? "" : ", over"}`;
+    byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}${alarm.returned_s == null ? "" : ", over"}`;
     facts(alarm);
     showWorkflow(alarm);
   }

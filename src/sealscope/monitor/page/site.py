@@ -29,14 +29,13 @@ from starlette.routing import Route
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.store import away
-from sealscope.monitor.outages import DATABASE
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
 from sealscope.monitor.page.admission import Admission
 from sealscope.monitor.page.connections import BACKLOG, limited_protocol, most_connections
 from sealscope.monitor.page.live import DRAWN, PRESSURES, LiveSamples, machine_of
 from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.settings import PageSettings, secret_of
-from sealscope.monitor.supervisor import Supervisor
+from sealscope.monitor.supervisor import DATABASE, Supervisor
 from sealscope.reporting.template import packaged
 from sealscope.storage.plain_values import parse_json
 
@@ -137,7 +136,7 @@ class _Pages:
         if summary is None:
             return _refusal("no such actuator", 404)
         seconds = float(span) * 3600.0 if _HOURS.fullmatch(span) else None
-        life = {"name": name, "summary": summary, "machine": self._machines[name]}
+        life: dict[str, Any] = {"name": name, "summary": summary, "machine": self._machines[name]}
         life |= {"course": self._store.course(name, seconds=seconds), "events": self._store.last_events(name)}
         return JSONResponse({**life, "alarms": self._store.alarms(actuator=name)[:50]})
 

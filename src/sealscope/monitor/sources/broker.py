@@ -25,11 +25,11 @@ from contextlib import suppress
 from typing import Any
 
 from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of
-from sealscope.monitor.outages import BROKER
 from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
 from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, SourceBlock, decoded
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import NAMESPACE
+from sealscope.monitor.supervisor import BROKER
 from sealscope.monitor.waiting import Waiting
 
 _log = logging.getLogger(__name__)
