@@ -451,11 +451,12 @@ def _all_stored(monitors: list[Monitor], wanted: int) -> None:
 
 def _marked(monitors: list[Monitor], chance: random.Random) -> int:
     """Mark open alarms, of all monitors alike; return how many marks there were."""
-    opened = monitors[0].rows("select actuator, state, alarm from alarms where state != 'normal' order by id")
+    lasting = "state not in ('closed', 'invalid')"
+    opened = monitors[0].rows(f"select actuator, state, alarm from alarms where {lasting} order by id")
     marks = 0
     for actuator, state, _ in chance.sample(opened, min(4, len(opened))):
-        choices = ["comment", "comment", "shelved", "false", "repaired"]
-        mark = chance.choice([*choices, *(3 * ["acknowledged"] if state == "unacknowledged" else [])])
+        choices = ["comment", "comment", "shelved", "invalid", "repaired"]
+        mark = chance.choice([*choices, *(3 * ["acknowledged"] if state == "new" else [])])
         said = {"mark": mark, "by": "Ada", "text": f"mark {marks}"}
         answers = [monitor.ask(f"/api/mark?name={quote(actuator, safe='')}", said) for monitor in monitors]
         if len({_shown(answer) for answer in answers}) > 1:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import sealscope as ss
-from sealscope.monitor.alarms.alarm import Alarm
+from sealscope.monitor.alarms import Alarm
 
 jsonschema = pytest.importorskip("jsonschema")
 REFERENCE = Path(__file__).parents[1] / "docs" / "reference"
@@ -42,7 +42,7 @@ def test_verdicts_follow_the_schema(options, channels):
 
 def test_alarms_follow_the_schema():
     alarm = Alarm(
-        id="press 1", actuator="press", level="error", state="unacknowledged", raised_s=90.0, updated_s=95.0,
+        id="press 1", actuator="press", level="error", state="new", raised_s=90.0, updated_s=95.0,
         onset_s=80.0, onset_interval_s=(79.0, 81.0), leak_lpm=0.01, leak_interval_lpm=(0.009, 0.011),
         cause="piston leak", evidence="a step", next_check="hold a load", baseline=1,
     )  # fmt: skip

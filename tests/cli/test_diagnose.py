@@ -38,6 +38,7 @@ KEYS = {
     "severity": dict | None,
     "limit": dict,
     "evidence": dict,
+    "state": dict,
 }
 VERDICTS = {"leak", "no leak", "cannot tell"}
 FOREIGN = ("--map", "p_A=PG_1", "--map", "p_B=PG_2", "--rate", "1000")

@@ -25,7 +25,7 @@ def test_files_of_a_folder_end_in_one_alarm(call, tmp_path, monkeypatch):
 def test_what_exists_is_not_overwritten(call, tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text("mine")
-    assert "must not exist yet" in call("monitor", "init", file).refused()
+    assert "must not exist yet" in call("monitor", "init", "-o", file).refused()
     assert file.read_text() == "mine"
 
 
@@ -43,7 +43,7 @@ def test_a_dashboard_and_labelled_data_are_written(call, tmp_path):
     assert (done.status, done.err) == (0, "")
     assert json.loads((tmp_path / "grafana.json").read_text())["panels"]
     settings = tmp_path / "monitor.toml"
-    call("monitor", "init", settings)
+    call("monitor", "init", "-o", settings)
     done = call("monitor", "export", settings, "-o", tmp_path / "labels")
     assert (done.status, done.out) == (0, f"{tmp_path / 'labels'}: 0 alarms, 0 estimates\n")
     assert (tmp_path / "labels" / "estimates.csv").read_text().startswith("actuator,t,status")

@@ -24,6 +24,7 @@ KEYS = [
     "file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm",
     "bound_lpm", "unused", "false_alarm_probability", "score", "threshold", "methods", "quality", "cause", "next_check",
     "passage", "chance", "odds", "summary", "start", "machine", "about", "rig", "severity", "limit", "evidence",
+    "state",
 ]  # fmt: skip
 VERDICTS = ("leak", "no leak", "cannot tell")
 CAUSES = get_args(Cause)

@@ -1,9 +1,10 @@
-"""An alarm's life: thresholds, debounce and hysteresis, and the states of ISA-18.2."""
+"""An alarm's life: thresholds, debounce and hysteresis, and what a person says of it."""
 
 from __future__ import annotations
 
 import io
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from sealscope.monitor.alarms.alarm import status_word
-from sealscope.monitor.alarms.judging import AlarmJudge, Thresholds
+from sealscope.errors import InputError
+from sealscope.monitor.alarms import MARKS, AlarmJudge, Thresholds
 from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.outputs.lines import EventLines
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
@@ -43,7 +44,7 @@ def test_one_block_is_no_alarm_two_are():
     assert through(judge, [0.003, 0.001, 0.003, 0.001]) == []
     assert through(judge, [0.003, 0.003]) == ["raised"]
     assert judge.alarm is not None
-    assert (judge.alarm.level, judge.alarm.diagnostic_number) == ("warning", 4101)
+    assert (judge.alarm.level, judge.alarm.plain()["diagnostic_number"]) == ("warning", 4101)
     assert "case drain" in judge.alarm.next_check
 
 
@@ -65,8 +66,9 @@ def test_it_returns_well_below_its_threshold():
     assert through(judge, [0.003] * 3 + [0.0015] * 20) == ["raised"]
     assert through(judge, [0.0009, 0.0011, 0.0009]) == []
     assert through(judge, [0.0009]) == ["returned"]
-    assert judge.alarm is not None and judge.alarm.state == "returned"
-    assert judge.marked("acknowledged", 100.0).state == "normal"
+    assert judge.alarm is not None and (judge.alarm.state, judge.alarm.active) == ("new", False)
+    assert judge.alarm.status_word == 4
+    assert judge.marked("acknowledged", 100.0).state == "closed"
     assert judge.alarm is None
 
 
@@ -76,7 +78,7 @@ def test_an_error_must_be_seen_again_and_becomes_a_warning_below():
     assert judge.marked("acknowledged", 5.0).state == "acknowledged"
     assert through(judge, [0.02] * 2) == ["error"]
     assert judge.alarm is not None
-    assert (judge.alarm.state, status_word([judge.alarm])) == ("unacknowledged", 6)
+    assert (judge.alarm.state, judge.alarm.status_word) == ("new", 6)
     assert through(judge, [0.004] * 2) == ["warning"]
     judge.marked("acknowledged", 50.0)
     assert through(judge, [0.0] * 2, None) == ["returned"]
@@ -89,18 +91,49 @@ def test_without_litres_a_leak_is_a_warning():
     assert judge.alarm is not None and judge.alarm.leak_lpm is None
 
 
+def test_a_valid_alarm_stays_so_until_its_cause_is_over_or_repaired():
+    judge = AlarmJudge("a")
+    through(judge, [0.003] * 2)
+    assert (judge.marked("valid", 5.0).state, judge.alarm.active) == ("valid", True)
+    with pytest.raises(InputError):
+        judge.marked("acknowledged", 6.0)
+    assert through(judge, [0.02] * 2) == ["error"]
+    assert (judge.alarm.state, judge.alarm.plain()["machine_state"]["name"]) == ("valid", "failure")
+    repaired = judge.marked("repaired", 20.0)
+    assert (repaired.state, repaired.mark, repaired.status_word, judge.alarm) == ("closed", "repaired", 0, None)
+    assert judge.over_s == 20.0
+    through(judge, [0.003] * 2)
+    judge.marked("valid", 30.0)
+    assert through(judge, [0.0] * 2, None) == ["returned"]
+    assert (judge.alarm, judge.raised) == (None, 2)
+
+
+def test_an_invalid_alarm_has_a_reason():
+    judge = AlarmJudge("a")
+    through(judge, [0.003] * 2)
+    for reason in ("", "  "):
+        with pytest.raises(InputError):
+            judge.marked("invalid", 5.0, reason=reason)
+    assert judge.alarm.state == "new"
+    invalid = judge.marked("invalid", 5.0, reason="the bypass was open")
+    assert (invalid.state, invalid.mark, invalid.reason) == ("invalid", "invalid", "the bypass was open")
+    assert (invalid.active, judge.alarm) == (False, None)
+    assert invalid.plain()["machine_state"]["name"] == "good"
+
+
 @settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from([0.0, 0.001, 0.003, 0.02]), st.sampled_from(["", "acknowledged", "false"]))))
-def test_its_state_is_plain_and_a_life_ends_in_normal(steps: list[tuple[float, str]]):
-    judge, lived = AlarmJudge("a"), []
+@given(st.lists(st.tuples(st.sampled_from([0.0, 0.001, 0.003, 0.02]), st.sampled_from(["", *MARKS]))))
+def test_its_state_is_plain_and_what_is_over_is_gone(steps: list[tuple[float, str]]):
+    judge, over = AlarmJudge("a"), 0
     for lpm, mark in steps:
         again = AlarmJudge.from_state(json.loads(json.dumps(judge.state())))
         assert again == judge
         through(judge, [lpm])
-        if judge.alarm is not None and mark and not (mark == "acknowledged" and judge.alarm.state == "acknowledged"):
-            lived.append(judge.marked(mark, 1.0).state)
-    assert judge.raised >= lived.count("normal")
-    assert judge.alarm is None or judge.alarm.state != "normal"
+        if judge.alarm is not None and mark:
+            with suppress(InputError):
+                over += judge.marked(mark, 1.0, reason="why").over
+    assert judge.raised >= over
+    assert judge.alarm is None or not judge.alarm.over
 
 
 def test_a_shelved_alarm_keeps_its_changes_to_itself(tmp_path: Path):
@@ -115,15 +148,15 @@ def test_a_shelved_alarm_keeps_its_changes_to_itself(tmp_path: Path):
 
     through(judge, [0.003] * 2)
     kept("raised")
-    judge.marked("shelved", 3.0, 100.0)
+    judge.marked("shelved", 3.0, until=100.0)
     kept("shelved")
-    assert judge.alarm is not None and status_word([judge.alarm]) == 1
+    assert judge.alarm is not None and judge.alarm.status_word == 1
     assert through(judge, [0.02] * 2) == ["error"]
     kept("error")
     assert [json.loads(line)["event"] for line in out.getvalue().splitlines()] == ["raised", "shelved"]
     assert through(judge, [0.02] * 40) == []
     assert judge.alarm.updated_s == pytest.approx(117.0)
-    assert status_word([judge.alarm]) == 6
+    assert judge.alarm.status_word == 6
 
 
 def test_an_actuator_s_latest_events_are_shown_however_many_there_are(tmp_path: Path) -> None:

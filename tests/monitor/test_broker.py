@@ -110,7 +110,11 @@ def test_what_comes_while_the_monitor_is_away_is_stored_once(broker: Broker, por
     assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
     retained = subscribe.simple("sealscope/press 1/alarm", hostname="127.0.0.1", port=port)
     alarm = json.loads(retained.payload)
-    assert (alarm["id"], alarm["state"]) == ("press 1-1", "unacknowledged")
+    assert (alarm["id"], alarm["state"]) == ("press 1-1", "new")
+    for name, state in second.service.states().items():
+        message = subscribe.simple(f"sealscope/{name}/state", hostname="127.0.0.1", port=port)
+        assert json.loads(message.payload) == state
+    assert alarm["machine_state"] == second.service.states()["press 1"]
 
 
 def test_a_broker_that_restarts_loses_nothing(broker: Broker, tmp_path: Path):

@@ -21,14 +21,13 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
 from sealscope.errors import InputError
-from sealscope.monitor.outages import Outages
 from sealscope.monitor.page import site as site_module
 from sealscope.monitor.page.admission import Admission
 from sealscope.monitor.page.connections import limited_protocol, most_connections
 from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings, topic_part
-from sealscope.monitor.supervisor import Supervisor
+from sealscope.monitor.supervisor import Outages, Supervisor
 
 from .plant import served, settings_in, until
 from .test_outputs import LINES
@@ -57,7 +56,7 @@ def page(service: Service) -> TestClient:
 def test_any_name_of_an_actuator_works_in_every_address(page: TestClient, name: str):
     of = f"?name={quote(name, safe='')}"
     life = page.get(f"/api/actuator{of}").json()
-    assert (life["name"], life["alarms"][0]["state"]) == (name, "unacknowledged")
+    assert (life["name"], life["alarms"][0]["state"]) == (name, "new")
     answer = page.post(f"/api/mark{of}", json={"mark": "acknowledged"}, headers=MARK)
     assert (answer.status_code, answer.json()["actuator"]) == (200, name)
     assert page.get(f"/api/actuator{of}").json()["events"][0]["event"] == "acknowledged"

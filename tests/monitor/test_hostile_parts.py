@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 
 from sealscope.cli.app import arguments_of
-from sealscope.monitor.outages import Outages
 from sealscope.monitor.outputs.webhook import Webhook
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import ActuatorSettings, read_settings
@@ -34,6 +33,7 @@ from sealscope.monitor.sources.source_block import (
 )
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import BIRTH_SEQUENCE, INT64, SparkplugMetric, SparkplugPayload, encoded
+from sealscope.monitor.supervisor import Outages
 from sealscope.recordings import write
 
 from ..recordings.test_packed_files import rows, workbook

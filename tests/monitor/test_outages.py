@@ -17,11 +17,11 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.testclient import TestClient
 
 from sealscope.monitor.memory.store import MonitorStore
-from sealscope.monitor.outages import BROKER, DATABASE, Outages
 from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
 from sealscope.monitor.sources.source_block import SourceBlock
+from sealscope.monitor.supervisor import BROKER, DATABASE, Outages
 from sealscope.monitor.waiting import Waiting
 
 from .plant import rows_of, served, settings_in, until

@@ -112,7 +112,7 @@ def test_the_dashboard_asks_for_metrics_that_there_are(watched):
     board = json.loads(json.dumps(dashboard()))
     asked = {name for panel in board["panels"] for name in re.findall(r"sealscope_\w+", panel["targets"][0]["expr"])}
     assert asked <= families
-    assert {"sealscope_leak_lpm", "sealscope_status_word", "sealscope_total_lpm"} <= asked
+    assert {"sealscope_leak_lpm", "sealscope_severity", "sealscope_total_lpm"} <= asked
     places = [panel["gridPos"] for panel in board["panels"]]
     cells = [(x, y) for p in places for x in range(p["x"], p["x"] + p["w"]) for y in range(p["y"], p["y"] + p["h"])]
     assert len(cells) == len(set(cells))  # no panel lies over another

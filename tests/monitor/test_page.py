@@ -9,16 +9,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
+from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, PageSettings
+from sealscope.recordings.recording import Recording
 
 from .plant import lines_of, until
 from .test_service import SOUND, WORN
@@ -150,16 +153,18 @@ def test_prometheus_reads_the_metrics(page: TestClient):
     assert families["sealscope_blocks"].type == "counter"
 
 
-def test_the_order_is_error_warning_unseen_then_evidence_then_the_sure_leak():
-    def row(word: int, low: float) -> dict[str, object]:
-        return {"status_word": word, "leak_interval_lpm": [low, 1.0], "leak_lpm": 0.5}
+def test_the_order_is_severity_new_then_evidence_then_the_sure_leak():
+    def row(condition: str, word: int, low: float) -> dict[str, object]:
+        own = {"status_word": word, "leak_interval_lpm": [low, 1.0], "leak_lpm": 0.5}
+        return {**own, "state": state_of(condition).as_dict()}
 
-    summaries = {"quiet": row(0, 0.0), "less": row(1, 0.1), "more": row(1, 0.2), "bad": row(2, 0.0), "gone": row(4, 0)}
-    names = [each["name"] for each in ranked(summaries, [])]
-    assert names == ["bad", "more", "less", "gone", "quiet"]
+    leaks = {"less": row("leak", 1, 0.1), "more": row("leak", 1, 0.2), "bad": row("leak over the limit", 2, 0.0)}
+    others = {"quiet": row("watched", 0, 0.0), "gone": row("watched", 4, 0), "silent": row("no data", 0, 0.0)}
+    names = [each["name"] for each in ranked({**others, **leaks}, [])]
+    assert names == ["bad", "more", "less", "silent", "gone", "quiet"]
     alarms = [{"actuator": "less", "by_chance_per_1000_h": 1e-6}, {"actuator": "more", "by_chance_per_1000_h": 1e-3}]
-    names = [each["name"] for each in ranked(summaries, alarms)]
-    assert names == ["bad", "less", "more", "gone", "quiet"]
+    names = [each["name"] for each in ranked({**others, **leaks}, alarms)]
+    assert names == ["bad", "less", "more", "silent", "gone", "quiet"]
 
 
 def test_a_port_in_use_is_one_line(service: Service):
@@ -201,7 +206,7 @@ def look_at_the_live_part(view: Any, live: LiveSamples) -> None:
 
 
 @pytest.mark.slow
-def test_the_page_in_a_browser(service: Service):
+def test_the_page_in_a_browser(service: Service, tmp_path: Path):
     """The alarm appears, the hostile name stays text, the alarm is acknowledged by keyboard, at both widths."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     browser_path = shutil.which("chromium")
@@ -212,7 +217,7 @@ def test_the_page_in_a_browser(service: Service):
     try:
         with playwright.sync_playwright() as player:
             browser = player.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
-            for width in (400, 1300):
+            for width in (400, 1280):
                 view = browser.new_page(viewport={"width": width, "height": 900})
                 errors: list[str] = []
                 view.on("pageerror", lambda error, seen=errors: seen.append(str(error)))
@@ -224,6 +229,15 @@ def test_the_page_in_a_browser(service: Service):
                 assert view.locator("img").count() == 0
                 assert view.evaluate("document.documentElement.scrollWidth") <= width
                 assert view.locator("#chart canvas").count() == 1
+                # what is wrong, how much, and what to do stand in the first screen of a wide page
+                assert view.locator("#fleet .badge").all_text_contents() == ["Mmaintenance required", "Ngood"]
+                line = view.text_content("#state") or ""
+                assert "maintenance required" in line and "L/min since" in line and "hold a load" in line
+                for part in ("#fleet", "#overall", *(() if width == 400 else ("#state", "#chart"))):
+                    box = view.locator(part).bounding_box()
+                    assert box is not None and box["y"] + box["height"] <= 900
+                image = view.screenshot(path=tmp_path / f"monitor-{width}.png")
+                assert len(image) > 10_000
                 if width == 400:
                     view.keyboard.press("Tab")
                     assert view.evaluate("document.activeElement.dataset.name") == HOSTILE
@@ -232,6 +246,11 @@ def test_the_page_in_a_browser(service: Service):
                     view.locator("#mark-answer", has_text="acknowledged").wait_for()
                     view.locator("#alarm-title", has_text="acknowledged").wait_for()
                 assert "acknowledged" in (view.text_content("#alarm-title") or "")
+                assert view.locator("#workflow [aria-current=step]").text_content() == "acknowledged"
+                assert view.locator("#marks button[value=acknowledged]").is_disabled()
+                view.locator("#marks button[value=invalid]").click()
+                view.locator("#mark-answer", has_text="reason").wait_for()
+                assert view.locator("#alarm").is_visible()
                 look_at_the_live_part(view, live)
                 assert errors == []
                 service.outages.lost("broker", "<b>gone</b>")
@@ -246,3 +265,60 @@ def test_the_page_in_a_browser(service: Service):
         server.close()
         service.actuators.closed = False
     assert service.store.alarms(actuator=HOSTILE)[0]["state"] == "acknowledged"
+
+
+def test_an_alarm_goes_through_its_life_and_survives_a_restart(tmp_path: Path):
+    """New, acknowledged, valid, closed by a repair; the next one invalid for a reason: as the database has it."""
+    settings = MonitorSettings.model_validate(
+        {
+            "database": str(tmp_path / "monitor.db"),
+            "lines": True,
+            "defaults": {"learn_hours": 0.02, "warning_lpm": 0.0005},
+            "actuator": [{"name": "press"}],
+        }
+    )
+    lines = lines_of({"press": WORN}, 500)
+
+    def restarted(**said: str) -> tuple[dict[str, Any], dict[str, Any]]:
+        service = Service(settings, once=True, stdin=io.BytesIO(lines), stdout=io.StringIO())
+        service.run()
+        view = TestClient(site(service.actuators, PageSettings(), None), base_url="http://localhost")
+        if said:
+            assert view.post(mark_of("press"), json=said, headers={"X-Sealscope": "mark"}).status_code == 200
+        life = view.get(of("press")).json()
+        service.store.engine.dispose()
+        return life["alarms"][0], life["summary"]["state"]
+
+    alarm, state = restarted()
+    assert (alarm["state"], state["name"], state["condition"]) == ("new", "maintenance required", "leak")
+    assert state == alarm["machine_state"]
+    assert restarted(mark="acknowledged")[0]["state"] == "acknowledged"
+    assert restarted(mark="valid", by="Ada")[0]["state"] == "valid"
+    assert restarted()[1]["name"] == "maintenance required"
+    alarm, state = restarted(mark="repaired")
+    assert (alarm["state"], alarm["mark"], state["condition"]) == ("closed", "repaired", "learning")
+    assert (state["name"], state["since_s"]) == ("check function", alarm["updated_s"])
+    assert restarted()[0]["state"] == "closed"
+
+
+def test_silence_and_a_duty_that_is_not_known_have_delays_of_their_own(tmp_path: Path):
+    def state(name: str, samples: Any, **delays: float) -> dict[str, Any]:
+        database = str(tmp_path / f"{name}.db")
+        defaults = {"learn_hours": 0.02, **delays}
+        settings = {"database": database, "lines": True, "defaults": defaults, "actuator": [{"name": "a"}]}
+        lines = io.BytesIO(lines_of({"a": samples}, 500))
+        service = Service(MonitorSettings.model_validate(settings), once=True, stdin=lines, stdout=io.StringIO())
+        service.run()
+        return service.states()["a"]
+
+    t, other = SOUND.t, SOUND.t > 90.0
+    channels = {name: np.where(other, SOUND[name][0], SOUND[name]) for name in SOUND.channels}
+    resting = Recording(t, channels, SOUND.units, SOUND.rate)  # from 90 s on it stands still
+    assert state("sound", SOUND)["condition"] == "watched"
+    assert state("patient", resting, not_comparable_s=1e4)["condition"] == "watched"
+    own = state("impatient", resting, not_comparable_s=20.0)
+    assert (own["condition"], own["name"]) == ("not comparable", "out of specification")
+    assert own["since_s"] == pytest.approx(90.0, abs=4.0)
+    silent = state("silent", SOUND, no_data_s=1e-6)
+    assert (silent["condition"], silent["name"], silent["since_s"] > 120.0) == ("no data", "check function", True)
+    assert state("leaking", WORN, no_data_s=1e-6)["condition"] == "leak"  # which silence does not take back

@@ -14,11 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.monitor.outages import Outages
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
-from sealscope.monitor.supervisor import Supervisor
+from sealscope.monitor.supervisor import Outages, Supervisor
 
 from .plant import settings_in, until
 from .servers import free_port

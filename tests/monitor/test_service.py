@@ -16,7 +16,7 @@ from sealscope.errors import InputError
 from sealscope.monitor.memory.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import TEMPLATE, read_settings
+from sealscope.monitor.settings import read_settings, template
 from sealscope.monitor.sources.source_block import digest_of
 from sealscope.monitor.stream.watch import STATE_VERSION
 from sealscope.simulation.simulate import simulate
@@ -42,7 +42,7 @@ def test_a_leak_becomes_one_alarm_with_litres_per_minute(undisturbed):
     assert [event["event"] for event in events] == ["raised"]
     alarm = events[0]["alarm"]
     assert alarm["actuator"] == "press 1"
-    assert (alarm["level"], alarm["state"], alarm["diagnostic_number"]) == ("warning", "unacknowledged", 4101)
+    assert (alarm["level"], alarm["state"], alarm["diagnostic_number"]) == ("warning", "new", 4101)
     assert alarm["onset_s"] == pytest.approx(100.0, abs=2.0)
     low, high = alarm["leak_interval_lpm"]
     assert low < 0.00195 < high
@@ -225,7 +225,7 @@ def test_marks_are_kept_and_act(tmp_path):
         service.actuators.mark("press 1", "acknowledged")
     service.actuators.mark("press 1", "comment", text="<b>seal ordered</b>")
     assert service.actuators.mark("press 1", "shelved", hours=2.0).shelved_until_s > 7200.0
-    assert service.actuators.mark("press 1", "repaired").state == "normal"
+    assert service.actuators.mark("press 1", "repaired").state == "closed"
     again = Service(settings, once=True)
     again._hold.close()
     assert again.actuators.plain()["press 1"]["alarm"] is None
@@ -277,6 +277,10 @@ def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
         of = "SELECT summary FROM summaries WHERE summaries.actuator = actuators.actuator"
         connection.exec_driver_sql(f"UPDATE actuators SET summary = ({of})")
         connection.exec_driver_sql("DELETE FROM summaries")
+        for table, column in (("alarms", "alarm"), ("events", "alarm"), ("actuators", "checkpoint")):
+            words = f"""UPDATE {table} SET {column} = REPLACE({column}, '"new"', '"unacknowledged"')"""
+            connection.exec_driver_sql(words)
+        connection.exec_driver_sql("UPDATE alarms SET state = 'unacknowledged'")
         connection.exec_driver_sql("UPDATE facts SET value = '1' WHERE name = 'schema'")
     before = service.actuators._actuators["press 1"].watch.baseline
     assert before is not None
@@ -293,6 +297,8 @@ def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
     assert "oil_celsius" in next(again.store.estimates())
     assert len(shown) == 2
     assert again.actuators.plain() == shown
+    assert [alarm["state"] for alarm in again.store.alarms(open_only=True)] == ["new"]
+    assert again.actuators.mark("press 1", "valid").state == "valid"
 
 
 def test_old_estimates_and_identities_are_forgotten(tmp_path, monkeypatch):
@@ -318,10 +324,10 @@ def test_one_monitor_at_a_time(tmp_path):
 
 def test_the_commented_file_is_valid(tmp_path):
     file = tmp_path / "monitor.toml"
-    file.write_text(TEMPLATE, encoding="utf-8")
+    file.write_text(template(), encoding="utf-8")
     settings = read_settings(file)
     assert settings.actuator[0].folder == tmp_path / "press 1"
-    uncommented = "\n".join(line[2:] if line.startswith("# simulate") else line for line in TEMPLATE.splitlines())
+    uncommented = "\n".join(line[2:] if line.startswith("# simulate") else line for line in template().splitlines())
     file.write_text(uncommented, encoding="utf-8")
     (actuator,) = read_settings(file).actuator
     assert actuator.simulate is not None

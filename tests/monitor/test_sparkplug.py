@@ -494,10 +494,15 @@ def test_a_node_is_born_tells_and_dies(tmp_path, monkeypatch):
     node, press, other = (values(payload) for _, payload in client.sent[:3])
     assert node == {"bdSeq": 1, "Node Control/Rebirth": False}
     assert values(client.will[1]) == values(client.sent[-1][1]) == {"bdSeq": 1}
-    assert (press["Alarm/State"], press["Alarm/Diagnostic Number"], press["Status Word"]) == ("unacknowledged", 4101, 5)
+    assert (press["Alarm/State"], press["Alarm/Diagnostic Number"], press["Status Word"]) == ("new", 4101, 5)
     assert press["Leak"] == pytest.approx(0.00195, rel=0.1)
     assert press["Leak Low"] < press["Leak"] < press["Leak High"]
     assert (other["Alarm/State"], other["Status Word"], other["Blocks"]) == (None, 0, 44)
+    assert (press["State"], press["State/Health"], press["State/Cause"]) == (
+        *("maintenance required", 4),
+        press["Alarm/Cause"],
+    )
+    assert (other["State"], other["State/Severity"]) == ("good", 0)
     assert all(metric.datatype for _, payload in client.sent for metric in payload.metrics)
     again = len(topics) - 1 - topics[::-1].index(first[0])
     assert topics[again : again + 3] == first  # the rebirth, with the number of the connection

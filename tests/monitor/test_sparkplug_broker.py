@@ -199,7 +199,7 @@ def test_samples_and_alarms_over_sparkplug(
     events = [values(payload) for payload in wire.of("Sealscope/DDATA/monitor/press 1")]
     events = [event for event in events if "Alarm/Event" in event]
     assert [(event["Alarm/Event"], event["Alarm/State"]) for event in events] == [
-        ("raised", "unacknowledged"),
+        ("raised", "new"),
         ("acknowledged", "acknowledged"),
     ]
     assert events[0]["Alarm/Leak Low"] < 0.00195 < events[0]["Alarm/Leak High"]

@@ -15,10 +15,9 @@ from sqlalchemy.exc import OperationalError
 
 from sealscope.errors import InputError
 from sealscope.monitor.memory.store import away
-from sealscope.monitor.outages import DATABASE, Outages
 from sealscope.monitor.service import Service
 from sealscope.monitor.sources.source_block import BlockReceiver, decoded
-from sealscope.monitor.supervisor import LimitedLines, PartAway, Supervisor
+from sealscope.monitor.supervisor import DATABASE, LimitedLines, Outages, PartAway, Supervisor
 from sealscope.units import to_si
 
 from .plant import rows_of, served, settings_in, until

@@ -159,7 +159,7 @@ def test_warm_oil_and_another_duty_are_no_leak():
 
 
 def test_a_level_is_stated_with_what_warm_oil_may_have_of_it():
-    place = {"version": 1, "learned_s": 0.0, "hours": 8.0, "lpm": None, "low_lpm": None, "high_lpm": None}
+    place = {"version": 1, "learned_s": 0.0, "hours": 8.0, "lpm": None}
     duty = {"duty_low": (0.0, 0.0), "duty_high": (0.0, 0.0)}
     baseline = WatchBaseline(level=2e-13, low=1e-13, high=3e-13, **place, **duty)
     rise = baseline.rise(1e5, 6e-13, 1e-15, 1e-6)

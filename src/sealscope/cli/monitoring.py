@@ -23,18 +23,20 @@ monitor = typer.Typer(
 
 @monitor.command()
 def init(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write.")] = Path("monitor.toml"),
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write.")] = Path(
+        "monitor.toml"
+    ),
 ) -> None:
     """Write a commented file of settings."""
     from sealscope.errors import InputError
-    from sealscope.monitor.settings import TEMPLATE
+    from sealscope.monitor.settings import template
     from sealscope.storage.atomic import atomic_write
 
-    if file.exists():
-        raise InputError(f"a new file of settings must not exist yet, got {file}")
-    with atomic_write(file) as temporary:
-        temporary.write_text(TEMPLATE, encoding="utf-8")
-    typer.echo(f"{file}: written; sealscope monitor {file}")
+    if output.exists():
+        raise InputError(f"a new file of settings must not exist yet, got {output}")
+    with atomic_write(output) as temporary:
+        temporary.write_text(template(), encoding="utf-8")
+    typer.echo(f"{output}: written; sealscope monitor {output}")
 
 
 @monitor.command()

@@ -9,28 +9,27 @@ import time
 import zlib
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from sqlalchemy import Connection
+from sqlalchemy.exc import IntegrityError
 
+from sealscope.diagnosis.verdict.states import LEAKING, state_of
 from sealscope.errors import InputError
-from sealscope.monitor.alarms.alarm import Alarm, status_word
-from sealscope.monitor.alarms.judging import AlarmJudge
+from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.memory.sharing import Share
 from sealscope.monitor.memory.store import KEPT_IDENTITIES, PENDING_BLOCKS, PENDING_BYTES, MonitorStore, StoredRows
-from sealscope.monitor.outages import Outages
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
-from sealscope.monitor.stream.baseline import plain_dataclass
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.monitor.stream.watch import STATE_VERSION, Watch, watch
+from sealscope.monitor.supervisor import Outages
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import part_of, plain_fields
+from sealscope.storage.plain_state import part_of, plain_fields, restored
 
 _log = logging.getLogger(__name__)
-#: What a person may say of an alarm.
-MARKS = ("acknowledged", "comment", "shelved", "false", "repaired")
 _LONGEST_TEXT = 2000
 #: How long blocks of others' actuators are kept, in leases: until a takeover, with time to spare.
 _KEPT_LEASES = 4.0
@@ -38,7 +37,7 @@ _KEPT_LEASES = 4.0
 
 @dataclass
 class _Actuator:
-    """What is in memory of an actuator."""
+    """What is in memory of an actuator; `judged_s`: end of the last block that was judged [s]."""
 
     settings: ActuatorSettings
     watch: Watch
@@ -49,13 +48,73 @@ class _Actuator:
     last: BlockEstimate | None = None
     shown: dict[str, Any] | None = None
     oil_celsius: float | None = None
+    judged_s: float | None = None
 
-    def warm(self, samples: Recording) -> None:
-        """Note the oil's temperature, where it is known and that of oil."""
+    def judged(self, samples: Recording, follows: bool) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
+        """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
+        estimates, happened = [], []
         if "T_oil" in samples and samples.units["T_oil"] == "K":
-            known = samples["T_oil"][np.abs(samples["T_oil"] - 373.15) < 200.0]
+            known = samples["T_oil"][np.abs(samples["T_oil"] - 373.15) < 200.0]  # that of oil
             if known.size:
                 self.oil_celsius = float(known.mean()) - 273.15
+        for estimate, leak in self.watch.each(samples, follows=follows):
+            version = 0 if self.watch.baseline is None else self.watch.baseline.version
+            change = self.judge.take(estimate, leak, version, self.settings.thresholds)
+            estimates.append(estimate)
+            self.last = estimate
+            if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
+                self.judged_s = estimate.t
+            if change is not None:
+                happened.append((*change, estimate.t))
+        return estimates, happened
+
+    def state(self) -> dict[str, Any]:
+        """Return all that a checkpoint keeps, as plain values."""
+        last = None if self.last is None else plain_fields(self.last)
+        own = {"oil_celsius": self.oil_celsius, "judged_s": self.judged_s}
+        return {"watch": self.watch.state(), "judge": self.judge.state(), "last": last, **own}
+
+    def _machine_state(self) -> dict[str, Any]:
+        """Return the state of NE 107, as far as the samples tell."""
+        alarm, baseline, over = self.judge.alarm, self.watch.baseline, self.judge.over_s
+        if alarm is not None and alarm.active:
+            own = state_of(alarm.condition, alarm.cause, since_s=alarm.onset_s, action=alarm.next_check)
+        elif self.last is None or self.judged_s is None:
+            own = state_of("no data")
+        elif self.last.t - self.judged_s > self.settings.not_comparable_s:
+            own = state_of("not comparable", self.last.status, since_s=self.judged_s)
+        elif baseline is None:
+            own = state_of("learning", since_s=over)
+        else:
+            own = state_of("watched", since_s=max(baseline.learned_s, over or -math.inf))
+        return own.as_dict()
+
+    def summary(self) -> dict[str, Any]:
+        """Return what it shows now, as plain values."""
+        last, base, alarm = self.last, self.watch.baseline, self.judge.alarm
+        return {
+            "blocks": self.watch.blocks,
+            "t": None if last is None else last.t,
+            "status": "waits for samples" if last is None else last.status,
+            "state": self._machine_state(),
+            "by": self.watch.by,
+            "total_lpm": None if last is None else last.total_lpm,
+            "leak_lpm": None if last is None else last.leak_lpm,
+            "leak_interval_lpm": None if last is None else last.leak_interval_lpm,
+            "oil_celsius": self.oil_celsius,
+            "baseline": None if base is None else {"version": base.version, "hours": base.hours, "lpm": base.lpm},
+            "alarm": None if alarm is None else alarm.id,
+            "status_word": 0 if alarm is None else alarm.status_word,
+            "counters": self.watch.counters,
+        }
+
+
+@dataclass
+class _Blocks:
+    """Blocks of another monitor's actuator, each with the clock at which it came; and when the last one came [s]."""
+
+    elsewhere: deque[tuple[float, SourceBlock]] = field(default_factory=deque)
+    heard: float = field(default_factory=time.monotonic)
 
 
 class _Repeated(Exception):  # noqa: N818 (says what happened)
@@ -73,59 +132,56 @@ class WatchedActuators:
         share: Share | None = None,
     ) -> None:
         self.store, self._share = store, share
-        self._elsewhere: dict[str, deque[tuple[float, SourceBlock]]] = {each.name: deque() for each in settings}
+        self.settings = {each.name: each for each in settings}
+        self._blocks = {name: _Blocks() for name in self.settings}
         self._keep_s = keep_days * 86_400.0
-        self._counters: dict[str, int] = {}
+        self._counters = Counter[str]()
         self._counting = threading.Lock()
         self.changes = threading.Condition()
         self.changed = 0
         self.closed = False
         self.outages = Outages(self._tell)
         self._lock = threading.RLock()
-        self._settings = {each.name: each for each in settings}
         self._actuators: dict[str, _Actuator] = {}
         if share is None:
-            self._actuators = {name: self._restored(each) for name, each in self._settings.items()}
+            self._actuators = {name: self._restored(each) for name, each in self.settings.items()}
 
     def _restored(self, settings: ActuatorSettings) -> _Actuator:
         """Return an actuator as its last transaction left it."""
-        saved = self.store.checkpoint(settings.name)
-        fresh = watch(
-            settings.rig,
-            false_alarms_per_1000_h=settings.false_alarms_per_1000_h,
-            learn_hours=settings.learn_hours,
-        )
+        name, rate = settings.name, settings.false_alarms_per_1000_h
+        saved = self.store.checkpoint(name)
+        fresh = watch(settings.rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
         if saved is None:
-            return self._begun_anew(_Actuator(settings, fresh, AlarmJudge(settings.name)))
+            return self._begun_anew(_Actuator(settings, fresh, AlarmJudge(name)))
         learned_with, state, pending = saved
         judge = AlarmJudge.from_state(state["judge"])
         if (version := part_of(state["watch"], "version", int)) != STATE_VERSION:
-            _log.warning("%s: its state has version %s, not %d, begins anew", settings.name, version, STATE_VERSION)
+            _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
             learned = part_of(state["watch"], "baseline_version", int)
-            fresh.continue_from(self.store.estimates_kept(settings.name), learned)
+            fresh.continue_from(self.store.last_number(self.store.tables.estimates, name), learned)
             return self._begun_anew(_Actuator(settings, fresh, judge))
         actuator = _Actuator(settings, Watch.from_state(state["watch"]), judge)
-        actuator.taken = self.store.blocks_kept(settings.name)
+        actuator.taken = self.store.last_number(self.store.tables.blocks, name)
         if state["last"] is not None:
-            actuator.last = plain_dataclass(BlockEstimate, state["last"], "last")
-        actuator.oil_celsius = state.get("oil_celsius")
+            actuator.last = restored(BlockEstimate, state["last"], "last")
+        actuator.oil_celsius, actuator.judged_s = state.get("oil_celsius"), state.get("judged_s")
         for samples, follows in pending:
-            self._judged(actuator, samples, follows)
+            actuator.judged(samples, follows)
             actuator.pending += 1
             actuator.bytes += bytes_of(samples)
         if learned_with != settings.learned_with:
-            _log.warning("%s: learned with %s, begins anew with other settings", settings.name, learned_with)
+            _log.warning("%s: learned with %s, begins anew with other settings", name, learned_with)
             fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
             actuator.watch = fresh
             return self._begun_anew(actuator)
-        if actuator.watch.false_alarms_per_1000_h != settings.false_alarms_per_1000_h:
-            actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h
+        if actuator.watch.false_alarms_per_1000_h != rate:
+            actuator.watch.false_alarms_per_1000_h = rate
             return self._begun_anew(actuator)  # with the same baseline
         return actuator
 
     def _begun_anew(self, actuator: _Actuator) -> _Actuator:
         """Return an actuator whose watch was changed by the settings, its state stored."""
-        actuator.taken = self.store.blocks_kept(actuator.settings.name)
+        actuator.taken = self.store.last_number(self.store.tables.blocks, actuator.settings.name)
         rows = StoredRows()
         self._checkpoint(actuator, rows)
         with self.store.writing() as connection:
@@ -136,7 +192,7 @@ class WatchedActuators:
         """Count something that was dropped."""
         if number:
             with self._counting:
-                self._counters[reason] = self._counters.get(reason, 0) + number
+                self._counters[reason] += number
 
     @property
     def counters(self) -> dict[str, int]:
@@ -154,12 +210,12 @@ class WatchedActuators:
             gained, lost = self._share.renew()
             for name in gained | lost:
                 self._actuators.pop(name, None)  # the database knows better
-            for name in sorted(self._share.held & set(self._settings)):
+            for name in sorted(self._share.held & set(self.settings)):
                 self._taken_over(name)
 
     def _taken_over(self, name: str) -> None:
         """Take the blocks that came while another monitor watched an actuator; those it stored are passed over."""
-        waiting = self._elsewhere[name]
+        waiting = self._blocks[name].elsewhere
         for _ in range(len(waiting)):
             self._take([waiting[0][1]])
             waiting.popleft()
@@ -168,7 +224,7 @@ class WatchedActuators:
         """Keep a block of another monitor's actuator for as long as its takeover may last."""
         assert self._share is not None
         self.count("blocks of another monitor's actuator")
-        waiting, now = self._elsewhere[block.actuator], time.monotonic()
+        waiting, now = self._blocks[block.actuator].elsewhere, time.monotonic()
         waiting.append((now, replace(block, done=nothing)))
         while waiting and waiting[0][0] < now - _KEPT_LEASES * self._share.lease_s:
             waiting.popleft()
@@ -179,21 +235,18 @@ class WatchedActuators:
         Return the estimates in their order. Raises what the database raises; the blocks can then be taken again.
         """
         with self._lock:
-            mine, others, unknown = [], [], 0
-            for block in blocks:
-                if block.actuator not in self._settings:
-                    unknown += 1
-                elif self._share is not None and block.actuator not in self._share.held:
-                    others.append(block)
-                else:
-                    mine.append(block)
+            known, held = [block for block in blocks if block.actuator in self.settings], self.held
+            mine = [block for block in known if block.actuator in held]
+            for name in {block.actuator for block in known}:
+                self._blocks[name].heard = time.monotonic()
             if self._share is not None:
                 for name in {block.actuator for block in mine}:
                     self._taken_over(name)
             estimates = self._take(mine)
-            for block in others:
-                self._keep_elsewhere(block)
-            self.count("blocks of an actuator that is not in the settings", unknown)
+            for block in known:
+                if block.actuator not in held:
+                    self._keep_elsewhere(block)
+            self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known))
         return estimates
 
     def _take(self, blocks: Sequence[SourceBlock]) -> list[BlockEstimate]:
@@ -203,10 +256,8 @@ class WatchedActuators:
         """
         if not blocks:
             return []
-        names = {block.actuator for block in blocks}
         new = {(block.actuator, block.identity): block for block in reversed(blocks)}  # of two the first
         fresh = [block for block in blocks if new[block.actuator, block.identity] is block]
-        lost: set[str] = set()
         try:
             try:
                 lost, estimates = self._stored(fresh)
@@ -217,7 +268,7 @@ class WatchedActuators:
                 lost, estimates = self._stored(fresh)
         except BaseException:
             # what the detectors took is not stored: the next blocks begin at the last transaction
-            for name in names:
+            for name in {block.actuator for block in blocks}:
                 self._actuators.pop(name, None)
             raise
         for block in fresh:
@@ -233,16 +284,13 @@ class WatchedActuators:
 
         Raises _Repeated, and no detector has taken anything, where one of the blocks is stored already.
         """
-        from sqlalchemy.exc import IntegrityError
-
         rows, estimates, lost = StoredRows(), list[BlockEstimate](), set[str]()
         with self.store.writing() as connection:
-            if self._share is not None:
+            if (share := self._share) is not None:
                 names = sorted({block.actuator for block in blocks})
-                lost = {name for name in names if not self._share.holds(connection, name)}
+                lost = {name for name in names if not share.holds(connection, name)}
             mine = [(block, self._actuator(block.actuator)) for block in blocks if block.actuator not in lost]
-            taken = Counter[str]()
-            numbered = []
+            taken, numbered = Counter[str](), []
             for block, actuator in mine:
                 taken[block.actuator] += 1
                 numbered.append((block.actuator, block.identity, actuator.taken + taken[block.actuator]))
@@ -254,20 +302,20 @@ class WatchedActuators:
             for block, actuator in mine:
                 actuator.taken += 1
                 if block.samples is not None:
-                    estimates += self._taken(connection, rows, actuator, block, block.samples)
+                    estimates += self._taken(connection, rows, actuator, block.samples, block.follows)
             self.store.keep_rows(connection, rows)
         return lost, estimates
 
     def _actuator(self, name: str) -> _Actuator:
         if name not in self._actuators:
-            self._actuators[name] = self._restored(self._settings[name])
+            self._actuators[name] = self._restored(self.settings[name])
         return self._actuators[name]
 
     def _taken(
-        self, connection: Any, rows: StoredRows, actuator: _Actuator, block: SourceBlock, samples: Recording
+        self, connection: Connection, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool
     ) -> list[BlockEstimate]:
-        name = block.actuator
-        estimates, happened = self._judged(actuator, samples, block.follows)
+        name = actuator.settings.name
+        estimates, happened = actuator.judged(samples, follows)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
             if kind:
@@ -280,96 +328,49 @@ class WatchedActuators:
         if turn == 0 or actuator.bytes >= PENDING_BYTES:
             self._checkpoint(actuator, rows)
         else:
-            rows.add_pending(name, actuator.pending, samples, block.follows)
+            rows.add_pending(name, actuator.pending, samples, follows)
             self._show(actuator, rows)
         return estimates
 
-    @staticmethod
-    def _judged(
-        actuator: _Actuator, samples: Recording, follows: bool
-    ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
-        """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
-        estimates, happened = [], []
-        actuator.warm(samples)
-        for estimate, leak in actuator.watch.each(samples, follows=follows):
-            version = 0 if actuator.watch.baseline is None else actuator.watch.baseline.version
-            change = actuator.judge.take(estimate, leak, version, actuator.settings.thresholds)
-            estimates.append(estimate)
-            if change is not None:
-                happened.append((*change, estimate.t))
-        if estimates:
-            actuator.last = estimates[-1]
-        return estimates, happened
-
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add the state to the rows, and what is old then."""
-        last = None if actuator.last is None else plain_fields(actuator.last)
-        parts = {"watch": actuator.watch.state(), "judge": actuator.judge.state(), "last": last}
-        state: dict[str, Any] = {**parts, "oil_celsius": actuator.oil_celsius}
         settings = actuator.settings
-        rows.add_checkpoint(settings.name, settings.learned_with, state)
+        rows.add_checkpoint(settings.name, settings.learned_with, actuator.state())
         self._show(actuator, rows)
         kept = self._keep_s / actuator.watch.block_seconds
         rows.old[settings.name] = actuator.taken - KEPT_IDENTITIES, math.floor(actuator.watch.blocks - kept)
         actuator.pending = actuator.bytes = 0
 
-    def _show(self, actuator: _Actuator, rows: StoredRows) -> None:
+    @staticmethod
+    def _show(actuator: _Actuator, rows: StoredRows) -> None:
         """Add what an actuator shows to the rows, where it has changed."""
-        summary = self._summary(actuator)
+        summary = actuator.summary()
         if summary != actuator.shown:
             rows.summaries[actuator.settings.name] = actuator.shown = summary
-
-    @staticmethod
-    def _summary(actuator: _Actuator) -> dict[str, Any]:
-        """Return what an actuator shows now, as plain values."""
-        last, baseline, alarm = actuator.last, actuator.watch.baseline, actuator.judge.alarm
-        return {
-            "blocks": actuator.watch.blocks,
-            "t": None if last is None else last.t,
-            "status": "waits for samples" if last is None else last.status,
-            "by": actuator.watch.by,
-            "total_lpm": None if last is None else last.total_lpm,
-            "leak_lpm": None if last is None else last.leak_lpm,
-            "leak_interval_lpm": None if last is None else last.leak_interval_lpm,
-            "oil_celsius": actuator.oil_celsius,
-            "baseline": None
-            if baseline is None
-            else {"version": baseline.version, "hours": baseline.hours, "lpm": baseline.lpm},
-            "alarm": None if alarm is None else alarm.id,
-            "status_word": status_word([] if alarm is None else [alarm]),
-            "counters": actuator.watch.counters,
-        }
 
     def mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "", hours: float = 8.0) -> Alarm:
         """Keep what a person says of an actuator's alarm, in one transaction.
 
-        `mark`: one of `MARKS`; ``false`` takes the leak back, ``repaired`` begins a new baseline as well; ``shelved``
-        announces nothing for `hours`. Raises InputError where there is no such alarm.
+        `mark`: one of `MARKS`; ``invalid``, for the reason `text`, takes the leak back, ``repaired`` begins a new
+        baseline as well; ``shelved`` announces nothing for `hours`. Raises InputError where there is no such alarm.
         """
-        if mark not in MARKS:
-            raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
         if len(text) > _LONGEST_TEXT or len(by_whom) > 80:
             raise InputError(f"a comment must have at most {_LONGEST_TEXT} characters, a name 80")
-        if not _storable(text + by_whom):
+        if "\0" in text + by_whom or any("\ud800" <= letter <= "\udfff" for letter in text + by_whom):
             raise InputError("a comment must be text, got a NUL or half of a surrogate pair")
         if not 0.0 < hours <= 10_000.0:
             raise InputError(f"an alarm must be shelved for > 0 h, got {hours:g}")
         with self._lock:
-            if name not in self._settings:
+            if name not in self.settings:
                 raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
-            if self._share is not None and name not in self._share.held:
+            if name not in self.held:
                 raise InputError(f"{name} is watched by another monitor; mark its alarm on that one's page")
             actuator = self._actuator(name)
             at = actuator.last.t if actuator.last is not None else 0.0
             try:
                 with self.store.writing() as connection:
-                    if mark == "comment":
-                        if actuator.judge.alarm is None:
-                            raise InputError(f"{name} must have an alarm to be commented on, got none")
-                        alarm = actuator.judge.alarm
-                    else:
-                        alarm = actuator.judge.marked(mark, at, at + hours * 3600.0)
-                    if mark == "false":
+                    alarm = actuator.judge.marked(mark, at, until=at + hours * 3600.0, reason=text)
+                    if mark == "invalid":
                         actuator.watch.dismiss()
                     elif mark == "repaired":
                         actuator.watch.relearn()
@@ -389,29 +390,30 @@ class WatchedActuators:
     @property
     def held(self) -> frozenset[str]:
         """The actuators that this monitor watches: all of its settings, or its share of them."""
-        return frozenset(self._settings) & (frozenset(self._settings) if self._share is None else self._share.held)
-
-    @property
-    def rigs(self) -> dict[str, str]:
-        """The rig of each actuator, by name or path."""
-        return {name: settings.rig for name, settings in self._settings.items()}
+        return frozenset(self.settings) & (frozenset(self.settings) if self._share is None else self._share.held)
 
     @property
     def false_alarms_per_1000_h(self) -> float:
         """False alarms of all healthy actuators together per 1000 h in which all of them run, at most."""
-        return sum(settings.false_alarms_per_1000_h for settings in self._settings.values())
+        return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 
     def plain(self) -> dict[str, dict[str, Any]]:
-        """Return what each actuator of the settings shows now, as its last transaction left it."""
-        known = self.store.summaries()
-        return {name: known[name] for name in self._settings if name in known}
+        """Return what each actuator of the settings shows now, as its last transaction left it.
+
+        Where nothing has come for `no_data_s` and no alarm lasts, its state says so.
+        """
+        known, now = self.store.summaries(), time.monotonic()
+        shown = {}
+        for name, settings in self.settings.items():
+            if name in known:
+                summary, own = known[name], known[name].get("state")
+                silent = now - self._blocks[name].heard > settings.no_data_s
+                if own is None or (silent and own["condition"] not in LEAKING):
+                    own = state_of("no data", since_s=summary["t"]).as_dict()
+                shown[name] = {**summary, "state": own}
+        return shown
 
     def _tell(self) -> None:
         with self.changes:
             self.changed += 1
             self.changes.notify_all()
-
-
-def _storable(text: str) -> bool:
-    """Return whether every database can hold a text."""
-    return "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)

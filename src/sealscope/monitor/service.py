@@ -11,17 +11,16 @@ from contextlib import ExitStack, suppress
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, TextIO, TypeVar
+from typing import Any, BinaryIO, TextIO, TypeVar
 
+from sqlalchemy.exc import SQLAlchemyError
 from threadpoolctl import threadpool_limits
 
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.sharing import Share
 from sealscope.monitor.memory.store import MonitorStore, away
-from sealscope.monitor.outages import DATABASE, WEBHOOK
 from sealscope.monitor.outputs.lines import EventLines
-from sealscope.monitor.outputs.webhook import Webhook
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import MonitorSettings, secret_of
@@ -34,7 +33,7 @@ from sealscope.monitor.sources.source_block import (
     SourceBlock,
     bytes_of,
 )
-from sealscope.monitor.supervisor import Supervisor
+from sealscope.monitor.supervisor import DATABASE, WEBHOOK, Supervisor
 from sealscope.monitor.waiting import Waiting
 from sealscope.storage.folders import locked
 
@@ -150,6 +149,10 @@ class Service:
         """Count something that was dropped."""
         self.actuators.count(reason)
 
+    def states(self) -> dict[str, dict[str, Any]]:
+        """Return the state of NE 107 of each actuator as plain values."""
+        return {name: summary["state"] for name, summary in self.actuators.plain().items()}
+
     def waits(self) -> tuple[int, int, int]:
         """Return how many blocks are not stored yet, their bytes, and how often a source had to wait for them."""
         return *self._queue.unsettled(), self._waits
@@ -178,8 +181,6 @@ class Service:
             for thread in ending:
                 if thread.name != _LINES:  # which may wait for a line for ever
                     thread.join(max(0.0, deadline - time.monotonic()))
-            from sqlalchemy.exc import SQLAlchemyError
-
             if self._share is not None:
                 with suppress(SQLAlchemyError):
                     self._share.give_back()
@@ -225,6 +226,8 @@ class Service:
             alarms = SparkplugNode(self.store, self.actuators.plain, self.count, broker, node, password)
             threads.append(supervisor.start("Sparkplug node", partial(alarms.run, self.stopping)))
         if (hook := self.settings.webhook) is not None:
+            from sealscope.monitor.outputs.webhook import Webhook
+
             token = secret_of(hook.token_file, "webhook.token_file")
             self.outages.expect(WEBHOOK)
             webhook = Webhook(self.store, hook.url, token, hook.timeout_s, self.outages)

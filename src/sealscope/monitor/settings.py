@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from sealscope.errors import InputError
-from sealscope.monitor.alarms.judging import Thresholds
+from sealscope.monitor.alarms import Thresholds
 from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.storage.toml_file import read_toml
 
@@ -31,6 +33,8 @@ class WatchSettings(_Part):
     error_lpm: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     debounce_blocks: int = Field(default=2, ge=1, le=1000)
     return_share: float = Field(default=0.7, gt=0, lt=1)
+    no_data_s: float = Field(default=3600.0, gt=0)
+    not_comparable_s: float = Field(default=3600.0, gt=0)
 
     @property
     def thresholds(self) -> Thresholds:
@@ -166,42 +170,37 @@ class MonitorSettings(_Part):
 
     @model_validator(mode="after")
     def _fits_together(self) -> MonitorSettings:
-        names = [actuator.name for actuator in self.actuator]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"actuators must have names of their own, got {name!r} twice")
-        topics = [actuator.topic for actuator in self.actuator if actuator.topic is not None]
-        for topic in topics:
-            if topics.count(topic) > 1 or any(letter in topic for letter in "+#"):
-                raise ValueError(f"each actuator must have a topic of its own without wildcards, got {topic!r}")
-        paths = [actuator.sparkplug for actuator in self.actuator if actuator.sparkplug is not None]
-        for path in paths:
-            if paths.count(path) > 1:
-                raise ValueError(f"each actuator must have a Sparkplug node or device of its own, got {path!r} twice")
-        if (topics or paths or self.sparkplug is not None) and self.mqtt is None:
+        actuators, mqtt, share, page = self.actuator, self.mqtt, self.share, self.page
+        topics = [each.topic for each in actuators if each.topic is not None]
+        paths = [each.sparkplug for each in actuators if each.sparkplug is not None]
+        for values, rule in (
+            ([each.name for each in actuators], "actuators must have names of their own"),
+            (topics, "each actuator must have a topic of its own without wildcards"),
+            (paths, "each actuator must have a Sparkplug node or device of its own"),
+        ):
+            for value, count in Counter(values).items():
+                if count > 1 or (values is topics and any(letter in value for letter in "+#")):
+                    raise ValueError(f"{rule}, got {value!r}" + (" twice" if count > 1 else ""))
+        if (topics or paths or self.sparkplug is not None) and mqtt is None:
             raise ValueError("an actuator with a topic, or Sparkplug B, needs the table [mqtt]")
-        for actuator in self.actuator:
-            if not actuator.nodes:
-                continue
-            if self.opcua is None or actuator.rate is None:
-                raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {actuator.name!r}")
-            for channel in {**actuator.nodes, **actuator.units}:
+        for each in actuators:
+            if each.nodes and (self.opcua is None or each.rate is None):
+                raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {each.name!r}")
+            for channel in {**each.nodes, **each.units} if each.nodes else ():
                 if channel not in CHANNELS:
                     raise ValueError(f"nodes must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
-        if self.sparkplug is not None or (self.mqtt is not None and self.mqtt.alarms_topic is not None):
-            devices = [topic_part(name) for name in names]
-            if len({*devices}) < len(devices):
-                raise ValueError("actuators must have names that differ in more than the letters + # / as topics")
+        sends = self.sparkplug is not None or (mqtt is not None and mqtt.alarms_topic is not None)
+        if sends and len({topic_part(each.name) for each in actuators}) < len(actuators):
+            raise ValueError("actuators must have names that differ in more than the letters + # / as topics")
         own = None if self.sparkplug is None else [self.sparkplug.group, self.sparkplug.node]
         if any(path.split("/")[:2] == own for path in paths):
             raise ValueError("the node of the alarms must be none of the actuators' nodes")
-        if self.share is not None and "://" not in self.database:
+        if share is not None and "://" not in self.database:
             raise ValueError(f"monitors that share actuators need a database by URL, got the file {self.database!r}")
-        if self.share is not None and self.mqtt is not None and self.mqtt.host_id is not None:
+        if share is not None and mqtt is not None and mqtt.host_id is not None:
             raise ValueError("monitors that share actuators are no primary host of Sparkplug: leave mqtt.host_id out")
-        local = self.page is None or self.page.host in ("127.0.0.1", "localhost", "::1")
-        if self.page is not None and not local and self.page.token_file is None:
-            raise ValueError(f"a page beyond this machine needs page.token_file, got host {self.page.host!r} without")
+        if page is not None and page.host not in ("127.0.0.1", "localhost", "::1") and page.token_file is None:
+            raise ValueError(f"a page beyond this machine needs page.token_file, got host {page.host!r} without")
         return self
 
 
@@ -234,18 +233,23 @@ def read_settings(path: Path) -> MonitorSettings:
         value = "" if first["type"] in ("value_error", "missing") else f", got {str(first['input'])[:60]!r}"
         raise InputError(f"{place}: {message}{value} ({path})") from None
     folder = path.resolve().parent
-    database = settings.database if "://" in settings.database else str(folder / settings.database)
-    actuators = [
-        one if one.folder is None else one.model_copy(update={"folder": folder / one.folder})
-        for one in settings.actuator
-    ]
-    changed: dict[str, Any] = {"database": database, "actuator": actuators}
-    for name, fields in _FILES.items():
-        part = getattr(settings, name)
-        if part is not None:
-            given = {field: getattr(part, field) for field in fields}
-            changed[name] = part.model_copy(update={f: folder / path for f, path in given.items() if path is not None})
+    changed: dict[str, Any] = {
+        "database": settings.database if "://" in settings.database else str(folder / settings.database),
+        "actuator": [
+            each if each.folder is None else each.model_copy(update={"folder": folder / each.folder})
+            for each in settings.actuator
+        ],
+    }
+    for name, own in _FILES.items():
+        if (part := getattr(settings, name)) is not None:
+            named = {field: getattr(part, field) for field in own}
+            changed[name] = part.model_copy(update={f: folder / path for f, path in named.items() if path is not None})
     return settings.model_copy(update=changed)
+
+
+def template() -> str:
+    """Return a commented file of settings."""
+    return (files("sealscope.monitor") / "template.toml").read_text("utf-8")
 
 
 def secret_of(path: Path | None, what: str) -> str | None:
@@ -259,77 +263,3 @@ def secret_of(path: Path | None, what: str) -> str | None:
     if not secret:
         raise InputError(f"{what} must hold a secret in its first line, got an empty file ({path})")
     return secret[0]
-
-
-#: A commented file of settings.
-TEMPLATE = """\
-# Settings of `sealscope monitor`; paths are taken from this file's folder.
-
-database = "monitor.db"          # a file of SQLite, or a URL such as postgresql+psycopg://user@host/name
-lines = false                    # take JSON lines from standard input
-keep_days = 90.0                 # estimates of so many days of operation are kept; alarms and marks stay
-# fleet_false_alarms_per_1000_h = 1.0 # of all healthy actuators together, in equal parts; in place of that below
-settle_s = 5.0                   # a file is read when it has not changed for so long [s]
-
-[defaults]                       # of every actuator
-rig = "thesis"                   # by name, or the path of a rig's TOML file
-false_alarms_per_1000_h = 1.0    # of a healthy actuator, at most
-learn_hours = 8.0                # operating hours of healthy running that the baseline is learned from
-warning_lpm = 0.0                # a leak of so much is a warning [L/min]; 0: every leak that the tests show
-# error_lpm = 0.01               # ... and of so much an error
-debounce_blocks = 2              # successive blocks (some 3 s each) that must say so
-return_share = 0.7               # an alarm returns below this share of its threshold
-
-[page]
-host = "127.0.0.1"
-port = 8765
-# token_file = "token.txt"       # needed for any other host; put a proxy with TLS before it
-
-# [mqtt]                         # MQTT 5
-# host = "localhost"
-# port = 1883
-# user = "monitor"
-# password_file = "password.txt"
-# tls = false
-# ca_file = "ca.pem"
-# alarms_topic = "sealscope"     # alarms go to sealscope/ACTUATOR/alarm, retained
-# host_id = "sealscope"          # nodes of Sparkplug B that have this primary host hear when the monitor is away
-
-# [opcua]                        # OPC UA
-# url = "opc.tcp://localhost:4840"
-# user = "monitor"
-# password_file = "password.txt"
-# security = "Basic256Sha256,SignAndEncrypt,certificate.der,key.pem"
-# block_s = 1.0                  # values are gathered into blocks of so long [s]
-
-# [sparkplug]                    # alarms also go out as an edge node of Sparkplug B, a device for each actuator
-# group = "Sealscope"
-# node = "monitor"               # each monitor's own
-# every_s = 10.0                 # what has changed is sent so often; alarms at once
-
-# [share]                        # several monitors over one PostgreSQL, each with the same actuators
-# name = "monitor 1"             # its own
-# lease_s = 12.0                 # one that says nothing for so long [s] loses its actuators to the others
-
-# [webhook]                      # each event is posted as the JSON object of its line
-# url = "https://example.com/alarms"
-# token_file = "hook-token.txt"  # sent as Authorization: Bearer
-# timeout_s = 10.0
-
-# An actuator is watched by p_A, p_B, x and theta or omega (balance of volumes: steps from 0.002 L/min on), or without
-# a position by p_A, p_B and u at 200 Hz or more (their response: steps from 0.005 L/min on). The first minute settles
-# which; other names stand in `map`.
-[[actuator]]
-name = "press 1"
-folder = "press 1"               # recordings that appear here are read, in any format that `sealscope diagnose` reads
-pattern = "*"
-# map = { p_A = "PG_1[bar]" }    # channels from foreign columns
-# topic = "plant/press1/samples" # JSON or CBOR: {"t": 0.0, "rate": 500, "p_A": [...], "p_B": [...], "x": [...], ...}
-# sparkplug = "plant/node/press" # or an edge node of Sparkplug B, or its device: GROUP/NODE or GROUP/NODE/DEVICE
-# nodes = { p_A = "ns=2;s=press1.p_A", p_B = "ns=2;s=press1.p_B" } # or nodes of the OPC UA server, by channel
-# units = { p_A = "bar" }        # theirs, where they are not SI
-# rate = 500.0                   # its sampling rate [Hz], where no metric `rate` states it
-# simulate = { command = "3 sin(4t)", leak = "0.0042 L/min from 120 s", seed = 1, speed = 20.0 } # or the simulated rig,
-#                                # in the words of `sealscope simulate`, at `speed` times real time
-# error_lpm = 0.02               # what differs from the defaults
-"""

@@ -37,37 +37,16 @@ _FIELD_OF_TYPE = {
 _MOST_METRICS = 100_000
 #: Property that names the unit of a metric.
 _UNIT = "engUnit"
-#: Message -> its fields: name, number, type (of `FieldDescriptorProto`, or another message), R repeated or V a value.
-_SCHEMA: dict[str, tuple[tuple[str, int, str, str], ...]] = {
-    "PropertyValue": (
-        ("type", 1, "UINT32", ""),
-        ("is_null", 2, "BOOL", ""),
-        ("int_value", 3, "UINT32", "V"),
-        ("long_value", 4, "UINT64", "V"),
-        ("float_value", 5, "FLOAT", "V"),
-        ("double_value", 6, "DOUBLE", "V"),
-        ("boolean_value", 7, "BOOL", "V"),
-        ("string_value", 8, "STRING", "V"),
-    ),
-    "PropertySet": (("keys", 1, "STRING", "R"), ("values", 2, "PropertyValue", "R")),
-    "Metric": (
-        ("name", 1, "STRING", ""),
-        ("alias", 2, "UINT64", ""),
-        ("timestamp", 3, "UINT64", ""),
-        ("datatype", 4, "UINT32", ""),
-        ("is_historical", 5, "BOOL", ""),
-        ("is_transient", 6, "BOOL", ""),
-        ("is_null", 7, "BOOL", ""),
-        ("properties", 9, "PropertySet", ""),
-        ("int_value", 10, "UINT32", "V"),
-        ("long_value", 11, "UINT64", "V"),
-        ("float_value", 12, "FLOAT", "V"),
-        ("double_value", 13, "DOUBLE", "V"),
-        ("boolean_value", 14, "BOOL", "V"),
-        ("string_value", 15, "STRING", "V"),
-        ("bytes_value", 16, "BYTES", "V"),
-    ),
-    "Payload": (("timestamp", 1, "UINT64", ""), ("metrics", 2, "Metric", "R"), ("seq", 3, "UINT64", "")),
+#: Message -> its fields: number, name, type (of `FieldDescriptorProto`, or another message), R repeated or V a value.
+_SCHEMA = {
+    "PropertyValue": """1 type UINT32, 2 is_null BOOL, 3 int_value UINT32 V, 4 long_value UINT64 V,
+        5 float_value FLOAT V, 6 double_value DOUBLE V, 7 boolean_value BOOL V, 8 string_value STRING V""",
+    "PropertySet": "1 keys STRING R, 2 values PropertyValue R",
+    "Metric": """1 name STRING, 2 alias UINT64, 3 timestamp UINT64, 4 datatype UINT32, 5 is_historical BOOL,
+        6 is_transient BOOL, 7 is_null BOOL, 9 properties PropertySet, 10 int_value UINT32 V, 11 long_value UINT64 V,
+        12 float_value FLOAT V, 13 double_value DOUBLE V, 14 boolean_value BOOL V, 15 string_value STRING V,
+        16 bytes_value BYTES V""",
+    "Payload": "1 timestamp UINT64, 2 metrics Metric R, 3 seq UINT64",
 }
 
 
@@ -108,16 +87,16 @@ def _payload_class() -> Any:
     kinds = descriptor_pb2.FieldDescriptorProto
     for message, fields in _SCHEMA.items():
         entry = file.message_type.add(name=message)
-        if any(role == "V" for *_, role in fields):
-            entry.oneof_decl.add(name="value")
-        for name, number, kind, role in fields:
-            label = kinds.LABEL_REPEATED if role == "R" else kinds.LABEL_OPTIONAL
-            field = entry.field.add(name=name, number=number, label=label)
+        for number, name, kind, *roles in map(str.split, fields.split(",")):
+            label = kinds.LABEL_REPEATED if "R" in roles else kinds.LABEL_OPTIONAL
+            field = entry.field.add(name=name, number=int(number), label=label)
             if kind in _SCHEMA:
                 field.type, field.type_name = kinds.TYPE_MESSAGE, f".sparkplug.{kind}"
             else:
                 field.type = kinds.Type.Value(f"TYPE_{kind}")
-            if role == "V":
+            if "V" in roles:
+                if not entry.oneof_decl:
+                    entry.oneof_decl.add(name="value")
                 field.oneof_index = 0
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())

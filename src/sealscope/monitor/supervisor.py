@@ -1,7 +1,8 @@
 """The supervisor: every source, decoder and output of a monitor runs under it, and starts again after an error.
 
-An error of a part is its outage: it is logged once, with its place, stands on page and metrics while it lasts, and the
-part starts again after a pause that doubles. An error of the database is the database's outage.
+What a part needs and does not reach, such as the database or the broker, and an error of the part itself are outages:
+each is said once in the log when it begins and once when it ends, and stands on page and metrics while it lasts. A part
+starts again after a pause that doubles. An error of the database is the database's outage.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-
-from sealscope.monitor.outages import DATABASE, Outages
+from typing import Any
 
 _log = logging.getLogger(__name__)
+#: Parts that can be away.
+DATABASE, BROKER, WEBHOOK, OPCUA = "database", "broker", "webhook", "OPC UA server"
 #: Pauses after errors [s]: the first one, the longest one, and the longest one where the database is away.
 FIRST_PAUSE_S, LONGEST_PAUSE_S, DATABASE_PAUSE_S = 0.2, 60.0, 5.0
 #: A part that has run for so long [s] since it was started again counts as reached.
@@ -25,16 +28,83 @@ _SOUND_S = 2.0
 #: Lines in a minute from one place in the code: of this package, and of the libraries that it uses.
 _OWN_LINES, _LIBRARY_LINES, _MINUTE_S, _MOST_PLACES = 300, 10, 60.0, 1000
 _PACKAGE = Path(__file__).resolve().parents[1]
+Away = Callable[[BaseException], str | None]
 
 
 class PartAway(Exception):  # noqa: N818 (says what happened)
     """What a part needs is not there, such as a folder: an outage with this reason, and nothing to trace."""
 
 
+@dataclass
+class _Outage:
+    """How one part is: `since` is the clock of its outage [s], None while it is reached."""
+
+    since: float | None = None
+    began: float = 0.0
+    reason: str = ""
+    count: int = 0
+    seconds: float = 0.0
+
+
+class Outages:
+    """The parts of a monitor that can be away; may be used by several threads.
+
+    `changed`: called when an outage begins or ends.
+    """
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self._changed = changed
+        self._lock = threading.Lock()
+        self._parts: dict[str, _Outage] = {}
+
+    def expect(self, part: str) -> None:
+        """State that the monitor needs a part, which is counted as reached until it is lost."""
+        with self._lock:
+            self._parts.setdefault(part, _Outage())
+
+    def lost(self, part: str, reason: object) -> None:
+        """State that a part is not reached; the first reason of an outage is kept."""
+        line = " ".join(str(reason).splitlines()[:1])[:200]
+        with self._lock:
+            entry = self._parts.setdefault(part, _Outage())
+            if entry.since is not None:
+                return
+            entry.since, entry.began, entry.reason = time.time(), time.monotonic(), line
+            entry.count += 1
+        _log.error("the %s is not reached: %s", part, line)
+        self._changed()
+
+    def back(self, part: str) -> None:
+        """State that a part is reached."""
+        with self._lock:
+            entry = self._parts.setdefault(part, _Outage())
+            if entry.since is None:
+                return
+            lasted = time.monotonic() - entry.began
+            entry.since, entry.seconds = None, entry.seconds + lasted
+        _log.warning("the %s is reached again after %.1f s", part, lasted)
+        self._changed()
+
+    def plain(self) -> list[dict[str, Any]]:
+        """Return the outages that last: part, clock of its begin [s] and reason."""
+        with self._lock:
+            lasting = [(part, entry) for part, entry in self._parts.items() if entry.since is not None]
+            return [{"part": part, "since": entry.since, "reason": entry.reason} for part, entry in lasting]
+
+    def totals(self) -> dict[str, tuple[bool, int, float]]:
+        """Return of each part whether it is reached, how many outages it had and how long they lasted [s]."""
+        now = time.monotonic()
+        with self._lock:
+            return {
+                part: (each.since is None, each.count, each.seconds + (0.0 if each.since is None else now - each.began))
+                for part, each in self._parts.items()
+            }
+
+
 class SupervisedPart:
     """A source, a decoder or an output; `attempt` runs it. Of one thread at a time."""
 
-    def __init__(self, name: str, outages: Outages, away: Callable[[BaseException], str | None]) -> None:
+    def __init__(self, name: str, outages: Outages, away: Away) -> None:
         self.name, self._outages, self._away = name, outages, away
         self._pause, self._due, self._failed = 0.0, 0.0, -math.inf
         self._out = False
@@ -91,12 +161,7 @@ class Supervisor:
     `away`: returns of an error why the database does not answer, None for one of another kind.
     """
 
-    def __init__(
-        self,
-        outages: Outages,
-        stopping: threading.Event,
-        away: Callable[[BaseException], str | None] = lambda error: None,
-    ) -> None:
+    def __init__(self, outages: Outages, stopping: threading.Event, away: Away = lambda error: None) -> None:
         self.outages, self._stopping, self._away = outages, stopping, away
         self._parts: dict[str, SupervisedPart] = {}
 
@@ -108,12 +173,7 @@ class Supervisor:
         return self._parts[name]
 
     def start(
-        self,
-        name: str,
-        work: Callable[[], object],
-        *,
-        again: bool = True,
-        ended: Callable[[], None] = lambda: None,
+        self, name: str, work: Callable[[], object], *, again: bool = True, ended: Callable[[], None] = lambda: None
     ) -> threading.Thread:
         """Start a thread that runs work, again after each error, until it ends without one, then `ended`.
 

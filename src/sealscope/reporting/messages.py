@@ -69,6 +69,12 @@ def cause(diagnosis: Diagnosis) -> str | None:
     return diagnosis.cause
 
 
+def state(diagnosis: Diagnosis) -> str:
+    """Return the state of the machine as NAMUR NE 107 names it, with its letter and its severity."""
+    own = diagnosis.state
+    return f"{own.name} ({own.symbol} of NE 107{f', severity {own.severity} of 1000' if own.severity else ''})"
+
+
 def since(diagnosis: Diagnosis) -> str | None:
     """Return since when oil leaks; None where there is no leak to date."""
     if diagnosis.verdict != "leak":
@@ -395,6 +401,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     """
     lines = [f"{_printable(diagnosis.file)}: {diagnosis.summary}"]
     rows = [
+        ("state", state(diagnosis)),
         ("since", since(diagnosis)),
         ("how much", _how_much_by_what(diagnosis)),
         ("how bad", how_bad(diagnosis)),

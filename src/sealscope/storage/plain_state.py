@@ -1,16 +1,18 @@
-"""Arrays as plain values that JSON holds to the bit, and back."""
+"""Arrays and dataclasses as plain values that JSON holds to the bit, and back."""
 
 from __future__ import annotations
 
 from base64 import b64decode, b64encode
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError
+from sealscope.storage.plain_values import as_type
 
+_T = TypeVar("_T")
 #: Most numbers of one array: what is larger is no state of a stream.
 _LARGEST = 50_000_000
 
@@ -24,6 +26,14 @@ def plain_array(values: NDArray[Any]) -> dict[str, Any]:
 def plain_fields(values: Any) -> dict[str, Any]:
     """Return the fields of a dataclass whose values are plain already; lists are copied, for they may grow."""
     return {name: list(value) if isinstance(value, list) else value for name, value in vars(values).items()}
+
+
+def restored(kind: type[_T], state: Any, name: str) -> _T:
+    """Return a part of a saved state as the dataclass `kind`; raises InputError where it does not fit."""
+    try:
+        return as_type(kind, state)
+    except ValueError as error:
+        raise InputError(f"saved state's {name} does not fit: {error}") from None
 
 
 def array_of(value: Any, name: str) -> NDArray[np.float64]:

@@ -292,6 +292,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
     samples = whole_samples(recording, needed)
     seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
     zero = 0.0
+    blocks: Blocks | None = None
     for _ in range(TURNS):
         stream = BlockStream(balances, recording.rate, seconds, None, float(recording.t[0]), zero)
         blocks = stream.push(samples, last=True)
@@ -301,7 +302,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
         zero, before = float(blocks.zero[0]), zero
         if abs(zero - before) < NEAR * priors()["zero"]["pressure"].value:
             break
-    return blocks.merged(), stream.columns
+    return None if blocks is None else (blocks.merged(), stream.columns)
 
 
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")

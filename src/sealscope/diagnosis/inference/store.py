@@ -108,4 +108,4 @@ def _information(level: Array, pressure: Array, length: float, begin: float) -> 
     weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()
     healthy = priors()["healthy"]["outside"].value
     precision, vector = flows.T @ weight @ flows, flows.T @ weight @ level
-    return Information(begin + time, 0.5 * (precision + precision.T), vector, healthy, healthy)
+    return Information(np.asarray(begin + time, dtype=float), 0.5 * (precision + precision.T), vector, healthy, healthy)

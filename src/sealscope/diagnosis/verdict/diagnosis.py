@@ -8,49 +8,16 @@ from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any
 
-from sealscope.diagnosis.verdict.evidence import LEAST_SPECIFIC, RAREST, Cause, Evidence, Passage, Verdict
+from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, RAREST, Cause, Evidence, Passage, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
+from sealscope.diagnosis.verdict.states import MachineState, state_of
 from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
 #: What a file may call the name of the machine.
 _MACHINE = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
-
-_CHECKS: Mapping[Cause, str] = {
-    "piston leak": (
-        "Make sure that the bypass valve across the cylinder is shut; then hold the piston against a load with the "
-        "motor at rest and watch x: creep confirms a worn piston seal."
-    ),
-    "piston or pump leak": (
-        "Tell the seal from the pump: shut the valves between pump and cylinder and hold the piston against a load; "
-        "creep is the seal's. Make sure before that the bypass valve across the cylinder is shut."
-    ),
-    "pump leak": (
-        "Block the cylinder lines and turn the pump slowly against the closed ports: flow or pressure that is lost "
-        "there is lost in the pump; check its case drain."
-    ),
-    "external leak": (
-        "Look for oil at the rod seals, fittings and hoses, and compare the charge pressure with its set value; fill "
-        "up only after the spot is found."
-    ),
-    "friction change": (
-        "Compare oil and seal temperature with earlier recordings, and look at rod, guides and load for binding or "
-        "side force; repeat when the machine is warm."
-    ),
-    "air in the oil": (
-        "Bleed the circuit, check the charge pressure and the suction side for drawn-in air, and record again."
-    ),
-    "sensor fault": (
-        "Compare the pressure sensors with one another at rest, and the encoders at a stop; check cables, supply and "
-        "range before any seal is changed."
-    ),
-    "changed duty": (
-        "Record again under the command, load and oil temperature of the earlier recordings; a changed duty cannot be "
-        "compared with them."
-    ),
-}
 
 
 def next_check(verdict: Verdict, cause: Cause | None, *, healthy: bool = False, coarse: bool = False) -> str:
@@ -59,26 +26,14 @@ def next_check(verdict: Verdict, cause: Cause | None, *, healthy: bool = False, 
     With `no leak`, `healthy`: whether the level of the leakage is known to be that of a healthy machine; `coarse`:
     whether only the least specific method, which states no size, could judge.
     """
-    if cause is not None:
-        return _CHECKS[cause]
-    if verdict == "leak":
-        return (
-            "Repeat the recording with the same command and oil temperature, with the bypass valve shut: a worn seal "
-            "shows again. What was recorded does not tell the seal from an open bypass, and maybe not from a worn pump."
-        )
-    if verdict == "no leak" and healthy:
-        return "Nothing needs a check; keep this recording as a baseline for later ones with the same command."
-    if verdict == "no leak" and coarse:
-        return (
-            "Nothing changed in the RMS of the pressures' details, the only method that could judge here, which misses "
-            "most small leaks: see what the others need (-v), and compare with leak-free recordings."
-        )
-    if verdict == "no leak":
-        return (
-            "Nothing changed within this recording, which does not show that the machine is healthy: compare it with "
-            "leak-free recordings, or with what a new machine loses, before it is kept as a baseline."
-        )
-    return "Remove the cause that the reason names and record again; a verdict was not forced out of these data."
+    return state_of(_condition(verdict, healthy, coarse), cause).action
+
+
+def _condition(verdict: Verdict, healthy: bool, coarse: bool) -> str:
+    """Return the condition of `states.toml` that a verdict is."""
+    if verdict != "no leak" or healthy:
+        return verdict
+    return "no change of RMS" if coarse else "no change"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,6 +144,15 @@ class Diagnosis(Evidence):
         return next_check(self.verdict, self.cause, healthy=self.known_healthy, coarse=self.detector == LEAST_SPECIFIC)
 
     @property
+    def state(self) -> MachineState:
+        """State of the machine as NAMUR NE 107 names it: failure where the leak is surely over the repair limit."""
+        condition = _condition(self.verdict, self.known_healthy, self.detector == LEAST_SPECIFIC)
+        if self.severity is not None and self.severity.level == "repair":
+            condition = "leak over the limit"
+        cause = self.cause if self.verdict == "leak" or self.cause not in LEAKS else None
+        return state_of(condition, cause, since_s=_plain(self.onset_s), action=self.next_check)
+
+    @property
     def known_healthy(self) -> bool:
         """Whether leak-free recordings or the rig show that the level is that of a healthy machine."""
         by_rig = self.passage is not None and self.passage.healthy
@@ -248,6 +212,7 @@ class Diagnosis(Evidence):
             "severity": None if self.severity is None else self.severity.as_dict(),
             "limit": self.limit.as_dict(),
             "evidence": self._evidence(),
+            "state": self.state.as_dict(),
         }
 
     def _evidence(self) -> dict[str, Any]:
@@ -283,6 +248,7 @@ class Diagnosis(Evidence):
             ("odds", self.odds),
             ("false-alarm probability", f"{self.false_alarm_probability:g}"),
             *((finding.severity, finding.text) for finding in self.quality),
+            ("state", self.state.name),
             ("next check", self.next_check),
         ]
         body = "".join(

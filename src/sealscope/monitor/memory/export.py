@@ -13,7 +13,7 @@ from sealscope.storage.atomic import atomic_write
 
 Label = Literal["healthy", "leak", ""]
 ALARM_COLUMNS = (
-    *("id", "actuator", "level", "state", "mark", "marked_by", "marked_s", "comments", "raised_s", "onset_s"),
+    *("id", "actuator", "level", "state", "mark", "reason", "marked_by", "marked_s", "comments", "raised_s", "onset_s"),
     *("onset_low_s", "onset_high_s", "leak_lpm", "leak_low_lpm", "leak_high_lpm", "cause", "evidence", "baseline"),
     "by_chance_per_1000_h",
 )
@@ -36,16 +36,16 @@ class _Marked:
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     """Write `alarms.csv` and `estimates.csv` into a folder, and return how many rows each has.
 
-    An estimate is labelled `leak` from the start of an alarm's onset interval on until it was marked `repaired`, and
-    `healthy` from the onset on until it was marked `false`; what nobody said anything of has no label.
+    An estimate is labelled `leak` from the start of an alarm's onset interval on until it was marked `repaired` or
+    `valid`, and `healthy` until it was marked `invalid`; what nobody said anything of has no label.
     """
     marks: dict[str, list[_Marked]] = {}
     rows = []
     for alarm, events in _alarms(store):
         rows.append(_alarm_row(alarm, events))
-        said = next((event for event in reversed(events) if event["event"] in ("false", "repaired")), None)
+        said = _judged(events)
         if said is not None:
-            label: Label = "leak" if said["event"] == "repaired" else "healthy"
+            label: Label = "healthy" if said["event"] == "invalid" else "leak"
             start = float((alarm["onset_interval_s"] or (alarm["onset_s"],))[0])
             marks.setdefault(alarm["actuator"], []).append(_Marked(start, float(said["t"]), label, alarm["id"]))
     _write(folder / "alarms.csv", ALARM_COLUMNS, rows)
@@ -65,9 +65,14 @@ def _alarms(store: MonitorStore) -> Iterator[tuple[dict[str, Any], list[dict[str
         yield alarm, events.get(alarm["id"], [])
 
 
+def _judged(events: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """Return the last event by which a person judged an alarm."""
+    return next((event for event in reversed(events) if event["event"] in ("valid", "invalid", "repaired")), None)
+
+
 def _alarm_row(alarm: Mapping[str, Any], events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     said = [event for event in events if event["by"]]
-    marked = next((event for event in reversed(said) if event["event"] in ("false", "repaired")), None)
+    marked = _judged(said)
     onset, leak = alarm["onset_interval_s"] or (None, None), alarm["leak_interval_lpm"] or (None, None)
     return {
         **{name: alarm.get(name) for name in ALARM_COLUMNS},

@@ -12,17 +12,20 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from sealscope.errors import InputError, MissingExtra
-from sealscope.monitor.alarms.alarm import Alarm
+import sqlalchemy as sa
+from sqlalchemy import bindparam, func, select
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
+
+from sealscope.errors import InputError
+from sealscope.monitor.alarms import Alarm
+from sealscope.monitor.memory import tables
 from sealscope.monitor.memory.packing import packed, unpacked_samples
 from sealscope.monitor.memory.postgresql import engine_options, limit_answers
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.recordings.recording import Recording
-
-if TYPE_CHECKING:
-    from sqlalchemy import Connection, Engine, Table
 
 #: Blocks of samples between two checkpoints, and their bytes.
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
@@ -32,6 +35,8 @@ KEPT_IDENTITIES = 100_000
 KEPT_REFUSED = 1000
 #: How often the tables are tried to be made where several monitors begin at once.
 _ATTEMPTS = 10
+#: Words of alarms of version 3 -> of version 4.
+_RENAMED = {'"unacknowledged"': '"new"', '"returned"': '"new"', '"normal"': '"closed"', '"false"': '"invalid"'}
 #: What makes tables of a version those of the next.
 _CHANGES = {
     "1": ("alter table estimates add column oil_celsius double precision",),
@@ -39,16 +44,16 @@ _CHANGES = {
         "insert into summaries select actuator, summary from actuators",
         "alter table actuators drop column summary",
     ),
+    "3": (
+        *(
+            f"update {table} set {column} = replace({column}, '{old}', '{new}')"
+            for table, column in (("alarms", "alarm"), ("events", "alarm"), ("actuators", "checkpoint"))
+            for old, new in _RENAMED.items()
+        ),
+        *(f"update alarms set state = {new} where state = {old}".replace('"', "'") for old, new in _RENAMED.items()),
+        "update events set kind = 'invalid' where kind = 'false'",
+    ),
 }
-_ESTIMATES = (
-    "total_lpm",
-    "total_low_lpm",
-    "total_high_lpm",
-    "leak_lpm",
-    "leak_low_lpm",
-    "leak_high_lpm",
-    "oil_celsius",
-)
 
 
 @dataclass
@@ -67,16 +72,11 @@ class StoredRows:
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
         """Add the estimates of a block, and the oil's temperature then."""
-        for estimate in estimates:
-            values = (
-                estimate.total_lpm,
-                *(estimate.total_interval_lpm or (None, None)),
-                estimate.leak_lpm,
-                *(estimate.leak_interval_lpm or (None, None)),
-                oil_celsius,
-            )
-            place = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": estimate.status[:160]}
-            self.estimates.append({**place, **dict(zip(_ESTIMATES, values, strict=True))})
+        for each in estimates:
+            total, leak = each.total_interval_lpm or (None, None), each.leak_interval_lpm or (None, None)
+            figures = (each.total_lpm, *total, each.leak_lpm, *leak, oil_celsius)
+            row = {"actuator": actuator, "number": each.number, "t": each.t, "status": each.status[:160]}
+            self.estimates.append({**row, **dict(zip(tables.FIGURES, figures, strict=True))})
 
     def add_pending(self, actuator: str, number: int, samples: Recording, follows: bool) -> None:
         """Add samples that a restart goes through once more after the checkpoint."""
@@ -92,32 +92,26 @@ class MonitorStore:
     """The database of a monitor, `database` a file of SQLite or a URL; raises InputError where it cannot be opened."""
 
     def __init__(self, database: str) -> None:
-        try:
-            import sqlalchemy
-        except ImportError:
-            raise MissingExtra("the monitor's memory needs SQLAlchemy: pip install 'sealscope[serve]'") from None
-        from sealscope.monitor.memory import tables
-
         self.tables = tables
         self.sends = True  # False while another monitor that shares the database sends for all
-        self._is_file = "://" not in database
+        is_file = "://" not in database
         # of the threads here one at a time writes to a file, which SQLite would let wait and then refuse
-        self._writing_lock: AbstractContextManager[object] = threading.RLock() if self._is_file else nullcontext()
-        url = f"sqlite:///{Path(database)}" if self._is_file else database
+        self._writing_lock: AbstractContextManager[object] = threading.RLock() if is_file else nullcontext()
+        url = f"sqlite:///{Path(database)}" if is_file else database
         try:
-            self.engine: Engine = sqlalchemy.create_engine(url, **engine_options(sqlalchemy.make_url(url)))
+            self.engine = sa.create_engine(url, **engine_options(sa.make_url(url)))
             limit_answers(self.engine)
             if self.engine.dialect.name == "sqlite":
-                sqlalchemy.event.listen(self.engine, "connect", _prepare_sqlite)
+                sa.event.listen(self.engine, "connect", _prepare_sqlite)
             for attempt in range(_ATTEMPTS):
                 try:
                     known = self._prepared()
                     break
-                except (sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError):
+                except (IntegrityError, ProgrammingError):
                     if attempt == _ATTEMPTS - 1:
                         raise
                     time.sleep(0.2)  # another monitor makes the tables at this moment
-        except (sqlalchemy.exc.SQLAlchemyError, ImportError, ValueError) as error:
+        except (SQLAlchemyError, ImportError, ValueError) as error:
             reason = str(getattr(error, "orig", None) or error).splitlines()[0]
             raise InputError(f"the monitor's database must be a file of SQLite or a URL, got: {reason}") from None
         if known not in (None, str(tables.SCHEMA)):
@@ -125,37 +119,41 @@ class MonitorStore:
 
     def _prepared(self) -> str | None:
         """Make the tables and columns that are missing, and return the version of those that were there."""
-        from sqlalchemy import select, text
-
+        facts = tables.facts
         with self.engine.begin() as connection:
-            self.tables.metadata.create_all(connection)
-            facts = self.tables.facts
+            tables.metadata.create_all(connection)
             version = facts.c.name == "schema"
             known = connection.execute(select(facts.c.value).where(version)).scalar()
             if known is None:
-                connection.execute(facts.insert().values(name="schema", value=str(self.tables.SCHEMA)))
+                connection.execute(facts.insert().values(name="schema", value=str(tables.SCHEMA)))
             while known in _CHANGES:
                 for change in _CHANGES[known]:
-                    connection.execute(text(change))
+                    connection.execute(sa.text(change))
                 known = str(int(known) + 1)
                 connection.execute(facts.update().where(version).values(value=known))
         return None if known is None else str(known)
 
     @contextmanager
-    def writing(self) -> Iterator[Connection]:
+    def writing(self) -> Iterator[sa.Connection]:
         """Return a connection whose changes are kept together when the block ends well."""
         with self._writing_lock, self.engine.begin() as connection:
             yield connection
 
-    def known(self, connection: Connection, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
-        """Return which of some blocks are stored; a block is an actuator and an identity."""
-        from sqlalchemy import bindparam, select
+    def _rows(self, query: Any) -> Sequence[sa.Row[Any]]:
+        with self.engine.connect() as connection:
+            return connection.execute(query).all()
 
+    def _value(self, query: Any) -> int:
+        """Return the number that a query gives, 0 for none."""
+        with self.engine.connect() as connection:
+            return int(connection.execute(query).scalar() or 0)
+
+    def known(self, connection: sa.Connection, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
+        """Return which of some blocks are stored; a block is an actuator and an identity."""
         # a query for each: SQLite goes through the whole table for a list of pairs
-        table = self.tables.blocks
-        query = select(table.c.number).where(
-            table.c.actuator == bindparam("of"), table.c.identity == bindparam("identity")
-        )
+        table = tables.blocks
+        chosen = (table.c.actuator == bindparam("of")) & (table.c.identity == bindparam("identity"))
+        query = select(table.c.number).where(chosen)
         return {
             block
             for block in blocks
@@ -167,19 +165,17 @@ class MonitorStore:
         with self.engine.connect() as connection:
             return bool(self.known(connection, [(actuator, identity)]))
 
-    def keep_blocks(self, connection: Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
+    def keep_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store blocks: actuator, identity, and number among those of the actuator.
 
         Raises IntegrityError, and the transaction is over, where one of them is stored already.
         """
         names = ("actuator", "identity", "number")
-        connection.execute(self.tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
+        connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
 
-    def keep_rows(self, connection: Connection, rows: StoredRows) -> None:
+    def keep_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
         """Store the rows of blocks, each table's at once."""
-        from sqlalchemy import String, bindparam
-
-        tables, of = self.tables, bindparam("of", type_=String)
+        of = bindparam("of", type_=sa.String)
         states = {
             name: {"settings": settings, "checkpoint": json.dumps(state, allow_nan=False)}
             for name, (settings, state) in rows.checkpoints.items()
@@ -187,10 +183,7 @@ class MonitorStore:
         if states:
             before = tables.pending.delete().where(tables.pending.c.actuator == of)
             connection.execute(before, [{"of": name} for name in states])
-        for table, values in (
-            (tables.estimates, rows.estimates),
-            (tables.pending, rows.pending),
-        ):
+        for table, values in ((tables.estimates, rows.estimates), (tables.pending, rows.pending)):
             if values:
                 connection.execute(table.insert(), values)
         self._put_all(connection, tables.actuators, states)
@@ -204,9 +197,7 @@ class MonitorStore:
 
     def keep_refused(self, rows: Sequence[dict[str, Any]]) -> None:
         """Store what was refused, `KEPT_REFUSED` at most with those before, in a transaction of its own."""
-        from sqlalchemy import func, select
-
-        table = self.tables.refused
+        table = tables.refused
         with self.writing() as connection:
             connection.execute(table.insert(), rows[-KEPT_REFUSED:])
             last = int(connection.execute(select(func.max(table.c.number))).scalar() or 0)
@@ -214,17 +205,11 @@ class MonitorStore:
 
     def refused(self, most: int = KEPT_REFUSED) -> list[dict[str, Any]]:
         """Return what was refused, the last one first."""
-        from sqlalchemy import select
+        table = tables.refused
+        return [dict(row._mapping) for row in self._rows(select(table).order_by(table.c.number.desc()).limit(most))]
 
-        table = self.tables.refused
-        with self.engine.connect() as connection:
-            rows = connection.execute(select(table).order_by(table.c.number.desc()).limit(most))
-            return [dict(row._mapping) for row in rows]
-
-    def _put_all(self, connection: Connection, table: Table, values: dict[str, dict[str, Any]]) -> None:
+    def _put_all(self, connection: sa.Connection, table: sa.Table, values: dict[str, dict[str, Any]]) -> None:
         """Change the rows of actuators, or insert those that are missing."""
-        from sqlalchemy import bindparam
-
         if not values:
             return
         statement = table.update().where(table.c.actuator == bindparam("of"))
@@ -233,55 +218,33 @@ class MonitorStore:
             for name, row in values.items():
                 self.put(connection, table, {"actuator": name}, row)
 
-    def blocks_kept(self, actuator: str) -> int:
-        """Return the number of the last block of an actuator."""
-        return self._last(self.tables.blocks, actuator)
+    def last_number(self, table: sa.Table, actuator: str) -> int:
+        """Return the number of an actuator's last row of a table, `tables.blocks` or `tables.estimates`."""
+        return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
-    def estimates_kept(self, actuator: str) -> int:
-        """Return the number of the last estimate of an actuator."""
-        return self._last(self.tables.estimates, actuator)
-
-    def _last(self, table: Any, actuator: str) -> int:
-        from sqlalchemy import func, select
-
-        with self.engine.connect() as connection:
-            query = select(func.max(table.c.number)).where(table.c.actuator == actuator)
-            return int(connection.execute(query).scalar() or 0)
-
-    def keep_alarm(self, connection: Connection, alarm: Alarm) -> None:
+    def keep_alarm(self, connection: sa.Connection, alarm: Alarm) -> None:
         """Store an alarm as it is now."""
         values = {"actuator": alarm.actuator, "state": alarm.state, "alarm": json.dumps(alarm.plain())}
-        self.put(connection, self.tables.alarms, {"id": alarm.id}, values)
+        self.put(connection, tables.alarms, {"id": alarm.id}, values)
 
     def keep_event(
-        self, connection: Connection, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = ""
+        self, connection: sa.Connection, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = ""
     ) -> None:
         """Append what happened to an alarm, or what a person said of it."""
-        values = {
-            "actuator": alarm.actuator,
-            "t": t,
-            "kind": kind,
-            "alarm_id": alarm.id,
-            "by_whom": by_whom,
-            "text": text,
-            "alarm": json.dumps(alarm.plain()),
-        }
-        connection.execute(self.tables.events.insert().values(**values))
+        own = {"actuator": alarm.actuator, "alarm_id": alarm.id, "alarm": json.dumps(alarm.plain())}
+        connection.execute(tables.events.insert().values(t=t, kind=kind, by_whom=by_whom, text=text, **own))
 
     def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
         """Return settings and state as of the checkpoint, and the samples since then; None where there is none."""
-        from sqlalchemy import select
-
-        actuators = self.tables.actuators
+        states = tables.actuators
         with self.engine.connect() as connection:
-            row = connection.execute(select(actuators).where(actuators.c.actuator == actuator)).first()
+            row = connection.execute(select(states).where(states.c.actuator == actuator)).first()
             samples = self._pending(connection, actuator)
         return None if row is None else (row.settings, json.loads(row.checkpoint), samples)
 
-    def _pending(self, connection: Connection, actuator: str) -> list[tuple[Recording, bool]]:
-        from sqlalchemy import select
-
-        pending = self.tables.pending
+    @staticmethod
+    def _pending(connection: sa.Connection, actuator: str) -> list[tuple[Recording, bool]]:
+        pending = tables.pending
         query = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
         return [unpacked_samples(data) for (data,) in connection.execute(query)]
 
@@ -292,71 +255,49 @@ class MonitorStore:
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Return what each actuator showed last."""
-        from sqlalchemy import select
-
-        with self.engine.connect() as connection:
-            rows = connection.execute(select(self.tables.summaries))
-            return {name: json.loads(summary) for name, summary in rows}
+        return {row.actuator: json.loads(row.summary) for row in self._rows(select(tables.summaries))}
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
         """Return alarms as plain values, the latest first."""
-        from sqlalchemy import select
-
-        alarms = self.tables.alarms
+        alarms = tables.alarms
         query = select(alarms.c.alarm)
         if open_only:
-            query = query.where(alarms.c.state != "normal")
+            query = query.where(alarms.c.state.not_in(("closed", "invalid")))
         if actuator is not None:
             query = query.where(alarms.c.actuator == actuator)
-        with self.engine.connect() as connection:
-            values = [json.loads(text) for (text,) in connection.execute(query)]
+        values = [json.loads(text) for (text,) in self._rows(query)]
         return sorted(values, key=lambda alarm: -float(alarm["raised_s"]))
 
     def events_since(self, number: int, most: int = 1000) -> list[tuple[int, dict[str, Any]]]:
         """Return events beyond a number with their own numbers, in their order."""
-        from sqlalchemy import select
-
-        events = self.tables.events
+        events = tables.events
         query = select(events).where(events.c.number > number).order_by(events.c.number).limit(most)
-        with self.engine.connect() as connection:
-            return [(row.number, _event(row)) for row in connection.execute(query)]
+        return [(row.number, _event(row)) for row in self._rows(query)]
 
     def last_events(self, actuator: str, most: int = 200) -> list[dict[str, Any]]:
         """Return the latest events of an actuator, the last one first."""
-        from sqlalchemy import select
-
-        events = self.tables.events
+        events = tables.events
         query = select(events).where(events.c.actuator == actuator).order_by(events.c.number.desc()).limit(most)
-        with self.engine.connect() as connection:
-            return [_event(row) for row in connection.execute(query)]
+        return [_event(row) for row in self._rows(query)]
 
     def course(self, actuator: str, most: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
         """Return the estimates of an actuator, means of successive ones where there are more than `most`.
 
         `seconds`: only the last of them.
         """
-        from sqlalchemy import func, select
-
-        estimates = self.tables.estimates
-        with self.engine.connect() as connection:
-            chosen = estimates.c.actuator == actuator
-            last = connection.execute(select(func.max(estimates.c.number), func.max(estimates.c.t)).where(chosen)).one()
-            if last[0] is None:
-                return []
-            if seconds is not None:
-                chosen &= estimates.c.t >= last[1] - seconds
-            count = connection.execute(select(func.count()).where(chosen)).scalar() or 0
-            every = max(1, -(-count // most))
-            group = estimates.c.number - estimates.c.number % every
-            columns = [func.avg(estimates.c[name]).label(name) for name in ("t", *_ESTIMATES)]
-            query = select(*columns).where(chosen).group_by(group).order_by(group)
-            return [dict(row._mapping) for row in connection.execute(query)]
+        estimates = tables.estimates
+        chosen = estimates.c.actuator == actuator
+        if seconds is not None:
+            chosen &= estimates.c.t >= select(func.max(estimates.c.t)).where(chosen).scalar_subquery() - seconds
+        every = max(1, -(-self._value(select(func.count()).where(chosen)) // most))
+        group = estimates.c.number - estimates.c.number % every
+        columns = [func.avg(estimates.c[name]).label(name) for name in ("t", *tables.FIGURES)]
+        query = select(*columns).where(chosen).group_by(group).order_by(group)
+        return [dict(row._mapping) for row in self._rows(query)]
 
     def estimates(self) -> Iterator[dict[str, Any]]:
         """Yield the estimates that are kept, by actuator in their order."""
-        from sqlalchemy import select
-
-        table = self.tables.estimates
+        table = tables.estimates
         query = select(table).order_by(table.c.actuator, table.c.number)
         with self.engine.connect() as connection:
             for row in connection.execution_options(yield_per=10_000).execute(query):
@@ -364,23 +305,17 @@ class MonitorStore:
 
     def position(self, name: str) -> int:
         """Return the number of the last event that an output has passed on."""
-        from sqlalchemy import select
-
-        facts = self.tables.facts
-        with self.engine.connect() as connection:
-            return int(connection.execute(select(facts.c.value).where(facts.c.name == name)).scalar() or 0)
+        return self._value(select(tables.facts.c.value).where(tables.facts.c.name == name))
 
     def keep_position(self, name: str, number: int) -> None:
         """Store how far an output is."""
         with self.writing() as connection:
-            self.put(connection, self.tables.facts, {"name": name}, {"value": str(number)})
+            self.put(connection, tables.facts, {"name": name}, {"value": str(number)})
 
     @staticmethod
-    def put(connection: Connection, table: Table, key: dict[str, Any], values: dict[str, Any]) -> None:
+    def put(connection: sa.Connection, table: sa.Table, key: dict[str, Any], values: dict[str, Any]) -> None:
         """Change the row of a key, or insert it."""
-        statement = table.update()
-        for name, value in key.items():
-            statement = statement.where(table.c[name] == value)
+        statement = table.update().where(*(table.c[name] == value for name, value in key.items()))
         if connection.execute(statement.values(**values)).rowcount == 0:
             connection.execute(table.insert().values(**key, **values))
 
@@ -390,9 +325,6 @@ def away(error: BaseException) -> str | None:
 
     Values that it cannot hold are another kind: they would be refused again.
     """
-    from sqlalchemy.exc import DataError, DBAPIError
-    from sqlalchemy.exc import TimeoutError as PoolTimeout
-
     if isinstance(error, PoolTimeout):
         return "every connection to the database is in use"
     if not isinstance(error, DBAPIError) or isinstance(error, DataError):
@@ -401,14 +333,9 @@ def away(error: BaseException) -> str | None:
 
 
 def _event(row: Any) -> dict[str, Any]:
-    return {
-        "number": row.number,
-        "event": row.kind,
-        "t": row._mapping["t"],
-        "by": row.by_whom,
-        "text": row.text,
-        "alarm": json.loads(row.alarm),
-    }
+    alarm = json.loads(row.alarm)
+    values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
+    return {**values, "alarm": alarm}
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:

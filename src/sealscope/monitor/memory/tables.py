@@ -2,100 +2,75 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy import Column, Float, Index, Integer, LargeBinary, MetaData, String, Table, Text
+from sqlalchemy.types import TypeEngine
 
 metadata = MetaData()
 #: Version of the tables, kept in `facts`.
-SCHEMA = 3
+SCHEMA = 4
+#: Figures of an estimate.
+FIGURES = (
+    *("total_lpm", "total_low_lpm", "total_high_lpm"),
+    *("leak_lpm", "leak_low_lpm", "leak_high_lpm", "oil_celsius"),
+)
 
-facts = Table("facts", metadata, Column("name", String(40), primary_key=True), Column("value", Text, nullable=False))
+
+def _key(name: str, kind: TypeEngine[Any]) -> Column[Any]:
+    return Column(name, kind, primary_key=True, autoincrement=False)
+
+
+def _stated(name: str, kind: TypeEngine[Any], *, index: bool = False) -> Column[Any]:
+    return Column(name, kind, nullable=False, index=index)
+
+
+_Name, _Long, _Double = String(120), String(160), Float(53)
+facts = Table("facts", metadata, _key("name", String(40)), _stated("value", Text()))
 #: Blocks that are stored, by identity.
 blocks = Table(
     "blocks",
     metadata,
-    Column("actuator", String(120), primary_key=True),
-    Column("identity", String(120), primary_key=True),
-    Column("number", Integer, nullable=False),
+    *(_key("actuator", _Name), _key("identity", _Name), _stated("number", Integer())),
     Index("blocks_in_order", "actuator", "number"),
 )
 #: Samples since the checkpoint, which a restart goes through once more.
 pending = Table(
-    "pending",
-    metadata,
-    Column("actuator", String(120), primary_key=True),
-    Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("samples", LargeBinary, nullable=False),
+    "pending", metadata, _key("actuator", _Name), _key("number", Integer()), _stated("samples", LargeBinary())
 )
 #: State of the detector and of the alarm, as of the checkpoint, in JSON.
 actuators = Table(
-    "actuators",
-    metadata,
-    Column("actuator", String(120), primary_key=True),
-    Column("settings", Text, nullable=False),
-    Column("checkpoint", Text, nullable=False),
+    "actuators", metadata, _key("actuator", _Name), _stated("settings", Text()), _stated("checkpoint", Text())
 )
 #: What each actuator shows now: a row of its own, for one is written whole, and a state is large.
-summaries = Table(
-    "summaries",
-    metadata,
-    Column("actuator", String(120), primary_key=True),
-    Column("summary", Text, nullable=False),
-)
+summaries = Table("summaries", metadata, _key("actuator", _Name), _stated("summary", Text()))
 estimates = Table(
     "estimates",
     metadata,
-    Column("actuator", String(120), primary_key=True),
-    Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("t", Float(53), nullable=False),
-    Column("status", String(160), nullable=False),
-    Column("total_lpm", Float(53)),
-    Column("total_low_lpm", Float(53)),
-    Column("total_high_lpm", Float(53)),
-    Column("leak_lpm", Float(53)),
-    Column("leak_low_lpm", Float(53)),
-    Column("leak_high_lpm", Float(53)),
-    Column("oil_celsius", Float(53)),
+    *(_key("actuator", _Name), _key("number", Integer()), _stated("t", _Double), _stated("status", _Long)),
+    *(Column(name, _Double) for name in FIGURES),
 )
 alarms = Table(
     "alarms",
     metadata,
-    Column("id", String(160), primary_key=True),
-    Column("actuator", String(120), nullable=False, index=True),
-    Column("state", String(20), nullable=False, index=True),
-    Column("alarm", Text, nullable=False),
+    *(_key("id", _Long), _stated("actuator", _Name, index=True), _stated("state", String(20), index=True)),
+    _stated("alarm", Text()),
 )
 #: What happened to alarms, and what persons said of them, in order; outputs keep how far they are.
 events = Table(
     "events",
     metadata,
-    Column("number", Integer, primary_key=True),
-    Column("actuator", String(120), nullable=False, index=True),
-    Column("t", Float(53), nullable=False),
-    Column("kind", String(20), nullable=False),
-    Column("alarm_id", String(160), nullable=False),
-    Column("by_whom", String(80), nullable=False),
-    Column("text", Text, nullable=False),
-    Column("alarm", Text, nullable=False),
+    *(Column("number", Integer, primary_key=True), _stated("actuator", _Name, index=True), _stated("t", _Double)),
+    *(_stated("kind", String(20)), _stated("alarm_id", _Long), _stated("by_whom", String(80))),
+    *(_stated("text", Text()), _stated("alarm", Text())),
 )
 #: The last messages and files that could not be taken: when [s], from where, why, their size and how they begin.
 refused = Table(
     "refused",
     metadata,
-    Column("number", Integer, primary_key=True),
-    Column("at", Float(53), nullable=False),
-    Column("reason", String(120), nullable=False),
-    Column("message", Text, nullable=False),
-    Column("size", Integer, nullable=False),
-    Column("beginning", LargeBinary, nullable=False),
+    *(Column("number", Integer, primary_key=True), _stated("at", _Double), _stated("reason", _Name)),
+    *(_stated("message", Text()), _stated("size", Integer()), _stated("beginning", LargeBinary())),
 )
 #: Monitors that share the database, and whose each actuator is, until when [s].
-monitors = Table(
-    "monitors", metadata, Column("name", String(120), primary_key=True), Column("until", Float(53), nullable=False)
-)
-leases = Table(
-    "leases",
-    metadata,
-    Column("actuator", String(120), primary_key=True),
-    Column("holder", String(120), nullable=False),
-    Column("until", Float(53), nullable=False),
-)
+monitors = Table("monitors", metadata, _key("name", _Name), _stated("until", _Double))
+leases = Table("leases", metadata, _key("actuator", _Name), _stated("holder", _Name), _stated("until", _Double))

@@ -8,7 +8,7 @@ _SOURCE = {"type": "prometheus", "uid": "${source}"}
 #: Title, kind of panel, query, legend, unit, and how many columns of 24 by rows it takes.
 _PANELS = (
     ("Leak beyond the healthy machine", "timeseries", "sealscope_leak_lpm{%s}", "{{actuator}}", "L/min", 16, 9),
-    ("Alarms: 1 warning, 2 error, 4 unseen", "table", "sealscope_status_word{%s} > 0", "{{actuator}}", "", 8, 9),
+    ("Severity of what is not good (NE 107)", "table", "sealscope_severity{%s} > 0", "{{actuator}}", "", 8, 9),
     ("Flow past pump and piston", "timeseries", "sealscope_total_lpm{%s}", "{{actuator}}", "L/min", 16, 8),
     ("Blocks a minute", "timeseries", "60 * rate(sealscope_blocks_total{%s}[5m])", "{{actuator}}", "", 8, 8),
     (

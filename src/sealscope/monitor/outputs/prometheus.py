@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 #: Content type of the text.
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-#: Key of a summary -> name, kind and help of its metric.
-_METRICS = (
-    ("leak_lpm", "sealscope_leak_lpm", "gauge", "Leak beyond the healthy machine [L/min]"),
-    ("total_lpm", "sealscope_total_lpm", "gauge", "Flow past pump and piston together [L/min]"),
-    ("oil_celsius", "sealscope_oil_temperature_celsius", "gauge", "Oil temperature as recorded [deg C]"),
-    ("status_word", "sealscope_status_word", "gauge", "Bits: 1 warning, 2 error, 4 not acknowledged"),
-    ("blocks", "sealscope_blocks_total", "counter", "Blocks since the beginning"),
-    ("t", "sealscope_block_time_seconds", "gauge", "Clock at the end of the last block"),
-)
-#: Place in the values of a part -> name, kind and help of its metric.
-_REACHED = (
-    (0, "sealscope_reached", "gauge", "1 while a part of the monitor or what it needs is reached, 0 during an outage"),
-    (1, "sealscope_outages_total", "counter", "Outages since the start"),
-    (2, "sealscope_outage_seconds_total", "counter", "How long outages lasted since the start"),
-)
-_WAITING = (
-    ("sealscope_waiting_blocks", "gauge", "Blocks that wait to be stored"),
-    ("sealscope_waiting_bytes", "gauge", "Bytes of the blocks that wait to be stored"),
-    ("sealscope_source_waits_total", "counter", "How often a source had to wait because too many blocks waited"),
-)
-_ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n"}
+#: Metric -> help, labels. A name that ends in `_total` is a counter.
+_METRICS = {
+    "sealscope_leak_lpm": ("Leak beyond the healthy machine [L/min]", ("actuator",)),
+    "sealscope_total_lpm": ("Flow past pump and piston together [L/min]", ("actuator",)),
+    "sealscope_oil_temperature_celsius": ("Oil temperature as recorded [deg C]", ("actuator",)),
+    "sealscope_status_word": ("Bits: 1 warning, 2 error, 4 new", ("actuator",)),
+    "sealscope_health": ("State of NE 107: 0 good, 1 failure, 2 check, 3 off spec, 4 maintenance", ("actuator",)),
+    "sealscope_severity": ("Severity of the state, 0 to 1000", ("actuator",)),
+    "sealscope_blocks_total": ("Blocks since the beginning", ("actuator",)),
+    "sealscope_block_time_seconds": ("Clock at the end of the last block", ("actuator",)),
+    "sealscope_watched": ("What an actuator is watched by: volumes, or pressures", ("actuator", "by")),
+    "sealscope_passed_over_total": ("Samples, blocks or events by reason", ("actuator", "reason")),
+    "sealscope_dropped_blocks_total": ("Messages dropped by reason", ("reason",)),
+    "sealscope_reached": ("1 while a part of the monitor or what it needs is reached, 0 in an outage", ("part",)),
+    "sealscope_outages_total": ("Outages since the start", ("part",)),
+    "sealscope_outage_seconds_total": ("How long outages lasted since the start", ("part",)),
+    "sealscope_waiting_blocks": ("Blocks that wait to be stored", ()),
+    "sealscope_waiting_bytes": ("Bytes of the blocks that wait to be stored", ()),
+    "sealscope_source_waits_total": ("How often a source had to wait because too many blocks waited", ()),
+}
+_Rows = Iterator[tuple[str, tuple[str, ...], float | None]]
 
 
 def metrics_text(
@@ -43,44 +45,45 @@ def metrics_text(
     many outages it had, and how long they lasted [s]; `waiting`: blocks that are to be stored, their bytes, and how
     often a source had to wait for them.
     """
-    lines: list[str] = []
-    for key, name, kind, text in _METRICS:
-        rows = [((("actuator", actuator),), summary.get(key)) for actuator, summary in summaries.items()]
-        lines += _family(name, kind, text, rows)
-    ways = [
-        ((("actuator", actuator), ("by", summary["by"])), 1)
-        for actuator, summary in summaries.items()
-        if "by" in summary
-    ]
-    lines += _family("sealscope_watched", "gauge", "What an actuator is watched by: volumes, or pressures", ways)
-    dropped = [
-        ((("actuator", actuator), ("reason", reason)), count)
-        for actuator, summary in summaries.items()
-        for reason, count in summary.get("counters", {}).items()
-    ]
-    lines += _family("sealscope_passed_over_total", "counter", "Samples, blocks or events by reason", dropped)
-    whole = [((("reason", reason),), count) for reason, count in counters.items()]
-    lines += _family("sealscope_dropped_blocks_total", "counter", "Messages dropped by reason", whole)
-    for place, name, kind, text in _REACHED:
-        state = [((("part", part),), float(values[place])) for part, values in (parts or {}).items()]
-        lines += _family(name, kind, text, state)
-    for (name, kind, text), number in zip(_WAITING, waiting, strict=True):
-        lines += _family(name, kind, text, [((), number)])
-    return "\n".join(lines) + "\n"
+    families: dict[str, Any] = {}
+    for name, labels, value in _rows(summaries, counters, parts or {}, waiting):
+        if value is None:
+            continue
+        if name not in families:
+            kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
+            families[name] = kind(name, _METRICS[name][0], labels=_METRICS[name][1])
+        families[name].add_metric(labels, float(value))
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(type("Families", (), {"collect": lambda self: families.values()})())
+    return generate_latest(registry).decode()
 
 
-def _family(
-    name: str, kind: str, text: str, rows: Iterable[tuple[tuple[tuple[str, str], ...], float | None]]
-) -> list[str]:
-    known = [(labels, value) for labels, value in rows if value is not None]
-    if not known:
-        return []
-    lines = [f"# HELP {name} {text}", f"# TYPE {name} {kind}"]
-    for labels, value in known:
-        inner = ",".join(f'{label}="{_escaped(of)}"' for label, of in labels)
-        lines.append(f"{name}{{{inner}}} {float(value)!r}" if inner else f"{name} {float(value)!r}")
-    return lines
-
-
-def _escaped(text: str) -> str:
-    return re.sub(r'[\\"\n]', lambda match: _ESCAPES[match[0]], text)
+def _rows(
+    summaries: Mapping[str, Mapping[str, Any]],
+    counters: Mapping[str, int],
+    parts: Mapping[str, tuple[bool, int, float]],
+    waiting: tuple[int, int, int],
+) -> _Rows:
+    """Yield metric, values of its labels, and its own value, None where it is not known."""
+    for name, summary in summaries.items():
+        own, state = (name,), summary.get("state", {})
+        yield "sealscope_leak_lpm", own, summary.get("leak_lpm")
+        yield "sealscope_total_lpm", own, summary.get("total_lpm")
+        yield "sealscope_oil_temperature_celsius", own, summary.get("oil_celsius")
+        yield "sealscope_status_word", own, summary.get("status_word")
+        yield "sealscope_health", own, state.get("health")
+        yield "sealscope_severity", own, state.get("severity")
+        yield "sealscope_blocks_total", own, summary.get("blocks")
+        yield "sealscope_block_time_seconds", own, summary.get("t")
+        if "by" in summary:
+            yield "sealscope_watched", (name, summary["by"]), 1
+        for reason, count in summary.get("counters", {}).items():
+            yield "sealscope_passed_over_total", (name, reason), count
+    for reason, count in counters.items():
+        yield "sealscope_dropped_blocks_total", (reason,), count
+    for part, (reached, outages, seconds) in parts.items():
+        yield "sealscope_reached", (part,), reached
+        yield "sealscope_outages_total", (part,), outages
+        yield "sealscope_outage_seconds_total", (part,), seconds
+    names = ("sealscope_waiting_blocks", "sealscope_waiting_bytes", "sealscope_source_waits_total")
+    yield from ((name, (), value) for name, value in zip(names, waiting, strict=True))

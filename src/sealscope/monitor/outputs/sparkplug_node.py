@@ -14,27 +14,10 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.memory.store import MonitorStore, away
 from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of
 from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, topic_part
-from sealscope.monitor.sparkplug import (
-    BIRTH_SEQUENCE,
-    BOOLEAN,
-    DOUBLE,
-    INT64,
-    REBIRTH,
-    STRING,
-    UINT32,
-    UINT64,
-    SparkplugMetric,
-    SparkplugPayload,
-    after,
-    check_sparkplug,
-    decoded_payload,
-    encoded,
-    named,
-    topic_of,
-)
 
 _log = logging.getLogger(__name__)
 _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
@@ -42,37 +25,44 @@ _LOOK_S, _SENT_S = 0.2, 5.0
 _Table = dict[str, tuple[int, str | None, tuple[str, ...]]]
 #: Metric of a device -> type, unit, and where it is in the summary of an actuator.
 _STATE: _Table = {
-    "Status": (STRING, None, ("status",)),
-    "Status Word": (UINT32, None, ("status_word",)),
-    "Leak": (DOUBLE, "L/min", ("leak_lpm",)),
-    "Leak Low": (DOUBLE, "L/min", ("leak_interval_lpm", "0")),
-    "Leak High": (DOUBLE, "L/min", ("leak_interval_lpm", "1")),
-    "Total": (DOUBLE, "L/min", ("total_lpm",)),
-    "Blocks": (UINT64, None, ("blocks",)),
-    "Block Time": (DOUBLE, "s", ("t",)),
-    "Baseline Version": (UINT32, None, ("baseline", "version")),
+    "Status": (spb.STRING, None, ("status",)),
+    "Status Word": (spb.UINT32, None, ("status_word",)),
+    "State": (spb.STRING, None, ("state", "name")),
+    "State/Health": (spb.UINT32, None, ("state", "health")),
+    "State/Severity": (spb.UINT32, None, ("state", "severity")),
+    "State/Since": (spb.DOUBLE, "s", ("state", "since_s")),
+    "State/Cause": (spb.STRING, None, ("state", "cause")),
+    "State/Action": (spb.STRING, None, ("state", "action")),
+    "Leak": (spb.DOUBLE, "L/min", ("leak_lpm",)),
+    "Leak Low": (spb.DOUBLE, "L/min", ("leak_interval_lpm", "0")),
+    "Leak High": (spb.DOUBLE, "L/min", ("leak_interval_lpm", "1")),
+    "Total": (spb.DOUBLE, "L/min", ("total_lpm",)),
+    "Blocks": (spb.UINT64, None, ("blocks",)),
+    "Block Time": (spb.DOUBLE, "s", ("t",)),
+    "Baseline Version": (spb.UINT32, None, ("baseline", "version")),
 }
 #: ... in its alarm.
 _ALARM: _Table = {
-    "Alarm/Id": (STRING, None, ("id",)),
-    "Alarm/Level": (STRING, None, ("level",)),
-    "Alarm/State": (STRING, None, ("state",)),
-    "Alarm/Diagnostic Number": (UINT32, None, ("diagnostic_number",)),
-    "Alarm/Leak": (DOUBLE, "L/min", ("leak_lpm",)),
-    "Alarm/Leak Low": (DOUBLE, "L/min", ("leak_interval_lpm", "0")),
-    "Alarm/Leak High": (DOUBLE, "L/min", ("leak_interval_lpm", "1")),
-    "Alarm/Onset": (DOUBLE, "s", ("onset_s",)),
-    "Alarm/Raised": (DOUBLE, "s", ("raised_s",)),
-    "Alarm/Cause": (STRING, None, ("cause",)),
-    "Alarm/Evidence": (STRING, None, ("evidence",)),
-    "Alarm/Next Check": (STRING, None, ("next_check",)),
-    "Alarm/Mark": (STRING, None, ("mark",)),
-    "Alarm/Shelved": (BOOLEAN, None, ("shelved",)),
+    "Alarm/Id": (spb.STRING, None, ("id",)),
+    "Alarm/Level": (spb.STRING, None, ("level",)),
+    "Alarm/State": (spb.STRING, None, ("state",)),
+    "Alarm/Diagnostic Number": (spb.UINT32, None, ("diagnostic_number",)),
+    "Alarm/Leak": (spb.DOUBLE, "L/min", ("leak_lpm",)),
+    "Alarm/Leak Low": (spb.DOUBLE, "L/min", ("leak_interval_lpm", "0")),
+    "Alarm/Leak High": (spb.DOUBLE, "L/min", ("leak_interval_lpm", "1")),
+    "Alarm/Onset": (spb.DOUBLE, "s", ("onset_s",)),
+    "Alarm/Raised": (spb.DOUBLE, "s", ("raised_s",)),
+    "Alarm/Cause": (spb.STRING, None, ("cause",)),
+    "Alarm/Evidence": (spb.STRING, None, ("evidence",)),
+    "Alarm/Next Check": (spb.STRING, None, ("next_check",)),
+    "Alarm/Mark": (spb.STRING, None, ("mark",)),
+    "Alarm/Reason": (spb.STRING, None, ("reason",)),
+    "Alarm/Shelved": (spb.BOOLEAN, None, ("shelved",)),
 }
 #: ... in an event.
 _EVENT: _Table = {
-    "Alarm/Event": (STRING, None, ("event",)),
-    "Alarm/Event Number": (UINT64, None, ("number",)),
+    "Alarm/Event": (spb.STRING, None, ("event",)),
+    "Alarm/Event Number": (spb.UINT64, None, ("number",)),
 }
 
 
@@ -102,7 +92,7 @@ class SparkplugNode:
         password: str | None = None,
     ) -> None:
         check_mqtt()
-        check_sparkplug()
+        spb.check_sparkplug()
         self._store, self._summaries, self._count = store, summaries, count
         self._settings, self._broker = settings, broker
         name = f"{broker.client_id}-{settings.group}-{settings.node}"
@@ -152,11 +142,11 @@ class SparkplugNode:
         self._client.loop_stop()
 
     def _topic(self, kind: str, device: str | None = None) -> str:
-        return topic_of(self._settings.group, kind, self._settings.node, device)
+        return spb.topic_of(self._settings.group, kind, self._settings.node, device)
 
     def _death(self) -> bytes:
-        number = SparkplugMetric(BIRTH_SEQUENCE, self._birth_number, INT64)
-        return encoded(SparkplugPayload(_now(), (number,), None))
+        number = spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
+        return spb.encoded(spb.SparkplugPayload(_now(), (number,), None))
 
     def _before_connection(self, client: Any, userdata: Any) -> None:
         """Set the will of the connection to come; its number is the one after that of the last birth."""
@@ -174,7 +164,7 @@ class SparkplugNode:
         if message.qos:
             client.ack(message.mid, message.qos)
         try:
-            asked = named(decoded_payload(message.payload).metrics, REBIRTH)
+            asked = spb.named(spb.decoded_payload(message.payload).metrics, spb.REBIRTH)
         except ValueError as error:
             self._count("Sparkplug commands that are none")
             _log.info("a command that is none: %s", error)
@@ -221,8 +211,8 @@ class SparkplugNode:
         self._born = self._birth_number
         summaries, latest = self._summaries(), _latest_alarms(self._store)
         self._seq, self._shown = 255, {}
-        number = SparkplugMetric(BIRTH_SEQUENCE, self._birth_number, INT64)
-        self._send("NBIRTH", [number, SparkplugMetric(REBIRTH, False, BOOLEAN)])
+        number = spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
+        self._send("NBIRTH", [number, spb.SparkplugMetric(spb.REBIRTH, False, spb.BOOLEAN)])
         for actuator, summary in summaries.items():
             self._bear_device(actuator, summary, latest.get(actuator, {}))
 
@@ -235,11 +225,11 @@ class SparkplugNode:
         self._send("DBIRTH", metrics, actuator)
         self._shown[actuator] = _values(_STATE, summary)
 
-    def _send(self, kind: str, metrics: list[SparkplugMetric], actuator: str | None = None) -> bool:
+    def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
         """Send a message with the next sequence number; return whether it went out."""
-        self._seq = after(self._seq)
+        self._seq = spb.after(self._seq)
         topic = self._topic(kind, None if actuator is None else topic_part(actuator))
-        sent = self._client.publish(topic, encoded(SparkplugPayload(_now(), tuple(metrics), self._seq)), qos=0)
+        sent = self._client.publish(topic, spb.encoded(spb.SparkplugPayload(_now(), tuple(metrics), self._seq)), qos=0)
         try:
             sent.wait_for_publish(_SENT_S)
         except (RuntimeError, ValueError):  # the connection is lost: births come with the next one
@@ -270,14 +260,14 @@ def _values(table: _Table, values: Mapping[str, Any]) -> dict[str, Any]:
     return known
 
 
-def _of_values(table: _Table, values: Mapping[str, Any], at: int) -> list[SparkplugMetric]:
+def _of_values(table: _Table, values: Mapping[str, Any], at: int) -> list[spb.SparkplugMetric]:
     return [
-        SparkplugMetric(name, value, table[name][0], timestamp=at, unit=table[name][1])
+        spb.SparkplugMetric(name, value, table[name][0], timestamp=at, unit=table[name][1])
         for name, value in values.items()
     ]
 
 
-def _metrics(table: _Table, values: Mapping[str, Any], at: int) -> list[SparkplugMetric]:
+def _metrics(table: _Table, values: Mapping[str, Any], at: int) -> list[spb.SparkplugMetric]:
     """Return the metrics of a table, of the time `at` [ms]."""
     return _of_values(table, _values(table, values), at)
 

@@ -68,9 +68,18 @@ const byChance = (alarm) =>
     ? ""
     : `healthy, the fleet would raise such an alarm once in ${onceIn(alarm.by_chance_per_1000_h * fleetCount)} or less often`;
 
+// the state of NE 107 as a badge: its letter, and its name for who cannot see colours
+function badge(state) {
+  const made = element("span", `badge ${state.symbol}`, state.name);
+  made.prepend(element("b", "", state.symbol));
+  return made;
+}
+
 function stateOf(row) {
-  if (!row.alarm) return row.status;
-  return `${row.alarm.level}, ${row.alarm.state}, since ${clock(row.alarm.onset_s)}`;
+  const since = row.state.since_s === null ? "" : ` since ${clock(row.state.since_s)}`;
+  const why = { "no data": "no data", "not comparable": `not comparable (${row.state.cause})`, learning: "learns its baseline" };
+  if (row.alarm) return `alarm ${row.alarm.state}; leak since ${clock(row.alarm.onset_s)}`;
+  return `${why[row.state.condition] || row.status}${since}`;
 }
 
 function showFleet(fleet) {
@@ -78,19 +87,17 @@ function showFleet(fleet) {
   const list = byId("fleet");
   const focused = document.activeElement && document.activeElement.dataset.name;
   list.replaceChildren();
-  let alarms = 0;
+  const states = new Map();
   for (const row of fleet.actuators) {
     const button = element("button");
     button.type = "button";
     button.dataset.name = row.name;
-    if (row.alarm) {
-      alarms += 1;
-      button.classList.add(row.alarm.level);
-    } else if (row.t === null) button.classList.add("waiting");
+    button.classList.add(row.state.symbol);
+    states.set(row.state.name, (states.get(row.state.name) || 0) + 1);
     if (row.name === chosen) button.setAttribute("aria-current", "true");
     button.append(element("span", "name", row.name));
     button.append(element("span", "figure", row.leak_lpm === null ? "" : `${litres(Math.max(row.leak_lpm, 0))} L/min`));
-    button.append(element("span", "state", stateOf(row)));
+    button.append(badge(row.state), element("span", "state", stateOf(row)));
     button.addEventListener("click", () => choose(row.name));
     const item = element("li");
     item.append(button);
@@ -100,8 +107,8 @@ function showFleet(fleet) {
   const count = fleet.actuators.length;
   byId("budget").textContent =
     `While all run, at most one false alarm in ${onceIn(fleet.false_alarms_per_1000_h)} is stated for all of them together.`;
-  byId("overall").textContent =
-    `${count} actuator${count === 1 ? "" : "s"}, ${alarms === 0 ? "no alarm" : alarms === 1 ? "1 alarm" : alarms + " alarms"}`;
+  const parts = [...states].map(([name, number]) => `${number} ${name}`);
+  byId("overall").textContent = `${count} actuator${count === 1 ? "" : "s"}: ${parts.join(", ")}`;
   const dropped = Object.entries(fleet.counters).map(([reason, number]) => `${number} ${reason}`);
   byId("dropped").textContent = dropped.length ? `Since the start: ${dropped.join("; ")}` : "";
 }
@@ -110,16 +117,29 @@ function facts(alarm) {
   const list = byId("alarm-facts");
   list.replaceChildren();
   const rows = [
-    ["Leak", flow(alarm.leak_lpm, alarm.leak_interval_lpm)],
     ["Since", `${clock(alarm.onset_s)} (${clock(alarm.onset_interval_s[0])} to ${clock(alarm.onset_interval_s[1])})`],
     ["Raised", clock(alarm.raised_s)],
-    ["Cause", alarm.cause],
     ["Evidence", alarm.evidence],
     ["By chance", byChance(alarm)],
-    ["Next check", alarm.next_check],
+    ["Reason", alarm.reason],
     ["Number", `${alarm.diagnostic_number}, baseline ${alarm.baseline}`],
   ];
   for (const [name, value] of rows.filter((row) => row[1])) list.append(element("dt", "", name), element("dd", "", value));
+}
+
+// the steps of an alarm's life, the one it is at marked
+function showWorkflow(alarm) {
+  const steps = ["new", "acknowledged", "valid", "closed"];
+  byId("workflow").replaceChildren(
+    ...steps.map((step) => {
+      const made = element("li", "", step);
+      if (step === alarm.state) made.setAttribute("aria-current", "step");
+      return made;
+    }),
+  );
+  for (const button of byId("marks").querySelectorAll("button")) {
+    button.disabled = button.value === alarm.state || (button.value === "acknowledged" && alarm.state === "valid");
+  }
 }
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -146,7 +166,7 @@ function draw(course, events) {
   chart = new uPlot(
     {
       width: Math.max(280, place.clientWidth),
-      height: 320,
+      height: 240,
       scales: { x: { time: dated } },
       bands: [{ series: [2, 1], fill: colour("--band") }],
       axes: [
@@ -203,13 +223,22 @@ function showLife(life) {
   const learned = base ? `; baseline ${base.version}, ${base.hours.toPrecision(2)} h` +
     (base.lpm === null ? "" : `, ${litres(Math.max(base.lpm, 0))} L/min`) : "; the baseline is being learned";
   const oil = now.oil_celsius === null || now.oil_celsius === undefined ? "" : `, oil ${now.oil_celsius.toFixed(0)} °C`;
+  const state = now.state;
+  const since = state.since_s === null ? "" : ` since ${clock(state.since_s)}`;
+  const size = state.condition.startsWith("leak") ? ` ${flow(now.leak_lpm, now.leak_interval_lpm)}` : "";
+  byId("state").replaceChildren(
+    badge(state),
+    element("strong", "", ` ${state.condition}${size}${since}`),
+    element("span", "action", `${state.cause ? `Cause: ${state.cause}. ` : ""}${state.action}`),
+  );
   byId("now").textContent =
     `${clock(now.t)}: ${now.status}; pump and piston pass ${flow(now.total_lpm)}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${oil}${learned}`;
-  const alarm = life.alarms.find((each) => each.state !== "normal");
+  const alarm = life.alarms.find((each) => each.state !== "closed" && each.state !== "invalid");
   byId("alarm").hidden = !alarm;
   if (alarm) {
-    byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}`;
+    byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}${alarm.returned_s == null ? "" : ", over"}`;
     facts(alarm);
+    showWorkflow(alarm);
   }
   const list = byId("events");
   list.replaceChildren();
@@ -254,6 +283,11 @@ function choose(name) {
 byId("marks").addEventListener("submit", async (event) => {
   event.preventDefault();
   const mark = event.submitter ? event.submitter.value : "comment";
+  if (mark === "invalid" && !byId("comment").value.trim()) {
+    byId("mark-answer").textContent = "Say the reason first: why is the alarm invalid?";
+    byId("comment").focus();
+    return;
+  }
   const answer = await asked(`/api/mark?name=${encodeURIComponent(chosen)}`, {
     method: "POST",
     headers: { "Content-Type": "application/json", "X-Sealscope": "mark" },

@@ -6,15 +6,15 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from sealscope.monitor.alarms.alarm import ERROR_BIT, UNSEEN_BIT, WARNING_BIT
+from sealscope.monitor.alarms import NEW_BIT
 
 
 def ranked(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the actuators with their open alarm: errors, warnings, what nobody has seen, then by evidence.
+    """Return the actuators with their open alarm: by severity of their state, new alarms first, then by evidence.
 
     The alarm that healthy actuators raise least often comes first, so that all compete for one budget of false alarms;
     among equals the one whose leak is larger for sure (the lower end of its interval), then the larger leak, then the
-    name. `alarms`: those that are not normal.
+    name. `alarms`: those that are not over.
     """
     by_actuator = {alarm["actuator"]: alarm for alarm in alarms}
     rows = [{"name": name, **summary, "alarm": by_actuator.get(name)} for name, summary in summaries.items()]
@@ -22,15 +22,6 @@ def ranked(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, An
 
 
 def _order(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    word = int(row["status_word"])
-    low = (row["leak_interval_lpm"] or (0.0, 0.0))[0]
-    chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
-    return (
-        -(word & ERROR_BIT),
-        -(word & WARNING_BIT),
-        -(word & UNSEEN_BIT),
-        math.inf if chance is None else chance,
-        -low,
-        -(row["leak_lpm"] or 0.0),
-        row["name"],
-    )
+    low, chance = (row["leak_interval_lpm"] or (0.0,))[0], (row["alarm"] or {}).get("by_chance_per_1000_h")
+    evidence = math.inf if chance is None else chance, -low, -(row["leak_lpm"] or 0.0)
+    return -row["state"]["severity"], -(row["status_word"] & NEW_BIT), *evidence, row["name"]

@@ -13,27 +13,31 @@ import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import ExitStack
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import parse_qs
 
-from sealscope.errors import InputError, MissingExtra
+import uvicorn
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.store import away
-from sealscope.monitor.outages import DATABASE
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
 from sealscope.monitor.page.admission import Admission
 from sealscope.monitor.page.connections import BACKLOG, limited_protocol, most_connections
 from sealscope.monitor.page.live import DRAWN, PRESSURES, LiveSamples, machine_of
 from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.settings import PageSettings, secret_of
-from sealscope.monitor.supervisor import Supervisor
+from sealscope.monitor.supervisor import DATABASE, Supervisor
 from sealscope.reporting.template import packaged
 from sealscope.storage.plain_values import parse_json
-
-if TYPE_CHECKING:
-    from starlette.applications import Starlette
-    from starlette.requests import Request
-    from starlette.responses import Response
 
 #: Largest body of a request [bytes], and most listeners at a time.
 _LARGEST_BODY, _MOST_LISTENERS = 10_000, 200
@@ -62,18 +66,31 @@ _FILES = {
     "/twin.js": ("twin.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
     "/login.css": ("page.css", "text/css"),
-}
-_VENDORED = {
     "/uPlot.js": ("vendor/uPlot.iife.min.js", "text/javascript"),
     "/uPlot.css": ("vendor/uPlot.min.css", "text/css"),
 }
+#: Address -> name of the method that answers, and what it is asked by.
+_ROUTES = {
+    **{path: ("file", "GET") for path in _FILES},
+    "/login": ("login", "GET POST"),
+    "/api/fleet": ("fleet", "GET"),
+    "/api/actuator": ("actuator", "GET"),
+    "/api/mark": ("mark", "POST"),
+    "/api/changes": ("changes", "GET"),
+    "/metrics": ("metrics", "GET"),
+}
+Waits = Callable[[], tuple[int, int, int]]
+
+
+def _nothing_waits() -> tuple[int, int, int]:
+    return 0, 0, 0
 
 
 def site(
     actuators: WatchedActuators,
     settings: PageSettings,
     token: str | None,
-    waits: Callable[[], tuple[int, int, int]] = lambda: (0, 0, 0),
+    waits: Waits = _nothing_waits,
     live: LiveSamples | None = None,
 ) -> Starlette:
     """Return the application of a monitor; with a token, nothing but the form for it is open without.
@@ -81,206 +98,183 @@ def site(
     `waits`: returns how many blocks wait to be stored, their bytes, and how often a source had to wait for them;
     `live`: the samples that the service takes, those that are stored alone where there is none.
     """
-    from sqlalchemy.exc import SQLAlchemyError
-    from starlette.applications import Starlette
-    from starlette.middleware import Middleware
-    from starlette.middleware.trustedhost import TrustedHostMiddleware
-    from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
-    from starlette.routing import Route
+    pages = _Pages(actuators, token, waits, live or LiveSamples(actuators.store.last_samples))
+    routes = [Route(path, getattr(pages, name), methods=ways.split()) for path, (name, ways) in _ROUTES.items()]
+    middleware = [Middleware(BaseHTTPMiddleware, dispatch=pages.guard)]
+    if settings.host in _LOCAL:  # a name of another site that leads to this machine is refused
+        middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*_LOCAL, "[::1]"]))
+    handlers: Any = {SQLAlchemyError: pages.not_answering}
+    return Starlette(routes=routes, middleware=middleware, exception_handlers=handlers)
 
-    store = actuators.store
-    live = live or LiveSamples(store.last_samples)
-    machines = {name: machine_of(rig) for name, rig in actuators.rigs.items()}
-    listeners, most_listeners = 0, min(_MOST_LISTENERS, most_connections() // 2)
-    admission = None if token is None else Admission(token)
 
-    def file(request: Request) -> Response:
-        path = request.url.path
-        if path in _VENDORED:
-            name, kind = _VENDORED[path]
-            return Response(str(packaged(name)), media_type=kind)
-        name, kind = _FILES[path]
-        return Response((resources.files("sealscope.monitor.page") / name).read_text("utf-8"), media_type=kind)
+class _Pages:
+    """The answers of the page: each method one address of `_ROUTES`."""
 
-    def fleet(request: Request) -> Response:
-        rows = ranked(actuators.plain(), store.alarms(open_only=True))
-        shown = {"actuators": rows, "counters": actuators.counters, "waiting": waits()[0]}
-        budget = actuators.false_alarms_per_1000_h
-        return JSONResponse({**shown, "outages": actuators.outages.plain(), "false_alarms_per_1000_h": budget})
+    def __init__(self, actuators: WatchedActuators, token: str | None, waits: Waits, live: LiveSamples) -> None:
+        self._actuators, self._store, self._waits, self._live = actuators, actuators.store, waits, live
+        self._machines = {name: machine_of(settings.rig) for name, settings in actuators.settings.items()}
+        self._listeners, self._most_listeners = 0, min(_MOST_LISTENERS, most_connections() // 2)
+        self._admission = None if token is None else Admission(token)
 
-    def actuator(request: Request) -> Response:
-        name = request.query_params.get("name", "")
-        if name not in actuators.plain():
-            return JSONResponse({"error": "no such actuator"}, 404)
-        span = request.query_params.get("hours", "")
+    def file(self, request: Request) -> Response:
+        name, kind = _FILES[request.url.path]
+        return Response(str(packaged(name)) if name.startswith("vendor/") else _packaged(name), media_type=kind)
+
+    def _known(self) -> dict[str, Any]:
+        """Return what is known without the database."""
+        own = self._actuators
+        return {"counters": own.counters, "waiting": self._waits()[0], "outages": own.outages.plain()}
+
+    def fleet(self, request: Request) -> Response:
+        rows = ranked(self._actuators.plain(), self._store.alarms(open_only=True))
+        budget = self._actuators.false_alarms_per_1000_h
+        return JSONResponse({"actuators": rows, **self._known(), "false_alarms_per_1000_h": budget})
+
+    def actuator(self, request: Request) -> Response:
+        name, span = request.query_params.get("name", ""), request.query_params.get("hours", "")
+        summary = self._actuators.plain().get(name)
+        if summary is None:
+            return _refusal("no such actuator", 404)
         seconds = float(span) * 3600.0 if _HOURS.fullmatch(span) else None
-        return JSONResponse(
-            {
-                "name": name,
-                "summary": actuators.plain()[name],
-                "machine": machines[name],
-                "course": store.course(name, seconds=seconds),
-                "alarms": store.alarms(actuator=name)[:50],
-                "events": store.last_events(name),
-            }
-        )
+        life: dict[str, Any] = {"name": name, "summary": summary, "machine": self._machines[name]}
+        life |= {"course": self._store.course(name, seconds=seconds), "events": self._store.last_events(name)}
+        return JSONResponse({**life, "alarms": self._store.alarms(actuator=name)[:50]})
 
-    async def mark(request: Request) -> Response:
+    async def mark(self, request: Request) -> Response:
         if request.headers.get("x-sealscope") != "mark":  # no form of another site can send it
-            return JSONResponse({"error": "the header X-Sealscope is missing"}, 403)
+            return _refusal("the header X-Sealscope is missing", 403)
+        name = request.query_params.get("name", "")
         try:
             values = parse_json(await _body(request))
             if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
                 raise InputError("a mark must be a mapping of texts")
-            alarm = await asyncio.to_thread(
-                actuators.mark,
-                request.query_params.get("name", ""),
-                values.get("mark", ""),
-                by_whom=values.get("by", ""),
-                text=values.get("text", ""),
-            )
+            said = {"by_whom": values.get("by", ""), "text": values.get("text", "")}
+            alarm = await asyncio.to_thread(self._actuators.mark, name, values.get("mark", ""), **said)
         except TimeoutError:
-            return JSONResponse({"error": f"a request must have come within {_BODY_S:g} s"}, 408)
+            return _refusal(f"a request must have come within {_BODY_S:g} s", 408)
         except ValueError as error:
-            return JSONResponse({"error": str(error)}, 400)
+            return _refusal(str(error), 400)
         return JSONResponse(alarm.plain())
 
-    async def changes(request: Request) -> Response:
-        nonlocal listeners
-        if listeners >= most_listeners:
-            return JSONResponse({"error": "too many listeners"}, 503)
+    async def changes(self, request: Request) -> Response:
+        if self._listeners >= self._most_listeners:
+            return _refusal("too many listeners", 503)
         asked = request.query_params
         name, pressure, drawn = asked.get("actuator", ""), asked.get("pressure", "p_A"), asked.get("drawn", "rms")
-        if name and name not in machines:
-            return JSONResponse({"error": "no such actuator"}, 404)
+        if name and name not in self._machines:
+            return _refusal("no such actuator", 404)
         if pressure not in PRESSURES or drawn not in DRAWN:
-            return JSONResponse({"error": f"pressure must be one of {PRESSURES}, drawn one of {DRAWN}"}, 400)
+            return _refusal(f"pressure must be one of {PRESSURES}, drawn one of {DRAWN}", 400)
+        self._listeners += 1
+        return _Listening(self._lines(request, name, pressure, drawn), self._left)
 
-        async def lines() -> AsyncIterator[str]:
-            looking = ExitStack()
-            try:
-                room = bool(name) and await asyncio.to_thread(looking.enter_context, live.looked_at(name))
-                if name and not room:
-                    yield _event("live", {"name": name, "t": None, "error": "too many others are looked at"})
-                seen, pictured, silent = -1, -1, 0.0
-                while not await request.is_disconnected() and not actuators.closed:
-                    if actuators.changed != seen or silent >= _ALIVE_S:
-                        seen, silent = actuators.changed, 0.0
-                        yield f"data: {seen}\n\n"
-                    if room and live.version(name) != pictured:
-                        pictured = live.version(name)
-                        yield _event("live", await asyncio.to_thread(live.picture, name, pressure, drawn))
-                    await asyncio.sleep(_LOOK_S)
-                    silent += _LOOK_S
-            finally:
-                looking.close()
+    def _left(self) -> None:
+        self._listeners -= 1
 
-        class Listening(StreamingResponse):
-            """Counts as a listener until it ends, however it ends."""
+    async def _lines(self, request: Request, name: str, pressure: str, drawn: str) -> AsyncIterator[str]:
+        """Yield server-sent events: numbers where something has changed, and pictures of an actuator's samples."""
+        live, actuators = self._live, self._actuators
+        with ExitStack() as looking:
+            room = bool(name) and await asyncio.to_thread(looking.enter_context, live.looked_at(name))
+            if name and not room:
+                yield _event("live", {"name": name, "t": None, "error": "too many others are looked at"})
+            shown, pictured, silent = -1, -1, 0.0
+            while not await request.is_disconnected() and not actuators.closed:
+                if actuators.changed != shown or silent >= _ALIVE_S:
+                    shown, silent = actuators.changed, 0.0
+                    yield f"data: {shown}\n\n"
+                if room and live.version(name) != pictured:
+                    pictured = live.version(name)
+                    yield _event("live", await asyncio.to_thread(live.picture, name, pressure, drawn))
+                await asyncio.sleep(_LOOK_S)
+                silent += _LOOK_S
 
-            async def __call__(self, *connection: Any) -> None:
-                nonlocal listeners
-                try:
-                    await super().__call__(*connection)
-                finally:
-                    listeners -= 1
+    def metrics(self, request: Request) -> Response:
+        return Response(self._measured(self._actuators.plain()), headers={"Content-Type": CONTENT_TYPE})
 
-        listeners += 1
-        return Listening(lines(), media_type="text/event-stream")
+    def _measured(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
+        own = self._actuators
+        return metrics_text(summaries, own.counters, own.outages.totals(), self._waits())
 
-    def metrics(request: Request) -> Response:
-        return Response(measured(actuators.plain()), headers={"Content-Type": CONTENT_TYPE})
-
-    def measured(summaries: Mapping[str, Mapping[str, Any]]) -> str:
-        return metrics_text(summaries, actuators.counters, actuators.outages.totals(), waits())
-
-    async def not_answering(request: Request, error: Exception) -> Response:
+    async def not_answering(self, request: Request, error: Exception) -> Response:
         """Say in the form that was asked for that the database is away, and what is known without it."""
         reason = away(error)
         if reason is None:
             raise error
-        actuators.outages.lost(DATABASE, reason)
+        self._actuators.outages.lost(DATABASE, reason)
         text = f"the database does not answer: {reason}"
         if request.url.path == "/metrics":
-            return Response(f"# {text}\n{measured({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
-        known = {"counters": actuators.counters, "waiting": waits()[0], "outages": actuators.outages.plain()}
-        return JSONResponse({"error": text, **known}, 503, _LATER)
+            return Response(f"# {text}\n{self._measured({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
+        return JSONResponse({"error": text, **self._known()}, 503, _LATER)
 
-    async def login(request: Request) -> Response:
+    async def login(self, request: Request) -> Response:
         status = 200
-        if request.method == "POST" and admission is not None:
+        if request.method == "POST" and (admission := self._admission) is not None:
             address = _address(request)
             if wait := admission.pause_s(address):
-                return later(wait)
+                return _later(wait)
             try:
                 given = parse_qs((await _body(request)).decode("utf-8", "replace")).get("token", [""])[0]
             except (InputError, TimeoutError):
                 given = ""
             if admission.admits(address, given):
-                answer = RedirectResponse("/", 303)
-                answer.set_cookie(
-                    _COOKIE,
-                    admission.session,
-                    max_age=30 * 86_400,
-                    secure=request.url.scheme == "https",
-                    httponly=True,
-                    samesite="strict",
-                )
+                answer, secure = RedirectResponse("/", 303), request.url.scheme == "https"
+                kept = {"max_age": 30 * 86_400, "httponly": True, "samesite": "strict"}
+                answer.set_cookie(_COOKIE, admission.session, secure=secure, **kept)  # type: ignore[arg-type]
                 return answer
             status = 401
-        text = (resources.files("sealscope.monitor.page") / "login.html").read_text("utf-8")
-        return Response(text, status, media_type="text/html")
+        return Response(_packaged("login.html"), status, media_type="text/html")
 
-    def later(wait: float) -> Response:
-        error = f"too many wrong tokens: wait {wait:.0f} s"
-        return JSONResponse({"error": error}, 429, {"Retry-After": str(math.ceil(wait))})
-
-    def refused(request: Request) -> Response | None:
+    def _refused(self, request: Request) -> Response | None:
         """Return the answer to a request without the token, None where it has it."""
+        admission = self._admission
         if admission is None or request.url.path in ("/login", "/login.css"):
             return None
         given, session = request.headers.get("authorization"), request.cookies.get(_COOKIE)
         if given is not None or session is not None:
             address = _address(request)
             if wait := admission.pause_s(address):
-                return later(wait)
+                return _later(wait)
             if given is not None and admission.admits(address, given.removeprefix("Bearer ")):
                 return None
             if session is not None and admission.admits(address, session, session=True):
                 return None
-        answer: Response
-        if request.url.path == "/":
-            answer = RedirectResponse("/login", 303)
-        else:
-            answer = JSONResponse({"error": "a token is needed"}, 401)
+        is_page = request.url.path == "/"
+        answer: Response = RedirectResponse("/login", 303) if is_page else _refusal("a token is needed", 401)
         if session is not None:  # of an earlier token: the browser must not go on with it
             answer.delete_cookie(_COOKIE)
         return answer
 
-    routes = [Route(path, file) for path in (*_FILES, *_VENDORED)]
-    routes += [
-        Route("/login", login, methods=["GET", "POST"]),
-        Route("/api/fleet", fleet),
-        Route("/api/actuator", actuator),
-        Route("/api/mark", mark, methods=["POST"]),
-        Route("/api/changes", changes),
-        Route("/metrics", metrics),
-    ]
-    middleware = []
-    if settings.host in _LOCAL:  # a name of another site that leads to this machine is refused
-        middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*_LOCAL, "[::1]"]))
-    application = Starlette(routes=routes, middleware=middleware, exception_handlers={SQLAlchemyError: not_answering})
-
-    async def guard(request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
-        answer = refused(request) or await call_next(request)
-        for name, value in _HEADERS.items():
-            answer.headers[name] = value
+    async def guard(self, request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
+        answer = self._refused(request) or await call_next(request)
+        answer.headers.update(_HEADERS)
         return answer
 
-    from starlette.middleware.base import BaseHTTPMiddleware
 
-    application.add_middleware(BaseHTTPMiddleware, dispatch=guard)
-    return application
+class _Listening(StreamingResponse):
+    """Server-sent events; `ended` is called when it ends, however it ends."""
+
+    def __init__(self, lines: AsyncIterator[str], ended: Callable[[], None]) -> None:
+        super().__init__(lines, media_type="text/event-stream")
+        self._ended = ended
+
+    async def __call__(self, *connection: Any) -> None:
+        try:
+            await super().__call__(*connection)
+        finally:
+            self._ended()
+
+
+def _packaged(name: str) -> str:
+    return (resources.files("sealscope.monitor.page") / name).read_text("utf-8")
+
+
+def _refusal(error: str, status: int, headers: dict[str, str] | None = None) -> JSONResponse:
+    return JSONResponse({"error": error}, status, headers)
+
+
+def _later(wait: float) -> Response:
+    return _refusal(f"too many wrong tokens: wait {wait:.0f} s", 429, {"Retry-After": str(math.ceil(wait))})
 
 
 def _event(kind: str, values: Mapping[str, Any]) -> str:
@@ -303,31 +297,23 @@ async def _body(request: Request) -> bytes:
 
 
 class PageServer:
-    """The page, served by a thread of its own until `close`.
-
-    Raises MissingExtra without starlette and uvicorn, InputError where the port is taken or the token cannot be read.
-    """
+    """The page, served by a thread of its own until `close`; InputError where its port or its token cannot be had."""
 
     def __init__(
         self,
         actuators: WatchedActuators,
         settings: PageSettings,
         supervisor: Supervisor,
-        waits: Callable[[], tuple[int, int, int]] = lambda: (0, 0, 0),
+        waits: Waits = _nothing_waits,
         live: LiveSamples | None = None,
     ) -> None:
-        try:
-            import starlette  # noqa: F401 (asked for before the port is taken)
-            import uvicorn  # noqa: F401
-        except ImportError:
-            raise MissingExtra("the page needs starlette and uvicorn: pip install 'sealscope[serve]'") from None
         token = secret_of(settings.token_file, "page.token_file")
         self._actuators, self._host, self.port = actuators, settings.host, settings.port
         self._application = site(actuators, settings, token, waits, live)
         self._socket: socket.socket | None = self._opened()
         self.port = int(self._socket.getsockname()[1])
         self.address = f"http://{settings.host}:{self.port}/"
-        self._server: Any = None
+        self._server: uvicorn.Server | None = None
         self._thread = supervisor.start("page", self._serve)
 
     def _opened(self) -> socket.socket:
@@ -340,8 +326,6 @@ class PageServer:
 
     def _serve(self) -> None:
         """Serve the page until `leave`; uvicorn closes the socket."""
-        import uvicorn
-
         opened, self._socket = self._socket or self._opened(), None
         config = uvicorn.Config(
             self._application,

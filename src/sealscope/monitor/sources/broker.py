@@ -25,11 +25,11 @@ from contextlib import suppress
 from typing import Any
 
 from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of
-from sealscope.monitor.outages import BROKER
 from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
 from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, SourceBlock, decoded
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import NAMESPACE
+from sealscope.monitor.supervisor import BROKER
 from sealscope.monitor.waiting import Waiting
 
 _log = logging.getLogger(__name__)
@@ -41,6 +41,8 @@ _ASSURED_ROOM, _ASSURED_BYTES = 2048, 192_000_000
 _NAME = "mqtt"
 #: How long a published alarm is waited for, and the decoder at the end [s].
 _SENT_S, _END_S = 2.0, 2.0
+#: How often the states of the actuators are looked at [s].
+_STATES_S = 2.0
 #: What messages are counted under that find no room.
 _NO_ROOM = "messages of QoS 0 that found no room"
 _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
@@ -70,6 +72,8 @@ class _Connection:
         self._refusing = -1  # the connection whose further messages are left to the broker
         self._to_close: Any = None  # the line of that connection
         self._ended = threading.Event()
+        self._states: dict[str, str] = {}  # as they were published
+        self._states_due = 0.0
         self._arrived: Waiting[Any] = Waiting(_ROOM, _ROOM_BYTES)
         self._client.on_connect_fail = self._unreached
         self._client.on_connect = self._connected
@@ -99,6 +103,7 @@ class _Connection:
             while not self._service.stopping.wait(0.2):
                 check_running(self._client)
                 alarms.attempt(self._pass_on)
+            self._states_due = 0.0
             alarms.attempt(self._pass_on)
         finally:
             self._ended.set()
@@ -114,6 +119,7 @@ class _Connection:
             self._service.outages.lost(BROKER, f"{self._settings.host} refuses the connection: {reason}")
             return
         self._service.outages.back(BROKER)
+        self._states.clear()
         for topic in self._names:
             client.subscribe(topic, qos=1)
         if self._settings.host_id is not None:
@@ -202,22 +208,32 @@ class _Connection:
             self._service.hand(block)
 
     def _pass_on(self) -> None:
-        """Publish the alarms of new events, each retained."""
-        topic, store = self._settings.alarms_topic, self._service.store
-        if topic is None or not store.sends or not self._client.is_connected():
+        """Publish the alarms of new events, and the states that have changed, each retained."""
+        store = self._service.store
+        if self._settings.alarms_topic is None or not store.sends or not self._client.is_connected():
             return
         for number, event in store.events_since(store.position(_NAME)):
             alarm = event["alarm"]
-            name = topic_part(alarm["actuator"])
-            sent = self._client.publish(f"{topic}/{name}/alarm", json.dumps(alarm), qos=1, retain=True)
-            try:
-                sent.wait_for_publish(timeout=_SENT_S)
-            except (RuntimeError, ValueError) as error:  # the connection is lost, or its queue is full
-                _log.warning("alarms wait for the broker: %s", str(error).splitlines()[0])
-                return
-            if not sent.is_published():
+            if not self._published(alarm["actuator"], "alarm", json.dumps(alarm)):
                 return
             store.keep_position(_NAME, number)
+        if time.monotonic() >= self._states_due:
+            self._states_due = time.monotonic() + _STATES_S
+            for name, values in self._service.states().items():
+                state = json.dumps(values)
+                if self._states.get(name) != state and self._published(name, "state", state):
+                    self._states[name] = state
+
+    def _published(self, actuator: str, what: str, message: str) -> bool:
+        """Publish a retained message of an actuator; return whether the broker has it."""
+        topic = f"{self._settings.alarms_topic}/{topic_part(actuator)}/{what}"
+        sent = self._client.publish(topic, message, qos=1, retain=True)
+        try:
+            sent.wait_for_publish(timeout=_SENT_S)
+        except (RuntimeError, ValueError) as error:  # the connection is lost, or its queue is full
+            _log.warning("alarms wait for the broker: %s", str(error).splitlines()[0])
+            return False
+        return bool(sent.is_published())
 
 
 def _why(error: BaseException | None) -> str:

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from sealscope.monitor.sources.source_block import MOST_SAMPLES
-from sealscope.recordings.recording import CHANNEL_UNITS, Recording
+from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 
 #: How long a channel may say nothing before it counts as unchanged [s].
 SILENT_S = 3.0
@@ -23,20 +24,35 @@ _AHEAD_S = 60.0
 LATE = "values that came after their block"
 
 
-class ValueGatherer:
-    """The values of one actuator.
+@dataclass
+class _Channel:
+    """One channel: `values` by their number on the time axis, and `held`, the one before them.
 
-    Parameters
-    ----------
-    channels : sequence of str
-    rate : float
-        Sampling rate of the blocks [Hz].
-    block_s : float
-        Length of a block [s].
-    count : callable
-        Counts what was dropped, by a reason.
-    now : callable
-        Returns a clock [s] that is never set.
+    `heard`: when a value came last [s]; `newest`: number of the newest value since the beginning.
+    """
+
+    values: dict[int, float] = field(default_factory=dict)
+    held: float | None = None
+    heard: float = -math.inf
+    newest: int | None = None
+
+    def last(self) -> float | None:
+        return self.values[max(self.values)] if self.values else self.held
+
+    def taken(self, first: int, stop: int) -> Array:
+        """Return the values from `first` to `stop`, those that are missing as before them, and forget them."""
+        known = sorted(k for k in self.values if k < stop)
+        places = np.searchsorted(known, np.arange(first, stop), side="right")
+        held = math.nan if self.held is None else self.held
+        samples = np.array([held, *(self.values.pop(k) for k in known)])[places]
+        self.held = float(samples[-1])
+        return samples
+
+
+class ValueGatherer:
+    """The values of one actuator at a rate [Hz], gathered into blocks of `block_s` [s].
+
+    `count`: counts what was dropped, by a reason; `now`: returns a clock [s] that is never set.
     """
 
     def __init__(
@@ -49,10 +65,7 @@ class ValueGatherer:
     ) -> None:
         self.rate, self._length = rate, max(1, round(block_s * rate))
         self._ahead, self._count, self._now = math.ceil(_AHEAD_S * rate), count, now
-        # when a channel was heard, and its newest sample since the beginning
-        self._heard: dict[str, tuple[float, int | None]] = {}
-        self._values: dict[str, dict[int, float]] = {channel: {} for channel in channels}
-        self._held: dict[str, float] = {}
+        self._channels = {name: _Channel() for name in channels}
         self._start: int | None = None
         self._newest: int | None = None
 
@@ -64,74 +77,53 @@ class ValueGatherer:
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MOST_SAMPLES:
             self._count("values without a clock, or too many")
             return []
-        first = round(t * self.rate)
-        own = self._values[channel]
-        if self._newest is not None and first - self._newest > self._ahead:
-            self._go_on()
+        first, own = round(t * self.rate), self._channels[channel]
+        if (
+            self._newest is not None and first - self._newest > self._ahead
+        ):  # after a pause, with the values as they are
+            held = {name: _Channel(held=each.last(), heard=each.heard) for name, each in self._channels.items()}
+            self.interrupted()
+            self._channels = held
         elif self._newest is not None and self._newest - first > self._ahead:
-            if not own and channel not in self._held:  # it has not changed for long
-                self._held[channel], self._heard[channel] = values[-1], (self._now(), None)
+            if own.last() is None:  # it has not changed for long
+                own.held, own.heard = values[-1], self._now()
                 return self._whole_blocks()
-            self._begin()  # the clock was set back
-        own = self._values[channel]
+            self.interrupted()  # the clock was set back
+        own = self._channels[channel]
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:
                 self._count(LATE)
             else:
-                own[k] = value
+                own.values[k] = value
         last = first + len(values) - 1
         self._newest = last if self._newest is None else max(self._newest, last)
-        before = self._heard.get(channel, (0.0, None))[1]
-        self._heard[channel] = self._now(), last if before is None else max(last, before)
+        own.heard, own.newest = self._now(), last if own.newest is None else max(last, own.newest)
         return self._whole_blocks()
 
     def interrupted(self) -> None:
         """Forget what waits, as after a lost connection: what was sent meanwhile is not known."""
-        self._begin()
-
-    def _begin(self) -> None:
-        self._values = {channel: {} for channel in self._values}
-        self._held, self._heard, self._start, self._newest = {}, {}, None, None
-
-    def _go_on(self) -> None:
-        """Begin a new block after a pause, with the values as they are."""
-        held = {channel: own[max(own)] for channel, own in self._values.items() if own}
-        held = {**self._held, **held}
-        heard: dict[str, tuple[float, int | None]] = {channel: (at, None) for channel, (at, _) in self._heard.items()}
-        self._begin()
-        self._held, self._heard = held, heard
+        self._channels = {name: _Channel() for name in self._channels}
+        self._start = self._newest = None
 
     def _whole_blocks(self) -> list[Recording]:
+        channels = self._channels.values()
         if self._start is None:
-            unknown = [own for channel, own in self._values.items() if channel not in self._held]
-            if not all(unknown) or not any(self._values.values()):
+            if any(each.last() is None for each in channels) or not any(each.values for each in channels):
                 return []
             # every channel has a value from there on
-            firsts = [min(own) for own in self._values.values() if own]
-            self._start = max(min(own) for own in unknown) if unknown else min(firsts)
-        blocks: list[Recording] = []
+            unknown = [min(each.values) for each in channels if each.held is None]
+            self._start = max(unknown) if unknown else min(min(each.values) for each in channels if each.values)
         recent = self._now() - SILENT_S
-        newest = [last for heard, last in self._heard.values() if heard >= recent]
+        newest = [each.newest for each in channels if each.heard >= recent]
         if not newest or None in newest:
             return []
-        while min(last for last in newest if last is not None) + 1 - self._start >= self._length:
-            blocks.append(self._block(self._start, self._start + self._length))
+        blocks: list[Recording] = []
+        known = min(last for last in newest if last is not None) + 1
+        while known - self._start >= self._length:
+            clock = np.arange(self._start, self._start + self._length)
+            samples = {name: each.taken(clock[0], clock[-1] + 1) for name, each in self._channels.items()}
+            blocks.append(
+                Recording(clock / self.rate, samples, {name: CHANNEL_UNITS[name] for name in samples}, self.rate)
+            )
             self._start += self._length
         return blocks
-
-    def _block(self, first: int, stop: int) -> Recording:
-        channels = {}
-        for channel, own in self._values.items():
-            samples = np.empty(stop - first)
-            value = self._held.get(channel, math.nan)
-            before = [k for k in own if k < first]
-            if before:
-                value = own[max(before)]
-            for k in range(first, stop):
-                value = own.get(k, value)
-                samples[k - first] = value
-            self._held[channel] = value
-            self._values[channel] = {k: kept for k, kept in own.items() if k >= stop}
-            channels[channel] = samples
-        units = {channel: CHANNEL_UNITS[channel] for channel in channels}
-        return Recording(np.arange(first, stop) / self.rate, channels, units, self.rate)

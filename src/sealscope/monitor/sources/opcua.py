@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from sealscope.errors import MissingExtra
-from sealscope.monitor.outages import OPCUA
 from sealscope.monitor.settings import OpcUaSettings, secret_of
 from sealscope.monitor.sources.gathering import ValueGatherer
 from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock, digest_of
+from sealscope.monitor.supervisor import OPCUA
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.units import to_si
 

@@ -25,9 +25,8 @@ from sealscope.units import to_si
 
 if TYPE_CHECKING:
     from sealscope.monitor.memory.store import MonitorStore
-    from sealscope.monitor.outages import Outages
     from sealscope.monitor.settings import MonitorSettings
-    from sealscope.monitor.supervisor import Supervisor
+    from sealscope.monitor.supervisor import Outages, Supervisor
 
 #: Largest message [bytes], and most samples of a channel in it.
 LARGEST, MOST_SAMPLES = 16_000_000, 1_000_000
@@ -52,6 +51,9 @@ class BlockReceiver(Protocol):
 
     def count(self, reason: str) -> None:
         """Count something that was dropped."""
+
+    def states(self) -> dict[str, dict[str, Any]]:
+        """Return the state of NE 107 of each actuator as plain values."""
 
 
 def nothing() -> None:

@@ -21,40 +21,10 @@ from typing import Any
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.settings import ActuatorSettings
-from sealscope.monitor.sources.source_block import (
-    MOST_SAMPLES,
-    NO_CLOCK,
-    NO_SAMPLES,
-    OUT_OF_SEQUENCE,
-    OVERSIZED,
-    STALE_DEATH,
-    UNBORN,
-    UNREADABLE,
-    WRONG_ACTUATOR,
-    WRONG_UNITS,
-    RefusedMessage,
-    SourceBlock,
-    digest_of,
-    nothing,
-    refusing,
-)
-from sealscope.monitor.sparkplug import (
-    BIRTH_SEQUENCE,
-    BOOLEAN,
-    NAMESPACE,
-    REBIRTH,
-    SparkplugMetric,
-    SparkplugPayload,
-    after,
-    check_sparkplug,
-    decoded_payload,
-    encoded,
-    named,
-    number_of,
-    topic_of,
-    typed,
-)
+from sealscope.monitor.sources import source_block as blocks
+from sealscope.monitor.sources.source_block import RefusedMessage, SourceBlock, digest_of, nothing, refusing
 from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.recordings.channels import SLOW
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
@@ -83,10 +53,10 @@ class _Birth:
 
     names: dict[str, str] = field(default_factory=dict)
     aliases: dict[int, str] = field(default_factory=dict)
-    metrics: dict[str, SparkplugMetric] = field(default_factory=dict)
+    metrics: dict[str, spb.SparkplugMetric] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, metrics: Iterable[SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
+    def of(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
         """Return the birth of an actuator: a name counts with a unit in brackets behind it, too."""
         birth, wanted = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
@@ -132,7 +102,7 @@ class SparkplugHost:
         publish: Callable[[str, bytes], None],
         count: Callable[[str], None],
     ) -> None:
-        check_sparkplug()
+        spb.check_sparkplug()
         self._publish, self._count = publish, count
         self._actuators = {actuator.sparkplug: actuator for actuator in actuators if actuator.sparkplug is not None}
         self._nodes: dict[tuple[str, str], _EdgeState] = {}
@@ -144,7 +114,7 @@ class SparkplugHost:
     @property
     def topics(self) -> list[str]:
         """The filters of what the nodes send."""
-        return [f"{topic_of(group, '+', node)}/#" for group, node in self._nodes]  # the parent level is included
+        return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]  # the parent level is included
 
     def ask_all(self) -> None:
         """Ask every node for its birth, as after a connection is made: something may have been missed."""
@@ -154,7 +124,7 @@ class SparkplugHost:
 
     def owns(self, topic: str) -> bool:
         """Return whether a topic is one of Sparkplug's."""
-        return topic.startswith(f"{NAMESPACE}/")
+        return topic.startswith(f"{spb.NAMESPACE}/")
 
     @refusing()
     def taken(self, topic: str, data: bytes, done: Callable[[], None] = nothing) -> SourceBlock | None:
@@ -169,13 +139,13 @@ class SparkplugHost:
         if kind in ("NCMD", "DCMD"):
             return None  # for the node, not from it
         if state is None or kind not in ("NBIRTH", "DBIRTH", "NDATA", "DDATA", "NDEATH", "DDEATH"):
-            raise RefusedMessage(WRONG_ACTUATOR, "its topic must be that of a node of the settings")
+            raise RefusedMessage(blocks.WRONG_ACTUATOR, "its topic must be that of a node of the settings")
         if (kind[0] == "D") != bool(device):
-            raise RefusedMessage(WRONG_ACTUATOR, f"{kind} must name {'a' if kind[0] == 'D' else 'no'} device")
+            raise RefusedMessage(blocks.WRONG_ACTUATOR, f"{kind} must name {'a' if kind[0] == 'D' else 'no'} device")
         try:
-            payload = decoded_payload(data)
+            payload = spb.decoded_payload(data)
         except ValueError as error:
-            raise RefusedMessage(UNREADABLE, error) from None
+            raise RefusedMessage(blocks.UNREADABLE, error) from None
         group, node = parts[1], parts[3]
         if kind == "NDEATH":
             self._died(state, payload)
@@ -197,7 +167,7 @@ class SparkplugHost:
         birth = state.births.get(device)
         if birth is None:
             self._ask(group, node)
-            raise RefusedMessage(UNBORN, f"data of {path} must follow its birth")
+            raise RefusedMessage(blocks.UNBORN, f"data of {path} must follow its birth")
         known = [self._known(metric, state, birth) for metric in payload.metrics]
         metrics = [metric for metric in known if metric is not None]
         samples = self._samples(actuator, birth, metrics, payload.timestamp)
@@ -206,43 +176,43 @@ class SparkplugHost:
         return SourceBlock(actuator.name, digest_of(topic.encode() + b"\0" + data), samples, done=done)
 
     @staticmethod
-    def _died(state: _EdgeState, payload: SparkplugPayload) -> None:
+    def _died(state: _EdgeState, payload: spb.SparkplugPayload) -> None:
         if state.birth_sequence is not None and _birth_sequence(payload) != state.birth_sequence:
-            raise RefusedMessage(STALE_DEATH, "a death must bear the bdSeq of the last birth")
+            raise RefusedMessage(blocks.STALE_DEATH, "a death must bear the bdSeq of the last birth")
         state.births, state.birth_sequence, state.seq, state.whole = {}, None, None, False
 
     @staticmethod
-    def _born(state: _EdgeState, payload: SparkplugPayload) -> None:
+    def _born(state: _EdgeState, payload: spb.SparkplugPayload) -> None:
         state.births, state.birth_sequence, state.seq, state.whole = {}, _birth_sequence(payload), payload.seq, True
 
-    def _in_order(self, group: str, node: str, state: _EdgeState, payload: SparkplugPayload) -> None:
+    def _in_order(self, group: str, node: str, state: _EdgeState, payload: spb.SparkplugPayload) -> None:
         """Look at the sequence number; where some are missing the node is asked for its birth."""
         if state.seq is None:
             self._ask(group, node)
-            raise RefusedMessage(UNBORN, f"a message of {group}/{node} must follow its birth")
+            raise RefusedMessage(blocks.UNBORN, f"a message of {group}/{node} must follow its birth")
         if payload.seq is None:
-            raise RefusedMessage(OUT_OF_SEQUENCE, f"a message of {group}/{node} must have a sequence number")
-        if payload.seq != after(state.seq):
+            raise RefusedMessage(blocks.OUT_OF_SEQUENCE, f"a message of {group}/{node} must have a sequence number")
+        if payload.seq != spb.after(state.seq):
             state.whole = False
             self._count(GAPS)
             self._ask(group, node)
         state.seq = payload.seq
 
     @staticmethod
-    def _known(metric: SparkplugMetric, state: _EdgeState, birth: _Birth) -> SparkplugMetric | None:
+    def _known(metric: spb.SparkplugMetric, state: _EdgeState, birth: _Birth) -> spb.SparkplugMetric | None:
         """Return a metric with name, type and unit of its birth, None where it is no channel."""
         name = metric.name
         if name is None:
             if not state.whole:
-                raise RefusedMessage(OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
+                raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
             name = birth.aliases.get(-1 if metric.alias is None else metric.alias)
         known = birth.metrics.get(name or "")
         if known is None:
             return None
         try:
-            metric = metric if metric.datatype else typed(metric, known.datatype)
+            metric = metric if metric.datatype else spb.typed(metric, known.datatype)
         except ValueError as error:
-            raise RefusedMessage(NO_SAMPLES, error) from None
+            raise RefusedMessage(blocks.NO_SAMPLES, error) from None
         return replace(metric, name=name, unit=metric.unit or known.unit)
 
     def _ask(self, group: str, node: str) -> None:
@@ -252,16 +222,18 @@ class SparkplugHost:
             return
         state.asked = now
         _log.info("%s/%s is asked for its birth", group, node)
-        request = SparkplugPayload(round(1000.0 * time.time()), (SparkplugMetric(REBIRTH, True, BOOLEAN),), None)
-        self._publish(topic_of(group, "NCMD", node), encoded(request))
+        request = spb.SparkplugPayload(
+            round(1000.0 * time.time()), (spb.SparkplugMetric(spb.REBIRTH, True, spb.BOOLEAN),), None
+        )
+        self._publish(spb.topic_of(group, "NCMD", node), spb.encoded(request))
 
     def _samples(
-        self, actuator: ActuatorSettings, birth: _Birth, metrics: list[SparkplugMetric], sent: int | None
+        self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent: int | None
     ) -> Recording | None:
         """Return the samples that metrics bring, None where none of them is a channel."""
         by_name = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         rate = self._rate(actuator, birth, metrics)
-        groups: dict[int, dict[str, SparkplugMetric]] = {}
+        groups: dict[int, dict[str, spb.SparkplugMetric]] = {}
         for metric in metrics:
             if metric.name is not None and metric.name in by_name:
                 if by_name[metric.name] in SLOW and not isinstance(metric.value, np.ndarray):
@@ -269,13 +241,13 @@ class SparkplugHost:
                     continue
                 at = metric.timestamp if metric.timestamp is not None else sent
                 if at is None:
-                    raise RefusedMessage(NO_CLOCK, f"the metric {metric.name[:40]!r} must have a time, got none")
+                    raise RefusedMessage(blocks.NO_CLOCK, f"the metric {metric.name[:40]!r} must have a time, got none")
                 groups.setdefault(at, {})[by_name[metric.name]] = metric
         if not groups:
             return None
         if rate is None:
             raise RefusedMessage(
-                NO_CLOCK, f"{actuator.name} must have a rate, in its settings or as the metric {_RATE!r}"
+                blocks.NO_CLOCK, f"{actuator.name} must have a rate, in its settings or as the metric {_RATE!r}"
             )
         times, pieces = [], []
         for at in sorted(groups):
@@ -285,8 +257,10 @@ class SparkplugHost:
             pieces.append(piece)
         names = [channel for channel in CHANNELS if any(channel in piece for piece in pieces)]
         t = np.concatenate(times)
-        if t.size > MOST_SAMPLES:
-            raise RefusedMessage(OVERSIZED, f"a channel must have at most {MOST_SAMPLES} samples, got {t.size}")
+        if t.size > blocks.MOST_SAMPLES:
+            raise RefusedMessage(
+                blocks.OVERSIZED, f"a channel must have at most {blocks.MOST_SAMPLES} samples, got {t.size}"
+            )
         values = {
             name: np.concatenate(
                 [piece.get(name, np.full(clock.size, np.nan)) for piece, clock in zip(pieces, times, strict=True)]
@@ -308,10 +282,10 @@ class SparkplugHost:
         return np.asarray(first + np.arange(size) / rate)
 
     @staticmethod
-    def _rate(actuator: ActuatorSettings, birth: _Birth, metrics: list[SparkplugMetric]) -> float | None:
+    def _rate(actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric]) -> float | None:
         """Return the sampling rate [Hz]: that of the settings, else that of the metric."""
         name = birth.names.get(_RATE, _RATE)
-        stated = named(metrics, name)
+        stated = spb.named(metrics, name)
         if stated is not None:
             birth.metrics[name] = stated
         if actuator.rate is not None:
@@ -320,38 +294,38 @@ class SparkplugHost:
         if metric is None:
             return None
         try:
-            rate = number_of(metric.value)
+            rate = spb.number_of(metric.value)
         except ValueError as error:
-            raise RefusedMessage(NO_CLOCK, f"{name}: {error}") from None
+            raise RefusedMessage(blocks.NO_CLOCK, f"{name}: {error}") from None
         if not 0.0 < rate < float("inf"):
-            raise RefusedMessage(NO_CLOCK, f"{name} must be > 0 Hz, got {rate:g}")
+            raise RefusedMessage(blocks.NO_CLOCK, f"{name} must be > 0 Hz, got {rate:g}")
         return rate
 
 
-def _birth_sequence(payload: SparkplugPayload) -> int | None:
+def _birth_sequence(payload: spb.SparkplugPayload) -> int | None:
     """Return the number that ties a death to its birth, None where there is none, or no whole number."""
-    given = named(payload.metrics, BIRTH_SEQUENCE)
+    given = spb.named(payload.metrics, spb.BIRTH_SEQUENCE)
     return given.value if given is not None and isinstance(given.value, int) else None
 
 
-def _piece(group: Mapping[str, SparkplugMetric], birth: _Birth, by_name: Mapping[str, str]) -> dict[str, Array]:
+def _piece(group: Mapping[str, spb.SparkplugMetric], birth: _Birth, by_name: Mapping[str, str]) -> dict[str, Array]:
     """Return the samples (n,) of the metrics of one time; a single one that is missing is as it was last."""
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}
         sizes = {values.size for values in piece.values()}
         if len(sizes) != 1 or 0 in sizes or any(values.dtype != np.float64 for values in piece.values()):
-            raise RefusedMessage(NO_SAMPLES, "metrics of one time must be arrays of equally many numbers")
+            raise RefusedMessage(blocks.NO_SAMPLES, "metrics of one time must be arrays of equally many numbers")
         return piece
     for metric in group.values():
         birth.metrics[str(metric.name)] = metric
     try:
         return {
-            channel: np.array([number_of(birth.metrics[name].value)])
+            channel: np.array([spb.number_of(birth.metrics[name].value)])
             for name, channel in by_name.items()
             if channel not in SLOW and not isinstance(birth.metrics[name].value, np.ndarray)
         }
     except ValueError as error:
-        raise RefusedMessage(NO_SAMPLES, error) from None
+        raise RefusedMessage(blocks.NO_SAMPLES, error) from None
 
 
 def _in_si(t: Array, values: dict[str, Array], rate: float, units: Mapping[str, str | None]) -> Recording:
@@ -364,5 +338,5 @@ def _in_si(t: Array, values: dict[str, Array], rate: float, units: Mapping[str, 
                 array if unit is None else to_si(array, unit[:40], CHANNEL_UNITS[channel], name=channel)
             )
         except InputError as error:
-            raise RefusedMessage(WRONG_UNITS, error) from None
+            raise RefusedMessage(blocks.WRONG_UNITS, error) from None
     return Recording(t, converted, {channel: CHANNEL_UNITS[channel] for channel in converted}, rate)

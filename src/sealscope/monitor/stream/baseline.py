@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 from sealscope.diagnosis.inference.terms import priors
-from sealscope.errors import InputError
-from sealscope.storage.plain_state import plain_fields
-from sealscope.storage.plain_values import as_type
 
-_T = TypeVar("_T")
 #: Logarithm by which pressure and flow of a duty may lie outside what was learned.
 _DUTY_MARGIN = 0.2
 #: ... and by which a leak may lower the pressure difference.
@@ -33,8 +28,8 @@ class WatchBaseline:
         Operating hours it rests on.
     level, low, high : float
         Conductance of pump and piston: mean, and least and largest mean of successive blocks [m^3/(s Pa)].
-    lpm, low_lpm, high_lpm : float or None
-        The same as a flow under the pressure difference learned with [L/min], None where L/min cannot be stated.
+    lpm : float or None
+        The mean as a flow under the pressure difference learned with [L/min], None where L/min cannot be stated.
     duty_low, duty_high : tuple of two floats
         Least and largest logarithm of mean pressure difference [Pa] and of rms flow of the pump [m^3/s].
     """
@@ -46,8 +41,6 @@ class WatchBaseline:
     low: float
     high: float
     lpm: float | None
-    low_lpm: float | None
-    high_lpm: float | None
     duty_low: tuple[float, float]
     duty_high: tuple[float, float]
 
@@ -104,15 +97,15 @@ def within(duty: tuple[float, float], low: tuple[float, float], high: tuple[floa
 
 @dataclass
 class BaselineLearning:
-    """Sums of the baseline that is being learned."""
+    """Sums of the baseline that is being learned; what no block has shown yet is None."""
 
     blocks: int = 0
     total: float = 0.0
     flow: float = 0.0
-    low: float = math.inf
-    high: float = -math.inf
-    duty_low: tuple[float, float] = (math.inf, math.inf)
-    duty_high: tuple[float, float] = (-math.inf, -math.inf)
+    low: float | None = None
+    high: float | None = None
+    duty_low: tuple[float, float] | None = None
+    duty_high: tuple[float, float] | None = None
     group: list[float] = field(default_factory=list)
 
     def add(self, g: float, flow: float, duty: tuple[float, float], group: int) -> None:
@@ -120,44 +113,20 @@ class BaselineLearning:
         self.blocks += 1
         self.total += g
         self.flow += flow
-        self.duty_low = (min(self.duty_low[0], duty[0]), min(self.duty_low[1], duty[1]))
-        self.duty_high = (max(self.duty_high[0], duty[0]), max(self.duty_high[1], duty[1]))
+        low, high = self.duty_low or duty, self.duty_high or duty
+        self.duty_low = min(low[0], duty[0]), min(low[1], duty[1])
+        self.duty_high = max(high[0], duty[0]), max(high[1], duty[1])
         self.group.append(g)
         if len(self.group) == group:
             mean = sum(self.group) / group
-            self.low, self.high, self.group = min(self.low, mean), max(self.high, mean), []
+            self.low = mean if self.low is None else min(self.low, mean)
+            self.high, self.group = mean if self.high is None else max(self.high, mean), []
 
     def frozen(self, version: int, at: float, hours: float, litres: bool) -> WatchBaseline:
-        """Return the baseline."""
-        level, flow = self.total / self.blocks, self.flow / self.blocks
-        if self.low > self.high:  # shorter than one group
-            low, high = min(self.group), max(self.group)
-        else:
-            low, high = self.low, self.high
-        lpm, low_lpm, high_lpm = (level * flow, low * flow, high * flow) if litres else (None, None, None)
-        return WatchBaseline(
-            version, at, hours, level, low, high, lpm, low_lpm, high_lpm, self.duty_low, self.duty_high
-        )
-
-    def state(self) -> dict[str, Any]:
-        """Return all of it as plain values; infinite ones are None."""
-        values = plain_fields(self)
-        for name in ("low", "high"):
-            values[name] = values[name] if math.isfinite(values[name]) else None
-        for name in ("duty_low", "duty_high"):
-            values[name] = list(values[name]) if math.isfinite(values[name][0]) else None
-        return values
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> BaselineLearning:
-        """Return what `state` was of; raises InputError where it does not fit."""
-        known = {name: value for name, value in state.items() if value is not None}
-        return plain_dataclass(cls, known, "learning")
-
-
-def plain_dataclass(kind: type[_T], state: Any, name: str) -> _T:
-    """Return a part of a saved state as the dataclass `kind`; raises InputError where it does not fit."""
-    try:
-        return as_type(kind, state)
-    except ValueError as error:
-        raise InputError(f"saved state's {name} does not fit: {error}") from None
+        """Return the baseline of one block or more."""
+        assert self.duty_low is not None and self.duty_high is not None
+        level = self.total / self.blocks
+        low = min(self.group) if self.low is None else self.low  # shorter than one group
+        high = max(self.group) if self.high is None else self.high
+        lpm = level * self.flow / self.blocks if litres else None
+        return WatchBaseline(version, at, hours, level, low, high, lpm, self.duty_low, self.duty_high)

@@ -35,6 +35,11 @@ class BlockEstimate:
     leak_lpm: float | None = None
     leak_interval_lpm: tuple[float, float] | None = None
 
+    @property
+    def judged(self) -> bool:
+        """Whether the block was compared with the machine before it."""
+        return self.status in ("learning", "watched", "alarm")
+
 
 @dataclass(frozen=True)
 class WatchedLeak:

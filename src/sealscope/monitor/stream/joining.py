@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.storage.plain_state import array_of, part_of, plain_array, restored
 
 #: Channels by which an actuator is watched, and with those that are kept beside the estimates.
 _WATCHED = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u")
@@ -70,7 +71,7 @@ class SampleJoiner:
     names: tuple[str, ...] = ()
     rate: float = 0.0
     newest: float = float("-inf")
-    pieces: list[list[Array]] = field(default_factory=list)
+    pieces: list[list[Any]] = field(default_factory=list)
     counters: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -205,37 +206,23 @@ class SampleJoiner:
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
-        t, *channels = self._joined(len(self))
-        return {
-            "late_s": self.late_s,
-            "valved": self.valved,
-            "settled": self.settled,
-            "names": list(self.names),
-            "rate": self.rate,
-            "newest": None if self.newest == float("-inf") else self.newest,
-            "t": plain_array(t),
-            "channels": {name: plain_array(values) for name, values in zip(self.names, channels, strict=True)},
-            "counters": dict(self.counters),
-        }
+        t, *channels = map(plain_array, self._joined(len(self)))
+        newest = None if self.newest == float("-inf") else self.newest
+        own = {**vars(self), "newest": newest, "counters": dict(self.counters)}
+        return {**own, "names": list(self.names), "pieces": [[t, *channels]] if len(self) else []}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> SampleJoiner:
         """Return the joiner that `state` was of; raises InputError where it does not fit."""
-        newest = part_of(state, "newest", (float, int, type(None)))
-        names = tuple(name for name in part_of(state, "names", list) if name in CHANNELS)
-        channels = part_of(state, "channels", Mapping)
-        piece = [array_of(part_of(state, "t", Mapping), "t")]
-        piece += [array_of(part_of(channels, name, Mapping), name) for name in names]
-        return cls(
-            float(part_of(state, "late_s", (float, int))),
-            bool(part_of(state, "valved", bool)),
-            bool(part_of(state, "settled", bool)),
-            names,
-            float(part_of(state, "rate", (float, int))),
-            float("-inf") if newest is None else float(newest),
-            [piece] if piece[0].size else [],
-            {str(reason): int(number) for reason, number in part_of(state, "counters", Mapping).items()},
-        )
+        pieces = [[array_of(values, "samples") for values in piece] for piece in part_of(state, "pieces", list)]
+        known = {name: value for name, value in state.items() if name != "pieces" and value is not None}
+        joiner = restored(cls, known, "samples")
+        if not {*joiner.names} <= {*CHANNELS} or any(
+            len(piece) != 1 + len(joiner.names) or len({values.size for values in piece}) != 1 for piece in pieces
+        ):
+            raise InputError("saved state's samples must be of channels that are known, of one length")
+        joiner.pieces = pieces
+        return joiner
 
 
 def _rest(values: Array, first: int) -> Array:

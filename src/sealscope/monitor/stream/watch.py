@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -26,18 +26,18 @@ from sealscope.diagnosis.inference.live.balance import (
 from sealscope.diagnosis.inference.live.sequential import RECENT, StepDetector
 from sealscope.diagnosis.inference.terms import priors
 from sealscope.errors import InputError
-from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, plain_dataclass, within
+from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, within
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 from sealscope.monitor.stream.joining import SampleJoiner
 from sealscope.monitor.stream.pressures import PressureEstimator
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import array_of, part_of, plain_array, plain_fields
+from sealscope.storage.plain_state import array_of, part_of, plain_array, plain_fields, restored
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 8
+STATE_VERSION = 9
 #: The duty's cycle is looked for in so long a run without a hole [s], where there is no position.
 _LEARN_SECONDS = 60.0
 #: Blocks are not compared across a pause of over so many seconds.
@@ -85,6 +85,8 @@ class Watch:
         False alarms of a healthy machine per 1000 operating hours, at most.
     learn_hours : float
         Operating hours of healthy running that the baseline is learned from.
+    litres : bool, optional
+        Whether the rig states what turns a conductance into L/min; by default it is asked.
 
     Attributes
     ----------
@@ -108,11 +110,13 @@ class Watch:
     True
     """
 
-    def __init__(self, rig: Rig, false_alarms_per_1000_h: float, learn_hours: float) -> None:
+    def __init__(
+        self, rig: Rig, false_alarms_per_1000_h: float, learn_hours: float, *, litres: bool | None = None
+    ) -> None:
         probability_of("step", false_alarms_per_1000_h, BLOCK_SECONDS)
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
-        self._rig, self._litres = rig, states_flow(rig)
+        self._rig, self._litres = rig, states_flow(rig) if litres is None else litres
         self._samples = SampleJoiner(valved=rig.valve.spool == "present")
         self._live: LiveBalance | None = None
         self._pressures: PressureEstimator | None = None
@@ -400,6 +404,8 @@ class Watch:
         dict
             Mappings, lists, texts and numbers; ``"version"`` is the format's.
         """
+        parts = {name: getattr(self, f"_{name}") for name in ("samples", "live", "pressures", "detector")}
+        facts = {"learning": self._learning, "baseline": self.baseline, "leak": self.leak}
         return {
             "version": STATE_VERSION,
             "rig": json.dumps(self._rig.model_dump()),
@@ -409,13 +415,8 @@ class Watch:
             "blocks": self.blocks,
             "baseline_version": self._version,
             "seconds": self._seconds,
-            "samples": self._samples.state(),
-            "live": None if self._live is None else self._live.state(),
-            "pressures": None if self._pressures is None else self._pressures.state(),
-            "learning": self._learning.state(),
-            "baseline": None if self.baseline is None else plain_fields(self.baseline),
-            "leak": None if self.leak is None else plain_fields(self.leak),
-            "detector": self._detector.state(),
+            **{name: None if part is None else part.state() for name, part in parts.items()},
+            **{name: None if fact is None else plain_fields(fact) for name, fact in facts.items()},
             "last": plain_array(np.array(self._last).reshape(-1, _COLUMNS)),
             "group": plain_array(np.array(self._group).reshape(-1, 4)),
         }
@@ -442,21 +443,19 @@ class Watch:
         version = part_of(state, "version", int)
         if version != STATE_VERSION:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")
-        watch = cls.__new__(cls)
         number = {name: part_of(state, name, (float, int)) for name in _NUMBERS}
-        watch._rig, watch._litres = _rig_of(part_of(state, "rig", str)), bool(part_of(state, "litres", bool))
-        watch.false_alarms_per_1000_h, watch.learn_hours = number["false_alarms_per_1000_h"], number["learn_hours"]
-        watch.blocks, watch._version = int(number["blocks"]), int(number["baseline_version"])
+        rig = _rig_of(part_of(state, "rig", str))
+        rate, hours = number["false_alarms_per_1000_h"], number["learn_hours"]
+        watch = cls(rig, rate, hours, litres=part_of(state, "litres", bool))
         watch._seconds = number["seconds"]
-        watch._samples = SampleJoiner.from_state(part_of(state, "samples", Mapping))
-        live, pressures = (part_of(state, name, (Mapping, type(None))) for name in ("live", "pressures"))
-        watch._live = None if live is None else LiveBalance.from_state(watch._rig, live)
-        watch._pressures = None if pressures is None else PressureEstimator.from_state(watch._rig, pressures)
-        watch._learning = BaselineLearning.from_state(part_of(state, "learning", Mapping))
-        baseline, leak = (part_of(state, name, (Mapping, type(None))) for name in ("baseline", "leak"))
-        watch.baseline = None if baseline is None else plain_dataclass(WatchBaseline, baseline, "baseline")
-        watch.leak = None if leak is None else plain_dataclass(WatchedLeak, leak, "leak")
-        watch._detector = StepDetector.from_state(part_of(state, "detector", Mapping))
+        watch.blocks, watch._version = int(number["blocks"]), int(number["baseline_version"])
+        kinds = {name: (Mapping, type(None)) if name in _OPTIONAL else Mapping for name in (*_PARTS, *_FACTS)}
+        saved = {name: part_of(state, name, kind) for name, kind in kinds.items()}
+        for name, restore in _PARTS.items():
+            setattr(watch, f"_{name}", None if saved[name] is None else restore(rig, saved[name]))
+        for name, kind in _FACTS.items():
+            fact = None if saved[name] is None else restored(kind, saved[name], name)
+            setattr(watch, "_learning" if name == "learning" else name, fact)
         last, group = (array_of(part_of(state, name, Mapping), name) for name in ("last", "group"))
         if last.shape[1:] != (_COLUMNS,) or group.shape[1:] != (4,):
             raise InputError(f"saved state's last blocks must have {_COLUMNS} columns, got {last.shape}, {group.shape}")
@@ -465,6 +464,15 @@ class Watch:
         return watch
 
 
+#: Parts of the state -> what restores each, of a rig; and those that are plain dataclasses.
+_PARTS: dict[str, Callable[[Any, Mapping[str, Any]], Any]] = {
+    "samples": lambda rig, state: SampleJoiner.from_state(state),
+    "live": LiveBalance.from_state,
+    "pressures": PressureEstimator.from_state,
+    "detector": lambda rig, state: StepDetector.from_state(state),
+}
+_FACTS: dict[str, type[Any]] = {"learning": BaselineLearning, "baseline": WatchBaseline, "leak": WatchedLeak}
+_OPTIONAL = ("live", "pressures", "baseline", "leak")
 _NUMBERS = ("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "seconds")
 
 

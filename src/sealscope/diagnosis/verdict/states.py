@@ -1,0 +1,77 @@
+"""States of a machine as NAMUR NE 107 names them, from what a recording or a watched actuator shows.
+
+The tables are in `states.toml`: the states, the conditions that lead to them, the causes, and what is to be done.
+
+Source: NAMUR NE 107 (2017); its states in OPC UA: OPC 10000-100, DeviceHealthEnumeration, used by OPC 10000-110.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+#: Conditions of a machine that leaks past piston or pump: the cause does not change their state.
+LEAKING = ("leak", "leak over the limit")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineState:
+    """State of a machine.
+
+    Parameters
+    ----------
+    name : {"good", "check function", "out of specification", "maintenance required", "failure"}
+    symbol : str
+        Its letter: N, C, S, M, F.
+    health : int
+        Number in DeviceHealthEnumeration of OPC UA.
+    severity : int
+        1 to 1000, as of an event of OPC UA; 0 for good.
+    condition : str
+        What it follows from, such as "leak" or "no data".
+    since_s : float, optional
+        Clock of the samples since when it holds [s]; None where it is not known.
+    cause : str, optional
+        What the change is taken for.
+    action : str
+        What is to be done.
+    """
+
+    name: str
+    symbol: str
+    health: int
+    severity: int
+    condition: str
+    since_s: float | None
+    cause: str | None
+    action: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state as plain JSON values."""
+        return asdict(self)
+
+
+@cache
+def _tables() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+    return tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))
+
+
+def state_of(
+    condition: str, cause: str | None = None, *, since_s: float | None = None, action: str | None = None
+) -> MachineState:
+    """Return the state of a machine under a condition of `states.toml`; KeyError where the table has none of that name.
+
+    `cause`: of the change, which proposes the action, and decides the state unless the machine leaks past piston or
+    pump; `since_s`: clock [s]; `action`: in place of the table's.
+    """
+    tables = _tables()
+    by_condition, by_cause = tables["conditions"][condition], tables["causes"].get(cause or "", {})
+    name = by_condition["state"] if condition in LEAKING else by_cause.get("state", by_condition["state"])
+    action = action or by_cause.get("action") or by_condition["action"]
+    return MachineState(
+        name=name, **tables["states"][name], condition=condition, since_s=since_s, cause=cause, action=action
+    )

@@ -1,1 +1,0 @@
-"""Alarms: their life, and what turns estimates into them."""
