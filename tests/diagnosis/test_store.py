@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.store import lost_oil
+from sealscope.diagnosis.inference.circuit.store import lost_oil
 from sealscope.diagnosis.inference.terms import ATMOSPHERE, Signals
 from sealscope.parameters import Rig, load_rig
 

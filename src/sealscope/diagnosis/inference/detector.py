@@ -10,12 +10,12 @@ import numpy as np
 
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Columns
+from sealscope.diagnosis.inference.circuit.store import lost_beside
+from sealscope.diagnosis.inference.circuit.without_position import circulations
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
-from sealscope.diagnosis.inference.store import lost_beside
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked, priors
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.without_position import circulations
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, whole_samples
 from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.circuit.store import cycle_length, lost_oil
 from sealscope.diagnosis.inference.onset import FEWEST, StepTest
-from sealscope.diagnosis.inference.store import cycle_length, lost_oil
 from sealscope.diagnosis.inference.terms import (
     LEAK,
     LOCKED,
