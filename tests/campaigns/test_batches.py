@@ -63,6 +63,7 @@ def alone(plan, case):
     return stated(examination, plan.onset_s, plan.detectors, plan.views)[0], made.truth
 
 
+@pytest.mark.slow
 def test_without_noise_the_scores_are_those_of_the_recordings(plan_with):
     records = [
         {"count": 4},

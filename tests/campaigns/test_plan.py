@@ -122,6 +122,7 @@ def test_the_packaged_plans_are_sound():
 
 
 @pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.slow
 def test_the_packaged_plans_draw_the_machines_of_their_published_figures(name):
     text = "".join(f"{case.id}{case.noise_seed}" for case in cases_of(load_plan(name)))
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == DRAWN[name]

@@ -71,6 +71,7 @@ def test_the_call_of_the_readme() -> None:
 
 @few_and_all(2, 6)
 @pytest.mark.parametrize("kind", ["both", "p_A alone", "common", "quieter"])
+@pytest.mark.slow
 def test_a_step_of_the_noise_is_no_leak(kind: str, count: int, records) -> None:  # type: ignore[no-untyped-def]
     for seed in range(count):
         recording = records(seed, duration=120.0, throttled=True)
@@ -100,6 +101,7 @@ def test_a_leak_is_found_beyond_a_step_of_the_noise(records) -> None:  # type: i
 
 @few_and_all(4, 10)
 @pytest.mark.parametrize("end", [0.9, 0.8, 0.6])
+@pytest.mark.slow
 def test_a_slow_drift_is_no_leak(end: float, count: int, records) -> None:  # type: ignore[no-untyped-def]
     """Gain falling evenly over the recording: the details shrink with it, and nothing says when."""
     alarms = 0

@@ -55,6 +55,7 @@ def part(first: float, last: float) -> Recording:
     return worn().samples(slice(round(first * 500.0), round(last * 500.0)))
 
 
+@pytest.mark.slow
 def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
     watch, estimates = whole()
     assert watch.by == "pressures"

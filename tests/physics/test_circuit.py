@@ -108,6 +108,7 @@ def test_mass_of_chambers_and_accumulator_is_kept(strokes):
 @given(
     amplitude=st.floats(0.5, 10.0), force=st.floats(-3e3, 3e3), G=st.floats(0.0, 1e-11), p_relief=st.floats(5e5, 2e6)
 )
+@pytest.mark.slow
 def test_where_volumes_are_fixed_no_oil_is_lost(drive, amplitude, force, G, p_relief):
     """Compressed oil, what the accumulator gave, what the rod displaced: a linear invariant."""
     rig = single_rod(**FIXED, F_l=force, p_relief=p_relief)

@@ -103,6 +103,7 @@ def test_the_solver_sees_an_edit_of_friction(copy, tmp_path):
     assert abs(after - before) > 100.0
 
 
+@pytest.mark.slow
 def test_a_cache_folder_that_cannot_be_written_is_no_error(copy, tmp_path):
     blocked = tmp_path / "a file, not a folder"
     blocked.write_text("")
@@ -122,6 +123,7 @@ def test_a_cache_folder_that_cannot_be_written_is_no_error(copy, tmp_path):
         pytest.param("kernels a link", marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_no_compiled_code_is_loaded_from_a_folder_that_others_can_write(copy, tmp_path, whose):
     temporary, home = tmp_path / "tmp", tmp_path / "home"
     temporary.mkdir()
@@ -147,6 +149,7 @@ def test_no_compiled_code_is_loaded_from_a_folder_that_others_can_write(copy, tm
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners and modes of folders")
+@pytest.mark.slow
 def test_the_folders_of_compiled_code_are_the_user_s_alone(copy, tmp_path):
     for cache in (tmp_path / "cache", tmp_path / "open"):
         (tmp_path / "open" / "kernels").mkdir(parents=True, exist_ok=True, mode=0o755)
@@ -159,6 +162,7 @@ def test_the_folders_of_compiled_code_are_the_user_s_alone(copy, tmp_path):
 
 
 @pytest.mark.parametrize(("suffix", "left"), [pytest.param("nbi", 7, marks=pytest.mark.slow), ("nbc", 0)])
+@pytest.mark.slow
 def test_a_cut_off_file_of_the_cache_is_a_miss(copy, tmp_path, suffix, left):
     before = ask(copy, SMALL, tmp_path)
     files = [path for path in Path(before[2]).rglob(f"*.{suffix}") if "leakage_series" in path.name]
@@ -178,6 +182,7 @@ def test_a_full_disk_is_no_error(copy, tmp_path):
     assert (hits, ask(copy, SMALL, tmp_path)[0]) == (0, value)
 
 
+@pytest.mark.slow
 def test_an_empty_cache_folder_turns_caching_off(copy):
     value, hits, folder = ask(copy, SMALL, "")
     assert value > 0

@@ -50,6 +50,7 @@ def test_air_softens_the_oil_at_low_pressure_and_not_at_high():
     assert moduli[-1] == pytest.approx(1.4e9, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_two_leaking_rod_seals_empty_the_circuit_exponentially(check_rig, drive):
     """Equal leakage on both sides: p_A + p_B = 2 p_charge exp(-K G t/V), whatever the piston does."""
     G = 4e-14
@@ -62,6 +63,7 @@ def test_two_leaking_rod_seals_empty_the_circuit_exponentially(check_rig, drive)
 
 
 @pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
+@pytest.mark.slow
 def test_what_leaks_out_and_what_is_made_up_account_for_the_oil(check_rig, drive, throttled):
     rig = check_rig(throttled, G_ext_A=5e-13, G_ext_B=2e-13, **MADE_UP)
     run = drive(rig, 5.0, rate=2000.0)
@@ -125,6 +127,7 @@ def test_air_keeps_the_oil_in_the_circuit(check_rig, drive):
     assert np.ptp(run["p_A"]) > 5e4
 
 
+@pytest.mark.slow
 def test_the_implicit_method_follows_the_air_too(check_rig, drive):
     rig = check_rig(True, air="1 %", d_line=2e-3, dp_0="0.1[MPa]")  # mild throttles: RK4 can be the judge
     truth = drive(rig, 2.0, method="rk4", step=2e-5)["p_A"]

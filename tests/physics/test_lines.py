@@ -275,6 +275,7 @@ def test_throttle_filter_and_bypass_share_the_pressure(total, g, R, bypass):
         )
 
 
+@pytest.mark.slow
 def test_a_filter_s_pressure_drop_over_what_passed_until_its_bypass_opens():
     """One stroke, dp = R Q (1 - k V/2)^-2 with V the integral of the flow; the valve then takes what is above."""
     values = {**PARTS, "k_clog_A": 4e4, "k_clog_B": 1e4, "n_clog": 1.5, "p_bypass": "2 bar", "G_bypass": 1e-9}

@@ -23,6 +23,7 @@ def table(path, head, *rows):
     return f"file {path}"
 
 
+@pytest.mark.slow
 def test_a_linear_table_is_a_spring_and_words_are_a_damper(check_rig, drive, tmp_path):
     known = drive(check_rig(k_load=2e5, **CHARGED), 1.0, u=2.0, step=2e-4)
     straight = parse_force(table(tmp_path / "x.csv", "x [mm],F [kN]", (-300.0, -60.0), (50.0, 10.0), (300.0, 60.0)))
