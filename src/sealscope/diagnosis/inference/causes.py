@@ -24,7 +24,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
-from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, Equation, priors
+from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation, priors, unlikely
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: Blocks that causes are weighed with: a step is dated by the leak's own test.
@@ -78,10 +78,12 @@ def hypotheses(
         best = step_test(own, signs)
         if best is not None:
             stored = lost.get(name.removesuffix(MADE_UP)) if cause == "external leak" else None
-            beside = {LEAK: -cost, ORIFICE: -cost, SCALE: -_unlikely(best)}.get(name, 0.0)
-            stepped.append(
-                StepHypothesis(name, cause, best, beside + (0.0 if stored is None else _agree(best, stored)))
-            )
+            beside = 0.0 if stored is None else _agree(best, stored)
+            if name in (LEAK, ORIFICE, PUMP):
+                beside -= cost
+            elif name == SCALE:
+                beside -= unlikely(best.fitted[0], "scale")
+            stepped.append(StepHypothesis(name, cause, best, beside))
     return tuple(sorted(stepped, key=lambda own: -own.score))
 
 
@@ -90,12 +92,6 @@ def _agree(test: StepTest, stored: StepTest) -> float:
     at = int(np.abs(stored.onsets - test.onsets[test.best]).argmin())
     lost, expected = np.array([stored.size[at], test.fitted[0]]) / stored.deviation[at]
     return float(lost**2 - (lost - expected) ** 2)
-
-
-def _unlikely(scale: StepTest) -> float:
-    """Return minus twice the logarithm of what is believed of a step of the scale, over that of the likeliest one."""
-    size, spread = (priors()["scale"][name].value for name in ("size", "spread"))
-    return float(np.log(max(abs(scale.fitted[0]), np.finfo(float).tiny) / size) / spread) ** 2
 
 
 def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Blocks:
