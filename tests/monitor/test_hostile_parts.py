@@ -218,7 +218,7 @@ def test_a_link_to_a_foreign_file_is_not_followed(tmp_path: Path, caplog):
 
 
 def test_a_removed_folder_is_one_outage_and_the_others_go_on(tmp_path: Path, monkeypatch, caplog):
-    monkeypatch.setattr("sealscope.monitor.service._LOOK_S", 0.05)
+    monkeypatch.setattr("sealscope.monitor.sources.folder._LOOK_S", 0.05)
     settings = settings_in(tmp_path, folder_settings(tmp_path, "press 3", "press 4"))
     settings = settings.model_copy(update={"lines": False})
     (tmp_path / "press 3").rmdir()

@@ -24,8 +24,8 @@ from sealscope.monitor.outputs.lines import EventLines
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import MonitorSettings, secret_of
-from sealscope.monitor.sources.folder import WatchedFolder
-from sealscope.monitor.sources.lines import blocks_of_lines
+from sealscope.monitor.sources.folder import folders_of
+from sealscope.monitor.sources.lines import lines_of
 from sealscope.monitor.sources.source_block import (
     UNREADABLE_FILE,
     BlockReceiver,
@@ -40,9 +40,9 @@ from sealscope.storage.folders import locked
 _log = logging.getLogger(__name__)
 #: Blocks that wait to be stored and their bytes, at most; sources wait beyond.
 _WAITING, _WAITING_BYTES = 512, 256_000_000
-#: How often folders are looked at and lines are written [s], the longest pause after an error of the database, and how
+#: How often lines are written [s], the longest pause after an error of the database, and how
 #: long what is under way at the end is waited for, all together.
-_LOOK_S, _LINES_S, _LONGEST_PAUSE_S, _END_S = 0.5, 0.2, 5.0, 2.5
+_LINES_S, _LONGEST_PAUSE_S, _END_S = 0.2, 5.0, 2.5
 #: Blocks that are stored in one transaction, at most, and how long the first one waits for others [s].
 _TOGETHER, _GATHER_S = 256, 0.02
 #: What a block is counted under that raised an error.
@@ -62,15 +62,8 @@ _Kept = TypeVar("_Kept", SourceBlock, RefusedMessage)
 class Service:
     """A running monitor.
 
-    Parameters
-    ----------
-    settings : MonitorSettings
-    once : bool
-        End when standard input has ended and the folders hold nothing new.
-    stdin, stdout : optional
-        Where lines come from and go to.
-    sources : iterable of Source
-        More sources, such as a simulated rig.
+    `once`: it ends when standard input has ended and the folders hold nothing new; `stdin`, `stdout`: where lines come
+    from and go to; `sources`: more sources, such as a simulated rig.
     """
 
     def __init__(
@@ -109,18 +102,14 @@ class Service:
             self.supervisor = Supervisor(self.outages, self.stopping, away)
             if self._share is not None:
                 self.actuators.renew()
+            self._live = LiveSamples(self.store.last_samples)
+            self._lines = EventLines(self.store, stdout or sys.stdout)
+            self.page: PageServer | None = None
+            if settings.page is not None and not once:
+                self.page = PageServer(self.actuators, settings.page, self.supervisor, self.waits, self._live)
         except BaseException:
             self._hold.close()
             raise
-        self._live = LiveSamples(self.store.last_samples)
-        self._lines = EventLines(self.store, stdout or sys.stdout)
-        self.page: PageServer | None = None
-        if settings.page is not None and not once:
-            try:
-                self.page = PageServer(self.actuators, settings.page, self.supervisor, self.waits, self._live)
-            except BaseException:
-                self._hold.close()
-                raise
 
     def hand(self, block: SourceBlock | RefusedMessage) -> None:
         """Give the service a block, or the error of a message that holds none; waits while too many wait."""
@@ -192,9 +181,9 @@ class Service:
         """Return the sources of the settings by name; raises InputError for a secret that cannot be read."""
         sources = [(f"source {number}", source) for number, source in enumerate(self._more_sources, 1)]
         if self.settings.lines:
-            sources.append((_LINES, _lines_of(self._stdin)))
+            sources.append((_LINES, lines_of(self._stdin)))
         if any(actuator.folder is not None for actuator in self.settings.actuator):
-            sources.append(("folders", partial(_folders_of, once=self.once)))
+            sources.append(("folders", partial(folders_of, once=self.once)))
         if self.settings.mqtt is not None:
             from sealscope.monitor.sources.broker import broker_of
 
@@ -294,37 +283,3 @@ class Service:
 def _worth_a_line(number: int) -> bool:
     """Return whether the log gets a line about the same trouble for this time: the first ones, then powers of two."""
     return number <= _FIRST_LINES or number & (number - 1) == 0
-
-
-def _lines_of(stream: BinaryIO) -> Source:
-    def hand_lines(service: BlockReceiver) -> None:
-        for block in blocks_of_lines(stream):
-            service.hand(block)
-            if service.stopping.is_set():
-                return
-
-    return hand_lines
-
-
-def _folders_of(service: BlockReceiver, *, once: bool) -> None:
-    settle = 0.0 if once else service.settings.settle_s
-    folders = [
-        WatchedFolder(
-            actuator.name, actuator.folder, actuator.pattern, settle, service.store.is_known, actuator.map or None
-        )
-        for actuator in service.settings.actuator
-        if actuator.folder is not None
-    ]
-    parts = [service.supervisor.part(f"folder of {folder.actuator}") for folder in folders]
-    while not service.stopping.is_set():
-        done = [part.attempt(partial(_hand_over, service, folder)) for part, folder in zip(parts, folders, strict=True)]
-        if once and (all(done) or DATABASE not in {outage["part"] for outage in service.outages.plain()}):
-            return
-        service.stopping.wait(_LOOK_S)
-
-
-def _hand_over(service: BlockReceiver, folder: WatchedFolder) -> None:
-    for block in folder.blocks():
-        if service.stopping.is_set():
-            return
-        service.hand(block)

@@ -10,14 +10,9 @@ _Item = TypeVar("_Item")
 
 
 class Waiting(Generic[_Item]):
-    """A queue between threads that is bounded in number and in bytes; something larger than all bytes fits alone.
+    """A queue between threads, of at most `most` things and `most_bytes` as `put` states them.
 
-    Parameters
-    ----------
-    most : int
-        Things at a time.
-    most_bytes : int
-        Their bytes, as `put` states them.
+    Something larger than all bytes fits alone.
     """
 
     def __init__(self, most: int, most_bytes: int) -> None:

@@ -24,17 +24,9 @@ OUTPUTS = ""
 
 
 class Share:
-    """The share of a monitor in the actuators of a database.
+    """The share of the monitor `name` in the `actuators` of a database.
 
-    Parameters
-    ----------
-    store : MonitorStore
-    name : str
-        The monitor's own name.
-    actuators : sequence of str
-        All actuators that are shared.
-    lease_s : float
-        How long a monitor that says nothing keeps its actuators [s].
+    `lease_s`: how long a monitor that says nothing keeps its actuators [s].
     """
 
     def __init__(self, store: MonitorStore, name: str, actuators: Sequence[str], lease_s: float) -> None:

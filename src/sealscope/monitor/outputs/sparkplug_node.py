@@ -69,17 +69,8 @@ _EVENT: _Table = {
 class SparkplugNode:
     """The edge node of a monitor.
 
-    Parameters
-    ----------
-    store : MonitorStore
-    summaries : callable
-        Returns what each actuator shows now.
-    count : callable
-        Counts what was dropped, by a reason.
-    broker : BrokerSettings
-    settings : SparkplugSettings
-    password : str, optional
-        Of the broker.
+    `summaries`: returns what each actuator shows now; `count`: counts what was dropped, by a reason; `password`: of the
+    broker.
     """
 
     def __init__(

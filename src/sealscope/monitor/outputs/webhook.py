@@ -28,18 +28,9 @@ class Webhook:
     """Posts the events of a store, each as the JSON object of its line, to an address.
 
     An answer of 200 to 299 means that it has arrived; else it is posted again after a pause that doubles up to 5
-    minutes. `Idempotency-Key` is the event's number, by which a receiver knows one that it has.
-
-    Parameters
-    ----------
-    store : MonitorStore
-    url : str
-    token : str, optional
-        Sent as `Authorization: Bearer`; it stands in no log, and no redirect is followed with it.
-    timeout : float
-        Longest time that the whole exchange of an event may take [s].
-    outages : Outages, optional
-        Is told when the address does not take an event, and when it does again.
+    minutes. `Idempotency-Key` is the event's number, by which a receiver knows one that it has. The token, sent as
+    `Authorization: Bearer`, stands in no log, and no redirect is followed with it. `timeout`: of the whole exchange of
+    an event [s]; `outages`: told when the address does not take an event, and when it does again.
     """
 
     def __init__(

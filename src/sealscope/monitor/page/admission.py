@@ -14,16 +14,10 @@ _FREE, _FIRST_S, _LONGEST_S, _FORGOTTEN_S, _ADDRESSES = 5, 1.0, 60.0, 3600.0, 10
 
 
 class Admission:
-    """The token of a page, and who guessed it wrong.
+    """The token of a page, and who guessed it wrong; `now` returns a clock [s].
 
     After five wrong ones an address waits before its next one is looked at, right or wrong: for 1 s, and twice as long
     after each further one, up to a minute. A network of IPv6 (/64) counts as one address.
-
-    Parameters
-    ----------
-    token : str
-    now : callable
-        Returns a clock [s].
     """
 
     def __init__(self, token: str, now: Callable[[], float] = time.monotonic) -> None:

@@ -68,10 +68,7 @@ class _Window:
 class LiveSamples:
     """The last seconds of the actuators that are looked at.
 
-    Parameters
-    ----------
-    recall : callable, optional
-        Returns the last samples of an actuator that are stored, for who begins to look.
+    `recall`: returns the last samples of an actuator that are stored, for who begins to look.
     """
 
     def __init__(self, recall: Callable[[str], Sequence[Recording]] = lambda name: ()) -> None:

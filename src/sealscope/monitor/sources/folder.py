@@ -6,14 +6,15 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from stat import S_ISREG
 
 import numpy as np
 
 from sealscope.errors import SealscopeError
-from sealscope.monitor.sources.source_block import UNREADABLE_FILE, RefusedMessage, SourceBlock
-from sealscope.monitor.supervisor import PartAway, place_of
+from sealscope.monitor.sources.source_block import UNREADABLE_FILE, BlockReceiver, RefusedMessage, SourceBlock
+from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
 from sealscope.recordings import Recording, read
 from sealscope.recordings.formats.columns import ChannelMap
 from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
@@ -21,6 +22,8 @@ from sealscope.recordings.formats.headings.oil_temperature import stated_oil_tem
 _log = logging.getLogger(__name__)
 #: Names of files that are still being written.
 _UNFINISHED = (".part", ".tmp", ".temp", ".crdownload", "~")
+#: How often folders are looked at [s].
+_LOOK_S = 0.5
 #: A file that cannot be read is tried once more when it has not changed for so many times the time to settle.
 _PATIENCE = 6.0
 #: A file that is dated so much later than now [s] is dated in the future.
@@ -30,18 +33,8 @@ _AHEAD_S = 60.0
 class WatchedFolder:
     """The recordings of one actuator in a folder.
 
-    Parameters
-    ----------
-    actuator : str
-    folder : Path
-    pattern : str
-        Names of the files, such as ``*.csv``.
-    settle_s : float
-        A file is read when its size and time have not changed for so long [s].
-    known : callable
-        Whether a block with an identity is stored already.
-    channel_map : mapping, optional
-        Channel -> column, as for `read`.
+    `pattern`: names of the files, such as ``*.csv``; `settle_s`: a file is read when its size and time have not changed
+    for so long [s]; `known`: whether a block with an identity is stored already; `channel_map`: channel -> column.
     """
 
     def __init__(
@@ -120,6 +113,31 @@ class WatchedFolder:
         if path.name not in self._led_out:
             self._led_out.add(path.name)
             _log.warning("%s: %s is a link out of the folder, and is not read", self.actuator, _shown(path.name))
+
+
+def folders_of(service: BlockReceiver, *, once: bool) -> None:
+    """Hand over what appears in the folders of a service's actuators; `once`: what is there now."""
+    settings = service.settings
+    folders = {
+        service.supervisor.part(f"folder of {each.name}"): WatchedFolder(
+            *(each.name, each.folder, each.pattern, 0.0 if once else settings.settle_s),
+            *(service.store.is_known, each.map or None),
+        )
+        for each in settings.actuator
+        if each.folder is not None
+    }
+    while not service.stopping.is_set():
+        done = [part.attempt(partial(_hand_over, service, folder)) for part, folder in folders.items()]
+        if once and (all(done) or DATABASE not in {outage["part"] for outage in service.outages.plain()}):
+            return
+        service.stopping.wait(_LOOK_S)
+
+
+def _hand_over(service: BlockReceiver, folder: WatchedFolder) -> None:
+    for block in folder.blocks():
+        if service.stopping.is_set():
+            return
+        service.hand(block)
 
 
 def _shown(name: str) -> str:

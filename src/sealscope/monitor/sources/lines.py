@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import BinaryIO
 
-from sealscope.monitor.sources.source_block import LARGEST, OVERSIZED, RefusedMessage, SourceBlock, decoded
+from sealscope.monitor.sources.source_block import (
+    LARGEST,
+    OVERSIZED,
+    BlockReceiver,
+    RefusedMessage,
+    SourceBlock,
+    decoded,
+)
 
 
-def blocks_of_lines(stream: BinaryIO) -> Iterator[SourceBlock | RefusedMessage]:
+def lines_of(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
+    """Return the source of a stream's lines."""
+
+    def hand_lines(service: BlockReceiver) -> None:
+        for block in _blocks(stream):
+            service.hand(block)
+            if service.stopping.is_set():
+                return
+
+    return hand_lines
+
+
+def _blocks(stream: BinaryIO) -> Iterator[SourceBlock | RefusedMessage]:
     """Yield the block of every line, or the error where a line holds none; empty lines are passed over."""
-    while True:
-        line = stream.readline(LARGEST + 1)
-        if not line:
-            return
+    while line := stream.readline(LARGEST + 1):
         if len(line) > LARGEST:
             refused = RefusedMessage(OVERSIZED, f"a line must have at most {LARGEST} bytes, got more", line)
             while line and not line.endswith(b"\n"):
                 line = stream.readline(LARGEST)
             yield refused
-            continue
-        line = line.strip()
-        if not line:
-            continue
-        try:
-            yield decoded(line)
-        except RefusedMessage as error:
-            yield RefusedMessage(error.reason, error, line)
+        elif line := line.strip():
+            try:
+                yield decoded(line)
+            except RefusedMessage as error:
+                yield RefusedMessage(error.reason, error, line)

@@ -84,16 +84,9 @@ class _EdgeState:
 
 
 class SparkplugHost:
-    """The actuators that are nodes, or devices of nodes, of Sparkplug B.
+    """The actuators that are nodes, or devices of nodes, of Sparkplug B; those without `sparkplug` are left out.
 
-    Parameters
-    ----------
-    actuators : iterable of ActuatorSettings
-        Those without `sparkplug` are left out.
-    publish : callable
-        Sends a topic and a payload.
-    count : callable
-        Counts what happened, by a reason.
+    `publish`: sends a topic and a payload; `count`: counts what happened, by a reason.
     """
 
     def __init__(

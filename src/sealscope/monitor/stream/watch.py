@@ -77,16 +77,8 @@ class Watch:
 
     Where the position is recorded it is watched by the balance of volumes, else by the pressures and the command.
 
-    Parameters
-    ----------
-    rig : Rig
-        Gives the piston's area and the pump's displacement; without a position all of the machine's model.
-    false_alarms_per_1000_h : float
-        False alarms of a healthy machine per 1000 operating hours, at most.
-    learn_hours : float
-        Operating hours of healthy running that the baseline is learned from.
-    litres : bool, optional
-        Whether the rig states what turns a conductance into L/min; by default it is asked.
+    `rig`, `false_alarms_per_1000_h`, `learn_hours`: as for `watch`; `litres`: whether the rig states what turns a
+    conductance into L/min, by default it is asked.
 
     Attributes
     ----------
