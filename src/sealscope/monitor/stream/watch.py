@@ -77,8 +77,12 @@ class Watch:
 
     Where the position is recorded it is watched by the balance of volumes, else by the pressures and the command.
 
-    `rig`, `false_alarms_per_1000_h`, `learn_hours`: as for `watch`; `litres`: whether the rig states what turns a
-    conductance into L/min, by default it is asked.
+    Parameters
+    ----------
+    rig, false_alarms_per_1000_h, learn_hours : Rig, float, float
+        As for `watch`.
+    litres : bool, optional
+        Whether the rig states what turns a conductance into L/min; by default it is asked.
 
     Attributes
     ----------
