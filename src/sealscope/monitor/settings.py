@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Thresholds
@@ -17,6 +17,18 @@ from sealscope.storage.toml_file import read_toml
 
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
 _Words = Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+def _in_folder(path: Path, info: ValidationInfo) -> Path:
+    """Return a path as taken from the folder of the file of settings, where there is one."""
+    return Path(info.context["folder"]) / path if info.context else path
+
+
+def _database(name: str, info: ValidationInfo) -> str:
+    return name if "://" in name else str(_in_folder(Path(name), info))
+
+
+_File = Annotated[Path, AfterValidator(_in_folder)]
 
 
 class _Part(BaseModel):
@@ -68,7 +80,7 @@ class ActuatorSettings(WatchSettings):
     """An actuator: its name, where its samples come from, and what differs from the defaults."""
 
     name: _Text
-    folder: Path | None = None
+    folder: _File | None = None
     pattern: str = "*"
     map: dict[str, str] = Field(default_factory=dict)
     topic: str | None = None
@@ -84,7 +96,7 @@ class PageSettings(_Part):
 
     host: str = "127.0.0.1"
     port: int = Field(default=8765, ge=0, le=65535)
-    token_file: Path | None = None
+    token_file: _File | None = None
 
 
 class BrokerSettings(_Part):
@@ -94,9 +106,9 @@ class BrokerSettings(_Part):
     port: int = Field(default=1883, ge=1, le=65535)
     client_id: _Text = "sealscope-monitor"
     user: str | None = None
-    password_file: Path | None = None
+    password_file: _File | None = None
     tls: bool = False
-    ca_file: Path | None = None
+    ca_file: _File | None = None
     alarms_topic: str | None = "sealscope"
     host_id: Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)] | None = None
 
@@ -106,7 +118,7 @@ class OpcUaSettings(_Part):
 
     url: Annotated[str, Field(pattern=r"^opc\.tcp://[^\s@]+$", max_length=2000)]
     user: str | None = None
-    password_file: Path | None = None
+    password_file: _File | None = None
     security: str | None = None
     block_s: float = Field(default=1.0, ge=0.1, le=60.0)
     timeout_s: float = Field(default=10.0, gt=0, le=300)
@@ -124,7 +136,7 @@ class WebhookSettings(_Part):
     """The address that events are posted to."""
 
     url: Annotated[str, Field(pattern=r"^https?://[^\s@]+$", max_length=2000)]
-    token_file: Path | None = None
+    token_file: _File | None = None
     timeout_s: float = Field(default=10.0, gt=0, le=300)
 
 
@@ -138,7 +150,7 @@ class ShareSettings(_Part):
 class MonitorSettings(_Part):
     """All settings of a monitor."""
 
-    database: str = "monitor.db"
+    database: Annotated[str, AfterValidator(_database)] = Field(default="monitor.db", validate_default=True)
     lines: bool = False
     settle_s: float = Field(default=5.0, ge=0, le=3600)
     keep_days: float = Field(default=90.0, gt=0)
@@ -209,15 +221,6 @@ def topic_part(name: str) -> str:
     return "".join("_" if letter in "+#/\0" else letter for letter in name)
 
 
-#: Files that the parts of the settings name.
-_FILES = {
-    "page": ("token_file",),
-    "mqtt": ("password_file", "ca_file"),
-    "opcua": ("password_file",),
-    "webhook": ("token_file",),
-}
-
-
 def read_settings(path: Path) -> MonitorSettings:
     """Return the settings of a file, paths in it taken from its folder.
 
@@ -225,26 +228,13 @@ def read_settings(path: Path) -> MonitorSettings:
     """
     values = read_toml(path, "the monitor's settings", os.fspath(path))
     try:
-        settings = MonitorSettings.model_validate(values)
+        return MonitorSettings.model_validate(values, context={"folder": path.resolve().parent})
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"])) or "settings"
         message = first["msg"].removeprefix("Value error, ")
         value = "" if first["type"] in ("value_error", "missing") else f", got {str(first['input'])[:60]!r}"
         raise InputError(f"{place}: {message}{value} ({path})") from None
-    folder = path.resolve().parent
-    changed: dict[str, Any] = {
-        "database": settings.database if "://" in settings.database else str(folder / settings.database),
-        "actuator": [
-            each if each.folder is None else each.model_copy(update={"folder": folder / each.folder})
-            for each in settings.actuator
-        ],
-    }
-    for name, own in _FILES.items():
-        if (part := getattr(settings, name)) is not None:
-            named = {field: getattr(part, field) for field in own}
-            changed[name] = part.model_copy(update={f: folder / path for f, path in named.items() if path is not None})
-    return settings.model_copy(update=changed)
 
 
 def template() -> str:

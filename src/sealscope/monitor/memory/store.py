@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -311,6 +311,13 @@ class MonitorStore:
         """Store how far an output is."""
         with self.writing() as connection:
             self.put(connection, tables.facts, {"name": name}, {"value": str(number)})
+
+    def pass_on(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
+        """Hand events to `send` in their order until it returns False, and store how far the output is after each."""
+        for number, event in self.events_since(self.position(output)) if self.sends else ():
+            if not send(event):
+                return
+            self.keep_position(output, number)
 
     @staticmethod
     def put(connection: sa.Connection, table: sa.Table, key: dict[str, Any], values: dict[str, Any]) -> None:

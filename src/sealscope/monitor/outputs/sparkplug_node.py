@@ -172,19 +172,17 @@ class SparkplugNode:
             except BaseException:
                 self._due.set()
                 raise
-        for number, event in self._store.events_since(self._store.position(_NAME)):
-            alarm = event["alarm"]
-            if alarm["actuator"] not in self._shown:  # it is no longer in the settings
-                self._store.keep_position(_NAME, number)
-                continue
-            metrics = [*_metrics(_ALARM, alarm, _clock(event["t"])), *_metrics(_EVENT, event, _clock(event["t"]))]
-            if not self._send("DDATA", metrics, alarm["actuator"]):
-                return
-            self._store.keep_position(_NAME, number)
+        self._store.pass_on(_NAME, self._sent_event)
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + self._settings.every_s
             for actuator, summary in self._summaries().items():
                 self._show(actuator, summary)
+
+    def _sent_event(self, event: dict[str, Any]) -> bool:
+        alarm, at = event["alarm"], _clock(event["t"])
+        if alarm["actuator"] not in self._shown:  # it is no longer in the settings
+            return True
+        return self._send("DDATA", [*_metrics(_ALARM, alarm, at), *_metrics(_EVENT, event, at)], alarm["actuator"])
 
     def _show(self, actuator: str, summary: dict[str, Any]) -> None:
         """Send what has changed of an actuator, or the birth of one that was not there."""

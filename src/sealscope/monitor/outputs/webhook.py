@@ -57,15 +57,10 @@ class Webhook:
 
     def pass_on(self) -> None:
         """Post what is new, unless a failure asks for a pause."""
-        if time.monotonic() < self._next or not self._store.sends:
+        if time.monotonic() < self._next:
             return
         try:
-            for number, event in self._store.events_since(self._store.position(_NAME)):
-                if announced(event):
-                    asyncio.run(self._post(number, event))
-                    self._outages.back(WEBHOOK)
-                self._store.keep_position(_NAME, number)
-                self._pause = 0.0
+            self._store.pass_on(_NAME, self._posted)
         except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError, DBAPIError) as error:
             self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), LONGEST_PAUSE_S)
             self._next = time.monotonic() + self._pause
@@ -74,8 +69,16 @@ class Webhook:
                 self._outages.lost(WEBHOOK, reason)
             _log.warning("the webhook does not take an event, tried again in %.0f s: %s", self._pause, reason)
 
-    async def _post(self, number: int, event: dict[str, Any]) -> None:
-        headers = {**self._headers, "Idempotency-Key": str(number)}
+    def _posted(self, event: dict[str, Any]) -> bool:
+        """Post an event that is announced; raises an error where it does not arrive."""
+        if announced(event):
+            asyncio.run(self._post(event))
+            self._outages.back(WEBHOOK)
+        self._pause = 0.0
+        return True
+
+    async def _post(self, event: dict[str, Any]) -> None:
+        headers = {**self._headers, "Idempotency-Key": str(event["number"])}
         client = httpx.AsyncClient(timeout=None)
         async with (
             asyncio.timeout(self._timeout),

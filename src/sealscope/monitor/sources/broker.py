@@ -212,11 +212,9 @@ class _Connection:
         store = self._service.store
         if self._settings.alarms_topic is None or not store.sends or not self._client.is_connected():
             return
-        for number, event in store.events_since(store.position(_NAME)):
-            alarm = event["alarm"]
-            if not self._published(alarm["actuator"], "alarm", json.dumps(alarm)):
-                return
-            store.keep_position(_NAME, number)
+        store.pass_on(
+            _NAME, lambda event: self._published(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
+        )
         if time.monotonic() >= self._states_due:
             self._states_due = time.monotonic() + _STATES_S
             for name, values in self._service.states().items():
