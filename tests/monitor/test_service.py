@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sqlite3
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from sealscope.monitor.stream.watch import STATE_VERSION
 from sealscope.simulation.simulate import simulate
 
 from ..diagnosis.balance_machine import machine, step
-from .plant import kill_often, lines_of, message, rows_of, served, settings_in, write_files
+from .plant import kill_often, lines_of, message, rows_of, served, settings_in, until, write_files
 
 WORN = machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=130.0, rate=50.0)
 SOUND = machine(2, duration=130.0, rate=50.0)
@@ -358,3 +360,18 @@ def test_wrong_settings_are_one_clear_line(tmp_path: Path, change: tuple[str, st
         read_settings(file)
     assert "\n" not in str(raised.value)
     assert str(file) in str(raised.value)
+
+
+def test_settings_that_nobody_edited_complain_once(tmp_path, caplog):
+    """The folder of the template's actuator is not there: one line, however often it is looked for."""
+    file = tmp_path / "monitor.toml"
+    file.write_text(template().replace("8765", "0"), encoding="utf-8")
+    service = Service(read_settings(file), stdin=io.BytesIO())
+    running = threading.Thread(target=service.run)
+    running.start()
+    until(service.outages.plain)
+    time.sleep(1.5)  # three times as long as between two looks at the folder
+    service.stop()
+    running.join()
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+    assert service.states()["press 1"]["condition"] == "no data"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import threading
@@ -137,7 +138,7 @@ class WatchedActuators:
         self._keep_s = keep_days * 86_400.0
         self._counters = Counter[str]()
         self._counting = threading.Lock()
-        self.changes = threading.Condition()
+        self._changes = itertools.count(1)
         self.changed = 0
         self.closed = False
         self.outages = Outages(self._tell)
@@ -414,6 +415,4 @@ class WatchedActuators:
         return shown
 
     def _tell(self) -> None:
-        with self.changes:
-            self.changed += 1
-            self.changes.notify_all()
+        self.changed = next(self._changes)
