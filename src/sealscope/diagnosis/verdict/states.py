@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, lru_cache
 from importlib.resources import files
 from typing import Any
 
@@ -52,7 +52,7 @@ class MachineState:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state as plain JSON values."""
-        return asdict(self)
+        return {**vars(self)}
 
 
 @cache
@@ -60,6 +60,7 @@ def _tables() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
     return tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))
 
 
+@lru_cache(maxsize=1024)
 def state_of(
     condition: str, cause: str | None = None, *, since_s: float | None = None, action: str | None = None
 ) -> MachineState:
