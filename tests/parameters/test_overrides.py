@@ -106,6 +106,8 @@ def test_immutable() -> None:
         ({"volumes": "fix"}, "volumes must be one of fixed, position, got 'fix' (set by caller)"),
         ({"volumes": ["fixed"]}, "volumes must be one of fixed, position, got ['fixed'] (set by caller)"),
         ({"V1": 1}, "'V1' is not a parameter; did you mean V_1?"),
+        ({"beta": 1e9}, "'beta' is not a parameter; did you mean fluid.K_oil?"),
+        ({"bulk_modulus": 1e9}, "'bulk_modulus' is not a parameter; did you mean fluid.K_oil?"),
         ({"moter.R_c": 1}, "'moter.R_c' is not a parameter; did you mean motor.R_c?"),
         ({"": 1}, "'' is not a parameter"),
         ({"xyzzy_unknown": 1}, "'xyzzy_unknown' is not a parameter"),

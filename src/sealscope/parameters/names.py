@@ -7,6 +7,16 @@ from collections.abc import Sequence
 from sealscope.calls import closest
 from sealscope.errors import InputError
 
+#: What textbooks and other programs call a parameter, without case and underscores.
+_OTHER_NAMES = {
+    **dict.fromkeys(("beta", "betae", "bulkmodulus"), "fluid.K_oil"),
+    **dict.fromkeys(("ap", "area", "pistonarea"), "cylinder.A_A"),
+    **dict.fromkeys(("m", "mass"), "cylinder.M_eq"),
+    **dict.fromkeys(("dp", "displacement"), "pump.q_b"),
+    **dict.fromkeys(("kt", "torqueconstant"), "motor.C_m"),
+    **dict.fromkeys(("stroke", "strokelength"), "cylinder.L"),
+}
+
 
 def resolve(name: str, dotted: Sequence[str]) -> str:
     """Return the dotted name that `name` stands for: itself, or the only one that ends with it (`V_1`, `p_A.noise`).
@@ -21,6 +31,9 @@ def resolve(name: str, dotted: Sequence[str]) -> str:
     if matches:
         shown = ", ".join(matches[:6]) + (", ..." if len(matches) > 6 else "")
         raise InputError(f"parameter {name} is not unique, give one of {shown}")
+    other = _OTHER_NAMES.get(name.casefold().replace("_", "").replace(" ", ""))
+    if other in dotted:
+        raise InputError(f"{name!r} is not a parameter; did you mean {other}?")
     bare = [full.rpartition(".")[2] for full in dotted]
     raise InputError(f"{name!r} is not a parameter{closest(name, dotted if '.' in name else [*dict.fromkeys(bare)])}")
 
