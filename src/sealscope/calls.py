@@ -12,6 +12,7 @@ from sealscope.errors import InputError
 
 P = ParamSpec("P")
 R = TypeVar("R")
+V = TypeVar("V")
 
 
 #: Longest word that near ones are looked for: the search takes longer than in proportion to the length.
@@ -58,3 +59,18 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return call
+
+
+def with_arguments_of(make: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
+    """Give a function of one value the arguments of the function that makes the value, so that they are listed once."""
+
+    def decorated(function: Callable[[V], R]) -> Callable[P, R]:
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            return function(make(*args, **kwargs))
+
+        returns = inspect.signature(function).return_annotation
+        call.__signature__ = inspect.signature(make).replace(return_annotation=returns)  # type: ignore[attr-defined]
+        return checked_call(call)
+
+    return decorated

@@ -5,18 +5,18 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.calls import checked_call
+from sealscope.calls import checked_call, with_arguments_of
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.simulation.changes import ParameterDrift
-from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment, Method
+from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment
 from sealscope.simulation.faults import Fault, Leak
 from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import DETAIL_TOLERANCE, Trajectory, oversampling, trajectory
@@ -25,10 +25,7 @@ from sealscope.storage.atomic import atomic_write
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
-    from sealscope.control import Controller
     from sealscope.parameters import Rig
-    from sealscope.simulation.commands import Command
-    from sealscope.simulation.courses import Force, Position
 
 #: Called with what is being done and how far it is, 0..1.
 Progress = Callable[[str, float], None]
@@ -314,26 +311,8 @@ def _drift_of(drift: ParameterDrift, t: Array) -> dict[str, Any]:
     return {"parameter": drift.parameter, "span_pct": 100.0 * span, "start_to_end_pct": 100.0 * end}
 
 
-@checked_call
-def simulate(
-    *,
-    rig: Rig | str | os.PathLike[str] = "thesis",
-    command: Command | Position | str = "3 sin(4t)",
-    leak: Leak | str | Iterable[Leak | str] | None = None,
-    fault: Fault | str | Iterable[Fault | str] | None = None,
-    drifts: Iterable[ParameterDrift] = (),
-    set: Mapping[str, float | str] | None = None,
-    duration: float | str = 180.0,
-    rate: float | str | None = None,
-    x_0: float | str = 0.0,
-    seed: int = 0,
-    method: Method = "auto",
-    step: float | str | None = None,
-    error: float | str | None = None,
-    allow_unresolved: bool = False,
-    load: Force | str | None = None,
-    controller: Controller | str | None = None,
-) -> Recording:
+@with_arguments_of(Experiment.of)
+def simulate(experiment: Experiment) -> Recording:
     """Simulate a rig under a command and record it as its instruments would.
 
     A quantity is a number in the SI unit stated below, or a text with a unit of its own (``"3 min"``, ``"20[Pa]"``),
@@ -401,9 +380,4 @@ def simulate(
     >>> recording.rate, len(recording)
     (500.0, 1000)
     """
-    experiment = Experiment.of(
-        rig=rig, command=command, leak=leak, fault=fault, drifts=drifts, set=set, duration=duration, rate=rate, x_0=x_0,
-        seed=seed, method=method, step=step, error=error, allow_unresolved=allow_unresolved, load=load,
-        controller=controller,
-    )  # fmt: skip
     return simulate_with_truth(experiment).recording
