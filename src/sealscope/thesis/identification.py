@@ -9,8 +9,10 @@ sigma is independent of it and has the RMS sigma in each detail d_j, so the RMS 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -36,7 +38,6 @@ if TYPE_CHECKING:
 
 #: Part of a run that is used [s]: after the start-up, two of the slowest command's cycles (2 pi seconds each).
 SETTLING, USED = 7.2, 4.0 * np.pi
-_RATIO = "geometric mean of simulated / measured leak-free RMS"
 
 
 def _identified_rig() -> Rig:
@@ -65,14 +66,8 @@ def noise_free_squares(
     from sealscope.simulation.sizing import sized_run
 
     padded = USED + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
-    experiment = Experiment.of(
-        rig=rig,
-        command=condition.command,
-        set={**experiment_values(condition), **(values or {})},
-        leak=leak,
-        duration=padded,
-        x_0=x_0,
-    )
+    values = {**experiment_values(condition), **(values or {})}
+    experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=padded, x_0=x_0)
     _, path = sized_run(experiment)
     factor, rate = oversampling(experiment), experiment.rate
     part = slice(round(SETTLING * rate), round((SETTLING + USED) * rate))
@@ -130,28 +125,13 @@ class Hypothesis:
     law: Literal["laminar", "orifice"] = "laminar"
 
 
-_MOVES: Mapping[str, float | str] = {"cylinder.volumes": "position"}
-#: The hypotheses on what the symmetric rig leaves unexplained.
-HYPOTHESES: tuple[Hypothesis, ...] = (
-    Hypothesis("the calibrated rig"),
-    Hypothesis("the bypass leaks as an orifice", law="orifice"),
-    Hypothesis("volumes change with the stroke", _MOVES),
-    Hypothesis("the piston starts 100 mm nearer to cap A", _MOVES, x_0=-0.10, x_0_then=-0.10),
-    Hypothesis("it moves 100 mm towards cap B between the halves", _MOVES, x_0=-0.10, x_0_then=0.0),
-    Hypothesis("it moves 200 mm towards cap B between the halves", _MOVES, x_0=-0.20, x_0_then=0.0),
-    Hypothesis("throttle B 10 % further closed", more_closed_B=0.10),
-    Hypothesis("line volume 1 twice line volume 2", factors={"line.V_1": 1.4, "line.V_2": 0.7}),
-    Hypothesis("sensor B reads 10 % less", gain_B=0.9),
-    Hypothesis("bulk modulus 10 % lower with the leak (air)", then={"fluid.K_oil": 0.9}),
-    Hypothesis("breakaway 5 % higher with the leak", then={"friction.K_brk": 1.05}),
-    Hypothesis(
-        "it moves 100 mm towards cap B, breakaway 5 % higher",
-        _MOVES,
-        then={"friction.K_brk": 1.05},
-        x_0=-0.10,
-        x_0_then=0.0,
-    ),
-)
+def _hypotheses() -> Iterator[Hypothesis]:
+    tree = tomllib.loads(files(__package__).joinpath("hypotheses.toml").read_text(encoding="utf-8"))
+    yield from (Hypothesis(name, **values) for name, values in tree.items())
+
+
+#: The hypotheses on what the symmetric rig leaves unexplained; the first is that rig itself.
+HYPOTHESES: tuple[Hypothesis, ...] = tuple(_hypotheses())
 
 
 def predicted_sheet(
@@ -200,27 +180,18 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     assert context.sheet is not None
     log = log_residuals(_identified_rig(), context.sheet)
     columns = [(c, q, log[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
-    summary = ThesisTable(
-        item.id,
-        item.title,
-        ("chamber", "detail", _RATIO, "within 25 %", "scatter between tests [factor]"),
-        tuple(
-            (
-                chamber,
-                name,
-                float(np.exp(of.mean())),
-                "yes" if abs(float(np.exp(of.mean())) - 1.0) <= 0.25 else "no",
-                float(np.exp(of.std(ddof=1))),
-            )
-            for chamber, name, of in columns
-        ),
-        notes="Only these columns were fitted. Noise is added by its mean square; nothing is drawn.",
-    )
-    heads = ("input", "closed [%]", "tests", *(f"{c} {q} simulated / measured" for c, q, _ in columns))
-    rows = []
-    for command, closed in groups():
-        of = np.array([condition.group == (command, closed) for condition in APPENDIX_C])
-        rows.append((command, closed, int(of.sum()), *np.exp(log[of].mean(axis=0)).ravel().tolist()))
+    heads = ("chamber", "detail", "geometric mean of simulated / measured leak-free RMS", "within 25 %")
+    rows: list[tuple[Cell, ...]] = []
+    for chamber, name, of in columns:
+        mean, scatter = float(np.exp(of.mean())), float(np.exp(of.std(ddof=1)))
+        rows.append((chamber, name, mean, "yes" if abs(mean - 1.0) <= 0.25 else "no", scatter))
+    notes = "Only these columns were fitted. Noise is added by its mean square; nothing is drawn."
+    heads = (*heads, "scatter between tests [factor]")
+    summary = ThesisTable(item.id, item.title, heads, tuple(rows), notes=notes)
+    heads, rows = ("input", "closed [%]", "tests", *(f"{c} {q} simulated / measured" for c, q, _ in columns)), []
+    for group in groups():
+        own = np.array([condition.group == group for condition in APPENDIX_C])
+        rows.append((*group, int(own.sum()), *np.exp(log[own].mean(axis=0)).ravel().tolist()))
     return summary, ThesisTable(f"{item.id}-conditions", f"{item.title}, by operating condition", heads, tuple(rows))
 
 
@@ -243,34 +214,18 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     rig = _identified_rig()
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
         predicted = predicted_sheet(rig, hypothesis)
-        rows.append(
-            (
-                hypothesis.name,
-                *(float(np.exp(np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])))) for c, q in shown),
-                *(100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in changed),
-                *(int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in shown),
-            )
-        )
+        levels = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in shown]
+        changes = [100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in changed]
+        same = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in shown]
+        rows.append((hypothesis.name, *(float(np.exp(level)) for level in levels), *changes, *same))
     notes = "Nothing here was fitted to the leak columns. Changes are geometric means over the 41 tests."
     return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=notes),)
 
 
+_FIT = "How the calibrated rig fits the leak-free columns of Appendix C"
+_WHY = "What could explain the columns that the calibrated rig does not"
 ITEMS: tuple[Item, ...] = (
     Item("calibration", 5, "table", "What the thesis leaves unknown, fitted to Appendix C", parameters_table),
-    Item(
-        "calibration-fit",
-        5,
-        "table",
-        "How the calibrated rig fits the leak-free columns of Appendix C",
-        fit_table,
-        needs_sheet=True,
-    ),
-    Item(
-        "calibration-hypotheses",
-        5,
-        "table",
-        "What could explain the columns that the calibrated rig does not",
-        hypotheses_table,
-        needs_sheet=True,
-    ),
+    Item("calibration-fit", 5, "table", _FIT, fit_table, needs_sheet=True),
+    Item("calibration-hypotheses", 5, "table", _WHY, hypotheses_table, needs_sheet=True),
 )
