@@ -135,15 +135,12 @@ def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
         numbers.append(Number(f"phase at {tone:g} Hz (cosine 0)", float(phase[k]), "deg"))
     numbers.append(Number("largest amplitude elsewhere", float(np.delete(amplitude, list(at.values())).max())))
     early, lines = t < 0.2, amplitude > 1e-6
+    signal = FigureCurve(t[early], x[early], "x(t), eq. 3.3", "reference")
+    spectrum = FigureCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems")
+    shown = (0.0, 150.0)
     panels = (
-        Panel("t [s]", "x(t) [1]", (FigureCurve(t[early], x[early], "x(t), eq. 3.3", "reference"),), "(a) Signal"),
-        Panel(
-            "frequency [Hz]",
-            "amplitude [1]",
-            (FigureCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems"),),
-            "(b) Amplitude spectrum",
-            x_range=(0.0, 150.0),
-        ),
+        Panel("t [s]", "x(t) [1]", (signal,), "(a) Signal"),
+        Panel("frequency [Hz]", "amplitude [1]", (spectrum,), "(b) Amplitude spectrum", x_range=shown),
     )
     notes = (
         "1 s sampled at 1000 Hz; the thesis gives neither. Its text names two cosines, eq. (3.3) has a sine at 30 Hz: "
@@ -156,10 +153,12 @@ def db8(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 3.3: mother wavelet and scaling function of db8, by the cascade of their filters."""
     phi, psi, t = mother_wavelet()
     step = float(t[1] - t[0])
-    frequency = wavelet_centre()[1]
-    panels = (
-        Panel("t [samples]", "psi(t) [1]", (FigureCurve(t, psi, "psi(t)", "reference"),), "(a) Mother wavelet"),
-        Panel("t [samples]", "phi(t) [1]", (FigureCurve(t, phi, "phi(t)", "other"),), "(b) Scaling function"),
+    drawn: tuple[tuple[str, Array, str, Role], ...] = (
+        ("psi(t)", psi, "(a) Mother wavelet", "reference"),
+        ("phi(t)", phi, "(b) Scaling function", "other"),
+    )
+    panels = tuple(
+        Panel("t [samples]", f"{name} [1]", (FigureCurve(t, y, name, role),), title) for name, y, title, role in drawn
     )
     numbers = (
         Number("integral of psi", float(psi.sum() * step)),
@@ -167,7 +166,7 @@ def db8(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("integral of phi", float(phi.sum() * step)),
         Number("length of both", float(t[-1] - t[0]), "samples"),
         Number("vanishing moments", float(vanishing_moments(psi, t))),
-        Number("frequency of the largest response", frequency, "1/sample"),
+        Number("frequency of the largest response", wavelet_centre()[1], "1/sample"),
     )
     notes = "The wavelet is asymmetric and of finite length: 15 sampling intervals at scale 1."
     return (Figure(item.id, item.title, panels, numbers, ("claim-3.3",), None, notes),)
@@ -196,27 +195,16 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
     times, bins, short = short_time_spectrum(x, RATE, window, 4)
     wanted = np.geomspace(10.0, 450.0, 64)
     wavelet = np.abs(continuous_transform(x, RATE, scales_for(wanted)))
+    signal = FigureCurve(t, x, "x(t)", "reference")
+    spectrum = FigureCurve(frequency, amplitude, "2 |X[n]| / N", "reference")
+    of_time = "t [s]", "frequency [Hz]"
+    by_window = f"(c) Short-time Fourier transform, window {window / RATE * 1e3:g} ms"
+    by_wavelet = Image(t, wanted, wavelet, "|CWT| [s^0.5]")
     panels = (
-        Panel("t [s]", "x(t) [1]", (FigureCurve(t, x, "x(t)", "reference"),), "(a) Time"),
-        Panel(
-            "frequency [Hz]",
-            "amplitude [1]",
-            (FigureCurve(frequency, amplitude, "2 |X[n]| / N", "reference"),),
-            "(b) Frequency",
-        ),
-        Panel(
-            "t [s]",
-            "frequency [Hz]",
-            title=f"(c) Short-time Fourier transform, window {window / RATE * 1e3:g} ms",
-            image=Image(times, bins, short, "amplitude [1]"),
-        ),
-        Panel(
-            "t [s]",
-            "frequency [Hz]",
-            title="(d) Wavelet transform, db8",
-            image=Image(t, wanted, wavelet, "|CWT| [s^0.5]"),
-            log_y=True,
-        ),
+        Panel("t [s]", "x(t) [1]", (signal,), "(a) Time"),
+        Panel("frequency [Hz]", "amplitude [1]", (spectrum,), "(b) Frequency"),
+        Panel(*of_time, title=by_window, image=Image(times, bins, short, "amplitude [1]")),
+        Panel(*of_time, title="(d) Wavelet transform, db8", image=by_wavelet, log_y=True),
     )
     pulse = (t > 0.6) & (t < 0.9)
     high = nearest(wanted, 300.0)

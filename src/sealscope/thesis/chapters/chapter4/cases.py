@@ -56,14 +56,11 @@ class ThesisCase:
 
 _THROTTLED = [(closed, command) for closed in CLOSINGS for command in COMMANDS]
 CASES: dict[str, ThesisCase] = {
-    case.name: case
-    for case in (
-        *(ThesisCase(f"4.2-{letter}", command, None) for letter, command in zip("abc", COMMANDS, strict=True)),
-        *(
-            ThesisCase(f"4.3-{letter}", command, closed)
-            for letter, (closed, command) in zip("abcdefghi", _THROTTLED, strict=True)
-        ),
-    )
+    **{f"4.2-{of}": ThesisCase(f"4.2-{of}", command, None) for of, command in zip("abc", COMMANDS, strict=True)},
+    **{
+        f"4.3-{of}": ThesisCase(f"4.3-{of}", command, closed)
+        for of, (closed, command) in zip("abcdefghi", _THROTTLED, strict=True)
+    },
 }
 
 
@@ -211,20 +208,17 @@ def numbers_of(run: SimulatedRun) -> RunNumbers:
     if run.diverged:
         nothing = dict.fromkeys(PRESSURES, math.nan)
         return RunNumbers(nothing, nothing, nothing, *(math.nan,) * 4, False)
-    Q_A, Q_B = steady_output(run, "Q_A"), steady_output(run, "Q_B")
-    drops = [
-        np.abs(steady_output(run, pump) - steady_output(run, end)).max()
-        for pump, end in (("p_1", "p_A"), ("p_2", "p_B"))
-    ]
+    of = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
+    drops = [of["p_1"] - of["p_A"], of["p_2"] - of["p_B"]]
     return RunNumbers(
-        {name: span(run, name) for name in PRESSURES},
-        {name: float(steady_output(run, name).max()) for name in PRESSURES},
-        {name: float(steady_output(run, name).min()) for name in PRESSURES},
-        mean_difference(run, "p_1", "p_A"),
-        mean_difference(run, "p_2", "p_B"),
-        float(max(drops)),
-        float(np.sqrt(np.mean((Q_A - Q_B) ** 2) / np.mean(Q_A**2))),
-        run.resolved,
+        span={name: float(np.ptp(of[name])) for name in PRESSURES},
+        peak={name: float(of[name].max()) for name in PRESSURES},
+        least={name: float(of[name].min()) for name in PRESSURES},
+        p_1_less_p_A=float(np.mean(drops[0])),
+        p_2_less_p_B=float(np.mean(drops[1])),
+        largest_drop=float(np.abs(drops).max()),
+        flows_differ=float(np.sqrt(np.mean((of["Q_A"] - of["Q_B"]) ** 2) / np.mean(of["Q_A"] ** 2))),
+        resolved=run.resolved,
     )
 
 
@@ -233,11 +227,6 @@ def throttled(
 ) -> RunNumbers:
     """Return the numbers of a command under a reading, with throttles closed by `closed_pct` [%] (None: absent)."""
     return numbers_of(context.run(spec(command, closed_pct, reading, solver)))
-
-
-def over_closings(context: Context, reading: Reading, solver: Solver) -> dict[float, RunNumbers]:
-    """Return the numbers at 0, 25, 50 and 75 % closed under the command of section 4.3."""
-    return {closed: throttled(context, reading, closed, solver) for closed in (0.0, *CLOSINGS)}
 
 
 def piston_drift(run: SimulatedRun) -> float:
