@@ -13,10 +13,9 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.appendix_c.simulation import SimulatedTest, table_of
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures
 from sealscope.thesis.claims import detection as claims
-from sealscope.thesis.claims import rates as claims_rates
 from sealscope.thesis.claims import rig as claims_rig
+from sealscope.thesis.claims import sheet as claims_sheet
 from sealscope.thesis.claims import tests as claims_tests
-from sealscope.thesis.claims import trends as claims_trends
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, correlated
 from sealscope.thesis.engine.products import Claim, Product
 from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
@@ -74,8 +73,7 @@ def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> Claim
 
 def every_claim(of: ClaimEvidence) -> dict[str, Claim]:
     found = (
-        *claims_rates.claims(of),
-        *claims_trends.claims(of),
+        *claims_sheet.claims(of),
         *claims_tests.curves(of),
         claims_tests.consistent(of),
         *claims_rig.claims(of),
@@ -102,7 +100,7 @@ def measured() -> dict[str, Claim]:
 
 def test_ids_are_unique_and_every_part_is_told(said: dict[str, Claim]) -> None:
     of = evidence(made(14, AS_SAID))
-    listed = [*claims_rates.claims(of), *claims_trends.claims(of), *claims_tests.curves(of), *claims_rig.claims(of)]
+    listed = [*claims_sheet.claims(of), *claims_tests.curves(of), *claims_rig.claims(of)]
     assert len({claim.id for claim in listed}) == len(listed)
     for claim in said.values():
         assert re.fullmatch(r"claim-[a1-6](\.\d+)+", claim.id)

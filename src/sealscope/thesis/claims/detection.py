@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from typing import get_args
 
-from sealscope.thesis.claims import rates, rig, tests, trends
+from sealscope.thesis.claims import rig, sheet, tests
 from sealscope.thesis.claims.evidence import gather
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
@@ -18,8 +18,7 @@ def detection(context: Context, item: Item) -> tuple[Claim, ...]:
     evidence = gather(context)
     claims = (
         *tests.levels(),
-        *rates.claims(evidence),
-        *trends.claims(evidence),
+        *sheet.claims(evidence),
         *tests.curves(evidence),
         tests.consistent(evidence),
         *rig.claims(evidence),

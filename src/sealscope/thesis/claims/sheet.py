@@ -1,4 +1,4 @@
-"""What abstract, section 5.6 and the conclusions say of success rates, judged by the sheet."""
+"""What the abstract, section 5.6 and the conclusions say of details, trends and success rates, judged by the sheet."""
 
 from __future__ import annotations
 
@@ -10,22 +10,27 @@ import numpy as np
 
 from sealscope.evaluation.binomial import at_least
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED, DIRECTION, Rule, d1_threshold
+from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED, DIRECTION, UNCLAIMED, Rule, d1_threshold
 from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM
+from sealscope.thesis.claims import regressions
 from sealscope.thesis.claims.evidence import (
     SENSITIVE,
     ClaimEvidence,
     Finding,
     SheetClaim,
     SheetTest,
+    corrected_p,
+    correlated,
     counted_share,
     fired,
     in_percent,
+    moves_beyond_chance,
 )
-from sealscope.thesis.claims.regressions import mean_leaks, told_apart_by_levels
+from sealscope.thesis.claims.regressions import mean_leaks
 from sealscope.thesis.engine.products import Claim
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet
 
+_N = len(APPENDIX_C)
 _A_D3, _, _A_BOTH, _, _, _B_BOTH, _TOGETHER = CLAIMED
 #: Where each cell of Table 5.1 is drawn, and its printed rates [%]: the table's, and the one the text has beside it.
 _CELLS: tuple[tuple[Rule, str, tuple[int, ...]], ...] = tuple(
@@ -132,7 +137,7 @@ def _identified(sheet: DataSheet) -> Iterator[Finding]:
 
 def _without_baseline(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
     of = ("test", "condition")
-    return {f"{name}s": "{:.2f} (AUC {:.3f})".format(*told_apart_by_levels(sheet, name)) for name in of}
+    return {f"{name}s": "{:.2f} (AUC {:.3f})".format(*regressions.told_apart_by_levels(sheet, name)) for name in of}
 
 
 def _at_5_percent(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
@@ -140,19 +145,80 @@ def _at_5_percent(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
     return {"controls": _controls(evidence, _A_D3), "finds": finds}
 
 
+def _trend(chamber: str) -> SheetTest:
+    """Find how the changes of a chamber's details go with the mean leak."""
+    leak, given, direction = mean_leaks(), regressions.condition_columns(), DIRECTION[chamber]
+
+    def test(sheet: DataSheet) -> Iterator[Finding]:
+        for name in SENSITIVE:
+            change = sheet.log_change(chamber, name)
+            raw, left = float(np.corrcoef(change, leak)[0, 1]), regressions.partial_correlation(change, leak, given)
+            beyond = correlated(raw, _N), correlated(left, _N, given.shape[1])
+            parts = [r * direction > 0 and of for r, of in zip((raw, left), beyond, strict=True)]
+            yield f"{name}: {raw:+.2f}, at equal condition {left:+.2f}", parts
+
+    return test
+
+
+def _predicted(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
+    columns = {"condition": regressions.condition_columns(), "changes": regressions.change_columns(sheet)}
+    return {name: regressions.left_out_r2(of, mean_leaks()) for name, of in columns.items()}
+
+
+def _sensitive(sheet: DataSheet) -> Iterator[Finding]:
+    p = corrected_p(sheet)
+    for rule in (*CLAIMED[:6], *UNCLAIMED):
+        ((chamber, name),) = rule.details
+        column = chamber, name
+        part = moves_beyond_chance(sheet, *column) if rule in CLAIMED else p[column] >= 0.05
+        yield f"{chamber} {name} {in_percent(sheet.log_change(*column)):+.1f} % (p = {p[column]:.2g})", [part]
+
+
+def _amplified(sheet: DataSheet) -> Iterator[Finding]:
+    for chamber in CHAMBERS:
+        changes = {name: sheet.log_change(chamber, name) * DIRECTION[chamber] for name in SENSITIVE}
+        sizes = {name: float(change.mean() / change.std(ddof=1)) for name, change in changes.items()}
+        text = ", ".join(f"{name} {size:.2f}" for name, size in sizes.items())
+        yield f"{chamber}: {text}", [sizes["d3d4"] > max(sizes["d3"], sizes["d4"])]
+
+
+def _inverse(sheet: DataSheet) -> Iterator[Finding]:
+    for name in SENSITIVE:
+        a, b = (sheet.log_change(chamber, name) for chamber in CHAMBERS)
+        r = float(np.corrcoef(a, b)[0, 1])
+        text = f"{name}: correlation {r:+.2f}, opposite signs in {int(np.sum(a * b < 0))} of {a.size}"
+        yield text, [r < 0 and correlated(r, a.size)]
+
+
+def _upward(sheet: DataSheet) -> Iterator[Finding]:
+    p = corrected_p(sheet)
+    for name in SENSITIVE:
+        up = int(np.sum(sheet.log_change("p_B", name) > 0))
+        yield f"{name} up in {up} (p = {p['p_B', name]:.2g})", [moves_beyond_chance(sheet, "p_B", name)]
+
+
 _SMALLEST = f"the {mean_leaks().min():g} L/min test: "
+_CORRELATION = "correlation of the change with the mean leak: "
 _CLAIMS: dict[str, SheetClaim] = {
     "a.1": SheetClaim(_identified, values=_without_baseline),
     "a.2": SheetClaim(_abstract_85, _SMALLEST),
-    "5.5.7": SheetClaim(_before_table, f"tests as the sentence says, of {len(APPENDIX_C)}: ", ", "),
+    "5.5.7": SheetClaim(_before_table, f"tests as the sentence says, of {_N}: ", ", "),
     "5.6.1": SheetClaim(_over_80, values=_at_5_percent),
     "5.6.2": SheetClaim(_levels, "d3 of P_A falls beyond noise: "),
     "5.6.3": SheetClaim(_smallest(CLAIMED[:6]), _SMALLEST),
     "6.1.1": SheetClaim(_passes_both, "smallest test that passes d3d4 on both chambers: "),
+    "5.5.1": SheetClaim(_sensitive, values=lambda evidence, sheet: {"d2": fired(sheet, UNCLAIMED[1])}),
+    "5.5.2": SheetClaim(_amplified, "mean over scatter of the log change, "),
+    "5.5.3": SheetClaim(_trend("p_A"), _CORRELATION, values=_predicted),
+    "5.5.4": SheetClaim(_trend("p_B"), _CORRELATION, values=_predicted),
+    "5.5.5": SheetClaim(_upward, f"of {_N}: ", ", "),
+    "5.5.6": SheetClaim(_inverse),
 }
 
 
-def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
+def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims of the abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6 on what was detected."""
-    cells = [_cell(*cell).judge(evidence, f"5.4.{number}", "5.4") for number, cell in enumerate(_CELLS, start=1)]
-    return (*cells, *(of.judge(evidence, id) for id, of in _CLAIMS.items()))
+    for number, cell in enumerate(_CELLS, start=1):
+        yield _cell(*cell).judge(evidence, f"5.4.{number}", "5.4")
+    for id, of in _CLAIMS.items():
+        yield of.judge(evidence, id)
